@@ -1,0 +1,52 @@
+# Everything a developer or CI runs. `make setup` once, then the rest; all of it in .venv.
+
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+# An old generator, so that robots are free in their protobuf and grpcio versions (1.71.2 emits code for protobuf >= 5.29).
+# It pins an old protobuf itself, hence its own environment.
+PROTO_TOOLS := grpcio-tools==1.71.2 setuptools==80.9.0
+PROTO_VENV  := $(VENV)/proto-tools
+
+.PHONY: help setup test lint format proto demo bench clean
+
+help:  ## List the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+
+$(VENV)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[server,dev]'
+	touch $@
+
+setup: $(VENV)/.installed  ## Create .venv with everything
+
+test: setup $(PROTO_VENV)/.installed  ## Run all tests
+	PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(ARGS)
+
+lint: setup  ## Check style, types and protos
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/buf lint
+
+format: setup  ## Format the code
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+$(PROTO_VENV)/.installed: Makefile $(VENV)/.installed
+	$(PYTHON) -m venv $(PROTO_VENV)
+	$(PROTO_VENV)/bin/pip install --quiet --disable-pip-version-check $(PROTO_TOOLS)
+	touch $@
+
+proto: $(PROTO_VENV)/.installed  ## Regenerate client/mapless/v1 from proto/
+	$(PROTO_VENV)/bin/python -m grpc_tools.protoc -I proto --python_out=client --pyi_out=client \
+	    --grpc_python_out=client $(wildcard proto/mapless/v1/*.proto)
+
+demo: setup  ## Localize photographs end to end; DATA=folder for real ones
+	$(BIN)/mapless-server demo $(if $(DATA),--data '$(DATA)')
+
+bench: setup  ## Measure accuracy and latency on the real scenes; DATA=folder with the scenes
+	$(BIN)/mapless-server bench $(if $(DATA),'$(DATA)',../shared/data)
+
+clean:  ## Remove the environment and caches
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache build *.egg-info

@@ -1,0 +1,1 @@
+"""mapless: visual localization without a map; the client."""

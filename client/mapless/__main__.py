@@ -1,0 +1,6 @@
+"""`mapless`."""
+
+
+def main() -> None:
+    """Run the command line."""
+    raise SystemExit("not yet")

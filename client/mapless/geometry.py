@@ -1,0 +1,308 @@
+"""The conventions of mapless, stated once: frames, transforms, cameras, projection.
+
+* Cameras look along +z, x points right, y points down (OpenCV). World frames are right-handed and metric.
+* A transform is named target_from_source and a point for its frame: ``x_in_world = world_from_camera @ x_in_camera``.
+  The paper's ``P = [R | t]`` is ``world_from_camera``: ``t`` is the camera centre in the world.
+* A similarity (with scale) is another type than a rigid motion, so metric and up-to-scale quantities cannot be mixed.
+* Pixel (0, 0) is the centre of the top-left pixel; intrinsics always travel with the image size they belong to.
+* Quaternions are named x, y, z, w, with w >= 0.
+
+Everything is float64 NumPy. Points are rows: ``(..., 3)``; pixels are ``(..., 2)`` in x, y order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+ROTATION_TOLERANCE = 1e-3
+"""How far a given rotation may be from orthonormal (or a quaternion's norm from 1) before it is refused."""
+
+
+@dataclass(frozen=True)
+class Quaternion:
+    """A unit quaternion with named parts; ``q`` and ``-q`` are the same rotation, and w >= 0 is the one we write."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+    def matrix(self) -> Array:
+        """The rotation matrix, (3, 3).
+
+        Raises:
+            ValueError: not finite, or the norm is further than ROTATION_TOLERANCE from one.
+        """
+        q = np.array([self.x, self.y, self.z, self.w])
+        norm = float(np.linalg.norm(q))
+        if not abs(norm - 1.0) <= ROTATION_TOLERANCE:
+            raise ValueError(f"quaternion must have norm 1, has {norm:g}")
+        x, y, z, w = q / norm
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
+    @staticmethod
+    def from_matrix(rotation: ArrayLike) -> Quaternion:
+        """The quaternion of a rotation matrix (3, 3), with w >= 0."""
+        r = np.asarray(rotation, float)
+        # The eigenvector of the largest eigenvalue of this symmetric matrix is the nearest unit quaternion (Bar-Itzhack
+        # 2000): no case distinction by the largest diagonal entry, and rounding in `rotation` is averaged out.
+        k = np.array(
+            [
+                [r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]],
+                [r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]],
+                [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1], r[1, 0] - r[0, 1]],
+                [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r[0, 0] + r[1, 1] + r[2, 2]],
+            ]
+        )
+        q = np.linalg.eigh(k)[1][:, -1]
+        x, y, z, w = (q if q[3] >= 0 else -q).tolist()
+        return Quaternion(x, y, z, w)
+
+
+def nearest_rotation(matrix: ArrayLike) -> Array:
+    """The rotation nearest to a matrix that is almost one, (3, 3).
+
+    Raises:
+        ValueError: not finite, further than ROTATION_TOLERANCE from orthonormal, or a reflection.
+    """
+    m = np.asarray(matrix, float)
+    if m.shape != (3, 3) or not np.abs(m @ m.T - np.eye(3)).max() <= 2 * ROTATION_TOLERANCE:
+        raise ValueError("rotation is not an orthonormal 3x3 matrix")
+    if np.linalg.det(m) < 0:
+        raise ValueError("rotation is a reflection (determinant -1)")
+    u, _, vt = np.linalg.svd(m)
+    return u @ vt
+
+
+def rotation_from_vector(vector: ArrayLike) -> Array:
+    """Rodrigues' formula: rotation about ``vector`` (3,) by its length in radians, (3, 3)."""
+    v = np.asarray(vector, float)
+    k = cross_matrix(v)
+    angle = float(np.linalg.norm(v))
+    if angle < 1e-8:
+        return np.eye(3) + k + 0.5 * k @ k
+    return np.eye(3) + math.sin(angle) / angle * k + (1 - math.cos(angle)) / angle**2 * k @ k
+
+
+def cross_matrix(vector: ArrayLike) -> Array:
+    """The matrix [v]x with [v]x w = v x w, (3, 3)."""
+    x, y, z = np.asarray(vector, float)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation_angle_deg(rotation: ArrayLike) -> float:
+    """Angle of a rotation matrix (3, 3), in degrees, 0 to 180; accurate near both ends."""
+    r = np.asarray(rotation, float)
+    sine = 0.5 * float(np.linalg.norm([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]))
+    return math.degrees(math.atan2(sine, 0.5 * (float(np.trace(r)) - 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class RigidTransform:
+    """``x_in_target = rotation @ x_in_source + translation``.
+
+    Attributes:
+        rotation: (3, 3), orthonormal with determinant 1, from source to target axes.
+        translation: (3,), origin of the source in the target frame; metres when both frames are metric.
+    """
+
+    rotation: Array
+    translation: Array
+
+    @staticmethod
+    def identity() -> RigidTransform:
+        """Source and target are the same frame."""
+        return RigidTransform(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_matrix(matrix: ArrayLike) -> RigidTransform:
+        """From a homogeneous matrix, (4, 4) or (3, 4); its rotation is re-orthonormalized.
+
+        Raises:
+            ValueError: wrong shape, not finite, or the rotation part is not a rotation.
+        """
+        m = np.asarray(matrix, float)
+        if m.shape not in ((4, 4), (3, 4)):
+            raise ValueError(f"expected a 4x4 or 3x4 matrix, got shape {m.shape}")
+        if m.shape == (4, 4) and not np.abs(m[3] - [0, 0, 0, 1]).max() <= ROTATION_TOLERANCE:
+            raise ValueError("last row of a rigid transform must be 0 0 0 1")
+        if not np.isfinite(m[:3, 3]).all():
+            raise ValueError("translation is not finite")
+        return RigidTransform(nearest_rotation(m[:3, :3]), m[:3, 3].copy())
+
+    def matrix(self) -> Array:
+        """The homogeneous matrix, (4, 4)."""
+        return np.block([[self.rotation, self.translation[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+    def quaternion(self) -> Quaternion:
+        """The rotation as a quaternion with w >= 0."""
+        return Quaternion.from_matrix(self.rotation)
+
+    def inverse(self) -> RigidTransform:
+        """``source_from_target``."""
+        return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def compose(self, source_from_other: RigidTransform) -> RigidTransform:
+        """``target_from_other``."""
+        return RigidTransform(
+            self.rotation @ source_from_other.rotation,
+            self.rotation @ source_from_other.translation + self.translation,
+        )
+
+    def apply(self, x_in_source: ArrayLike) -> Array:
+        """Points (..., 3) in the target frame."""
+        return np.asarray(x_in_source, float) @ self.rotation.T + self.translation
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """``x_in_target = scale * rotation @ x_in_source + translation``: relates an up-to-scale frame to a metric one.
+
+    Attributes:
+        scale: above 0; target units (metres) per source unit.
+        rotation: (3, 3), from source to target axes.
+        translation: (3,), origin of the source in the target frame, target units.
+    """
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    def apply(self, x_in_source: ArrayLike) -> Array:
+        """Points (..., 3) in the target frame."""
+        return self.scale * (np.asarray(x_in_source, float) @ self.rotation.T) + self.translation
+
+    def inverse(self) -> Similarity:
+        """``source_from_target``."""
+        rotation = self.rotation.T
+        return Similarity(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+    def transform_pose(self, source_from_camera: RigidTransform) -> RigidTransform:
+        """``target_from_camera`` of a camera posed in the source frame."""
+        return RigidTransform(self.rotation @ source_from_camera.rotation, self.apply(source_from_camera.translation))
+
+
+@dataclass(frozen=True)
+class RadialTangential:
+    """OpenCV's radial-tangential distortion of normalized image coordinates."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    def distort(self, ideal: Array) -> Array:
+        """Normalized coordinates (..., 2) of an ideal pinhole to those the lens gives."""
+        x, y = ideal[..., 0], ideal[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        return np.stack(
+            [
+                x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),
+                y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y,
+            ],
+            axis=-1,
+        )
+
+
+@dataclass(frozen=True)
+class Fisheye:
+    """OpenCV's fisheye distortion: theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+    def distort(self, ideal: Array) -> Array:
+        """Normalized coordinates (..., 2) of an ideal pinhole to those the lens gives."""
+        r = np.linalg.norm(ideal, axis=-1, keepdims=True)
+        theta = np.arctan(r)
+        t2 = theta * theta
+        theta_d = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
+        return ideal * np.where(r > 1e-12, theta_d / np.maximum(r, 1e-12), 1.0)
+
+
+Distortion = RadialTangential | Fisheye
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics bound to the size of the image they belong to, in its pixels.
+
+    Attributes:
+        width_px, height_px: size of the image.
+        focal_x_px, focal_y_px: focal lengths.
+        principal_x_px, principal_y_px: principal point; (0, 0) is the centre of the top-left pixel.
+        distortion: None for a pinhole.
+    """
+
+    width_px: int
+    height_px: int
+    focal_x_px: float
+    focal_y_px: float
+    principal_x_px: float
+    principal_y_px: float
+    distortion: Distortion | None = None
+
+    def matrix(self) -> Array:
+        """K, (3, 3)."""
+        return np.array(
+            [[self.focal_x_px, 0.0, self.principal_x_px], [0.0, self.focal_y_px, self.principal_y_px], [0.0, 0.0, 1.0]]
+        )
+
+    def pinhole(self) -> Camera:
+        """The ideal camera with the same K and size."""
+        return replace(self, distortion=None)
+
+    def resized(self, width_px: int, height_px: int) -> Camera:
+        """The camera of the same photograph resampled to another size.
+
+        A pixel covers [-1/2, 1/2] around its centre, so the image's edge, not its first pixel centre, is the fixed point
+        of resizing: c' = s (c + 1/2) - 1/2.
+        """
+        scale_x, scale_y = width_px / self.width_px, height_px / self.height_px
+        return replace(
+            self,
+            width_px=width_px,
+            height_px=height_px,
+            focal_x_px=self.focal_x_px * scale_x,
+            focal_y_px=self.focal_y_px * scale_y,
+            principal_x_px=resized_pixel(self.principal_x_px, scale_x),
+            principal_y_px=resized_pixel(self.principal_y_px, scale_y),
+        )
+
+    def project(self, x_in_camera: ArrayLike) -> Array:
+        """Pixels (..., 2) of points (..., 3) in the camera frame; NaN for points that are not in front of it."""
+        x = np.asarray(x_in_camera, float)
+        depth = np.where(x[..., 2:] > 0, x[..., 2:], np.nan)
+        ideal = x[..., :2] / depth
+        if self.distortion is not None:
+            ideal = self.distortion.distort(ideal)
+        return ideal * (self.focal_x_px, self.focal_y_px) + (self.principal_x_px, self.principal_y_px)
+
+    def rays(self, pixels: ArrayLike) -> Array:
+        """Points (..., 3) at depth 1 in the camera frame seen at ``pixels`` (..., 2) of the ideal pinhole camera."""
+        ideal = (np.asarray(pixels, float) - (self.principal_x_px, self.principal_y_px)) / (
+            self.focal_x_px,
+            self.focal_y_px,
+        )
+        return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
+
+
+def resized_pixel(pixel: float, scale: float) -> float:
+    """Where a pixel coordinate goes when its image is resampled by ``scale`` (new size / old size)."""
+    return scale * (pixel + 0.5) - 0.5

@@ -1,0 +1,66 @@
+"""What the pipeline works on: photographs reduced to a pinhole camera and local features."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Camera, RigidTransform
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Local features of one photograph.
+
+    Attributes:
+        keypoints: (N, 2) float32, x and y in pixels of the view's camera, lens distortion removed.
+        descriptors: (N, D) float32, unit length, so that a product is a cosine.
+        sizes_px: (N,) float32, diameter of the patch that each descriptor describes.
+    """
+
+    keypoints: NDArray[np.float32]
+    descriptors: NDArray[np.float32]
+    sizes_px: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        n = len(self.keypoints)
+        if self.keypoints.shape != (n, 2) or self.descriptors.ndim != 2 or len(self.descriptors) != n:
+            raise ValueError(f"keypoints {self.keypoints.shape} and descriptors {self.descriptors.shape} do not fit")
+        if self.sizes_px.shape != (n,):
+            raise ValueError(f"sizes {self.sizes_px.shape} do not fit {n} keypoints")
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A photograph as the pipeline sees it: processed size, no distortion.
+
+    Attributes:
+        camera: pinhole, in pixels of the processed (reduced) image.
+        features: in the same pixels.
+    """
+
+    camera: Camera
+    features: Features
+
+
+@dataclass(frozen=True, eq=False)
+class PosedView:
+    """A reference as the pipeline sees it.
+
+    Attributes:
+        key: identifies the stored reference for good (references never change, keys are never reused): what caches of
+            anything computed from it are keyed by.
+        name: "scenes/{scene}/references/{reference}".
+        view: camera and features.
+        world_from_camera: its pose, metric.
+    """
+
+    key: str
+    name: str
+    view: View
+    world_from_camera: RigidTransform
