@@ -1,6 +1,214 @@
-"""`mapless`."""
+"""The command `mapless`: what the client can do, from a shell. Answers are JSON on standard output.
+
+Exit codes: 0 done, 1 the call failed, 2 wrong usage, 3 the photograph was not localized (the answer says why).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from datetime import datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from google.protobuf import json_format
+from google.protobuf.message import Message
+
+from . import wire
+from .client import Client, NewReference, PositionPrior
+from .errors import MaplessError
+from .geometry import Camera, RigidTransform
+from .options import ConnectOptions
+from .results import Rejected
+from .v1 import geometry_pb2
+
+EXIT_FAILED, EXIT_USAGE, EXIT_REJECTED = 1, 2, 3
+
+M = TypeVar("M", bound=Message)
+
+_FILE_FORMATS = """\
+CAMERA is a JSON file (or JSON text) as the interface defines CameraIntrinsics:
+  {"width_px": 1600, "height_px": 1067, "focal_x_px": 1437.2, "focal_y_px": 1440.1,
+   "principal_x_px": 791.8, "principal_y_px": 524.3, "radial_tangential": {"k1": 0.1}}
+POSE likewise, RigidTransform:
+  {"rotation": {"x": 0, "y": 0, "z": 0, "w": 1}, "translation_m": {"x": 0, "y": 0, "z": 1.5}}
+"""
 
 
-def main() -> None:
-    """Run the command line."""
-    raise SystemExit("not yet")
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line; exits."""
+    parsed = _parser().parse_args(arguments)
+    try:
+        with Client(parsed.address, ConnectOptions(timeout_s=parsed.timeout)) as client:
+            sys.exit(parsed.run(client, parsed))
+    except MaplessError as error:
+        field = f" (field {error.field})" if error.field else ""
+        print(f"mapless: {error}{field}", file=sys.stderr)
+        sys.exit(EXIT_FAILED)
+    except (OSError, ValueError) as error:
+        print(f"mapless: {error}", file=sys.stderr)
+        sys.exit(EXIT_USAGE)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="mapless", description=__doc__, epilog=_FILE_FORMATS, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--version", action="version", version=f"mapless {version('mapless')}")
+    parser.add_argument("--address", default="localhost:50051", help="of the server (default: %(default)s)")
+    parser.add_argument("--timeout", type=float, default=30.0, help="of a call, seconds (default: %(default)s)")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    health = commands.add_parser("health", help="whether the server takes calls")
+    health.set_defaults(run=_health)
+
+    scene = commands.add_parser("scene", help="create, get, list, delete").add_subparsers(
+        required=True, metavar="ACTION"
+    )
+    for action, run in (("create", _create_scene), ("get", _get_scene), ("delete", _delete_scene)):
+        one = scene.add_parser(action)
+        one.add_argument("scene")
+        one.set_defaults(run=run)
+    scene.add_parser("list").set_defaults(run=_list_scenes)
+
+    reference = commands.add_parser("reference", help="add, list, delete")
+    reference_actions = reference.add_subparsers(required=True, metavar="ACTION")
+    add = reference_actions.add_parser("add", help="store a photograph with its camera and pose")
+    add.add_argument("scene")
+    add.add_argument("photo", type=Path)
+    add.add_argument("--id", help="of the reference (default: the file's name without its ending)")
+    add.add_argument("--camera", required=True, help="its camera, see below of `mapless --help`")
+    add.add_argument("--pose", required=True, help="world_from_camera")
+    add.set_defaults(run=_add_reference)
+    listing = reference_actions.add_parser("list")
+    listing.add_argument("scene")
+    listing.set_defaults(run=_list_references)
+    delete = reference_actions.add_parser("delete")
+    delete.add_argument("scene")
+    delete.add_argument("reference")
+    delete.set_defaults(run=_delete_reference)
+
+    localize = commands.add_parser("localize", help="where a photograph was taken")
+    localize.add_argument("scene")
+    localize.add_argument("photo", type=Path)
+    localize.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
+    localize.add_argument("--reference", action="append", default=[], help="compare with this one; may be repeated")
+    localize.add_argument("--count", type=int, default=0, help="how many references the server chooses")
+    localize.add_argument(
+        "--near", type=float, nargs=4, metavar=("X", "Y", "Z", "RADIUS"), help="position prior, metres"
+    )
+    localize.add_argument("--variant", default="", help="best, full, no_structure or coarse")
+    localize.add_argument("--scale-strategy", default="", help="two_stage, triangulation or trajectory")
+    localize.set_defaults(run=_localize)
+    return parser
+
+
+def _health(client: Client, arguments: argparse.Namespace) -> int:
+    serving = client.is_serving()
+    print("SERVING" if serving else "NOT_SERVING")
+    return 0 if serving else EXIT_FAILED
+
+
+def _create_scene(client: Client, arguments: argparse.Namespace) -> int:
+    return _print(client.create_scene(arguments.scene))
+
+
+def _get_scene(client: Client, arguments: argparse.Namespace) -> int:
+    return _print(client.get_scene(arguments.scene))
+
+
+def _list_scenes(client: Client, arguments: argparse.Namespace) -> int:
+    return _print(list(client.list_scenes()))
+
+
+def _delete_scene(client: Client, arguments: argparse.Namespace) -> int:
+    client.delete_scene(arguments.scene)
+    return 0
+
+
+def _add_reference(client: Client, arguments: argparse.Namespace) -> int:
+    reference = NewReference(
+        reference_id=arguments.id or arguments.photo.stem,
+        image=arguments.photo,
+        camera=_read_camera(arguments.camera),
+        world_from_camera=_read_pose(arguments.pose),
+    )
+    return _print(client.add_reference(arguments.scene, reference))
+
+
+def _list_references(client: Client, arguments: argparse.Namespace) -> int:
+    return _print(list(client.list_references(arguments.scene)))
+
+
+def _delete_reference(client: Client, arguments: argparse.Namespace) -> int:
+    client.delete_reference(arguments.scene, arguments.reference)
+    return 0
+
+
+def _localize(client: Client, arguments: argparse.Namespace) -> int:
+    near = arguments.near
+    answer = client.localize(
+        arguments.photo,
+        _read_camera(arguments.camera),
+        arguments.scene,
+        arguments.reference,
+        position_prior=PositionPrior(np.array(near[:3]), near[3]) if near else None,
+        variant=arguments.variant,
+        scale_strategy=arguments.scale_strategy,
+        reference_count=arguments.count,
+    )
+    _print(answer)
+    return EXIT_REJECTED if isinstance(answer, Rejected) else 0
+
+
+def _read_camera(source: str) -> Camera:
+    return wire.camera_from_message(_read_json(source, geometry_pb2.CameraIntrinsics()), "camera")
+
+
+def _read_pose(source: str) -> RigidTransform:
+    return wire.transform_from_message(_read_json(source, geometry_pb2.RigidTransform()), "pose")
+
+
+def _read_json(source: str, message: M) -> M:
+    """The message that a JSON file, or JSON text, holds."""
+    text = source if source.lstrip().startswith("{") else Path(source).read_text()
+    try:
+        json_format.Parse(text, message)
+    except json_format.ParseError as error:
+        raise ValueError(f"{source}: {error}") from None
+    return message
+
+
+def _print(value: object) -> int:
+    print(json.dumps(_plain(value), indent=2))
+    return 0
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold of a result; geometry in the form that --camera and --pose read."""
+    if isinstance(value, Camera):
+        return _plain(wire.camera_to_message(value))
+    if isinstance(value, RigidTransform):
+        return _plain(wire.transform_to_message(value))
+    if isinstance(value, Message):
+        return json_format.MessageToDict(value, preserving_proto_field_name=True)
+    if dataclasses.is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, datetime):
+        return value.isoformat()
+    return value
+
+
+if __name__ == "__main__":
+    main()

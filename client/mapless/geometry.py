@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -83,7 +84,7 @@ def nearest_rotation(matrix: ArrayLike) -> Array:
     if np.linalg.det(m) < 0:
         raise ValueError("rotation is a reflection (determinant -1)")
     u, _, vt = np.linalg.svd(m)
-    return u @ vt
+    return np.asarray(u @ vt)
 
 
 def rotation_from_vector(vector: ArrayLike) -> Array:
@@ -287,9 +288,7 @@ class Camera:
 
     def project(self, x_in_camera: ArrayLike) -> Array:
         """Pixels (..., 2) of points (..., 3) in the camera frame; NaN for points that are not in front of it."""
-        x = np.asarray(x_in_camera, float)
-        depth = np.where(x[..., 2:] > 0, x[..., 2:], np.nan)
-        ideal = x[..., :2] / depth
+        ideal = normalize(x_in_camera)
         if self.distortion is not None:
             ideal = self.distortion.distort(ideal)
         return ideal * (self.focal_x_px, self.focal_y_px) + (self.principal_x_px, self.principal_y_px)
@@ -303,6 +302,25 @@ class Camera:
         return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
 
 
-def resized_pixel(pixel: float, scale: float) -> float:
+def normalize(x_in_camera: ArrayLike) -> Array:
+    """The perspective division: (..., 3) in the camera frame to (..., 2) at depth 1; NaN where not in front."""
+    x = np.asarray(x_in_camera, float)
+    return x[..., :2] / np.where(x[..., 2:] > 0, x[..., 2:], np.nan)
+
+
+def normalize_jacobian(x_in_camera: ArrayLike) -> Array:
+    """Derivative (..., 2, 3) of `normalize` by its argument."""
+    x = np.asarray(x_in_camera, float)
+    inverse_depth = 1 / np.where(x[..., 2] > 0, x[..., 2], np.nan)
+    jacobian = np.zeros((*x.shape[:-1], 2, 3))
+    jacobian[..., 0, 0] = jacobian[..., 1, 1] = inverse_depth
+    jacobian[..., :, 2] = -normalize(x) * inverse_depth[..., None]
+    return jacobian
+
+
+Number = TypeVar("Number", float, NDArray[np.floating])
+
+
+def resized_pixel(pixel: Number, scale: float) -> Number:
     """Where a pixel coordinate goes when its image is resampled by ``scale`` (new size / old size)."""
     return scale * (pixel + 0.5) - 0.5

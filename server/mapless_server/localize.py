@@ -1,87 +1,232 @@
-"""The method on one screen (types first; body follows)."""
+"""The method, on one screen.
+
+Five stages, each knowing the result of the one before: coarse > scale > structure > match > pnp; and a sixth of our own,
+adjust. Beneath them all lie the correspondences between the photographs' features.
+
+This module knows nothing of grpc, queues or storage.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from enum import Enum
+
+import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 
+from .adjust import AdjustOptions, adjust_pose
+from .coarse import Reconstructor
+from .coarse.geometric import GeometricReconstructor
+from .correspond import Correspondences, Matcher
+from .match import PAPER_MATCH, MatchOptions, PointMatches, match_points
+from .pnp import PnpOptions, PoseEstimate, PoseStage, solve_pose
+from .rejection import Rejection, RejectionReason
+from .scale import MetricScale, ScaleOptions, ScaleStrategy, estimate_scale
+from .structure import PAPER_STRUCTURE, Structure, StructureOptions, build_structure
 from .views import PosedView, View
+
+MIN_FEATURES = 12
+"""A photograph with fewer local features is blank, black or blurred."""
 
 
 class Variant(str, Enum):
+    """Forms of the method; all but `BEST` are the paper's."""
+
     COARSE = "coarse"
+    """The reconstruction's own pose at metric scale."""
     NO_STRUCTURE = "no_structure"
+    """PnP on predicted points."""
     FULL = "full"
+    """The paper's method."""
     BEST = "best"
-
-
-class ScaleStrategy(str, Enum):
-    TRIANGULATION = "triangulation"
-    TRAJECTORY = "trajectory"
-    TWO_STAGE = "two_stage"
-
-
-class RejectionReason(str, Enum):
-    NO_USABLE_REFERENCES = "no_usable_references"
-    DEGENERATE_REFERENCES = "degenerate_references"
-    LOW_TEXTURE = "low_texture"
-    LOW_OVERLAP = "low_overlap"
-    SCALE_UNRELIABLE = "scale_unreliable"
-    TOO_FEW_MATCHES = "too_few_matches"
-    PNP_FAILED = "pnp_failed"
-    GATE = "gate"
-
-
-class PoseStage(str, Enum):
-    INITIAL = "initial"
-    REFINED = "refined"
-
-
-class ScaleStage(str, Enum):
-    TRIANGULATION = "triangulation"
-    TRAJECTORY = "trajectory"
+    """Tracks over all references, keypoints weighted by their noise, a final adjustment of everything."""
 
 
 @dataclass(frozen=True)
 class LocalizeOptions:
+    """Options of the method; the defaults are the best we know.
+
+    Attributes:
+        variant: decides `structure`, `match` and `adjust` unless they are given.
+        scale_strategy: how the metric scale is found.
+    """
+
     variant: Variant = Variant.BEST
     scale_strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
+    pnp: PnpOptions = field(default_factory=PnpOptions)
+    adjust: AdjustOptions = field(default_factory=AdjustOptions)
+
+    @property
+    def structure(self) -> StructureOptions:
+        """Options of the structure stage."""
+        if self.variant is Variant.BEST:
+            return StructureOptions()
+        return replace(PAPER_STRUCTURE, optimize=self.variant is Variant.FULL)
+
+    @property
+    def match(self) -> MatchOptions:
+        """Options of the matching stage."""
+        return MatchOptions() if self.variant is Variant.BEST else PAPER_MATCH
 
 
 @dataclass(frozen=True, eq=False)
 class Localization:
+    """Where the query was taken.
+
+    Attributes:
+        world_from_camera: metric.
+        covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians; None for `Variant.COARSE`.
+        pose_stage: whether the refined or the initial pose is answered.
+        inlier_count: 2D-3D matches that agree with it.
+        match_count: 2D-3D matches tried.
+        reprojection_error_px: median of the inliers, pixels of the processed image.
+    """
+
     world_from_camera: RigidTransform
-    covariance: Array | None  # (6, 6) order x y z rx ry rz, fixed world axes, metres and radians
+    covariance: Array | None
     pose_stage: PoseStage
     inlier_count: int
     match_count: int
     reprojection_error_px: float
 
 
-@dataclass(frozen=True)
-class Rejection:
-    reason: RejectionReason
-    message: str
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What the method says of one query.
 
+    Attributes:
+        outcome: the pose, or why there is none.
+        scale: None if that stage was not reached.
+        stage_seconds: time of each stage that ran, in order.
+        reference_match_counts: per reference, feature matches with the query.
+        reference_inlier_counts: per reference, inliers on points that it observes.
+    """
 
-@dataclass(frozen=True)
-class UsedScale:
-    metres_per_unit: float
-    stage: ScaleStage
-    deviation: float
+    outcome: Localization | Rejection
+    scale: MetricScale | None = None
+    stage_seconds: dict[str, float] = field(default_factory=dict)
+    reference_match_counts: tuple[int, ...] = ()
+    reference_inlier_counts: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    outcome: Localization | Rejection
-    scale: UsedScale | None
+class Pipeline:
+    """What the method runs on, shared by all queries.
+
+    Attributes:
+        reconstructor: the coarse backend.
+        matcher: remembers matches between references.
+    """
+
+    reconstructor: Reconstructor = field(default_factory=GeometricReconstructor)
+    matcher: Matcher = field(default_factory=Matcher)
+
+
+def make_pipeline(backend: str) -> Pipeline:
+    """The pipeline that a setting names.
+
+    Raises:
+        ValueError: unknown name.
+    """
+    if backend == "geometric":
+        return Pipeline()
+    raise ValueError(f"unknown backend {backend!r}; known: geometric")
+
+
+@dataclass(eq=False)
+class _Progress:
+    """What is known of an answer while its stages run."""
+
+    reference_count: int
     stage_seconds: dict[str, float] = field(default_factory=dict)
-    reference_match_counts: tuple[int, ...] = ()  # per reference, in order
-    reference_inlier_counts: tuple[int, ...] = ()  # per reference, in order
+    correspondences: Correspondences | None = None
+    scale: MetricScale | None = None
+    inlier_counts: tuple[int, ...] = ()
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start_s = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.stage_seconds[name] = time.perf_counter() - start_s
+
+    def answer(self, outcome: Localization | Rejection) -> Answer:
+        none = (0,) * self.reference_count
+        matches = tuple(len(m) for m in self.correspondences.query_matches) if self.correspondences else none
+        return Answer(outcome, self.scale, self.stage_seconds, matches, self.inlier_counts or none)
 
 
-def localize(query: View, references: Sequence[PosedView], pipeline: object, options: LocalizeOptions) -> Answer:
-    raise NotImplementedError
+def localize(query: View, references: Sequence[PosedView], pipeline: Pipeline, options: LocalizeOptions) -> Answer:
+    """Localizes a query among posed references.
+
+    Args:
+        query: the photograph.
+        references: the most similar first.
+        pipeline: what to run on.
+        options: see there.
+
+    Returns:
+        The answer; "no pose" is one, with the first stage that could not do its work.
+    """
+    progress = _Progress(len(references))
+    return progress.answer(_stages(query, references, pipeline, options, progress))
+
+
+def _stages(
+    query: View, references: Sequence[PosedView], pipeline: Pipeline, options: LocalizeOptions, progress: _Progress
+) -> Localization | Rejection:
+    if not references:
+        return Rejection(RejectionReason.NO_USABLE_REFERENCES, "no references")
+    if len(query.features) < MIN_FEATURES:
+        message = f"the photograph has {len(query.features)} local features, {MIN_FEATURES} are needed"
+        return Rejection(RejectionReason.LOW_TEXTURE, message)
+
+    with progress.stage("correspond"):
+        correspondences = pipeline.matcher.correspond(query, references)
+        progress.correspondences = correspondences
+    with progress.stage("coarse"):
+        reconstruction = pipeline.reconstructor.reconstruct(query, references, correspondences)
+    if isinstance(reconstruction, Rejection):
+        return reconstruction
+    with progress.stage("scale"):
+        scale = estimate_scale(reconstruction, references, correspondences, ScaleOptions(options.scale_strategy))
+    if isinstance(scale, Rejection):
+        return scale
+    progress.scale = scale
+    if options.variant is Variant.COARSE:
+        return Localization(scale.world_from_query, None, PoseStage.INITIAL, 0, 0, 0.0)
+    with progress.stage("structure"):
+        structure = build_structure(reconstruction, scale, references, correspondences, options.structure)
+    with progress.stage("match"):
+        initial = scale.world_from_query
+        matches = match_points(query, references, structure, correspondences, initial, options.match)
+    with progress.stage("pnp"):
+        estimate = solve_pose(query, structure, matches, initial, options.pnp)
+    if isinstance(estimate, Rejection):
+        return estimate
+    if options.variant is Variant.BEST:
+        with progress.stage("adjust"):
+            estimate = adjust_pose(query, references, structure, matches, estimate, options.adjust)
+    progress.inlier_counts = _inliers_by_reference(structure, matches, estimate, len(references))
+    return Localization(
+        estimate.world_from_camera,
+        estimate.covariance,
+        estimate.stage,
+        int(estimate.inliers.sum()),
+        len(matches),
+        float(np.median(estimate.errors_px[estimate.inliers])),
+    )
+
+
+def _inliers_by_reference(
+    structure: Structure, matches: PointMatches, estimate: PoseEstimate, reference_count: int
+) -> tuple[int, ...]:
+    agreeing = np.zeros(len(structure.x_in_world), bool)
+    agreeing[matches.point[estimate.inliers]] = True
+    seen = structure.tracks.view[agreeing[structure.tracks.point]]
+    return tuple(np.bincount(seen, minlength=reference_count).tolist())

@@ -1,0 +1,294 @@
+"""The client: one blocking method per thing a caller wants, one function that makes every call."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import grpc
+
+from . import errors, names, wire
+from .geometry import Array, Camera, RigidTransform
+from .options import ConnectOptions
+from .results import (
+    LocalizationResult,
+    Reference,
+    Rejected,
+    Scene,
+    answer_from_message,
+    reference_from_message,
+    scene_from_message,
+)
+from .v1 import geometry_pb2
+from .v1 import localization_service_pb2 as localization_pb
+from .v1 import reference_service_pb2 as reference_pb
+from .v1.localization_service_pb2_grpc import LocalizationServiceStub
+from .v1.reference_service_pb2_grpc import ReferenceServiceStub
+
+ImageSource = bytes | str | os.PathLike[str]
+"""The bytes of a JPEG, PNG or WebP file, or its path. They are sent as they are."""
+
+# grpc.health.v1 as bytes, which spares robots a package: the request for the whole server is empty, the answer is
+# {status: SERVING}.
+_HEALTH_METHOD = "/grpc.health.v1.Health/Check"
+_SERVING = b"\x08\x01"
+
+
+@dataclass(frozen=True, eq=False)
+class NewReference:
+    """A reference to be stored: id within the scene, photograph, its camera and its pose (metric)."""
+
+    reference_id: str
+    image: ImageSource
+    camera: Camera
+    world_from_camera: RigidTransform
+
+
+@dataclass(frozen=True, eq=False)
+class PositionPrior:
+    """The camera is known to be within `radius_m` of `position_m` (3,), world frame."""
+
+    position_m: Array
+    radius_m: float
+
+
+class Client:
+    """A connection to a mapless server; use it from any thread, close it or use it as a context manager.
+
+    Scenes and references are given by id or by name ("scenes/{scene}"). Every method raises `MaplessError`, and takes
+    `timeout_s`, which stands for the options' own.
+    """
+
+    def __init__(self, address: str, options: ConnectOptions | None = None) -> None:
+        """Does not connect yet: a server that cannot be reached is noticed by the first call.
+
+        Args:
+            address: "host:port".
+            options: how to connect.
+        """
+        self.options = options or ConnectOptions()
+        arguments = self.options.channel_options()
+        if self.options.tls:
+            credentials = grpc.ssl_channel_credentials(self.options.root_certificates)
+            self._channel = grpc.secure_channel(address, credentials, options=arguments)
+        else:
+            self._channel = grpc.insecure_channel(address, options=arguments)
+        self._localization = LocalizationServiceStub(self._channel)
+        self._references = ReferenceServiceStub(self._channel)
+        self._health = self._channel.unary_unary(_HEALTH_METHOD)
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the connection; calls still running fail."""
+        self._channel.close()
+
+    def is_serving(self, *, timeout_s: float | None = None) -> bool:
+        """Whether the server takes calls; False while it starts or drains, an error if it cannot be reached."""
+        return bool(self._call(self._health, b"", timeout_s) == _SERVING)
+
+    def localize(
+        self,
+        image: ImageSource,
+        camera: Camera,
+        scene: str,
+        references: Sequence[str] = (),
+        *,
+        position_prior: PositionPrior | None = None,
+        variant: str = "",
+        scale_strategy: str = "",
+        reference_count: int = 0,
+        capture_time: datetime | None = None,
+        session_from_camera: RigidTransform | None = None,
+        timeout_s: float | None = None,
+    ) -> LocalizationResult | Rejected:
+        """Where a photograph was taken.
+
+        Args:
+            image: the photograph.
+            camera: the camera that took it, in pixels of the file as it is stored, before any EXIF rotation.
+            scene: where to look.
+            references: what to compare with, most similar first, at most 64; none: the server chooses.
+            position_prior: what is known of the position; a pose outside is rejected.
+            variant: "best" (default), "full", "no_structure" or "coarse".
+            scale_strategy: "two_stage" (default), "triangulation" or "trajectory".
+            reference_count: how many references the server chooses if none are named; 0 is its default.
+            capture_time: when it was taken, with time zone; echoed.
+            session_from_camera: where the device believed its camera to be then; echoed, and what makes
+                `LocalizationResult.world_from_session`.
+            timeout_s: deadline of the call.
+        """
+        scene = _scene_name(scene)
+        request = localization_pb.LocalizeRequest(
+            scene=scene,
+            references=[_reference_name(scene, reference) for reference in references],
+            image=_read(image),
+            intrinsics=wire.camera_to_message(camera),
+            options=localization_pb.LocalizeOptions(
+                variant=_enum_value(localization_pb.Variant, variant),
+                scale_strategy=_enum_value(localization_pb.ScaleStrategy, scale_strategy),
+                reference_count=reference_count,
+            ),
+        )
+        if position_prior is not None:
+            x, y, z = map(float, position_prior.position_m)
+            request.position_prior.position_m.CopyFrom(geometry_pb2.Vector3(x=x, y=y, z=z))
+            request.position_prior.radius_m = position_prior.radius_m
+        if capture_time is not None:
+            request.capture_time.FromDatetime(capture_time)
+        if session_from_camera is not None:
+            request.session_from_camera.CopyFrom(wire.transform_to_message(session_from_camera))
+        return answer_from_message(self._call(self._localization.Localize, request, timeout_s))
+
+    def create_scene(self, scene_id: str, *, timeout_s: float | None = None) -> Scene:
+        """A new, empty scene."""
+        request = reference_pb.CreateSceneRequest(scene_id=scene_id)
+        return scene_from_message(self._call(self._references.CreateScene, request, timeout_s).scene)
+
+    def get_scene(self, scene: str, *, timeout_s: float | None = None) -> Scene:
+        """A scene."""
+        request = reference_pb.GetSceneRequest(name=_scene_name(scene))
+        return scene_from_message(self._call(self._references.GetScene, request, timeout_s).scene)
+
+    def list_scenes(self, *, page_size: int = 0, timeout_s: float | None = None) -> Iterator[Scene]:
+        """All scenes by id, fetched page by page; the deadline is each page's."""
+        request = reference_pb.ListScenesRequest(page_size=page_size)
+        for page in self._pages(self._references.ListScenes, request, timeout_s):
+            yield from map(scene_from_message, page.scenes)
+
+    def delete_scene(self, scene: str, *, timeout_s: float | None = None) -> None:
+        """Deletes a scene and all its references."""
+        self._call(self._references.DeleteScene, reference_pb.DeleteSceneRequest(name=_scene_name(scene)), timeout_s)
+
+    def add_reference(self, scene: str, reference: NewReference, *, timeout_s: float | None = None) -> Reference:
+        """Stores a reference."""
+        request = _create_request(_scene_name(scene), reference)
+        return reference_from_message(self._call(self._references.CreateReference, request, timeout_s).reference)
+
+    def add_references(
+        self,
+        scene: str,
+        references: Iterable[NewReference],
+        *,
+        on_progress: Callable[[int], None] | None = None,
+        timeout_s: float | None = None,
+    ) -> list[Reference]:
+        """Stores many references, in as many messages as needed.
+
+        A message is stored whole or not at all. When one fails, those before it stay: list the scene to see how far
+        it came.
+
+        Args:
+            scene: where to.
+            references: what to store; files are read as they are sent.
+            on_progress: told the number stored so far, after each message.
+            timeout_s: deadline of each message; None for `upload_timeout_s`.
+        """
+        name = _scene_name(scene)
+        stored: list[Reference] = []
+        for requests in self._batches(_create_request(name, reference) for reference in references):
+            message = reference_pb.BatchCreateReferencesRequest(scene=name, requests=requests)
+            response = self._call(
+                self._references.BatchCreateReferences, message, timeout_s or self.options.upload_timeout_s
+            )
+            stored += map(reference_from_message, response.references)
+            if on_progress is not None:
+                on_progress(len(stored))
+        return stored
+
+    def get_reference(
+        self, scene: str, reference: str, *, include_image: bool = False, timeout_s: float | None = None
+    ) -> Reference:
+        """A reference, with its photograph if asked for."""
+        name = _reference_name(_scene_name(scene), reference)
+        request = reference_pb.GetReferenceRequest(name=name, include_image=include_image)
+        return reference_from_message(self._call(self._references.GetReference, request, timeout_s).reference)
+
+    def list_references(self, scene: str, *, page_size: int = 0, timeout_s: float | None = None) -> Iterator[Reference]:
+        """A scene's references by id, without photographs, fetched page by page; the deadline is each page's."""
+        request = reference_pb.ListReferencesRequest(scene=_scene_name(scene), page_size=page_size)
+        for page in self._pages(self._references.ListReferences, request, timeout_s):
+            yield from map(reference_from_message, page.references)
+
+    def delete_reference(self, scene: str, reference: str, *, timeout_s: float | None = None) -> None:
+        """Deletes a reference."""
+        request = reference_pb.DeleteReferenceRequest(name=_reference_name(_scene_name(scene), reference))
+        self._call(self._references.DeleteReference, request, timeout_s)
+
+    def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None) -> Any:
+        """Every call: always with a deadline, and errors as ours."""
+        try:
+            return method(request, timeout=timeout_s or self.options.timeout_s)
+        except grpc.RpcError as error:
+            raise errors.from_rpc_error(error) from error
+
+    def _pages(self, method: Callable[..., Any], request: Any, timeout_s: float | None) -> Iterator[Any]:
+        while True:
+            page = self._call(method, request, timeout_s)
+            yield page
+            if not page.next_page_token:
+                return
+            request.page_token = page.next_page_token
+
+    def _batches(
+        self, requests: Iterable[reference_pb.CreateReferenceRequest]
+    ) -> Iterator[list[reference_pb.CreateReferenceRequest]]:
+        """Requests in their order, as many together as fit a message; one that is too large goes alone."""
+        batch: list[reference_pb.CreateReferenceRequest] = []
+        batch_bytes = 0
+        for request in requests:
+            size_bytes = request.ByteSize()
+            full = batch_bytes + size_bytes > self.options.batch_mib * 2**20 or len(batch) == self.options.batch_count
+            if batch and full:
+                yield batch
+                batch, batch_bytes = [], 0
+            batch.append(request)
+            batch_bytes += size_bytes
+        if batch:
+            yield batch
+
+
+def _create_request(scene_name: str, reference: NewReference) -> reference_pb.CreateReferenceRequest:
+    return reference_pb.CreateReferenceRequest(
+        scene=scene_name,
+        reference_id=reference.reference_id,
+        reference=reference_pb.Reference(
+            image=_read(reference.image),
+            intrinsics=wire.camera_to_message(reference.camera),
+            world_from_camera=wire.transform_to_message(reference.world_from_camera),
+        ),
+    )
+
+
+def _read(image: ImageSource) -> bytes:
+    return image if isinstance(image, bytes) else Path(image).read_bytes()
+
+
+def _scene_name(scene: str) -> str:
+    return scene if scene.startswith("scenes/") else names.scene_name(scene)
+
+
+def _reference_name(scene_name: str, reference: str) -> str:
+    return reference if reference.startswith("scenes/") else f"{scene_name}/references/{reference}"
+
+
+def _enum_value(enum: wire.ProtoEnum, value: str) -> Any:
+    """The number of an option's value; ValueError names those there are."""
+    prefix = wire.enum_prefix(enum)
+    if not value:
+        return 0
+    known = [name.removeprefix(prefix).lower() for name in enum.keys()[1:]]
+    if value not in known:
+        raise ValueError(f"{enum.DESCRIPTOR.name} is one of {', '.join(known)}, not {value!r}")
+    return enum.Value(prefix + value.upper())

@@ -1,0 +1,63 @@
+"""Names of scenes and references: "scenes/{scene}" and "scenes/{scene}/references/{reference}"."""
+
+from __future__ import annotations
+
+import re
+
+_ID = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,126}[A-Za-z0-9_])?", re.ASCII)
+_SHOWN_CHARACTERS = 60  # of a bad value in a message: callers send ids of 10,000
+
+
+def check_id(value: str) -> str:
+    """The id of a scene or a reference, unchanged.
+
+    Raises:
+        ValueError: not an id.
+    """
+    if not _ID.fullmatch(value) or ".." in value:
+        raise ValueError(
+            "an id is 1 to 128 characters of A-Z a-z 0-9 . _ -, begins and ends with a letter, digit or underscore and "
+            f"does not contain '..'; got {shown(value)}"
+        )
+    return value
+
+
+def scene_name(scene_id: str) -> str:
+    """The name of a scene."""
+    return f"scenes/{scene_id}"
+
+
+def reference_name(scene_id: str, reference_id: str) -> str:
+    """The name of a reference."""
+    return f"scenes/{scene_id}/references/{reference_id}"
+
+
+def parse_scene_name(name: str) -> str:
+    """The scene's id.
+
+    Raises:
+        ValueError: not "scenes/{scene}".
+    """
+    collection, _, scene_id = name.partition("/")
+    if collection != "scenes" or not scene_id:
+        raise ValueError(f"must be scenes/{{scene}}, got {shown(name)}")
+    return check_id(scene_id)
+
+
+def parse_reference_name(name: str) -> tuple[str, str]:
+    """The ids of the scene and of the reference.
+
+    Raises:
+        ValueError: not "scenes/{scene}/references/{reference}".
+    """
+    parts = name.split("/", 3)
+    if len(parts) != 4 or parts[0] != "scenes" or parts[2] != "references":
+        raise ValueError(f"must be scenes/{{scene}}/references/{{reference}}, got {shown(name)}")
+    return check_id(parts[1]), check_id(parts[3])
+
+
+def shown(value: str) -> str:
+    """A value as messages quote it: escaped and cut to a readable length."""
+    if len(value) > _SHOWN_CHARACTERS:
+        return f"{value[:_SHOWN_CHARACTERS]!a}... ({len(value)} characters)"
+    return ascii(value)

@@ -1,0 +1,67 @@
+"""How a client connects."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ConnectOptions:
+    """Options of a connection.
+
+    Attributes:
+        timeout_s: for a call that is given none of its own. Every call has a deadline, retries included: without one a
+            lost server would block the caller for ever.
+        upload_timeout_s: the same for one message of a bulk upload; it returns when its photographs are described.
+        max_message_mib: largest message that is sent or received; the server's own limit (32 by default) holds too.
+        batch_mib: a bulk upload sends messages of about this size at most; must fit the server's limit.
+        batch_count: and of so many references at most, so that progress shows.
+        max_attempts: tries of a call that finds the server UNAVAILABLE, 1 to 5.
+        initial_backoff_s, max_backoff_s: pause before the second try, doubled for each further one up to the maximum.
+        keepalive_s: a connection in use is probed after so much silence; servers refuse less than 30.
+        tls: whether to encrypt, and to check the server's certificate.
+        root_certificates: PEM bytes to check it with; None for the system's.
+    """
+
+    timeout_s: float = 30.0
+    upload_timeout_s: float = 300.0
+    max_message_mib: int = 64
+    batch_mib: float = 24.0
+    batch_count: int = 32
+    max_attempts: int = 4
+    initial_backoff_s: float = 0.2
+    max_backoff_s: float = 2.0
+    keepalive_s: float = 60.0
+    tls: bool = False
+    root_certificates: bytes | None = None
+
+    def __post_init__(self) -> None:
+        if not (self.timeout_s > 0 and self.upload_timeout_s > 0 and self.keepalive_s > 0):
+            raise ValueError("times must be above 0")
+        if not (self.max_message_mib >= 1 and 0 < self.batch_mib <= self.max_message_mib and self.batch_count >= 1):
+            raise ValueError("batch_mib must be above 0 and at most max_message_mib, counts at least 1")
+        if not (1 <= self.max_attempts <= 5 and 0 < self.initial_backoff_s <= self.max_backoff_s):
+            raise ValueError("max_attempts must be 1 to 5 and initial_backoff_s above 0 and at most max_backoff_s")
+
+    def channel_options(self) -> list[tuple[str, int | str]]:
+        """The options as grpc takes them."""
+        max_message_bytes = self.max_message_mib * 2**20
+        options: list[tuple[str, int | str]] = [
+            ("grpc.max_send_message_length", max_message_bytes),
+            ("grpc.max_receive_message_length", max_message_bytes),
+            ("grpc.keepalive_time_ms", round(1000 * self.keepalive_s)),
+            # A message that does not fit into this buffer, 256 KiB unless set, is not retried: no photograph would be.
+            ("grpc.per_rpc_retry_buffer_size", max_message_bytes),
+        ]
+        if self.max_attempts > 1:
+            policy = {
+                "maxAttempts": self.max_attempts,
+                "initialBackoff": f"{self.initial_backoff_s}s",
+                "maxBackoff": f"{self.max_backoff_s}s",
+                "backoffMultiplier": 2,
+                "retryableStatusCodes": ["UNAVAILABLE"],
+            }
+            config = {"methodConfig": [{"name": [{}], "retryPolicy": policy}]}
+            options.append(("grpc.service_config", json.dumps(config)))
+        return options

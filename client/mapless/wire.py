@@ -1,0 +1,173 @@
+"""Geometry types to messages and back; client and server share it.
+
+Reading a message checks everything the proto's comments promise. What is wrong is a `FieldError` that names the field
+by its path in the request, "requests[3].reference.intrinsics.focal_x_px".
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from . import names
+from .geometry import Array, Camera, Distortion, Fisheye, Quaternion, RadialTangential, RigidTransform
+from .v1 import geometry_pb2 as pb
+
+ProtoEnum = Any
+"""A generated enum: the wrapper that has `Name`, `Value` and `values`."""
+
+MIN_SIDE_PX, MAX_SIDE_PX = 32, 16384
+MAX_COORDINATE_M = 1e7
+MAX_DISTORTION = 100.0
+MAX_FOCAL_PER_SIDE = 100.0
+
+
+class FieldError(ValueError):
+    """A field of a message breaks its contract.
+
+    Attributes:
+        field: its path in the request.
+    """
+
+    def __init__(self, field: str, message: str) -> None:
+        super().__init__(f"{field}: {message}")
+        self.field = field
+
+
+def joined(path: str, field: str) -> str:
+    """The path of a field of the message at `path`; "" is the request itself."""
+    return f"{path}.{field}" if path else field
+
+
+def scene_id_from_name(name: str, field: str) -> str:
+    """The id in "scenes/{scene}"; FieldError if it is not that."""
+    try:
+        return names.parse_scene_name(name)
+    except ValueError as error:
+        raise FieldError(field, str(error)) from None
+
+
+def reference_ids_from_name(name: str, field: str) -> tuple[str, str]:
+    """The ids in "scenes/{scene}/references/{reference}"; FieldError if it is not that."""
+    try:
+        return names.parse_reference_name(name)
+    except ValueError as error:
+        raise FieldError(field, str(error)) from None
+
+
+def checked_id(value: str, field: str) -> str:
+    """The id, unchanged; FieldError if it is not one."""
+    try:
+        return names.check_id(value)
+    except ValueError as error:
+        raise FieldError(field, str(error)) from None
+
+
+def camera_to_message(camera: Camera) -> pb.CameraIntrinsics:
+    """Message of a camera."""
+    message = pb.CameraIntrinsics(
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        focal_x_px=camera.focal_x_px,
+        focal_y_px=camera.focal_y_px,
+        principal_x_px=camera.principal_x_px,
+        principal_y_px=camera.principal_y_px,
+    )
+    lens = camera.distortion
+    if isinstance(lens, RadialTangential):
+        message.radial_tangential.CopyFrom(
+            pb.RadialTangentialDistortion(k1=lens.k1, k2=lens.k2, p1=lens.p1, p2=lens.p2, k3=lens.k3)
+        )
+    elif isinstance(lens, Fisheye):
+        message.fisheye.CopyFrom(pb.FisheyeDistortion(k1=lens.k1, k2=lens.k2, k3=lens.k3, k4=lens.k4))
+    return message
+
+
+def camera_from_message(message: pb.CameraIntrinsics, field: str) -> Camera:
+    """Camera of a message.
+
+    Raises:
+        FieldError: a number is not finite or out of the range that geometry.proto states.
+    """
+    for side in ("width_px", "height_px"):
+        value = getattr(message, side)
+        if not MIN_SIDE_PX <= value <= MAX_SIDE_PX:
+            raise FieldError(joined(field, side), f"must be {MIN_SIDE_PX} to {MAX_SIDE_PX}, is {value}")
+    max_focal_px = MAX_FOCAL_PER_SIDE * max(message.width_px, message.height_px)
+    for focal in ("focal_x_px", "focal_y_px"):
+        value = getattr(message, focal)
+        if not 0 < value <= max_focal_px:
+            raise FieldError(joined(field, focal), f"must be above 0 and at most {max_focal_px:g}, is {value:g}")
+    for principal, side_px in (("principal_x_px", message.width_px), ("principal_y_px", message.height_px)):
+        value = getattr(message, principal)
+        if not -side_px <= value <= 2 * side_px:
+            raise FieldError(joined(field, principal), f"must be {-side_px} to {2 * side_px}, is {value:g}")
+    return Camera(
+        message.width_px,
+        message.height_px,
+        message.focal_x_px,
+        message.focal_y_px,
+        message.principal_x_px,
+        message.principal_y_px,
+        _distortion_from_message(message, field),
+    )
+
+
+def _distortion_from_message(message: pb.CameraIntrinsics, field: str) -> Distortion | None:
+    kind = message.WhichOneof("distortion")
+    if kind is None:
+        return None
+    lens = getattr(message, kind)
+    coefficients = {name: getattr(lens, name) for name in lens.DESCRIPTOR.fields_by_name}
+    for name, value in coefficients.items():
+        if not abs(value) <= MAX_DISTORTION:
+            raise FieldError(
+                joined(field, f"{kind}.{name}"), f"must be at most {MAX_DISTORTION:g} in magnitude, is {value:g}"
+            )
+    return RadialTangential(**coefficients) if kind == "radial_tangential" else Fisheye(**coefficients)
+
+
+def transform_to_message(target_from_source: RigidTransform) -> pb.RigidTransform:
+    """Message of a rigid transform, its quaternion with w >= 0."""
+    q, (x, y, z) = target_from_source.quaternion(), target_from_source.translation.tolist()
+    return pb.RigidTransform(
+        rotation=pb.Quaternion(x=q.x, y=q.y, z=q.z, w=q.w), translation_m=pb.Vector3(x=x, y=y, z=z)
+    )
+
+
+def transform_from_message(
+    message: pb.RigidTransform, field: str, max_coordinate_m: float = math.inf
+) -> RigidTransform:
+    """Rigid transform of a message, its rotation normalized.
+
+    Raises:
+        FieldError: a part is missing or not finite, the quaternion's norm is not one, a coordinate exceeds the maximum.
+    """
+    for part in ("rotation", "translation_m"):
+        if not message.HasField(part):
+            raise FieldError(joined(field, part), "is required")
+    q = message.rotation
+    try:
+        rotation = Quaternion(q.x, q.y, q.z, q.w).matrix()
+    except ValueError as error:
+        raise FieldError(joined(field, "rotation"), str(error)) from None
+    translation = vector_from_message(message.translation_m, joined(field, "translation_m"), max_coordinate_m)
+    return RigidTransform(rotation, translation)
+
+
+def vector_from_message(message: pb.Vector3, field: str, max_coordinate_m: float = math.inf) -> Array:
+    """Coordinates (3,) in metres; FieldError if one is not finite or exceeds the maximum in magnitude."""
+    for axis in ("x", "y", "z"):
+        value = getattr(message, axis)
+        if not math.isfinite(value):
+            raise FieldError(joined(field, axis), f"must be finite, is {value}")
+        if abs(value) > max_coordinate_m:
+            raise FieldError(joined(field, axis), f"must be at most {max_coordinate_m:g} m in magnitude, is {value:g}")
+    return np.array([message.x, message.y, message.z])
+
+
+def enum_prefix(enum: ProtoEnum) -> str:
+    """What the names of an enum's values begin with on the wire, "SCALE_STAGE_"."""
+    return str(enum.Name(0)).removesuffix("UNSPECIFIED")

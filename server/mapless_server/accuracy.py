@@ -1,0 +1,48 @@
+"""Radii that a person can use, from a covariance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from mapless.geometry import Array
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Errors not exceeded in 68 and 95 % of cases, if the covariance is right."""
+
+    position_68_m: float
+    position_95_m: float
+    rotation_68_deg: float
+    rotation_95_deg: float
+
+
+def accuracy_from_covariance(covariance: Array) -> Accuracy:
+    """Radii of a pose's covariance (6, 6): order x y z rx ry rz, metres and radians."""
+    position, rotation = covariance[:3, :3], covariance[3:, 3:]
+    return Accuracy(
+        position_68_m=error_radius(position, 0.68),
+        position_95_m=error_radius(position, 0.95),
+        rotation_68_deg=math.degrees(error_radius(rotation, 0.68)),
+        rotation_95_deg=math.degrees(error_radius(rotation, 0.95)),
+    )
+
+
+def error_radius(covariance: Array, probability: float) -> float:
+    """Length that a zero-mean normal vector with this covariance (n, n) does not exceed with this probability.
+
+    The squared length is a sum of chi-squares weighted by the eigenvalues; it is taken as one scaled chi-square with
+    the same mean and variance (Satterthwaite). Exact where all eigenvalues are equal or all but one vanish, within 4 %
+    between.
+    """
+    eigenvalues = np.linalg.eigvalsh(covariance).clip(min=0)
+    total = float(eigenvalues.sum())
+    if total <= 0:
+        return 0.0
+    scale = float((eigenvalues**2).sum()) / total
+    degrees_of_freedom = total / scale
+    return math.sqrt(2 * scale * float(gammaincinv(degrees_of_freedom / 2, probability)))

@@ -1,0 +1,102 @@
+"""A server of one's own: the real one, as a child process on the loopback interface."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+START_TIMEOUT_S = 120.0
+GRACE_S = 1.0
+_ANNOUNCEMENT = "mapless-server listening on "
+
+
+class ServerFailed(Exception):
+    """The server did not start; it has said why on standard error."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Memory of a process.
+
+    Attributes:
+        resident_mib: now.
+        peak_mib: the most it ever was (VmHWM).
+    """
+
+    resident_mib: float
+    peak_mib: float
+
+
+@dataclass(frozen=True)
+class ChildServer:
+    """A running server."""
+
+    address: str
+    process_id: int
+
+    def memory(self) -> Memory | None:
+        """What the process holds; None where the system does not tell (it is read from /proc)."""
+        try:
+            status = Path(f"/proc/{self.process_id}/status").read_text()
+        except OSError:
+            return None
+        fields = dict(line.split(":", 1) for line in status.splitlines())
+        if "VmRSS" not in fields or "VmHWM" not in fields:
+            return None
+        return Memory(int(fields["VmRSS"].split()[0]) / 1024, int(fields["VmHWM"].split()[0]) / 1024)
+
+
+@contextmanager
+def child_server(data_dir: Path) -> Iterator[ChildServer]:
+    """A server on a free port of the loopback interface until the block is left, by whatever way.
+
+    Settings of the environment hold for it, except where it listens and stores.
+
+    Raises:
+        ServerFailed: it ended, or did not listen within `START_TIMEOUT_S`.
+    """
+    flags = {
+        "--host": "127.0.0.1",
+        "--port": "0",
+        "--data-dir": str(data_dir),
+        "--log-level": "warning",
+        "--drain-grace-s": str(GRACE_S),
+    }
+    arguments = [part for flag in flags.items() for part in flag]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mapless_server", "serve", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield ChildServer(_read_address(process), process.pid)
+    finally:
+        process.terminate()
+        try:
+            process.wait(GRACE_S + 30)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def _read_address(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    # Reading a pipe has no deadline; a child that is gone ends it.
+    deadline = threading.Timer(START_TIMEOUT_S, process.kill)
+    deadline.daemon = True
+    deadline.start()
+    try:
+        for line in process.stdout:
+            if line.startswith(_ANNOUNCEMENT):
+                return line.removeprefix(_ANNOUNCEMENT).strip()
+    finally:
+        deadline.cancel()
+    raise ServerFailed(f"the server did not start (exit code {process.wait()}); its own message is above")

@@ -1,0 +1,91 @@
+"""The coarse stage: query and references reconstructed together, up to one common scale.
+
+A seam. The paper calls a feed-forward network here (its equation for Phi); whatever else gives local points, confidences
+and poses in one local frame will do. A backend is one file in this package with a `Reconstructor`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import RigidTransform, resized_pixel
+
+from ..correspond import Correspondences
+from ..rejection import Rejection
+from ..views import PosedView, View
+
+
+@dataclass(frozen=True, eq=False)
+class ReconstructedView:
+    """One view's part of a reconstruction. Its maps may be smaller than the view's image; pixel centres correspond as in
+    resizing.
+
+    Attributes:
+        point_map: (H, W, 3) float32, the point seen at each pixel, in this camera's frame, up to the common scale; NaN
+            where unknown.
+        confidence: (H, W) float32, 0 to 1; 0 where unknown.
+        local_from_camera: the camera's pose in the reconstruction's frame, up to the common scale.
+    """
+
+    point_map: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    local_from_camera: RigidTransform
+
+    def depth_at(self, pixels: NDArray[np.floating], width_px: int, height_px: int) -> NDArray[np.float64]:
+        """Depth (N,) at pixels (N, 2) of the view's image of the given size, nearest neighbour; NaN where unknown."""
+        rows, columns = self.cells(pixels, width_px, height_px)
+        return np.asarray(self.point_map[rows, columns, 2], np.float64)
+
+    def cells(
+        self, pixels: NDArray[np.floating], width_px: int, height_px: int
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows and columns (N,) of the maps' cells that hold pixels (N, 2) of the view's image."""
+        height, width = self.confidence.shape
+        columns = resized_pixel(pixels[:, 0], width / width_px)
+        rows = resized_pixel(pixels[:, 1], height / height_px)
+        return (
+            np.clip(np.rint(rows), 0, height - 1).astype(np.intp),
+            np.clip(np.rint(columns), 0, width - 1).astype(np.intp),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """Query and references in one local frame whose scale is unknown.
+
+    Attributes:
+        query: the query's part.
+        references: one for each reference, in their order.
+    """
+
+    query: ReconstructedView
+    references: tuple[ReconstructedView, ...]
+
+
+class Reconstructor(Protocol):
+    """A coarse backend.
+
+    Attributes:
+        name: "geometric", "pi3", ...
+        weights_sha256: of the network's weights; empty without any.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def weights_sha256(self) -> str: ...
+
+    def reconstruct(
+        self, query: View, references: Sequence[PosedView], correspondences: Correspondences
+    ) -> Reconstruction | Rejection:
+        """Reconstructs the query and its references together, or says why it cannot.
+
+        A network looks at the images and ignores the correspondences; the geometric backend lives on them.
+        """
+        ...

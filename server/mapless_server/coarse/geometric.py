@@ -1,0 +1,148 @@
+"""The coarse stage without a network: the embedded default on a machine without a GPU or weights.
+
+Features matched among the references are triangulated from the references' known poses, and the query is posed by PnP on
+what it matches of them. The sparse points are scattered into the point maps, in a frame of its own with a scale of its
+own, as a network would give them: the stages behind the seam see no difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mapless.geometry import Array, RigidTransform, Similarity
+
+from ..correspond import Correspondences
+from ..match import vote
+from ..pnp import PnpOptions, log10_false_alarms, ransac, reprojection_errors_px
+from ..rejection import Rejection, RejectionReason
+from ..structure import FIRST_GUESS, Structure, StructureOptions, adjust_points, observe, triangulate, trustworthy
+from ..tracks import build_tracks
+from ..views import PosedView, View
+from . import ReconstructedView, Reconstruction
+
+
+@dataclass(frozen=True)
+class GeometricOptions:
+    """Options of the geometric backend.
+
+    Attributes:
+        structure: a few steps only, since the structure stage follows.
+        pnp: of the query's pose.
+        min_baseline_m: references that all stand closer together than this triangulate nothing.
+        cell_px: side of a cell of the point maps, pixels of the view. Small enough that two keypoints seldom share one.
+    """
+
+    structure: StructureOptions = field(default_factory=lambda: StructureOptions(iterations=3))
+    pnp: PnpOptions = field(default_factory=PnpOptions)
+    min_baseline_m: float = 0.02
+    cell_px: int = 2
+
+    def __post_init__(self) -> None:
+        if not (self.min_baseline_m > 0 and self.cell_px >= 1):
+            raise ValueError(f"senseless options: {self}")
+
+
+@dataclass(frozen=True)
+class GeometricReconstructor:
+    """See the module."""
+
+    options: GeometricOptions = field(default_factory=GeometricOptions)
+    name: str = "geometric"
+    weights_sha256: str = ""
+
+    def reconstruct(
+        self, query: View, references: Sequence[PosedView], correspondences: Correspondences
+    ) -> Reconstruction | Rejection:
+        """See Reconstructor.reconstruct."""
+        rejection = self._check(references)
+        if rejection:
+            return rejection
+        structure = self._triangulate(references, correspondences)
+        if not len(structure.x_in_world):
+            return Rejection(
+                RejectionReason.NO_USABLE_REFERENCES, "the references share no points that could be triangulated"
+            )
+        matches = vote(structure, [len(r.view.features) for r in references], correspondences)
+        x_in_world = structure.x_in_world[matches.point]
+        pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
+        pose = ransac(query.camera, x_in_world, pixels, None, self.options.pnp) if len(matches) >= 4 else None
+        if pose is None:
+            return Rejection(
+                RejectionReason.LOW_OVERLAP,
+                f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references",
+            )
+        inliers = reprojection_errors_px(query.camera, pose, x_in_world, pixels) < self.options.pnp.inlier_px
+        false_alarms = log10_false_alarms(query.camera, inliers, matches.guided, self.options.pnp)
+        if false_alarms > self.options.pnp.max_log10_false_alarms:
+            return Rejection(
+                RejectionReason.LOW_OVERLAP,
+                f"{inliers.sum()} of {len(matches)} matches with the references' points agree on a pose, which chance"
+                f" could do (10^{false_alarms:.1f} expected)",
+            )
+        return self._scatter(query, references, structure, pose, x_in_world[inliers], pixels[inliers])
+
+    def _check(self, references: Sequence[PosedView]) -> Rejection | None:
+        if len(references) < 2:
+            return Rejection(
+                RejectionReason.NO_USABLE_REFERENCES, f"{len(references)} reference, at least 2 are needed for depth"
+            )
+        centres = np.stack([r.world_from_camera.translation for r in references])
+        extent_m = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+        if extent_m < self.options.min_baseline_m:
+            return Rejection(
+                RejectionReason.DEGENERATE_REFERENCES,
+                f"all {len(references)} references stand within {extent_m:.3f} m: without a baseline there is no scale",
+            )
+        return None
+
+    def _triangulate(self, references: Sequence[PosedView], correspondences: Correspondences) -> Structure:
+        options = self.options.structure
+        tracks = build_tracks(correspondences.reference_pairs, [len(r.view.features) for r in references])
+        observations = observe(tracks, references, FIRST_GUESS)
+        points = triangulate(observations)
+        points = adjust_points(observations, points, options.loss_scale_sigma, options.iterations)
+        keep = trustworthy(observations, points, options)
+        return Structure(points[keep], tracks.select(keep), FIRST_GUESS)
+
+    def _scatter(
+        self,
+        query: View,
+        references: Sequence[PosedView],
+        structure: Structure,
+        world_from_query: RigidTransform,
+        query_points: Array,
+        query_pixels: Array,
+    ) -> Reconstruction:
+        """Point maps in a local frame: that of the first reference, where the median point is one unit away."""
+        local_from_world = _unit_frame(references[0].world_from_camera, structure.x_in_world)
+        tracks = structure.tracks
+        views = []
+        for index, reference in enumerate(references):
+            mine = tracks.view == index
+            points = structure.x_in_world[tracks.point[mine]]
+            pixels = reference.view.features.keypoints[tracks.keypoint[mine]].astype(np.float64)
+            views.append(self._view(reference.view, reference.world_from_camera, local_from_world, points, pixels))
+        queried = self._view(query, world_from_query, local_from_world, query_points, query_pixels)
+        return Reconstruction(queried, tuple(views))
+
+    def _view(
+        self, view: View, world_from_camera: RigidTransform, local_from_world: Similarity, points: Array, pixels: Array
+    ) -> ReconstructedView:
+        shape = (-(-view.camera.height_px // self.options.cell_px), -(-view.camera.width_px // self.options.cell_px))
+        maps = ReconstructedView(
+            np.full((*shape, 3), np.nan, np.float32),
+            np.zeros(shape, np.float32),
+            local_from_world.transform_pose(world_from_camera),
+        )
+        rows, columns = maps.cells(pixels, view.camera.width_px, view.camera.height_px)
+        maps.point_map[rows, columns] = local_from_world.scale * world_from_camera.inverse().apply(points)
+        maps.confidence[rows, columns] = 1.0
+        return maps
+
+
+def _unit_frame(world_from_camera: RigidTransform, x_in_world: Array) -> Similarity:
+    distance_m = float(np.median(np.linalg.norm(x_in_world - world_from_camera.translation, axis=1)))
+    return Similarity(distance_m, world_from_camera.rotation, world_from_camera.translation).inverse()

@@ -1,0 +1,149 @@
+"""What an evaluation comes to: errors, recall, latency. A query that was not localized counts as infinitely wrong."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+
+RECALL_BARS = {"1cm_1deg": (0.01, 1.0), "5cm_5deg": (0.05, 5.0), "25cm_2deg": (0.25, 2.0)}
+"""Names of the field's usual bars: metres and degrees, both inclusive."""
+
+
+@dataclass(frozen=True)
+class QueryResult:
+    """What became of one query; a rejected one has infinite errors.
+
+    Attributes:
+        name: of the frame.
+        references: names of the references it was given, in order.
+        translation_error: distance between true and answered camera centre, the dataset's unit.
+        rotation_error_deg: angle between true and answered orientation.
+        reference_distance: median distance from the true camera centre to those of its references, the dataset's unit.
+        position_68: the server's own claim, position error not exceeded in 68 % of cases; None without one.
+        inlier_count, match_count: of the answer; 0 for a rejection.
+        rejection: reason; empty if localized.
+        message: the rejection's sentence.
+        latency_ms: of the call, as the client sees it.
+        stage_ms: inside the server, by stage.
+        backend, features: what computed it.
+    """
+
+    name: str
+    references: tuple[str, ...]
+    translation_error: float
+    rotation_error_deg: float
+    reference_distance: float
+    position_68: float | None
+    inlier_count: int
+    match_count: int
+    rejection: str
+    message: str
+    latency_ms: float
+    stage_ms: Mapping[str, float]
+    backend: str
+    features: str
+
+    @property
+    def localized(self) -> bool:
+        """Whether there is a pose."""
+        return not self.rejection
+
+
+@dataclass(frozen=True)
+class Summary:
+    """All queries together. Medians, p90 and recall are over all queries, infinite where too many were rejected.
+
+    Attributes:
+        query_count, localized_count: how many.
+        median_translation, p90_translation: the dataset's unit.
+        median_rotation_deg: degrees.
+        median_relative: translation error over the distance to the query's references, no unit.
+        recall: share of queries within each of `RECALL_BARS`; meaningless if the dataset is not metric.
+        claim_held: share of claimed 68 % radii that held; None if nothing was claimed.
+        latency_p50_ms, latency_p95_ms: of calls, the first left out if there are more.
+        latency_first_ms: of the first, which finds every cache empty.
+        stage_share: share of each stage in the time of all.
+        rejections: how many by reason.
+    """
+
+    query_count: int
+    localized_count: int
+    median_translation: float
+    median_rotation_deg: float
+    p90_translation: float
+    median_relative: float
+    recall: Mapping[str, float]
+    claim_held: float | None
+    latency_p50_ms: float
+    latency_p95_ms: float
+    latency_first_ms: float
+    stage_share: Mapping[str, float]
+    rejections: Mapping[str, int]
+
+
+def pose_error(true: RigidTransform, answered: RigidTransform) -> tuple[float, float]:
+    """Distance of two cameras' centres, in their unit, and the angle between their orientations, degrees."""
+    return (
+        float(np.linalg.norm(true.translation - answered.translation)),
+        rotation_angle_deg(true.rotation.T @ answered.rotation),
+    )
+
+
+def summarize(results: Sequence[QueryResult]) -> Summary:
+    """The summary of at least one result."""
+    translations = [r.translation_error for r in results]
+    rotations = [r.rotation_error_deg for r in results]
+    claims = [r.translation_error <= r.position_68 for r in results if r.position_68 is not None]
+    latencies = [r.latency_ms for r in results]
+    steady = latencies[1:] or latencies
+    return Summary(
+        query_count=len(results),
+        localized_count=sum(r.localized for r in results),
+        median_translation=quantile(translations, 0.5),
+        median_rotation_deg=quantile(rotations, 0.5),
+        p90_translation=quantile(translations, 0.9),
+        median_relative=quantile([_ratio(r.translation_error, r.reference_distance) for r in results], 0.5),
+        recall={
+            name: sum(t <= metres and d <= degrees for t, d in zip(translations, rotations, strict=True)) / len(results)
+            for name, (metres, degrees) in RECALL_BARS.items()
+        },
+        claim_held=sum(claims) / len(claims) if claims else None,
+        latency_p50_ms=quantile(steady, 0.5),
+        latency_p95_ms=quantile(steady, 0.95),
+        latency_first_ms=latencies[0],
+        stage_share=stage_share(results),
+        rejections=dict(Counter(r.rejection for r in results if not r.localized).most_common()),
+    )
+
+
+def quantile(values: Sequence[float], share: float) -> float:
+    """Quantile by linear interpolation; infinite where it touches an infinite value (NumPy's is NaN there)."""
+    ordered = sorted(values)
+    position = share * (len(ordered) - 1)
+    lower, upper = ordered[math.floor(position)], ordered[math.ceil(position)]
+    return upper if math.isinf(upper) else lower + (upper - lower) * (position - math.floor(position))
+
+
+def stage_share(results: Sequence[QueryResult]) -> dict[str, float]:
+    """Each stage's share in the time of all stages of all queries, in the order they run."""
+    totals: dict[str, float] = {}
+    for result in results:
+        for stage, milliseconds in result.stage_ms.items():
+            totals[stage] = totals.get(stage, 0.0) + milliseconds
+    whole = sum(totals.values())
+    return {stage: total / whole for stage, total in totals.items()} if whole > 0 else {}
+
+
+def trajectory_radius(centres: Array) -> float:
+    """Root mean square distance of camera centres (N, 3) from their centroid: the paper's r."""
+    return float(np.sqrt(((centres - centres.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def _ratio(value: float, whole: float) -> float:
+    return value / whole if whole > 0 else math.inf

@@ -1,0 +1,124 @@
+"""An evaluation from end to end: client, gRPC, decoding, engine, pipeline; nothing is bypassed."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapless import Client, ConnectOptions, LocalizationResult, NewReference
+
+from ..child import child_server
+from ..dataset import Dataset
+from ..features import make_extractor
+from ..serve import image_limits
+from ..settings import Settings
+from .metrics import QueryResult, pose_error, trajectory_radius
+from .plan import EvaluationOptions, Plan, PlannedQuery, Progress, make_plan
+
+SCENE = "evaluation"
+
+# An answer is measured however late it comes, and however large the photographs are.
+CONNECT = ConnectOptions(timeout_s=600.0, upload_timeout_s=3600.0, batch_count=8)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Results and what they are results of.
+
+    Attributes:
+        reference_count: references of the scene; when one is left out, the query among them.
+        trajectory_radius: of the references, the dataset's unit.
+    """
+
+    dataset: Dataset
+    options: EvaluationOptions
+    reference_count: int
+    trajectory_radius: float
+    results: tuple[QueryResult, ...]
+
+
+def evaluate(dataset: Dataset, options: EvaluationOptions, settings: Settings, progress: Progress) -> Evaluation:
+    """Measures the server on a folder; starts one and ends it.
+
+    Raises:
+        UsageError: the folder does not hold what the options ask for.
+        ServerFailed: the server does not start.
+        MaplessError: a call failed.
+    """
+    plan = plan_for(dataset, options, settings, progress)
+    with (
+        tempfile.TemporaryDirectory(prefix="mapless-evaluate-") as data_dir,
+        child_server(Path(data_dir)) as server,
+        Client(server.address, CONNECT) as client,
+    ):
+        upload(client, plan, progress)
+        return evaluation_of(plan, options, localize_queries(client, plan, options, progress))
+
+
+def plan_for(dataset: Dataset, options: EvaluationOptions, settings: Settings, progress: Progress) -> Plan:
+    """The plan, with the features that a server of these settings has; UsageError as `make_plan`."""
+    return make_plan(dataset, options, make_extractor(settings.features), image_limits(settings), progress)
+
+
+def upload(client: Client, plan: Plan, progress: Progress) -> None:
+    """Creates the scene and stores the plan's references in it."""
+    client.create_scene(SCENE)
+    new = (NewReference(f.name, f.image_path, f.camera, f.world_from_camera) for f in plan.references)
+    total = len(plan.references)
+    progress("storing references", 0, total)
+    client.add_references(SCENE, new, on_progress=lambda done: progress("storing references", done, total))
+
+
+def localize_queries(
+    client: Client, plan: Plan, options: EvaluationOptions, progress: Progress
+) -> tuple[QueryResult, ...]:
+    """Localizes the plan's queries, one after the other."""
+    results: list[QueryResult] = []
+    progress("localizing", 0, len(plan.queries))
+    for query in plan.queries:
+        results.append(_localize(client, query, options))
+        progress("localizing", len(results), len(plan.queries))
+    return tuple(results)
+
+
+def evaluation_of(plan: Plan, options: EvaluationOptions, results: tuple[QueryResult, ...]) -> Evaluation:
+    """Results and their plan."""
+    radius = trajectory_radius(np.array([f.world_from_camera.translation for f in plan.references]))
+    return Evaluation(plan.dataset, options, len(plan.references), radius, results)
+
+
+def _localize(client: Client, query: PlannedQuery, options: EvaluationOptions) -> QueryResult:
+    frame = query.frame
+    names = tuple(reference.name for reference in query.references)
+    image = frame.image_path.read_bytes()
+    start_s = time.perf_counter()
+    answer = client.localize(
+        image, frame.camera, SCENE, names, variant=options.variant, scale_strategy=options.scale_strategy
+    )
+    latency_ms = 1000 * (time.perf_counter() - start_s)
+    centres = np.array([reference.world_from_camera.translation for reference in query.references])
+    distances = np.linalg.norm(centres - frame.world_from_camera.translation, axis=1)
+    found = answer if isinstance(answer, LocalizationResult) else None
+    errors = pose_error(frame.world_from_camera, found.world_from_camera) if found else (math.inf, math.inf)
+    diagnostics = answer.diagnostics
+    return QueryResult(
+        name=frame.name,
+        references=names,
+        translation_error=errors[0],
+        rotation_error_deg=errors[1],
+        reference_distance=float(np.median(distances)),
+        position_68=found.accuracy.position_68_m if found and found.accuracy else None,
+        inlier_count=found.inlier_count if found else 0,
+        match_count=found.match_count if found else 0,
+        rejection="" if isinstance(answer, LocalizationResult) else answer.reason,
+        message="" if isinstance(answer, LocalizationResult) else answer.message,
+        latency_ms=latency_ms,
+        stage_ms={stage: 1000 * seconds for stage, seconds in diagnostics.stage_s.items()},
+        backend=diagnostics.backend,
+        features=diagnostics.features,
+    )

@@ -1,0 +1,160 @@
+"""Matching: which keypoints of the query show which points of the structure.
+
+The paper projects every point with the query's initial pose, u_k = pi(P_q^init, X_k), and takes the nearest descriptor
+within a radius. Ours first takes what the query's matches with each reference say through the tracks, and lets the guided
+search only add to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from mapless.geometry import RigidTransform
+
+from .correspond import Correspondences
+from .structure import Structure
+from .views import PosedView, View
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """Options of matching.
+
+    Attributes:
+        through_tracks: begin with the matches between the query and the references, carried to points by their tracks.
+        radius_px: how far from its projection a point's keypoint is searched; the paper's 20. Ours searches only for points
+            that have no match yet, and near, because the initial pose is good.
+        min_similarity: smallest cosine of descriptors found by the guided search; -1 takes the nearest however far, as the
+            paper does.
+    """
+
+    through_tracks: bool = True
+    radius_px: float = 6.0
+    min_similarity: float = 0.85
+
+    def __post_init__(self) -> None:
+        if not (self.radius_px >= 0 and -1 <= self.min_similarity <= 1):
+            raise ValueError(f"senseless options: {self}")
+
+
+PAPER_MATCH = MatchOptions(through_tracks=False, radius_px=20.0, min_similarity=-1.0)
+"""What the paper does."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointMatches:
+    """2D-3D matches; no point and no keypoint stands twice.
+
+    Attributes:
+        point: (M,) index into the structure.
+        keypoint: (M,) index into the query's keypoints.
+        guided: (M,) whether the match was searched for near its projection, rather than found in the whole image.
+    """
+
+    point: NDArray[np.intp]
+    keypoint: NDArray[np.intp]
+    guided: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+
+def match_points(
+    query: View,
+    references: Sequence[PosedView],
+    structure: Structure,
+    correspondences: Correspondences,
+    world_from_query: RigidTransform,
+    options: MatchOptions,
+) -> PointMatches:
+    """Matches of the query with the points of a structure.
+
+    Args:
+        query: the query.
+        references: in the order that the structure's tracks number them.
+        structure: metric points.
+        correspondences: matches between query and references.
+        world_from_query: the query's initial pose.
+        options: `PAPER_MATCH` for the paper's form.
+    """
+    nothing = np.empty(0, np.intp)
+    known = PointMatches(nothing, nothing, np.empty(0, bool))
+    if options.through_tracks:
+        known = vote(structure, [len(r.view.features) for r in references], correspondences)
+    found = search(query, references, structure, world_from_query, known, options)
+    return PointMatches(
+        np.concatenate([known.point, found.point]),
+        np.concatenate([known.keypoint, found.keypoint]),
+        np.concatenate([known.guided, found.guided]),
+    )
+
+
+def vote(structure: Structure, keypoint_counts: Sequence[int], correspondences: Correspondences) -> PointMatches:
+    """Carries matches between query and references to points; where references disagree, most of them win."""
+    tracks = structure.tracks
+    offsets = np.concatenate([[0], np.cumsum(keypoint_counts)])
+    point_of = np.full(offsets[-1], -1)
+    point_of[offsets[tracks.view] + tracks.keypoint] = tracks.point
+    matches = correspondences.query_matches
+    keypoint = np.concatenate([m[:, 0] for m in matches]).astype(np.intp)
+    point = np.concatenate([point_of[offsets[view] + m[:, 1]] for view, m in enumerate(matches)])
+    keypoint, point = keypoint[point >= 0], point[point >= 0]
+    pairs, votes = np.unique(np.stack([keypoint, point], axis=1), axis=0, return_counts=True)
+    keypoint, point = one_to_one(pairs[:, 0], pairs[:, 1], votes.astype(float))
+    return PointMatches(point, keypoint, np.zeros(len(point), bool))
+
+
+def search(
+    query: View,
+    references: Sequence[PosedView],
+    structure: Structure,
+    world_from_query: RigidTransform,
+    known: PointMatches,
+    options: MatchOptions,
+) -> PointMatches:
+    """The most similar free keypoint within the radius of each free point's projection.
+
+    The similarity of a point and a keypoint is that of the best of the point's descriptors, one for each observation.
+    """
+    keypoints = query.features.keypoints.astype(np.float64)
+    projected = query.camera.project(world_from_query.inverse().apply(structure.x_in_world))
+    size = np.array([query.camera.width_px, query.camera.height_px])
+    inside = ((projected > -options.radius_px) & (projected < size + options.radius_px)).all(axis=1)
+    inside[known.point] = False
+    free_points = np.flatnonzero(inside)
+    free_keypoints = np.setdiff1d(np.arange(len(keypoints)), known.keypoint)
+    near = KDTree(projected[free_points]).sparse_distance_matrix(
+        KDTree(keypoints[free_keypoints]), options.radius_px, output_type="ndarray"
+    )
+    point, keypoint = free_points[near["i"]], free_keypoints[near["j"]]
+
+    tracks = structure.tracks
+    offsets = np.concatenate([[0], np.cumsum([len(r.view.features) for r in references])])
+    descriptors = np.concatenate([r.view.features.descriptors for r in references])
+    length = np.diff(np.append(tracks.starts, len(tracks.point)))[point]
+    first = np.cumsum(length) - length  # where each pair's observations begin below
+    observation = np.arange(length.sum()) - np.repeat(first - tracks.starts[point], length)
+    theirs = descriptors[offsets[tracks.view[observation]] + tracks.keypoint[observation]]
+    ours = query.features.descriptors[np.repeat(keypoint, length)]
+    similarity = np.einsum("od,od->o", theirs, ours)
+    best = np.maximum.reduceat(similarity, first) if len(first) else similarity
+    good = best > options.min_similarity
+    keypoint, point = one_to_one(keypoint[good], point[good], best[good].astype(np.float64))
+    return PointMatches(point, keypoint, np.ones(len(point), bool))
+
+
+def one_to_one(
+    first: NDArray[np.intp], second: NDArray[np.intp], score: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Of scored pairs, those that are the best of their first and then of their second element."""
+    for key in (0, 1):
+        order = np.lexsort((-score, (first, second)[key]))
+        first, second, score = first[order], second[order], score[order]
+        leading = np.diff((first, second)[key], prepend=-1) != 0
+        first, second, score = first[leading], second[leading], score[leading]
+    return first, second

@@ -1,0 +1,205 @@
+"""ReferenceService: scenes and references as resources; images are described before the store is touched."""
+# ruff: noqa: N802  methods carry the names of their RPCs
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+from mapless import names, wire
+from mapless.geometry import RigidTransform
+from mapless.v1 import reference_service_pb2 as pb
+from mapless.v1 import reference_service_pb2_grpc as rpcs
+from mapless.wire import FieldError
+
+from .engine import Engine, Photo
+from .errors import AlreadyExists
+from .photos import photo_from_message
+from .rpc import Call
+from .store import NewReference, ReferenceRecord, SceneRecord, Store
+
+DEFAULT_PAGE_SIZE = 100
+MAX_PAGE_SIZE = 1000
+MAX_BATCH = 1000
+STORE_THREADS = 4  # writers queue for one lock anyhow; these keep readers from waiting behind them
+
+T = TypeVar("T")
+Record = TypeVar("Record")
+Draft = tuple[str, Photo, RigidTransform]
+"""Reference id, photograph and world_from_camera."""
+PageRequest = pb.ListScenesRequest | pb.ListReferencesRequest
+
+
+class ReferenceService(rpcs.ReferenceServiceServicer):
+    """Keeps scenes and their references."""
+
+    def __init__(self, engine: Engine, store: Store) -> None:
+        self._engine = engine
+        self._store = store
+        self._threads = ThreadPoolExecutor(STORE_THREADS, thread_name_prefix="store")
+
+    def close(self) -> None:
+        """Waits for what the store is doing."""
+        self._threads.shutdown(wait=True)
+
+    async def CreateScene(self, request: pb.CreateSceneRequest, call: Call) -> pb.CreateSceneResponse:
+        """Implements ReferenceService.CreateScene."""
+        scene_id = wire.checked_id(request.scene_id, "scene_id")
+        scene = await self._stored(self._store.create_scene, scene_id)
+        return pb.CreateSceneResponse(scene=_scene_to_message(scene))
+
+    async def GetScene(self, request: pb.GetSceneRequest, call: Call) -> pb.GetSceneResponse:
+        """Implements ReferenceService.GetScene."""
+        scene_id = wire.scene_id_from_name(request.name, "name")
+        scene = await self._stored(self._store.get_scene, scene_id)
+        return pb.GetSceneResponse(scene=_scene_to_message(scene))
+
+    async def ListScenes(self, request: pb.ListScenesRequest, call: Call) -> pb.ListScenesResponse:
+        """Implements ReferenceService.ListScenes."""
+        page = Page(request, "scenes")
+        found = await self._stored(self._store.list_scenes, page.limit, page.after)
+        scenes, token = page.cut(found, lambda scene: scene.scene_id)
+        return pb.ListScenesResponse(scenes=map(_scene_to_message, scenes), next_page_token=token)
+
+    async def DeleteScene(self, request: pb.DeleteSceneRequest, call: Call) -> pb.DeleteSceneResponse:
+        """Implements ReferenceService.DeleteScene."""
+        await self._stored(self._store.delete_scene, wire.scene_id_from_name(request.name, "name"))
+        return pb.DeleteSceneResponse()
+
+    async def CreateReference(self, request: pb.CreateReferenceRequest, call: Call) -> pb.CreateReferenceResponse:
+        """Implements ReferenceService.CreateReference."""
+        scene_id = wire.scene_id_from_name(request.scene, "scene")
+        draft = self._draft(request, "")
+        try:
+            (record,) = await self._add(scene_id, [draft], call)
+        except AlreadyExists as error:
+            raise AlreadyExists(str(error), field="reference_id") from error
+        return pb.CreateReferenceResponse(reference=_reference_to_message(record))
+
+    async def BatchCreateReferences(
+        self, request: pb.BatchCreateReferencesRequest, call: Call
+    ) -> pb.BatchCreateReferencesResponse:
+        """Implements ReferenceService.BatchCreateReferences."""
+        scene_id = wire.scene_id_from_name(request.scene, "scene")
+        if not 1 <= len(request.requests) <= MAX_BATCH:
+            raise FieldError("requests", f"must be 1 to {MAX_BATCH}, are {len(request.requests)}")
+        seen: set[str] = set()
+        for i, item in enumerate(request.requests):
+            if item.scene not in ("", request.scene):
+                raise FieldError(f"requests[{i}].scene", f"must be empty or {request.scene!r}")
+            if item.reference_id in seen:
+                raise FieldError(f"requests[{i}].reference_id", f"{names.shown(item.reference_id)} stands twice")
+            seen.add(item.reference_id)
+        drafts = [self._draft(item, f"requests[{i}]") for i, item in enumerate(request.requests)]
+        records = await self._add(scene_id, drafts, call)
+        return pb.BatchCreateReferencesResponse(references=map(_reference_to_message, records))
+
+    async def GetReference(self, request: pb.GetReferenceRequest, call: Call) -> pb.GetReferenceResponse:
+        """Implements ReferenceService.GetReference."""
+        ids = wire.reference_ids_from_name(request.name, "name")
+        message = _reference_to_message(await self._stored(self._store.get_reference, *ids))
+        if request.include_image:
+            message.image = await self._stored(self._store.read_image, *ids)
+        return pb.GetReferenceResponse(reference=message)
+
+    async def ListReferences(self, request: pb.ListReferencesRequest, call: Call) -> pb.ListReferencesResponse:
+        """Implements ReferenceService.ListReferences."""
+        scene_id = wire.scene_id_from_name(request.scene, "scene")
+        page = Page(request, request.scene)
+        found = await self._stored(self._store.list_references, scene_id, page.limit, page.after)
+        references, token = page.cut(found, lambda reference: reference.reference_id)
+        return pb.ListReferencesResponse(references=map(_reference_to_message, references), next_page_token=token)
+
+    async def DeleteReference(self, request: pb.DeleteReferenceRequest, call: Call) -> pb.DeleteReferenceResponse:
+        """Implements ReferenceService.DeleteReference."""
+        ids = wire.reference_ids_from_name(request.name, "name")
+        await self._stored(self._store.delete_reference, *ids)
+        return pb.DeleteReferenceResponse()
+
+    def _draft(self, request: pb.CreateReferenceRequest, path: str) -> Draft:
+        """What a request asks to store, all checked but the pixels; FieldError or InvalidArgument names the field."""
+        reference_id = wire.checked_id(request.reference_id, wire.joined(path, "reference_id"))
+        path = wire.joined(path, "reference")
+        if not request.HasField("reference"):
+            raise FieldError(path, "is required")
+        reference = request.reference
+        if not reference.HasField("world_from_camera"):
+            raise FieldError(f"{path}.world_from_camera", "is required")
+        world_from_camera = wire.transform_from_message(
+            reference.world_from_camera, f"{path}.world_from_camera", wire.MAX_COORDINATE_M
+        )
+        photo = photo_from_message(reference, path, self._engine.options.image_limits)
+        return reference_id, photo, world_from_camera
+
+    async def _add(self, scene_id: str, drafts: Sequence[Draft], call: Call) -> Sequence[ReferenceRecord]:
+        # Describing takes long: an unknown scene is worth noticing before. The store looks again when it adds.
+        await self._stored(self._store.get_scene, scene_id)
+        views = await self._engine.describe([photo for _, photo, _ in drafts], call.deadline_s)
+        extractor = self._engine.extractor.name
+        references = [
+            NewReference(reference_id, photo.image, photo.camera, world_from_camera, view, extractor)
+            for (reference_id, photo, world_from_camera), view in zip(drafts, views, strict=True)
+        ]
+        return await self._stored(self._store.add_references, scene_id, references)
+
+    async def _stored(self, operation: Callable[..., T], *arguments: object) -> T:
+        """An operation of the store, off the event loop."""
+        return await asyncio.get_running_loop().run_in_executor(self._threads, operation, *arguments)
+
+
+class Page:
+    """One page of a list: how much to ask the store for, where to begin, where the next page begins.
+
+    A token is the collection and the last id of the page before: opaque to callers, and good for its own list only.
+
+    Raises:
+        FieldError: a negative page size, or a token that this list did not give.
+    """
+
+    def __init__(self, request: PageRequest, collection: str) -> None:
+        if request.page_size < 0:
+            raise FieldError("page_size", f"must not be negative, is {request.page_size}")
+        self._size = min(request.page_size or DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE)
+        self._collection = collection
+        self.limit = self._size + 1  # one more tells whether there is a next page
+        self.after = self._read_token(request.page_token) if request.page_token else ""
+
+    def cut(self, records: Sequence[Record], id_of: Callable[[Record], str]) -> tuple[Sequence[Record], str]:
+        """The records of this page, and the token of the next one."""
+        if len(records) <= self._size:
+            return records, ""
+        token = f"{self._collection}\n{id_of(records[self._size - 1])}"
+        return records[: self._size], base64.urlsafe_b64encode(token.encode()).decode()
+
+    def _read_token(self, token: str) -> str:
+        try:
+            collection, _, after = base64.b64decode(token, b"-_", validate=True).decode().partition("\n")
+            if collection == self._collection:
+                return names.check_id(after)
+        except (binascii.Error, ValueError):
+            pass
+        raise FieldError("page_token", "is not one that this list gave")
+
+
+def _scene_to_message(scene: SceneRecord) -> pb.Scene:
+    message = pb.Scene(
+        name=names.scene_name(scene.scene_id), generation=scene.generation, reference_count=scene.reference_count
+    )
+    message.create_time.FromDatetime(scene.create_time)
+    return message
+
+
+def _reference_to_message(reference: ReferenceRecord) -> pb.Reference:
+    message = pb.Reference(
+        name=names.reference_name(reference.scene_id, reference.reference_id),
+        intrinsics=wire.camera_to_message(reference.camera),
+        world_from_camera=wire.transform_to_message(reference.world_from_camera),
+        image_sha256=reference.image_sha256,
+        feature_count=reference.feature_count,
+    )
+    message.create_time.FromDatetime(reference.create_time)
+    return message

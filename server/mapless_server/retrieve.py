@@ -1,0 +1,67 @@
+"""Choosing references for a photograph: those that share the most matches with it, not all from one spot.
+
+The rule looks at nothing but the photographs, so it never uses what it is asked for, the query's pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .correspond import CorrespondOptions, mutual_matches
+from .views import PosedView, View
+
+
+@dataclass(frozen=True)
+class RetrieveOptions:
+    """Options of the choice.
+
+    Attributes:
+        apart_m: references closer together than this see the same and triangulate nothing (the paper's baseline).
+        nearby_weight: what the match count of a reference is worth when one within `apart_m` is chosen already. 0 would
+            spread the references at any price; half of the matches is worth a baseline, a tenth is not: in a dense
+            sequence the strictly spread ones see so little of the query that they cost a third of the accuracy.
+    """
+
+    apart_m: float = 0.3
+    nearby_weight: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not (self.apart_m >= 0 and 0 <= self.nearby_weight <= 1):
+            raise ValueError(f"senseless options: {self}")
+
+
+def choose_references(
+    query: View, candidates: Sequence[PosedView], count: int, options: RetrieveOptions | None = None
+) -> list[int]:
+    """Indices of at most `count` candidates, in the order of choice, the most similar first."""
+    ratio = CorrespondOptions().query_ratio
+    matches = [len(mutual_matches(query.features, c.view.features, ratio)) for c in candidates]
+    return spread_choice(matches, [c.world_from_camera.translation for c in candidates], count, options)
+
+
+def spread_choice(
+    match_counts: ArrayLike, centres: ArrayLike, count: int, options: RetrieveOptions | None = None
+) -> list[int]:
+    """Takes the best score again and again, where a candidate near a chosen one scores less; ties go to the first.
+
+    Args:
+        match_counts: (N,) matches with the query.
+        centres: (N, 3) camera centres, metres.
+        count: how many to choose.
+        options: see there.
+    """
+    options = options or RetrieveOptions()
+    score: NDArray[np.float64] = np.asarray(match_counts, float).copy()
+    centre = np.asarray(centres, float).reshape(-1, 3)
+    nearby = np.zeros(len(score), bool)
+    chosen: list[int] = []
+    for _ in range(min(count, len(score))):
+        best = int(np.argmax(np.where(nearby, options.nearby_weight, 1.0) * score))
+        chosen.append(best)
+        score[best] = -np.inf
+        nearby |= np.linalg.norm(centre - centre[best], axis=1) < options.apart_m
+    return chosen

@@ -1,0 +1,153 @@
+"""What an operator can set: by flag, environment (MAPLESS_...), file (TOML) or default; the first that says it wins."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError, model_validator
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    TomlConfigSettingsSource,
+)
+
+PREFIX = "MAPLESS_"
+CONFIG_VARIABLE = "MAPLESS_CONFIG"
+
+# Kubernetes sets these in every pod that has a service called "mapless" beside it; MAPLESS_PORT is then "tcp://...".
+_SERVICE_LINKS = re.compile(r"MAPLESS_SERVICE_(HOST|PORT.*)|MAPLESS_PORT_\d+_.*")
+_SERVICE_LINK_VALUE = "tcp://"
+
+
+class ConfigError(Exception):
+    """A setting is wrong; the message is for the operator."""
+
+
+def available_cores() -> int:
+    """Cores that this process may use, which in a container are fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Settings(BaseSettings):
+    """All settings of the server; frozen, and a name that is not here is an error wherever it stands."""
+
+    model_config = SettingsConfigDict(frozen=True, extra="forbid", env_prefix=PREFIX, validate_default=True)
+
+    host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on; 0.0.0.0 for all.")
+    port: int = Field(default=50051, ge=0, le=65535, description="Port to listen on; 0 for any free one.")
+    data_dir: Path = Field(default=Path("mapless-data"), description="Folder of the store, on a local disk.")
+    backend: str = Field(default="geometric", description="What does the coarse stage.")
+    features: str = Field(default="sift", description="Local features; references are stored with theirs.")
+    workers: int = Field(default_factory=available_cores, ge=1, description="Threads that compute; default: all cores.")
+    max_waiting: int = Field(default=32, ge=0, description="Calls that may wait for a thread; more are refused.")
+    default_deadline_s: float = Field(
+        default=30.0, gt=0, description="Time for calls that come without a deadline, seconds."
+    )
+    max_message_mib: int = Field(default=32, ge=1, le=1024, description="Largest message, either way, MiB.")
+    max_image_mib: int = Field(default=16, ge=1, description="Largest image file, MiB.")
+    max_image_megapixels: float = Field(default=50.0, gt=0, le=268, description="Largest image, width times height.")
+    retrieval_max_references: int = Field(
+        default=200, ge=1, description="References compared with a photograph when the request names none."
+    )
+    reference_cache_mib: int = Field(default=512, ge=0, description="Memory for references' features, MiB.")
+    drain_grace_s: float = Field(
+        default=10.0, ge=0, description="Time that running calls get when the server stops, seconds."
+    )
+    reflection: bool = Field(
+        default=True, description="Whether the server describes its interface to grpcurl and the like."
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="Least severity that is logged."
+    )
+
+    @model_validator(mode="after")
+    def _check_together(self) -> Settings:
+        if self.max_image_mib > self.max_message_mib:
+            raise ValueError("max_image_mib must not exceed max_message_mib")
+        return self
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Only what is passed: `load_settings` reads the sources itself, to know where each value comes from."""
+        return (init_settings,)
+
+
+@dataclass(frozen=True)
+class LoadedSettings:
+    """Settings and where each value comes from: "flag", "environment", "file" or "default"."""
+
+    settings: Settings
+    origins: Mapping[str, str]
+
+    def __str__(self) -> str:
+        """A block for the log; a SecretStr shows as asterisks."""
+        width = max(map(len, self.origins))
+        return "\n".join(
+            f"  {name:<{width}}  {getattr(self.settings, name)}  ({origin})" for name, origin in self.origins.items()
+        )
+
+
+def load_settings(flags: Mapping[str, Any], config: Path | None = None) -> LoadedSettings:
+    """Settings from all sources.
+
+    Args:
+        flags: values given on the command line, by name; None means not given.
+        config: a TOML file; None means that of MAPLESS_CONFIG, if any.
+
+    Raises:
+        ConfigError: the file cannot be read, a name is unknown or a value is wrong; one line a fault.
+    """
+    config = config or (Path(os.environ[CONFIG_VARIABLE]) if os.environ.get(CONFIG_VARIABLE) else None)
+    sources = {
+        "file": _read_file(config) if config else {},
+        "environment": _read_environment(),
+        "flag": {name: value for name, value in flags.items() if value is not None},
+    }
+    values: dict[str, Any] = {}
+    origins = dict.fromkeys(Settings.model_fields, "default")
+    for origin, given in sources.items():
+        values |= given
+        origins |= dict.fromkeys(given, origin)
+    try:
+        return LoadedSettings(Settings(**values), origins)
+    except ValidationError as error:
+        raise ConfigError("\n".join(_describe(fault, origins) for fault in error.errors())) from None
+
+
+def _read_file(path: Path) -> dict[str, Any]:
+    if not path.is_file():  # pydantic-settings passes over a missing file in silence
+        raise ConfigError(f"{path}: no such file")
+    try:
+        return TomlConfigSettingsSource(Settings, path)()
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def _read_environment() -> dict[str, Any]:
+    known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields} | {CONFIG_VARIABLE}
+    unknown = {name for name in os.environ if name.startswith(PREFIX) and not _SERVICE_LINKS.fullmatch(name)} - known
+    if unknown:
+        raise ConfigError("\n".join(f"environment: {name} is not a setting" for name in sorted(unknown)))
+    values = EnvSettingsSource(Settings)()
+    if str(values.get("port", "")).startswith(_SERVICE_LINK_VALUE):
+        del values["port"]
+    return values
+
+
+def _describe(fault: Mapping[str, Any], origins: Mapping[str, str]) -> str:
+    name = ".".join(map(str, fault["loc"]))
+    return f"{name} ({origins.get(name, 'default')}): {fault['msg']}" if name else str(fault["msg"])

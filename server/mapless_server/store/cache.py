@@ -1,0 +1,49 @@
+"""A thread-safe cache that forgets what was used longest ago."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Hashable
+from typing import Generic, TypeVar
+
+Value = TypeVar("Value")
+
+
+class LruCache(Generic[Value]):
+    """Holds values of at most ``capacity_bytes`` together; 0 holds nothing."""
+
+    def __init__(self, capacity_bytes: int) -> None:
+        """Raises ValueError if the capacity is negative."""
+        if capacity_bytes < 0:
+            raise ValueError(f"cache capacity must not be negative, is {capacity_bytes} bytes")
+        self._capacity_bytes = capacity_bytes
+        self._used_bytes = 0
+        self._entries: OrderedDict[Hashable, tuple[Value, int]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    @property
+    def used_bytes(self) -> int:
+        """Sum of the sizes of the values held."""
+        return self._used_bytes
+
+    def get(self, key: Hashable) -> Value | None:
+        """The value, which becomes the most recently used, or None."""
+        with self._lock:
+            entry = self._entries.get(key)
+            if entry is None:
+                return None
+            self._entries.move_to_end(key)
+            return entry[0]
+
+    def put(self, key: Hashable, value: Value, size_bytes: int) -> None:
+        """Hold a value, unless it is larger than the whole cache."""
+        if size_bytes > self._capacity_bytes:
+            return
+        with self._lock:
+            _, replaced_bytes = self._entries.pop(key, (None, 0))
+            self._entries[key] = (value, size_bytes)
+            self._used_bytes += size_bytes - replaced_bytes
+            while self._used_bytes > self._capacity_bytes:
+                _, (_, forgotten_bytes) = self._entries.popitem(last=False)
+                self._used_bytes -= forgotten_bytes

@@ -1,0 +1,132 @@
+"""Cameras, poses and features as stored: exact to the bit, and never believed without their checksum.
+
+Geometry is JSON text: Python writes the shortest decimal that reads back as the same float64. A view is one blob:
+
+    byte 0       format version
+    bytes 4..8   length of the header, uint32
+    header       JSON (camera, count, dimension), padded with spaces so that the arrays are aligned
+    arrays       keypoints (N, 2), sizes (N,), descriptors (N, D), float32
+
+Everything is little-endian.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform
+from mapless_server.views import Features, View
+
+VIEW_FORMAT_VERSION = 1
+_PREFIX = struct.Struct("<B3xI")
+_ALIGNMENT_BYTES = 16
+_FLOAT32 = np.dtype("<f4")
+
+_DISTORTION_TYPES: dict[str, type[RadialTangential] | type[Fisheye]] = {
+    "radial_tangential": RadialTangential,
+    "fisheye": Fisheye,
+}
+
+
+class Damaged(Exception):
+    """Stored bytes are not what was stored."""
+
+
+def sha256_for(owner: str, data: bytes) -> str:
+    """Hexadecimal SHA-256 of ``data`` together with whom it belongs to, so that bytes of another row do not pass."""
+    digest = hashlib.sha256(owner.encode() + b"\0")
+    digest.update(data)
+    return digest.hexdigest()
+
+
+def encode_geometry(camera: Camera, world_from_camera: RigidTransform) -> bytes:
+    """Camera and pose as JSON.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
+    pose = {"rotation": world_from_camera.rotation.tolist(), "translation": world_from_camera.translation.tolist()}
+    return _to_json({"camera": _camera_to_dict(camera), "world_from_camera": pose})
+
+
+def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, RigidTransform]:
+    """The camera and pose that ``encode_geometry`` was given; read-only arrays.
+
+    Raises:
+        Damaged: the checksum does not match.
+    """
+    _check(owner, data, sha256, "camera and pose")
+    content = json.loads(data)
+    pose = content["world_from_camera"]
+    rotation, translation = np.array(pose["rotation"], float), np.array(pose["translation"], float)
+    rotation.setflags(write=False)
+    translation.setflags(write=False)
+    return _camera_from_dict(content["camera"]), RigidTransform(rotation, translation)
+
+
+def encode_view(view: View) -> bytes:
+    """Processed camera and features as one blob.
+
+    Raises:
+        ValueError: an array is not float32 (storing it would round it), or a camera's number is not finite.
+    """
+    features = view.features
+    arrays = (features.keypoints, features.sizes_px, features.descriptors)
+    if any(array.dtype != np.float32 for array in arrays):
+        raise ValueError(f"features must be float32, are {', '.join(str(array.dtype) for array in arrays)}")
+    count, dimension = features.descriptors.shape
+    header = _to_json({"camera": _camera_to_dict(view.camera), "count": count, "dimension": dimension})
+    header += b" " * (-(_PREFIX.size + len(header)) % _ALIGNMENT_BYTES)
+    body = [array.astype(_FLOAT32, copy=False).tobytes() for array in arrays]
+    return b"".join([_PREFIX.pack(VIEW_FORMAT_VERSION, len(header)), header, *body])
+
+
+def decode_view(owner: str, blob: bytes, sha256: str) -> View:
+    """The view that ``encode_view`` was given; its arrays are read-only and share the blob's memory.
+
+    Raises:
+        Damaged: the checksum does not match, or the format is unknown.
+    """
+    _check(owner, blob, sha256, "features")
+    version, header_length = _PREFIX.unpack_from(blob)
+    if version != VIEW_FORMAT_VERSION:
+        raise Damaged(f"features (format {version} is unknown)")
+    offset = _PREFIX.size + header_length
+    header = json.loads(blob[_PREFIX.size : offset])
+    count, dimension = header["count"], header["dimension"]
+    floats = np.frombuffer(blob, _FLOAT32, offset=offset)
+    keypoints, sizes_px, descriptors = np.split(floats, [2 * count, 3 * count])
+    features = Features(keypoints.reshape(count, 2), descriptors.reshape(count, dimension), sizes_px)
+    return View(_camera_from_dict(header["camera"]), features)
+
+
+def _check(owner: str, data: object, sha256: str, what: str) -> None:
+    # One flipped bit can make SQLite take a blob for text, so the type is as little to be trusted as the content.
+    if not isinstance(data, bytes) or sha256_for(owner, data) != sha256:
+        raise Damaged(what)
+
+
+def _to_json(content: dict[str, Any]) -> bytes:
+    return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
+
+
+def _camera_to_dict(camera: Camera) -> dict[str, Any]:
+    content = asdict(camera)
+    if camera.distortion is not None:
+        model = next(name for name, kind in _DISTORTION_TYPES.items() if isinstance(camera.distortion, kind))
+        content["distortion"] = {"model": model, **asdict(camera.distortion)}
+    return content
+
+
+def _camera_from_dict(content: dict[str, Any]) -> Camera:
+    distortion: Distortion | None = None
+    if content["distortion"] is not None:
+        parameters = dict(content["distortion"])
+        distortion = _DISTORTION_TYPES[parameters.pop("model")](**parameters)
+    return Camera(**{**content, "distortion": distortion})

@@ -1,0 +1,127 @@
+"""The statements that several calls of the store share. Each runs in the caller's transaction."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from sqlalchemy import Connection, Row, Select, func, select, update
+
+from mapless_server.errors import AlreadyExists, NotFound
+from mapless_server.store.tables import features, reference, scene, scene_generation
+
+_IDS_PER_STATEMENT = 500
+"""Databases bound the number of parameters of a statement."""
+
+
+def select_scenes() -> Select[Any]:
+    """Columns of ``scene``, ``generation`` and ``reference_count``."""
+    count = select(func.count()).where(reference.c.scene_id == scene.c.scene_id).scalar_subquery()
+    return (
+        select(scene, scene_generation.c.generation, count.label("reference_count"))
+        .select_from(scene)
+        .join(scene_generation, scene_generation.c.scene_id == scene.c.scene_id)
+    )
+
+
+def find_scene(connection: Connection, scene_id: str) -> Row[Any]:
+    """The row of ``select_scenes`` for one scene. Raises NotFound."""
+    row = connection.execute(select_scenes().where(scene.c.scene_id == scene_id)).one_or_none()
+    if row is None:
+        raise _scene_not_found(scene_id)
+    return row
+
+
+def read_generation(connection: Connection, scene_id: str) -> int:
+    """Generation of a scene. Raises NotFound."""
+    generation: int | None = connection.scalar(
+        select(scene_generation.c.generation)
+        .join(scene, scene.c.scene_id == scene_generation.c.scene_id)
+        .where(scene.c.scene_id == scene_id)
+    )
+    if generation is None:
+        raise _scene_not_found(scene_id)
+    return generation
+
+
+def raise_generation(connection: Connection, scene_id: str) -> bool:
+    """Count a change; False if no scene of this id ever existed."""
+    generation = scene_generation.c.generation
+    change = update(scene_generation).where(scene_generation.c.scene_id == scene_id).values(generation=generation + 1)
+    return connection.execute(change).rowcount == 1
+
+
+def begin_change(connection: Connection, scene_id: str) -> None:
+    """Count a change of a scene that must exist. Raises NotFound.
+
+    The counter is raised before anything is looked at: its row is the lock that orders the changes of a scene where the
+    database lets several writers in.
+    """
+    raise_generation(connection, scene_id)
+    read_generation(connection, scene_id)
+
+
+def find_keys(connection: Connection, scene_id: str, reference_ids: Sequence[str]) -> dict[str, str]:
+    """Keys by id, of those of these references that exist."""
+    statement = select(reference.c.reference_id, reference.c.key).where(reference.c.scene_id == scene_id)
+    keys: dict[str, str] = {}
+    for ids in _portions(reference_ids):
+        rows = connection.execute(statement.where(reference.c.reference_id.in_(ids)))
+        keys.update((row.reference_id, row.key) for row in rows)
+    return keys
+
+
+def list_keys(connection: Connection, scene_id: str) -> dict[str, str]:
+    """Keys by id of all references of a scene, ordered by id."""
+    statement = select(reference.c.reference_id, reference.c.key).where(reference.c.scene_id == scene_id)
+    rows = connection.execute(statement.order_by(reference.c.reference_id))
+    return {row.reference_id: row.key for row in rows}
+
+
+def find_key(connection: Connection, scene_id: str, reference_id: str) -> str:
+    """Key of one reference. Raises NotFound for the scene or the reference."""
+    read_generation(connection, scene_id)
+    keys = find_keys(connection, scene_id, [reference_id])
+    if reference_id not in keys:
+        raise reference_not_found(scene_id, reference_id, field="name")
+    return keys[reference_id]
+
+
+def refuse_taken_ids(connection: Connection, scene_id: str, reference_ids: Sequence[str]) -> None:
+    """Raises AlreadyExists for the first id that is stored already or stands twice."""
+    taken = set(find_keys(connection, scene_id, reference_ids))
+    for index, reference_id in enumerate(reference_ids):
+        if reference_id in taken:
+            raise AlreadyExists(
+                f"reference {reference_id!r} exists already in scene {scene_id!r}",
+                field=f"requests[{index}].reference_id",
+            )
+        taken.add(reference_id)
+
+
+def features_by_key(connection: Connection, keys: Sequence[str], extractor: str) -> dict[str, Row[Any]]:
+    """Rows of ``reference`` joined with ``features``, by key, of those that have features of this extractor."""
+    statement: Select[Any] = (
+        select(reference, features.c.extractor, features.c.data, features.c.sha256)
+        .join(features, features.c.reference_key == reference.c.key)
+        .where(features.c.extractor == extractor)
+    )
+    return {
+        row.key: row
+        for portion in _portions(keys)
+        for row in connection.execute(statement.where(reference.c.key.in_(portion)))
+    }
+
+
+def reference_not_found(scene_id: str, reference_id: str, field: str) -> NotFound:
+    """The answer for a reference that does not exist."""
+    return NotFound(f"there is no reference {reference_id!r} in scene {scene_id!r}", field=field)
+
+
+def _scene_not_found(scene_id: str) -> NotFound:
+    return NotFound(f"there is no scene {scene_id!r}", field="scene")
+
+
+def _portions(ids: Sequence[str]) -> Iterator[Sequence[str]]:
+    for start in range(0, len(ids), _IDS_PER_STATEMENT):
+        yield ids[start : start + _IDS_PER_STATEMENT]

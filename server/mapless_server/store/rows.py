@@ -1,0 +1,101 @@
+"""Between what callers see and what the tables hold; everything read is checked here."""
+
+from __future__ import annotations
+
+import hashlib
+import uuid
+from datetime import datetime, timedelta, timezone
+from typing import Any
+
+from sqlalchemy import Row
+
+from mapless_server.errors import DataLoss
+from mapless_server.store import codec
+from mapless_server.store.records import NewReference, ReferenceRecord, SceneRecord
+from mapless_server.views import PosedView, View
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
+_MICROSECOND = timedelta(microseconds=1)
+
+
+def time_us(time: datetime) -> int:
+    """Microseconds since 1970: databases do not agree on what a time zone is."""
+    return (time - _EPOCH) // _MICROSECOND
+
+
+def scene_record(row: Row[Any]) -> SceneRecord:
+    """From a row of ``queries.select_scenes``."""
+    return SceneRecord(row.scene_id, row.generation, row.reference_count, _EPOCH + row.create_time_us * _MICROSECOND)
+
+
+def new_record(scene_id: str, new: NewReference, create_time: datetime) -> ReferenceRecord:
+    """The record of a reference about to be stored, with a key nobody had before."""
+    return ReferenceRecord(
+        scene_id=scene_id,
+        reference_id=new.reference_id,
+        key=uuid.uuid4().hex,
+        camera=new.camera,
+        world_from_camera=new.world_from_camera,
+        image_sha256=hashlib.sha256(new.image).hexdigest(),
+        feature_count=len(new.view.features),
+        create_time=create_time,
+    )
+
+
+def reference_row(record: ReferenceRecord) -> dict[str, Any]:
+    """For the table ``reference``. Raises ValueError if a number is not finite."""
+    geometry = codec.encode_geometry(record.camera, record.world_from_camera)
+    return {
+        "key": record.key,
+        "scene_id": record.scene_id,
+        "reference_id": record.reference_id,
+        "geometry": geometry,
+        "geometry_sha256": codec.sha256_for(record.key, geometry),
+        "image_sha256": record.image_sha256,
+        "feature_count": record.feature_count,
+        "create_time_us": time_us(record.create_time),
+    }
+
+
+def reference_record(row: Row[Any]) -> ReferenceRecord:
+    """From a row of the table ``reference``. Raises DataLoss if it is damaged."""
+    try:
+        camera, world_from_camera = codec.decode_geometry(row.key, row.geometry, row.geometry_sha256)
+    except codec.Damaged as error:
+        raise data_loss(row.reference_id, str(error)) from error
+    return ReferenceRecord(
+        scene_id=row.scene_id,
+        reference_id=row.reference_id,
+        key=row.key,
+        camera=camera,
+        world_from_camera=world_from_camera,
+        image_sha256=row.image_sha256,
+        feature_count=row.feature_count,
+        create_time=_EPOCH + row.create_time_us * _MICROSECOND,
+    )
+
+
+def features_row(key: str, extractor: str, view: View) -> dict[str, Any]:
+    """For the table ``features``. Raises ValueError if an array is not float32 or a number not finite."""
+    data = codec.encode_view(view)
+    return {
+        "reference_key": key,
+        "extractor": extractor,
+        "data": data,
+        "sha256": codec.sha256_for(f"{key}/{extractor}", data),
+    }
+
+
+def posed_view(row: Row[Any]) -> PosedView:
+    """From a row of ``queries.features_by_key``. Raises DataLoss if it is damaged."""
+    try:
+        _, world_from_camera = codec.decode_geometry(row.key, row.geometry, row.geometry_sha256)
+        view = codec.decode_view(f"{row.key}/{row.extractor}", row.data, row.sha256)
+    except codec.Damaged as error:
+        raise data_loss(row.reference_id, str(error)) from error
+    return PosedView(row.key, f"scenes/{row.scene_id}/references/{row.reference_id}", view, world_from_camera)
+
+
+def data_loss(reference_id: str, what: str) -> DataLoss:
+    """The answer where stored bytes are not what was stored."""
+    return DataLoss(f"reference {reference_id!r} is damaged in the store ({what}); delete it and add it again")

@@ -1,0 +1,270 @@
+"""The store: what the service calls. Every public method is one transaction, and safe from any thread."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from types import TracebackType
+
+from sqlalchemy import delete, insert, select
+
+from mapless_server.errors import AlreadyExists, FailedPrecondition
+from mapless_server.store import queries, rows, tables
+from mapless_server.store.cache import LruCache
+from mapless_server.store.records import NewReference, ReferencePose, ReferenceRecord, SceneRecord, SceneSnapshot
+from mapless_server.store.sqlite import SqliteDatabase
+from mapless_server.views import PosedView, View
+
+DEFAULT_CACHE_BYTES = 512 * 2**20
+"""About 500 references with 2048 SIFT features each; 0 reads the database every time."""
+
+POSE_CACHE_BYTES = 32 * 2**20
+POSE_BYTES = 700
+"""About the size of a ReferencePose in memory, arrays and strings included."""
+
+
+class Store:
+    """Scenes and their references, in one database of a data folder.
+
+    DataLoss is raised wherever stored bytes turn out not to be what was stored; other references are still served, and
+    the damaged one can be deleted.
+    """
+
+    def __init__(self, database: SqliteDatabase, views: LruCache[PosedView]) -> None:
+        self._database = database
+        # By (key, extractor): references never change and keys are never reused, so no entry is ever stale.
+        self._views = views
+        # By (scene_id, generation), which are never reused either.
+        self._poses: LruCache[tuple[ReferencePose, ...]] = LruCache(POSE_CACHE_BYTES)
+
+    @staticmethod
+    def open(data_dir: Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
+        """Open the store of a data folder; creates both if missing.
+
+        Args:
+            data_dir: a folder on a local disk that no other server uses.
+            cache_bytes: bound of the features held in memory, 0 or more.
+
+        Raises:
+            StoreError: the folder or the database cannot be used, with one sentence that says why.
+            ValueError: cache_bytes is negative.
+        """
+        views: LruCache[PosedView] = LruCache(cache_bytes)
+        return Store(SqliteDatabase.open(data_dir), views)
+
+    def close(self) -> None:
+        """Release the data folder; no call may be in progress or follow."""
+        self._database.close()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def create_scene(self, scene_id: str) -> SceneRecord:
+        """Create an empty scene.
+
+        Raises:
+            AlreadyExists: the id is taken.
+        """
+        scene, generation = tables.scene, tables.scene_generation
+        with self._database.write() as connection:
+            if not queries.raise_generation(connection, scene_id):
+                connection.execute(insert(generation).values(scene_id=scene_id, generation=1))
+            if connection.scalar(select(scene.c.scene_id).where(scene.c.scene_id == scene_id)) is not None:
+                raise AlreadyExists(f"scene {scene_id!r} exists already", field="scene_id")
+            connection.execute(insert(scene).values(scene_id=scene_id, create_time_us=rows.time_us(_now())))
+            return rows.scene_record(queries.find_scene(connection, scene_id))
+
+    def get_scene(self, scene_id: str) -> SceneRecord:
+        """A scene.
+
+        Raises:
+            NotFound: there is no such scene.
+        """
+        with self._database.read() as connection:
+            return rows.scene_record(queries.find_scene(connection, scene_id))
+
+    def list_scenes(self, limit: int, after: str = "") -> list[SceneRecord]:
+        """At most ``limit`` scenes, by id, of those whose id is greater than ``after``."""
+        scene_id = tables.scene.c.scene_id
+        page = queries.select_scenes().where(scene_id > after).order_by(scene_id).limit(limit)
+        with self._database.read() as connection:
+            return [rows.scene_record(row) for row in connection.execute(page)]
+
+    def delete_scene(self, scene_id: str) -> None:
+        """Delete a scene and all its references.
+
+        Raises:
+            NotFound: there is no such scene.
+        """
+        with self._database.write() as connection:
+            queries.begin_change(connection, scene_id)
+            connection.execute(delete(tables.scene).where(tables.scene.c.scene_id == scene_id))
+
+    def add_references(self, scene_id: str, references: Sequence[NewReference]) -> list[ReferenceRecord]:
+        """Add references, all or none; one change of the scene.
+
+        Returns:
+            The new references in the order given.
+
+        Raises:
+            NotFound: there is no such scene.
+            AlreadyExists: an id is taken or stands twice; the field is "requests[i].reference_id".
+            ValueError: features are not float32, a number of a camera or pose is not finite, or no reference is given.
+        """
+        if not references:
+            raise ValueError("no reference to add")
+        now = _now()
+        # Encoding takes milliseconds a reference, so it is done before the others who want to write have to wait.
+        records = [rows.new_record(scene_id, new, now) for new in references]
+        reference_rows = [rows.reference_row(record) for record in records]
+        image_rows, features_rows = [], []
+        for record, new in zip(records, references, strict=True):
+            image_rows.append({"reference_key": record.key, "data": new.image})
+            features_rows.append(rows.features_row(record.key, new.extractor, new.view))
+        with self._database.write() as connection:
+            queries.begin_change(connection, scene_id)
+            queries.refuse_taken_ids(connection, scene_id, [new.reference_id for new in references])
+            connection.execute(insert(tables.reference), reference_rows)
+            connection.execute(insert(tables.image), image_rows)
+            connection.execute(insert(tables.features), features_rows)
+        return records
+
+    def add_features(self, scene_id: str, reference_id: str, extractor: str, view: View) -> None:
+        """Store what another extractor found in a reference's image.
+
+        Raises:
+            NotFound: there is no such scene or reference.
+            AlreadyExists: the reference has features of this extractor.
+            ValueError: features are not float32, or a number of the camera is not finite.
+        """
+        with self._database.write() as connection:
+            queries.begin_change(connection, scene_id)
+            key = queries.find_key(connection, scene_id, reference_id)
+            if queries.features_by_key(connection, [key], extractor):
+                raise AlreadyExists(f"reference {reference_id!r} has features of {extractor!r} already")
+            connection.execute(insert(tables.features).values(rows.features_row(key, extractor, view)))
+
+    def get_reference(self, scene_id: str, reference_id: str) -> ReferenceRecord:
+        """A reference without its image.
+
+        Raises:
+            NotFound: there is no such scene or reference.
+            DataLoss: its camera and pose are damaged.
+        """
+        with self._database.read() as connection:
+            key = queries.find_key(connection, scene_id, reference_id)
+            row = connection.execute(select(tables.reference).where(tables.reference.c.key == key)).one()
+        return rows.reference_record(row)
+
+    def read_image(self, scene_id: str, reference_id: str) -> bytes:
+        """The image's bytes as they came.
+
+        Raises:
+            NotFound: there is no such scene or reference.
+            DataLoss: the bytes are damaged.
+        """
+        reference, image = tables.reference, tables.image
+        with self._database.read() as connection:
+            key = queries.find_key(connection, scene_id, reference_id)
+            sha256 = connection.scalar(select(reference.c.image_sha256).where(reference.c.key == key))
+            data: object = connection.scalar(select(image.c.data).where(image.c.reference_key == key))
+        if not isinstance(data, bytes) or hashlib.sha256(data).hexdigest() != sha256:
+            raise rows.data_loss(reference_id, "image")
+        return data
+
+    def list_references(self, scene_id: str, limit: int, after: str = "") -> list[ReferenceRecord]:
+        """At most ``limit`` references of a scene, by id, of those whose id is greater than ``after``.
+
+        Raises:
+            NotFound: there is no such scene.
+            DataLoss: camera and pose of one of them are damaged.
+        """
+        column = tables.reference.c
+        page = select(tables.reference).where(column.scene_id == scene_id, column.reference_id > after)
+        with self._database.read() as connection:
+            queries.read_generation(connection, scene_id)
+            found = connection.execute(page.order_by(column.reference_id).limit(limit)).all()
+        return [rows.reference_record(row) for row in found]
+
+    def delete_reference(self, scene_id: str, reference_id: str) -> None:
+        """Delete a reference with its image and features; works on a damaged one, too.
+
+        Raises:
+            NotFound: there is no such scene or reference.
+        """
+        with self._database.write() as connection:
+            queries.begin_change(connection, scene_id)
+            key = queries.find_key(connection, scene_id, reference_id)
+            connection.execute(delete(tables.reference).where(tables.reference.c.key == key))
+
+    def list_poses(self, scene_id: str) -> tuple[int, tuple[ReferencePose, ...]]:
+        """The scene's generation and the poses of all its references, by id; from memory when nothing has changed.
+
+        Raises:
+            NotFound: there is no such scene.
+            DataLoss: camera and pose of a reference are damaged.
+        """
+        column = tables.reference.c
+        with self._database.read() as connection:
+            generation = queries.read_generation(connection, scene_id)
+            poses = self._poses.get((scene_id, generation))
+            if poses is not None:
+                return generation, poses
+            statement = select(tables.reference).where(column.scene_id == scene_id).order_by(column.reference_id)
+            found = connection.execute(statement).all()
+        records = [rows.reference_record(row) for row in found]
+        poses = tuple(ReferencePose(it.reference_id, it.key, it.world_from_camera) for it in records)
+        self._poses.put((scene_id, generation), poses, POSE_BYTES * len(poses))
+        return generation, poses
+
+    def load_references(self, scene_id: str, reference_ids: Sequence[str] | None, extractor: str) -> SceneSnapshot:
+        """References with their features, and the generation they belong to, read at one moment.
+
+        References that were loaded before come from memory.
+
+        Args:
+            scene_id: the scene.
+            reference_ids: which references, in the order wanted; None for all, by id.
+            extractor: whose features.
+
+        Raises:
+            NotFound: there is no such scene (field "scene") or reference (field "references[i]").
+            FailedPrecondition: a reference has no features of this extractor (reason "FEATURES_MISSING").
+            DataLoss: features, camera or pose of one of them are damaged.
+        """
+        with self._database.read() as connection:
+            generation = queries.read_generation(connection, scene_id)
+            if reference_ids is None:
+                keys = queries.list_keys(connection, scene_id)
+                reference_ids = list(keys)
+            else:
+                keys = queries.find_keys(connection, scene_id, reference_ids)
+            for index, reference_id in enumerate(reference_ids):
+                if reference_id not in keys:
+                    raise queries.reference_not_found(scene_id, reference_id, field=f"references[{index}]")
+            views = {key: self._views.get((key, extractor)) for key in keys.values()}
+            absent = [key for key, view in views.items() if view is None]
+            found = queries.features_by_key(connection, absent, extractor)
+        for key, row in found.items():
+            loaded = views[key] = rows.posed_view(row)
+            self._views.put((key, extractor), loaded, len(row.data) + POSE_BYTES)
+        references = []
+        for reference_id in reference_ids:
+            view = views[keys[reference_id]]
+            if view is None:
+                raise FailedPrecondition(
+                    f"reference {reference_id!r} has no features of {extractor!r}", reason="FEATURES_MISSING"
+                )
+            references.append(view)
+        return SceneSnapshot(generation, tuple(references))
+
+
+def _now() -> datetime:
+    return datetime.now(timezone.utc)

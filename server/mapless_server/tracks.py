@@ -1,0 +1,89 @@
+"""Merging pairwise matches into tracks: which keypoints of all references show one point."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from .correspond import Matches
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Observations of points, sorted by point, then view; a point is seen at most once in a view, and in at least two.
+
+    Attributes:
+        point: (O,) index of the point, 0 to P - 1, every one occurring.
+        view: (O,) index of the observing reference.
+        keypoint: (O,) index of its keypoint there.
+    """
+
+    point: NDArray[np.intp]
+    view: NDArray[np.intp]
+    keypoint: NDArray[np.intp]
+
+    @property
+    def point_count(self) -> int:
+        """Number of points."""
+        return int(self.point[-1]) + 1 if len(self.point) else 0
+
+    @property
+    def starts(self) -> NDArray[np.intp]:
+        """(P,) index of each point's first observation."""
+        return np.flatnonzero(np.diff(self.point, prepend=-1))
+
+    def select(self, points: NDArray[np.bool_]) -> Tracks:
+        """The tracks of the chosen points, renumbered; ``points`` is (P,)."""
+        keep = points[self.point]
+        renumbered = np.cumsum(points) - 1
+        return Tracks(renumbered[self.point[keep]], self.view[keep], self.keypoint[keep])
+
+
+def build_tracks(
+    pairs: Mapping[tuple[int, int], Matches], keypoint_counts: Sequence[int], anchor: int | None = None
+) -> Tracks:
+    """Merges pairwise matches into tracks.
+
+    Args:
+        pairs: matches of views i < j.
+        keypoint_counts: number of keypoints of each view.
+        anchor: None merges over all pairs. A view merges that view's pairs alone (the paper), so that every track begins
+            at one of its keypoints.
+
+    Returns:
+        The tracks. Where a chain of matches reaches two keypoints of one view, the one with more matches is kept.
+    """
+    offsets = np.concatenate([[0], np.cumsum(keypoint_counts)])
+    used = [
+        matches + offsets[[i, j]]
+        for (i, j), matches in pairs.items()
+        if (anchor is None or anchor in (i, j)) and len(matches)
+    ]
+    if not used:
+        nothing = np.empty(0, np.intp)
+        return Tracks(nothing, nothing, nothing)
+    edges = np.concatenate(used)
+    total = int(offsets[-1])
+    graph: Any = coo_array(  # type: ignore[no-untyped-call]
+        (np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(total, total)
+    )
+    _, component = connected_components(graph, directed=False)
+    degree = np.bincount(edges.ravel(), minlength=total)
+    node = np.flatnonzero(degree)
+    view = np.searchsorted(offsets, node, side="right") - 1
+    # Sorted by (component, view, -degree), the first of each (component, view) is the one to keep.
+    order = np.lexsort((-degree[node], view, component[node]))
+    node, view = node[order], view[order]
+    label = component[node]
+    first = np.concatenate([[True], (label[1:] != label[:-1]) | (view[1:] != view[:-1])])
+    node, view, label = node[first], view[first], label[first]
+    _, point, count = np.unique(label, return_inverse=True, return_counts=True)
+    seen_twice = count[point] >= 2
+    point = np.unique(point[seen_twice], return_inverse=True)[1]
+    return Tracks(point, view[seen_twice], node[seen_twice] - offsets[view[seen_twice]])

@@ -1,0 +1,25 @@
+"""Photographs that are not part of the repository: beside it, or in the folder of MAPLESS_TEST_DATA."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mapless_server.dataset import Dataset, read_folder
+
+DATA = Path(os.environ.get("MAPLESS_TEST_DATA") or Path(__file__).parents[3] / "shared" / "data")
+
+
+@pytest.fixture(scope="session")
+def photographs() -> Callable[[str], Dataset]:
+    """Reads a scene's folder; skips the test where there is none."""
+
+    def read(folder: str) -> Dataset:
+        if not (DATA / folder / "cameras.json").is_file():
+            pytest.skip(f"needs real photographs, {DATA / folder} is absent (MAPLESS_TEST_DATA names another place)")
+        return read_folder(DATA / folder)
+
+    return read

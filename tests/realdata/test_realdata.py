@@ -1,0 +1,120 @@
+"""The whole service on real photographs: what it promises of accuracy, and that it does not find what is not there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from mapless import Client, LocalizationResult
+from mapless_server.child import child_server
+from mapless_server.dataset import Dataset, Frame
+from mapless_server.evaluation.metrics import Summary, summarize
+from mapless_server.evaluation.plan import EvaluationOptions, Plan
+from mapless_server.evaluation.run import CONNECT, SCENE, evaluate, localize_queries, plan_for, upload
+from mapless_server.settings import Settings
+
+pytestmark = pytest.mark.realdata
+
+Photographs = Callable[[str], Dataset]
+KITCHEN = "7scenes-redkitchen-seq01-first600"
+OFFICE = "tum-fr3-office"
+DRIVE = "kitti-drive-a"
+FOX = "fox-portrait"
+
+
+def measure(dataset: Dataset, **options: object) -> Summary:
+    checked = EvaluationOptions(**options)  # type: ignore[arg-type]
+    return summarize(evaluate(dataset, checked, Settings(), ignore).results)
+
+
+def ignore(step: str, done: int, total: int) -> None:
+    """No progress is shown."""
+
+
+@pytest.mark.parametrize(
+    ("folder", "references", "queries", "translation_cm", "rotation_deg"),
+    [
+        ("fountain-P11", None, None, 0.24, 0.020),
+        ("herz-jesus-P8", None, None, 0.45, 0.020),
+        (KITCHEN, 10, 15, 0.45, 0.13),
+        (OFFICE, None, None, 0.50, 0.21),
+    ],
+)
+def test_accuracy(
+    photographs: Photographs,
+    folder: str,
+    references: int | None,
+    queries: int | None,
+    translation_cm: float,
+    rotation_deg: float,
+) -> None:
+    summary = measure(photographs(folder), reference_count=references, query_count=queries)
+    assert summary.localized_count == summary.query_count
+    assert 100 * summary.median_translation <= translation_cm
+    assert summary.median_rotation_deg <= rotation_deg
+
+
+@pytest.fixture(scope="module")
+def fountain(photographs: Photographs, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Client, Plan]]:
+    dataset = photographs("fountain-P11")
+    plan = plan_for(dataset, EvaluationOptions(query_count=3), Settings(), ignore)
+    data_dir = tmp_path_factory.mktemp("fountain")
+    with child_server(data_dir) as server, Client(server.address, CONNECT) as client:
+        upload(client, plan, ignore)
+        yield client, plan
+
+
+class TestForms:
+    """Three photographs of the fountain, each from all others, by every form of the method."""
+
+    @pytest.mark.parametrize(
+        ("variant", "translation_cm"), [("coarse", 5.0), ("no_structure", 2.0), ("full", 1.0), ("best", 0.3)]
+    )
+    def test_variants(self, fountain: tuple[Client, Plan], variant: str, translation_cm: float) -> None:
+        self.check(*fountain, EvaluationOptions(variant=variant), translation_cm)
+
+    @pytest.mark.parametrize("strategy", ["triangulation", "trajectory", "two_stage"])
+    def test_scale_strategies(self, fountain: tuple[Client, Plan], strategy: str) -> None:
+        self.check(*fountain, EvaluationOptions(variant="coarse", scale_strategy=strategy), 5.0)
+
+    def check(self, client: Client, plan: Plan, options: EvaluationOptions, translation_cm: float) -> None:
+        summary = summarize(localize_queries(client, plan, options, ignore))
+        assert summary.localized_count == 3
+        assert 100 * summary.median_translation <= translation_cm
+
+
+@pytest.mark.parametrize(
+    ("place", "elsewhere"),
+    [
+        ("fountain-P11", (KITCHEN, OFFICE, DRIVE, FOX, "herz-jesus-P8")),
+        (KITCHEN, ("fountain-P11", OFFICE, DRIVE, FOX, "herz-jesus-P8")),
+    ],
+)
+def test_no_photograph_of_another_place_is_localized(
+    photographs: Photographs, tmp_path: Path, place: str, elsewhere: tuple[str, ...]
+) -> None:
+    """25 photographs of five other places, each against ten references of this one."""
+    dataset = photographs(place)
+    plan = Plan(dataset, spread(dataset, 10), ())
+    strangers = [frame for folder in elsewhere for frame in spread(photographs(folder), 5)]
+    with child_server(tmp_path) as server, Client(server.address, CONNECT) as client:
+        upload(client, plan, ignore)
+        names = [reference.name for reference in plan.references]
+        answers = {
+            frame.image_path: client.localize(frame.image_path, frame.camera, SCENE, names) for frame in strangers
+        }
+    assert len(answers) == 25
+    found = {
+        file.parts[-3:]: answer.inlier_count
+        for file, answer in answers.items()
+        if isinstance(answer, LocalizationResult)
+    }
+    assert not found, "localized in a place where they were not taken, with so many inliers"
+
+
+def spread(dataset: Dataset, count: int) -> tuple[Frame, ...]:
+    last = len(dataset.frames) - 1
+    return tuple(dataset.frames[math.floor(i * last / (count - 1))] for i in range(count))

@@ -1,0 +1,182 @@
+"""A real server on loopback, with a real store and a stand-in for the method."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import grpc
+import numpy as np
+import pytest
+from images import encode, textured
+from numpy.typing import NDArray
+
+from mapless import MaplessError, wire
+from mapless.errors import from_rpc_error
+from mapless.geometry import Camera, RigidTransform, Similarity, rotation_from_vector
+from mapless.v1 import localization_service_pb2 as localization_pb
+from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
+from mapless_server.decode import ImageLimits
+from mapless_server.engine import Engine, EngineOptions
+from mapless_server.localize import Answer, Localization, LocalizeOptions, Pipeline
+from mapless_server.pnp import PoseStage
+from mapless_server.scale import MetricScale, ScaleStage
+from mapless_server.serve import running_server
+from mapless_server.settings import Settings
+from mapless_server.store import Store
+from mapless_server.views import Features, PosedView, View
+
+CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
+PHOTO = encode(".png", textured())
+COVARIANCE = np.diag([0.01, 0.01, 0.01, 1e-4, 1e-4, 1e-4])
+
+
+def pose(x_m: float) -> RigidTransform:
+    return RigidTransform(rotation_from_vector([0.1, x_m / 10, -0.2]), np.array([x_m, 2.0, -1.0]))
+
+
+@dataclass
+class StandInExtractor:
+    """Finds one feature in each photograph: where the brightest pixel is."""
+
+    name: str = "stand-in"
+    seen: list[NDArray[np.uint8]] = field(default_factory=list)
+
+    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+        self.seen.append(image)
+        y, x = np.unravel_index(image.sum(axis=2).argmax(), image.shape[:2])
+        descriptor = np.full((1, 4), 0.5, np.float32)
+        features = Features(np.array([[x, y]], np.float32), descriptor, np.ones(1, np.float32))
+        return View(camera.pinhole(), features)
+
+
+@dataclass(frozen=True)
+class StandInReconstructor:
+    name: str = "geometric"
+    weights_sha256: str = ""
+
+    def reconstruct(self, *_: Any) -> Any:
+        raise NotImplementedError
+
+
+@dataclass
+class StandInMethod:
+    """Answers the first reference's pose.
+
+    Attributes:
+        gate: calls wait here; open unless a test closes it.
+        started: released by every call that begins.
+        failure: raised instead of an answer.
+    """
+
+    gate: threading.Event = field(default_factory=threading.Event)
+    started: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+    failure: Exception | None = None
+    call_count: int = 0
+
+    def __call__(
+        self, query: View, references: Sequence[PosedView], pipeline: Pipeline, options: LocalizeOptions
+    ) -> Answer:
+        self.call_count += 1
+        self.started.release()
+        assert self.gate.wait(60)
+        if self.failure is not None:
+            raise self.failure
+        found = Localization(references[0].world_from_camera, COVARIANCE, PoseStage.REFINED, 90, 120, 0.7)
+        counts = tuple(range(len(references)))
+        return Answer(
+            found,
+            MetricScale(2.0, ScaleStage.TRIANGULATION, 0.01, 0, Similarity(2.0, np.eye(3), np.zeros(3)), pose(0.0)),
+            {"coarse": 0.1, "pnp": 0.05},
+            counts,
+            counts,
+        )
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Calls that begin meanwhile do not end."""
+        self.gate.clear()
+        try:
+            yield
+        finally:
+            self.gate.set()
+
+
+@dataclass
+class RunningServer:
+    """A server in a thread of its own."""
+
+    address: str
+    method: StandInMethod
+    extractor: StandInExtractor
+    engine: Engine
+    stop: Callable[[], None]
+
+
+@contextmanager
+def serving(data_dir: Path, **options: Any) -> Iterator[RunningServer]:
+    """A server with the given settings until the block is left, or `stop` is called, which begins to drain it."""
+    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, **({"workers": 2, "max_waiting": 2} | options))
+    store = Store.open(data_dir)
+    method, extractor = StandInMethod(), StandInExtractor()
+    method.gate.set()
+    engine_options = EngineOptions(
+        workers=settings.workers,
+        max_waiting=settings.max_waiting,
+        max_candidates=settings.retrieval_max_references,
+        image_limits=ImageLimits(),
+    )
+    pipeline = Pipeline(cast(Any, StandInReconstructor()), cast(Any, None))
+    engine = Engine(store, extractor, pipeline, engine_options, localize=method)
+    address: Future[str] = Future()
+    loop = asyncio.new_event_loop()
+    stopping = asyncio.Event()
+
+    async def run() -> None:
+        async with running_server(settings, engine, store) as bound:
+            address.set_result(bound)
+            await stopping.wait()
+
+    thread = threading.Thread(target=loop.run_until_complete, args=(run(),))
+    thread.start()
+
+    def stop() -> None:
+        loop.call_soon_threadsafe(stopping.set)
+
+    try:
+        yield RunningServer(address.result(30), method, extractor, engine, stop)
+    finally:
+        method.gate.set()
+        stop()
+        thread.join(30)
+        assert not thread.is_alive()
+        loop.close()
+
+
+@dataclass
+class Stubs:
+    """The generated stubs, for requests that the client would not make."""
+
+    localization: LocalizationServiceStub
+    references: ReferenceServiceStub
+
+
+def failure_of(method: Callable[..., Any], request: Any, **arguments: Any) -> MaplessError:
+    """The error that a call ends with."""
+    with pytest.raises(grpc.RpcError) as caught:
+        method(request, timeout=30, **arguments)
+    return from_rpc_error(caught.value)
+
+
+def localize_request(scene_id: str) -> localization_pb.LocalizeRequest:
+    """A good request."""
+    return localization_pb.LocalizeRequest(
+        scene=f"scenes/{scene_id}", image=PHOTO, intrinsics=wire.camera_to_message(CAMERA)
+    )

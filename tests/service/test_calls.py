@@ -1,0 +1,232 @@
+"""What every call has: a bound, a deadline, a request id, and errors that say what the caller may know."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent import futures
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose, serving
+
+from mapless import (
+    Client,
+    ConnectOptions,
+    DeadlineExceeded,
+    Internal,
+    LocalizationResult,
+    NewReference,
+    ResourceExhausted,
+    Unavailable,
+)
+from mapless.errors import from_rpc_error
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.errors import DataLoss
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def pool() -> Iterator[futures.ThreadPoolExecutor]:
+    with futures.ThreadPoolExecutor(16) as threads:
+        yield threads
+
+
+def test_a_full_queue_refuses_and_says_when_to_come_back(
+    server: RunningServer, client: Client, scene: str, pool: futures.ThreadPoolExecutor
+) -> None:
+    with server.method.held():
+        admitted = [pool.submit(client.localize, PHOTO, CAMERA, scene) for _ in range(4)]  # two run, two wait
+        for _ in range(2):
+            assert server.method.started.acquire(timeout=20)
+        wait_until(lambda: server.engine._admitted_count == 4)
+        start_s = time.monotonic()
+        with pytest.raises(ResourceExhausted) as caught:
+            client.localize(PHOTO, CAMERA, scene)
+        assert time.monotonic() - start_s < 2
+        assert caught.value.reason == "OVERLOADED"
+        assert caught.value.retry_after_s is not None
+        assert 0 < caught.value.retry_after_s < 60
+        # The loop is free meanwhile: what needs no thread is answered.
+        assert client.is_serving()
+        assert client.get_scene(scene).reference_count == 3
+    assert all(isinstance(future.result(30), LocalizationResult) for future in admitted)
+    wait_until(lambda: server.engine._admitted_count == 0)
+
+
+def test_what_nobody_waits_for_is_not_computed(
+    server: RunningServer, client: Client, scene: str, stubs: Stubs, pool: futures.ThreadPoolExecutor
+) -> None:
+    before = server.method.call_count
+    with server.method.held():
+        running = [pool.submit(client.localize, PHOTO, CAMERA, scene) for _ in range(2)]
+        wait_until(lambda: server.method.call_count == before + 2)
+        expires = pool.submit(client.localize, PHOTO, CAMERA, scene, timeout_s=0.3)
+        cancelled = stubs.localization.Localize.future(localize_request(scene))
+        wait_until(lambda: server.engine._admitted_count == 4)
+        with pytest.raises(DeadlineExceeded):
+            expires.result(30)
+        cancelled.cancel()
+        wait_until(lambda: server.engine._admitted_count == 2)
+    for future in running:
+        future.result(30)
+    client.localize(PHOTO, CAMERA, scene)
+    assert server.method.call_count == before + 3
+
+
+def test_a_call_without_deadline_gets_the_default(tmp_path: Path) -> None:
+    with serving(tmp_path, default_deadline_s=0.3) as server, Client(server.address) as client:
+        client.create_scene("s")
+        client.add_reference("s", NewReference("r", PHOTO, CAMERA, pose(0)))
+        with grpc.insecure_channel(server.address) as channel, server.method.held():
+            method = channel.unary_unary("/mapless.v1.LocalizationService/Localize")
+            with pytest.raises(grpc.RpcError) as caught:
+                method(localize_request("s").SerializeToString())
+        assert from_rpc_error(caught.value).code == "DEADLINE_EXCEEDED"
+
+
+def test_faults_of_ours_are_internal_without_detail(
+    server: RunningServer, client: Client, scene: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    server.method.failure = RuntimeError("secret path /srv/x")
+    try:
+        with pytest.raises(Internal) as caught:
+            client.localize(PHOTO, CAMERA, scene)
+    finally:
+        server.method.failure = None
+    assert caught.value.message == f"internal error, id={caught.value.request_id}"
+    record = next(record for record in caplog.records if record.exc_info)
+    assert caught.value.request_id in record.getMessage()
+    assert "secret path" in caplog.text
+    client.localize(PHOTO, CAMERA, scene)
+
+
+def test_errors_raised_below_keep_their_code(server: RunningServer, client: Client, scene: str) -> None:
+    server.method.failure = DataLoss("reference 'r1': features are damaged")
+    try:
+        with pytest.raises(Exception, match="features are damaged") as caught:
+            client.localize(PHOTO, CAMERA, scene)
+    finally:
+        server.method.failure = None
+    assert getattr(caught.value, "code", None) == "DATA_LOSS"
+
+
+@pytest.mark.parametrize("given", ["robot-7.frame_12", "x" * 64])
+def test_a_request_id_is_taken_over(stubs: Stubs, scene: str, given: str) -> None:
+    response, call = stubs.localization.Localize.with_call(
+        localize_request(scene), metadata=[("x-request-id", given)], timeout=30
+    )
+    assert response.diagnostics.request_id == given
+    assert dict(call.trailing_metadata())["x-request-id"] == given
+    error = failure_of(stubs.localization.Localize, pb.LocalizeRequest(), metadata=[("x-request-id", given)])
+    assert error.request_id == given
+
+
+@pytest.mark.parametrize("given", ["x" * 65, "a b", 'id="1"', "a%0a", ""])
+def test_a_strange_request_id_is_not(stubs: Stubs, scene: str, given: str) -> None:
+    response = stubs.localization.Localize(localize_request(scene), metadata=[("x-request-id", given)], timeout=30)
+    assert response.diagnostics.request_id != given
+    assert len(response.diagnostics.request_id) == 32
+
+
+def test_every_call_is_one_line_in_the_log(stubs: Stubs, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "mapless_server.rpc")
+    request = pb.LocalizeRequest(scene="scenes/a\nrequest_id=forged")
+    failure_of(stubs.localization.Localize, request, metadata=[("x-request-id", "logged")])
+    wait_until(lambda: "request_id=logged" in caplog.text)
+    (line,) = [r.getMessage() for r in caplog.records if "request_id=logged" in r.getMessage()]
+    assert "\n" not in line
+    assert "method=/mapless.v1.LocalizationService/Localize" in line
+    assert "outcome=INVALID_ARGUMENT" in line
+    assert "duration_ms=" in line
+
+
+def test_a_message_over_the_limit(server: RunningServer, stubs: Stubs, client: Client, scene: str) -> None:
+    request = localize_request(scene)
+    request.image = bytes(33 * 2**20)
+    assert failure_of(stubs.localization.Localize, request).code == "RESOURCE_EXHAUSTED"
+    small = Client(server.address, ConnectOptions(max_message_mib=1, batch_mib=1))
+    with small, pytest.raises(ResourceExhausted):
+        small.localize(bytes(2 * 2**20), CAMERA, scene)
+    client.localize(PHOTO, CAMERA, scene)
+
+
+def test_a_compressed_message_over_the_limit(server: RunningServer, client: Client, scene: str) -> None:
+    with (
+        grpc.insecure_channel(
+            server.address, [("grpc.max_send_message_length", -1)], compression=grpc.Compression.Gzip
+        ) as channel,
+        pytest.raises(grpc.RpcError) as caught,
+    ):
+        channel.unary_unary("/mapless.v1.LocalizationService/Localize")(bytes(64 * 2**20), timeout=30)
+    assert from_rpc_error(caught.value).code == "RESOURCE_EXHAUSTED"
+    client.localize(PHOTO, CAMERA, scene)
+
+
+@pytest.mark.parametrize("data", [b"\xff" * 40, b"\x0a\x05abc", b"\x0a\x02\xff\xfe"])
+def test_bytes_that_are_no_request(server: RunningServer, data: bytes) -> None:
+    with grpc.insecure_channel(server.address) as channel, pytest.raises(grpc.RpcError) as caught:
+        channel.unary_unary("/mapless.v1.LocalizationService/Localize")(data, timeout=30)
+    error = from_rpc_error(caught.value)
+    assert (error.code, error.reason) == ("INVALID_ARGUMENT", "MALFORMED_MESSAGE")
+
+
+class Unready(grpc.GenericRpcHandler):
+    """A server that says UNAVAILABLE some times before it answers."""
+
+    def __init__(self, failures: int) -> None:
+        self.failures = failures
+        self.tries = 0
+        self._lock = threading.Lock()
+
+    def service(self, handler_call_details: Any) -> Any:
+        newer: Any = pb.LocalizeResponse()
+        newer.rejection.reason = 99
+
+        def answer(data: bytes, context: Any) -> Any:
+            with self._lock:
+                self.tries += 1
+                if self.tries <= self.failures:
+                    context.abort(grpc.StatusCode.UNAVAILABLE, "starting")
+            return newer.SerializeToString()
+
+        return grpc.unary_unary_rpc_method_handler(answer)
+
+
+@pytest.mark.parametrize(("failures", "tries"), [(2, 3), (9, 4)])
+def test_the_client_retries_whole_photographs_while_a_server_starts(
+    pool: futures.ThreadPoolExecutor, failures: int, tries: int
+) -> None:
+    unready = Unready(failures)
+    server = grpc.server(pool, [unready], options=[("grpc.max_receive_message_length", -1)])
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    options = ConnectOptions(initial_backoff_s=0.01, max_backoff_s=0.02)
+    photo = bytes(3 * 2**20)
+    with Client(f"127.0.0.1:{port}", options) as client:
+        if failures < tries:
+            answer = client.localize(photo, CAMERA, "s")
+            assert getattr(answer, "reason", None) == "99"  # a reason newer than this client
+        else:
+            with pytest.raises(Unavailable):
+                client.localize(photo, CAMERA, "s")
+    assert unready.tries == tries
+    server.stop(None).wait()
+
+
+def test_a_server_that_is_not_there_is_unavailable() -> None:
+    with (
+        Client("127.0.0.1:9", ConnectOptions(initial_backoff_s=0.01, max_backoff_s=0.02)) as client,
+        pytest.raises(Unavailable),
+    ):
+        client.get_scene("s", timeout_s=10)

@@ -1,0 +1,173 @@
+"""`mapless-server evaluate` as a person runs it, on a rendered wall."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from images import encode, textured
+from numpy.typing import NDArray
+from scenes import random_for
+from typer.testing import CliRunner
+
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless_server.cli import app
+
+CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
+PIXELS_PER_METRE = 150.0
+BOARDS_M = ((5.0, 9.0, 7.0), (3.6, 1.6, 1.1))
+"""Depth, width and height of two upright boards, the far one behind everything."""
+
+
+def photograph(boards: list[NDArray[np.uint8]], world_from_camera: RigidTransform) -> NDArray[np.uint8]:
+    """Boards at z = depth, centred on the world's z axis, seen by CAMERA: each is one homography."""
+    camera_from_world = world_from_camera.inverse()
+    image = np.zeros((CAMERA.height_px, CAMERA.width_px, 3), np.uint8)
+    for board, (depth_m, width_m, height_m) in zip(boards, BOARDS_M, strict=True):
+        board_x, board_y = np.array([1, 0, 0]) / PIXELS_PER_METRE, np.array([0, 1, 0]) / PIXELS_PER_METRE
+        corner = np.array([-width_m / 2, -height_m / 2, depth_m])
+        on_board = np.stack([board_x, board_y, corner], axis=1)
+        in_camera = camera_from_world.rotation @ on_board
+        in_camera[:, 2] += camera_from_world.translation
+        cv2.warpPerspective(
+            board, CAMERA.matrix() @ in_camera, image.shape[1::-1], image, cv2.INTER_AREA, cv2.BORDER_TRANSPARENT
+        )
+    return image
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Nine photographs, 0.35 m apart."""
+    path = tmp_path_factory.mktemp("wall")
+    (path / "images").mkdir()
+    random = random_for("wall")
+    boards = [
+        textured(round(width_m * PIXELS_PER_METRE), round(height_m * PIXELS_PER_METRE), seed=i)
+        for i, (_, width_m, height_m) in enumerate(BOARDS_M)
+    ]
+    frames = []
+    for i in range(9):
+        rotation = rotation_from_vector(random.normal(0, 0.05, 3))
+        pose = RigidTransform(rotation, np.array([0.35 * (i - 4), random.normal(0, 0.1), random.normal(0, 0.1)]))
+        (path / "images" / f"{i}.png").write_bytes(encode(".png", photograph(boards, pose)))
+        frames.append(
+            {
+                "image": f"images/{i}.png",
+                "width": CAMERA.width_px,
+                "height": CAMERA.height_px,
+                "K": CAMERA.matrix().tolist(),
+                "dist": None,
+                "world_from_camera": pose.matrix().tolist(),
+            }
+        )
+    (path / "cameras.json").write_text(json.dumps({"metric": True, "source": "rendered", "frames": frames}))
+    return path
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "mapless_server", *map(str, arguments)]
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=120)
+
+
+def refusal(*arguments: object) -> str:
+    """What is said of arguments that are wrong: one line, and exit code 2."""
+    done = CliRunner().invoke(app, [*map(str, arguments)])
+    assert done.exit_code == 2
+    assert done.stdout == ""
+    assert len(done.stderr.strip().splitlines()) == 1
+    return done.stderr
+
+
+def test_leaves_one_out(folder: Path, tmp_path: Path) -> None:
+    done = run("evaluate", folder, "--queries", 3, "--json", tmp_path / "figures.json")
+    assert done.returncode == 0, done.stderr
+    assert "3 of 3" in done.stdout
+    assert "localizing: 3" in done.stderr
+    figures: dict[str, Any] = json.loads((tmp_path / "figures.json").read_text())
+    assert (figures["queries"], figures["localized"]) == (3, 3)
+    assert figures["median_translation_m"] < 0.02
+    assert figures["latency_ms"]["p50"] > 0
+    for query in figures["per_query"]:
+        assert query["name"] not in query["references"], "no query is its own reference"
+        assert len(query["references"]) == 8
+
+
+def test_chosen_references(folder: Path, tmp_path: Path) -> None:
+    done = run("evaluate", folder, "--references", 4, "--queries", 3, "--k", 3, "--json", tmp_path / "figures.json")
+    assert done.returncode == 0, done.stderr
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    references = {"0", "3", "5", "8"}
+    assert figures["references"] == 4
+    for query in figures["per_query"]:
+        assert query["name"] not in references
+        assert len(query["references"]) == 3
+        assert set(query["references"]) <= references
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--references", 1), "at least 2"),
+        (("--references", 10), "the folder has 9 frames"),
+        (("--k", 0), "k, the references of a query"),
+        (("--variant", "bset"), "variant must be one of"),
+        (("--json", "/nowhere/figures.json"), "cannot be written"),
+    ],
+)
+def test_wrong_arguments_are_one_line(folder: Path, arguments: tuple[object, ...], words: str) -> None:
+    assert words in refusal("evaluate", folder, *arguments)
+
+
+def test_wrong_folders_are_one_line(folder: Path, tmp_path: Path) -> None:
+    assert "cameras.json" in refusal("evaluate", tmp_path / "nowhere")
+    content = json.loads((folder / "cameras.json").read_text())
+    (tmp_path / "cameras.json").write_text(json.dumps(content))
+    assert "there is no file" in refusal("evaluate", tmp_path)
+    (tmp_path / "images").symlink_to(folder / "images")
+    content["frames"][4]["width"] = 640
+    (tmp_path / "cameras.json").write_text(json.dumps(content))
+    assert "4.png has 480x360 pixels" in refusal("evaluate", tmp_path)
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the server through /proc")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_it_takes_its_server_along(folder: Path, number: signal.Signals) -> None:
+    process = subprocess.Popen(
+        command("evaluate", folder), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    try:
+        assert any(line.startswith("storing") for line in process.stderr)
+        children = children_of(process.pid)
+        assert len(children) == 1
+        process.send_signal(number)
+        assert process.wait(60) != 0
+    finally:
+        process.kill()
+        process.wait()
+        process.stderr.close()
+    deadline_s = time.monotonic() + 10
+    while time.monotonic() < deadline_s and any(os.path.exists(f"/proc/{child}") for child in children):
+        time.sleep(0.05)
+    assert not any(os.path.exists(f"/proc/{child}") for child in children)
+
+
+def children_of(process_id: int) -> list[int]:
+    tasks = Path(f"/proc/{process_id}/task").iterdir()
+    return [int(child) for task in tasks for child in (task / "children").read_text().split()]
+
+
+def test_bench_without_scenes_is_one_line(tmp_path: Path) -> None:
+    assert "holds none of the scenes" in refusal("bench", tmp_path)

@@ -1,0 +1,245 @@
+"""Localize through a real server: what is asked, what comes back, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from datetime import datetime, timezone
+
+import numpy as np
+import pytest
+from images import cmyk_jpeg, encode, png_claiming, textured, with_exif_orientation
+from servers import CAMERA, COVARIANCE, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose, serving
+
+from mapless import (
+    Client,
+    FailedPrecondition,
+    InvalidArgument,
+    LocalizationResult,
+    NewReference,
+    NotFound,
+    PositionPrior,
+    Rejected,
+)
+from mapless.geometry import Camera
+from mapless.v1 import geometry_pb2 as geometry_pb
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.decode import ImageLimits, decode_image
+
+Request = pb.LocalizeRequest
+DEEP = np.random.default_rng(3).integers(0, 65536, (64, 96, 3)).astype(np.uint16)
+JPEG = encode(".jpg", textured())
+
+
+def localized(answer: LocalizationResult | Rejected) -> LocalizationResult:
+    assert isinstance(answer, LocalizationResult)
+    return answer
+
+
+def rejected(answer: LocalizationResult | Rejected) -> Rejected:
+    assert isinstance(answer, Rejected)
+    return answer
+
+
+def test_an_answer_in_full(client: Client, scene: str) -> None:
+    captured = datetime(2026, 1, 2, 3, 4, 5, 678901, timezone.utc)
+    answer = localized(
+        client.localize(
+            PHOTO, CAMERA, scene, ["r2", "r0"], variant="full", capture_time=captured, session_from_camera=pose(7.0)
+        )
+    )
+    np.testing.assert_allclose(answer.world_from_camera.matrix(), pose(2.0).matrix(), atol=1e-12)
+    assert answer.covariance is not None
+    np.testing.assert_array_equal(answer.covariance, COVARIANCE)
+    assert answer.accuracy is not None
+    assert 0.18 < answer.accuracy.position_68_m < 0.19
+    assert answer.accuracy.position_68_m < answer.accuracy.position_95_m
+    assert not answer.accuracy.calibrated
+    assert (answer.pose_stage, answer.inlier_count, answer.match_count) == ("REFINED", 90, 120)
+    assert answer.capture_time == captured
+    assert answer.world_from_session is not None
+    now = answer.world_from_session.compose(pose(7.0))
+    np.testing.assert_allclose(now.matrix(), pose(2.0).matrix(), atol=1e-12)
+
+    used = answer.diagnostics
+    assert [use.name for use in used.references] == [f"scenes/{scene}/references/{r}" for r in ("r2", "r0")]
+    assert [use.match_count for use in used.references] == [0, 1]
+    assert (used.backend, used.features, used.variant) == ("geometric", "stand-in", "FULL")
+    assert used.store_generation == client.get_scene(scene).generation
+    assert used.scale is not None
+    assert (used.scale.metres_per_unit, used.scale.stage) == (2.0, "TRIANGULATION")
+    assert list(used.stage_s) == ["decode", "features", "coarse", "pnp"]
+    assert used.stage_s["coarse"] == 0.1
+    assert 0 <= used.queue_s <= used.total_s
+    assert (used.processed_width_px, used.processed_height_px) == (96, 64)
+    assert len(used.request_id) == 32
+
+
+def test_without_references_the_server_chooses(client: Client, scene: str) -> None:
+    answer = localized(client.localize(PHOTO, CAMERA, scene, reference_count=2))
+    assert len(answer.diagnostics.references) == 2
+    assert "retrieval" in answer.diagnostics.stage_s
+
+
+def test_an_empty_scene_is_a_rejection(client: Client) -> None:
+    client.create_scene("empty")
+    answer = rejected(client.localize(PHOTO, CAMERA, "empty"))
+    assert answer.reason == "NO_USABLE_REFERENCES"
+    assert answer.diagnostics.processed_width_px == 96
+    client.delete_scene("empty")
+
+
+def test_a_pose_outside_the_prior_is_rejected(client: Client, scene: str) -> None:
+    at_r1 = pose(1.0).translation
+    near = PositionPrior(at_r1 + np.array([0.3, 0, 0]), 0.5)
+    far = PositionPrior(at_r1 + np.array([0.6, 0, 0]), 0.5)
+    localized(client.localize(PHOTO, CAMERA, scene, ["r1"], position_prior=near))
+    answer = rejected(client.localize(PHOTO, CAMERA, scene, ["r1"], position_prior=far))
+    assert answer.reason == "GATE"
+    assert "0.10 m outside" in answer.message
+
+
+def test_a_prior_narrows_the_choice_to_its_radius_and_ten_metres(client: Client) -> None:
+    client.create_scene("street")
+    client.add_references("street", [NewReference(f"x{x}", PHOTO, CAMERA, pose(float(x))) for x in (0, 8, 16, 40)])
+    prior = PositionPrior(pose(4.0).translation, 3.0)
+    answer = client.localize(PHOTO, CAMERA, "street", position_prior=prior)
+    assert {use.name.rpartition("/")[2] for use in answer.diagnostics.references} == {"x0", "x8", "x16"}
+    nowhere = PositionPrior(np.array([1e6, 0, 0]), 3.0)
+    assert rejected(client.localize(PHOTO, CAMERA, "street", position_prior=nowhere)).reason == "NO_USABLE_REFERENCES"
+    client.delete_scene("street")
+
+
+def test_too_many_candidates_are_a_failed_precondition(tmp_path_factory: pytest.TempPathFactory) -> None:
+    with (
+        serving(tmp_path_factory.mktemp("data"), retrieval_max_references=2) as server,
+        Client(server.address) as client,
+    ):
+        client.create_scene("s")
+        client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(30.0 * i)) for i in range(3)])
+        with pytest.raises(FailedPrecondition) as caught:
+            client.localize(PHOTO, CAMERA, "s")
+        assert caught.value.reason == "TOO_MANY_CANDIDATES"
+        localized(client.localize(PHOTO, CAMERA, "s", ["r0", "r1", "r2"]))
+        near_r0 = PositionPrior(pose(0.0).translation, 5.0)
+        assert len(client.localize(PHOTO, CAMERA, "s", position_prior=near_r0).diagnostics.references) == 1
+
+
+@pytest.mark.parametrize(
+    ("image", "same_as"),
+    [
+        (encode(".png", DEEP), None),
+        (cmyk_jpeg(np.full((8, 12, 4), 200, np.uint8)), None),
+        (encode(".png", textured(channels=4)), None),
+        (encode(".png", textured()[..., 0].copy()), None),
+        (encode(".webp", textured()), None),
+        (with_exif_orientation(JPEG, 6), JPEG),
+    ],
+    ids=["16 bit", "CMYK", "alpha", "grey", "webp", "EXIF"],
+)
+def test_unusual_images_are_read_as_stored(
+    server: RunningServer, client: Client, scene: str, image: bytes, same_as: bytes | None
+) -> None:
+    localized(client.localize(image, CAMERA, scene))
+    expected = decode_image(same_as or image, ImageLimits())
+    np.testing.assert_array_equal(server.extractor.seen[-1], expected)
+
+
+def test_exif_orientation_does_not_turn_the_intrinsics(client: Client, scene: str) -> None:
+    turned = Camera(64, 96, 80.0, 81.0, 31.5, 47.5)
+    with pytest.raises(InvalidArgument, match="64x96 pixels, the image has 96x64") as caught:
+        client.localize(with_exif_orientation(JPEG, 6), turned, scene)
+    assert caught.value.field == "intrinsics.width_px"
+
+
+def set_image(data: bytes) -> Callable[[Request], None]:
+    return lambda request: setattr(request, "image", data)
+
+
+def set_intrinsics(name: str, value: float) -> Callable[[Request], None]:
+    return lambda request: setattr(request.intrinsics, name, value)
+
+
+def set_session_rotation(**quaternion: float) -> Callable[[Request], None]:
+    def change(request: Request) -> None:
+        request.session_from_camera.rotation.CopyFrom(geometry_pb.Quaternion(**quaternion))
+        request.session_from_camera.translation_m.CopyFrom(geometry_pb.Vector3())
+
+    return change
+
+
+def set_prior(radius_m: float, x: float = 0.0) -> Callable[[Request], None]:
+    def change(request: Request) -> None:
+        request.position_prior.position_m.CopyFrom(geometry_pb.Vector3(x=x))
+        request.position_prior.radius_m = radius_m
+
+    return change
+
+
+def add_references(*references: str) -> Callable[[Request], None]:
+    """Names with {scene} for the request's own."""
+    return lambda request: request.references.extend(name.format(scene=request.scene) for name in references)
+
+
+def set_option(name: str, value: int) -> Callable[[Request], None]:
+    return lambda request: setattr(request.options, name, value)
+
+
+BAD_REQUESTS: dict[str, tuple[Callable[[Request], object], str]] = {
+    "no image": (set_image(b""), "image"),
+    "not an image": (set_image(b"<svg/>" * 30), "image"),
+    "truncated": (set_image(PHOTO[:-100]), "image"),
+    "900 megapixels": (set_image(png_claiming(30_000, 30_000)), "image"),
+    "too many bytes": (set_image(PHOTO + bytes(17 * 2**20)), "image"),
+    "no intrinsics": (lambda request: request.ClearField("intrinsics"), "intrinsics"),
+    "other size": (set_intrinsics("width_px", 97), "intrinsics.width_px"),
+    "focal length 0": (set_intrinsics("focal_x_px", 0.0), "intrinsics.focal_x_px"),
+    "focal length below 0": (set_intrinsics("focal_y_px", -5.0), "intrinsics.focal_y_px"),
+    "focal length NaN": (set_intrinsics("focal_x_px", math.nan), "intrinsics.focal_x_px"),
+    "principal point infinite": (set_intrinsics("principal_y_px", math.inf), "intrinsics.principal_y_px"),
+    "zero quaternion": (set_session_rotation(), "session_from_camera.rotation"),
+    "long quaternion": (set_session_rotation(x=1, w=1), "session_from_camera.rotation"),
+    "NaN quaternion": (set_session_rotation(w=math.nan), "session_from_camera.rotation"),
+    "radius 0": (set_prior(0.0), "position_prior.radius_m"),
+    "radius NaN": (set_prior(math.nan), "position_prior.radius_m"),
+    "radius infinite": (set_prior(math.inf), "position_prior.radius_m"),
+    "prior at NaN": (set_prior(1.0, math.nan), "position_prior.position_m.x"),
+    "prior nowhere": (lambda request: setattr(request.position_prior, "radius_m", 1), "position_prior.position_m"),
+    "no scene": (lambda request: request.ClearField("scene"), "scene"),
+    "scene id alone": (lambda request: setattr(request, "scene", "kitchen"), "scene"),
+    "duplicate reference": (add_references("{scene}/references/r1", "{scene}/references/r1"), "references[1]"),
+    "reference of another scene": (add_references("scenes/other/references/r1"), "references[0]"),
+    "reference id with ..": (add_references("{scene}/references/a..b"), "references[0]"),
+    "reference id with /": (add_references("{scene}/references/../../etc/passwd"), "references[0]"),
+    "reference id of 10,000": (add_references("{scene}/references/" + "x" * 10_000), "references[0]"),
+    "65 references": (add_references(*(f"{{scene}}/references/r{i}" for i in range(65))), "references"),
+    "unknown variant": (set_option("variant", 77), "options.variant"),
+    "unknown scale strategy": (set_option("scale_strategy", -1), "options.scale_strategy"),
+    "65 chosen": (set_option("reference_count", 65), "options.reference_count"),
+    "-1 chosen": (set_option("reference_count", -1), "options.reference_count"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_REQUESTS)
+def test_bad_requests_are_refused_by_field(
+    server: RunningServer, stubs: Stubs, client: Client, scene: str, name: str
+) -> None:
+    change, field = BAD_REQUESTS[name]
+    request = localize_request(scene)
+    change(request)
+    computed_before = server.method.call_count
+    error = failure_of(stubs.localization.Localize, request)
+    assert (error.code, error.field) == ("INVALID_ARGUMENT", field)
+    assert len(error.message) <= 1000
+    assert server.method.call_count == computed_before
+    localized(client.localize(PHOTO, CAMERA, scene))
+
+
+def test_unknown_scenes_and_references(client: Client, scene: str) -> None:
+    with pytest.raises(NotFound, match="nowhere"):
+        client.localize(PHOTO, CAMERA, "nowhere")
+    with pytest.raises(NotFound, match="nowhere"):
+        client.localize(PHOTO, CAMERA, "nowhere", ["r1"])
+    with pytest.raises(NotFound) as caught:
+        client.localize(PHOTO, CAMERA, scene, ["r1", "absent"])
+    assert caught.value.field == "references[1]"

@@ -1,0 +1,195 @@
+"""Scenes and references as resources, through a real server and a real store."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from images import encode, textured
+from servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, pose
+
+from mapless import AlreadyExists, Client, ConnectOptions, InvalidArgument, NewReference, NotFound, wire
+from mapless.v1 import reference_service_pb2 as pb
+
+
+def create_request(reference_id: str) -> pb.CreateReferenceRequest:
+    """A good one."""
+    return pb.CreateReferenceRequest(
+        reference_id=reference_id,
+        reference=pb.Reference(
+            image=PHOTO,
+            intrinsics=wire.camera_to_message(CAMERA),
+            world_from_camera=wire.transform_to_message(pose(0.5)),
+        ),
+    )
+
+
+def test_the_life_of_a_scene(client: Client) -> None:
+    created = client.create_scene("life")
+    assert (created.scene_id, created.generation, created.reference_count) == ("life", 1, 0)
+    with pytest.raises(AlreadyExists) as caught:
+        client.create_scene("life")
+    assert caught.value.field == "scene_id"
+    assert client.get_scene("scenes/life") == created
+    client.delete_scene("life")
+    for operation in (client.get_scene, client.delete_scene):
+        with pytest.raises(NotFound):
+            operation("life")
+
+
+def test_the_life_of_a_reference(client: Client, scene: str, tmp_path: Path) -> None:
+    generation = client.get_scene(scene).generation
+    path = tmp_path / "photo.png"
+    path.write_bytes(PHOTO)
+    added = client.add_reference(scene, NewReference("new", path, CAMERA, pose(0.25)))
+    assert (added.scene_id, added.reference_id, added.camera, added.feature_count) == (scene, "new", CAMERA, 1)
+    assert added.image is None
+    np.testing.assert_allclose(added.world_from_camera.matrix(), pose(0.25).matrix(), atol=1e-12)
+    assert client.get_reference(scene, "new", include_image=True).image == PHOTO
+    assert added.image_sha256 == hashlib.sha256(PHOTO).hexdigest()
+    with pytest.raises(AlreadyExists) as caught:
+        client.add_reference(scene, NewReference("new", PHOTO, CAMERA, pose(0.25)))
+    assert caught.value.field == "reference_id"
+    client.delete_reference(scene, f"scenes/{scene}/references/new")
+    with pytest.raises(NotFound):
+        client.get_reference(scene, "new")
+    assert client.get_scene(scene).generation > generation
+
+
+def test_lists_are_paged(client: Client, stubs: Stubs, scene: str) -> None:
+    assert [r.reference_id for r in client.list_references(scene)] == ["r0", "r1", "r2"]
+    assert [r.reference_id for r in client.list_references(scene, page_size=1)] == ["r0", "r1", "r2"]
+    assert scene in [s.scene_id for s in client.list_scenes(page_size=1)]
+    request = pb.ListReferencesRequest(scene=f"scenes/{scene}", page_size=3)
+    assert stubs.references.ListReferences(request).next_page_token == ""
+    request.page_size = 2
+    first = stubs.references.ListReferences(request)
+    assert len(first.references) == 2
+    assert not any(reference.image for reference in first.references)
+
+    for token in ("x", "r1", first.next_page_token[:-2], first.next_page_token + "A", "€"):
+        request.page_token = token
+        assert failure_of(stubs.references.ListReferences, request).field == "page_token"
+    foreign = pb.ListScenesRequest(page_token=first.next_page_token)
+    assert failure_of(stubs.references.ListScenes, foreign).field == "page_token"
+    assert failure_of(stubs.references.ListScenes, pb.ListScenesRequest(page_size=-1)).field == "page_size"
+    stubs.references.ListScenes(pb.ListScenesRequest(page_size=10**6))
+
+
+def test_a_bulk_upload_is_cut_into_messages(server: RunningServer, client: Client, scene: str) -> None:
+    photos = [encode(".png", textured(seed=i)) for i in range(7)]
+    progress: list[int] = []
+    options = ConnectOptions(batch_mib=2.5 * max(map(len, photos)) / 2**20, batch_count=3)
+    with Client(server.address, options) as small:
+        stored = small.add_references(
+            scene,
+            (NewReference(f"bulk{i}", photo, CAMERA, pose(i)) for i, photo in enumerate(photos)),
+            on_progress=progress.append,
+        )
+    assert [reference.reference_id for reference in stored] == [f"bulk{i}" for i in range(7)]
+    assert progress == [2, 4, 6, 7]
+    assert client.get_reference(scene, "bulk6", include_image=True).image == photos[6]
+
+
+def test_a_large_batch_takes_one_place_in_the_queue(server: RunningServer, client: Client, scene: str) -> None:
+    assert server.engine.options.workers + server.engine.options.max_waiting < 20
+    assert len(client.add_references(scene, [NewReference(f"x{i}", PHOTO, CAMERA, pose(i)) for i in range(20)])) == 20
+
+
+Change = Callable[[pb.BatchCreateReferencesRequest], object]
+
+
+def set_pose(**quaternion: float) -> Change:
+    def change(batch: pb.BatchCreateReferencesRequest) -> None:
+        rotation = batch.requests[1].reference.world_from_camera.rotation
+        rotation.Clear()
+        for name, value in quaternion.items():
+            setattr(rotation, name, value)
+
+    return change
+
+
+BAD_BATCHES: dict[str, tuple[Change, str]] = {
+    "none": (lambda batch: batch.ClearField("requests"), "requests"),
+    "1001": (lambda batch: batch.requests.extend(create_request(f"x{i}") for i in range(999)), "requests"),
+    "no id": (lambda batch: batch.requests[1].ClearField("reference_id"), "requests[1].reference_id"),
+    "id with ..": (lambda batch: setattr(batch.requests[1], "reference_id", "a..b"), "requests[1].reference_id"),
+    "id with /": (lambda batch: setattr(batch.requests[1], "reference_id", "a/b"), "requests[1].reference_id"),
+    "id of 10,000": (
+        lambda batch: setattr(batch.requests[1], "reference_id", "x" * 10_000),
+        "requests[1].reference_id",
+    ),
+    "twice": (lambda batch: setattr(batch.requests[1], "reference_id", "n0"), "requests[1].reference_id"),
+    "other scene": (lambda batch: setattr(batch.requests[1], "scene", "scenes/other"), "requests[1].scene"),
+    "no reference": (lambda batch: batch.requests[1].ClearField("reference"), "requests[1].reference"),
+    "no image": (lambda batch: batch.requests[1].reference.ClearField("image"), "requests[1].reference.image"),
+    "truncated": (
+        lambda batch: setattr(batch.requests[1].reference, "image", PHOTO[:-50]),
+        "requests[1].reference.image",
+    ),
+    "other size": (
+        lambda batch: setattr(batch.requests[1].reference.intrinsics, "height_px", 65),
+        "requests[1].reference.intrinsics.width_px",
+    ),
+    "no pose": (
+        lambda batch: batch.requests[1].reference.ClearField("world_from_camera"),
+        "requests[1].reference.world_from_camera",
+    ),
+    "zero quaternion": (set_pose(), "requests[1].reference.world_from_camera.rotation"),
+    "long quaternion": (set_pose(w=1.1), "requests[1].reference.world_from_camera.rotation"),
+    "too far": (
+        lambda batch: setattr(batch.requests[1].reference.world_from_camera.translation_m, "y", 1.1e7),
+        "requests[1].reference.world_from_camera.translation_m.y",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_BATCHES)
+def test_a_batch_with_one_bad_item_stores_nothing(client: Client, stubs: Stubs, scene: str, name: str) -> None:
+    batch = pb.BatchCreateReferencesRequest(
+        scene=f"scenes/{scene}", requests=[create_request("n0"), create_request("n1")]
+    )
+    change, field = BAD_BATCHES[name]
+    change(batch)
+    error = failure_of(stubs.references.BatchCreateReferences, batch)
+    assert (error.code, error.field) == ("INVALID_ARGUMENT", field)
+    assert client.get_scene(scene).reference_count == 3
+
+
+def test_a_batch_with_a_taken_id_stores_nothing(client: Client, stubs: Stubs, scene: str) -> None:
+    batch = pb.BatchCreateReferencesRequest(
+        scene=f"scenes/{scene}", requests=[create_request("n0"), create_request("r1")]
+    )
+    error = failure_of(stubs.references.BatchCreateReferences, batch)
+    assert (error.code, error.field) == ("ALREADY_EXISTS", "requests[1].reference_id")
+    assert client.get_scene(scene).reference_count == 3
+
+
+def test_names_are_checked_everywhere(client: Client, stubs: Stubs) -> None:
+    bad = "scenes/../references/x"
+    calls = [
+        (stubs.references.CreateScene, pb.CreateSceneRequest(scene_id=".."), "scene_id"),
+        (stubs.references.GetScene, pb.GetSceneRequest(name="scenes/.."), "name"),
+        (stubs.references.DeleteScene, pb.DeleteSceneRequest(name=bad), "name"),
+        (stubs.references.CreateReference, create_request("x"), "scene"),
+        (stubs.references.GetReference, pb.GetReferenceRequest(name=bad), "name"),
+        (stubs.references.ListReferences, pb.ListReferencesRequest(scene=bad), "scene"),
+        (stubs.references.DeleteReference, pb.DeleteReferenceRequest(name=bad), "name"),
+    ]
+    for method, request, field in calls:
+        error = failure_of(method, request)
+        assert (error.code, error.field) == ("INVALID_ARGUMENT", field)
+    with pytest.raises(InvalidArgument):
+        client.get_scene("a b")
+
+
+def test_references_of_an_unknown_scene(client: Client) -> None:
+    with pytest.raises(NotFound):
+        client.add_reference("nowhere", NewReference("r", PHOTO, CAMERA, pose(0)))
+    with pytest.raises(NotFound):
+        list(client.list_references("nowhere"))
+    with pytest.raises(NotFound):
+        client.get_reference("nowhere", "r")

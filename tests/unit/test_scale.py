@@ -1,0 +1,397 @@
+"""Scale and initial pose: planted similarities come back; faults move the answer to the other stage or reject it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from fake_network import FakeNetwork, FakeNetworkOptions
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import SceneOptions, SyntheticScene, make_scene, random_for
+
+from mapless.geometry import RigidTransform, Similarity, rotation_angle_deg, rotation_from_vector
+from mapless_server.coarse import ReconstructedView, Reconstruction
+from mapless_server.correspond import Correspondences
+from mapless_server.rejection import Rejection, RejectionReason
+from mapless_server.scale import (
+    MetricScale,
+    ScaleOptions,
+    ScaleStage,
+    ScaleStrategy,
+    estimate_scale,
+    trajectory_radius,
+    trajectory_scale,
+    triangulate_depths,
+)
+
+EXACT = SceneOptions(noise_px=0.0)
+TRIANGULATION = ScaleOptions(strategy=ScaleStrategy.TRIANGULATION)
+TRAJECTORY = ScaleOptions(strategy=ScaleStrategy.TRAJECTORY)
+CONSISTENTLY_WRONG = FakeNetworkOptions(bad_depth_share=0.7, bad_depth_factors=(1.4, 1.4), depth_noise_m=0.01)
+
+
+def true_matches(scene: SyntheticScene, per_pair: int | None = None) -> Correspondences:
+    """The matches that show the same point, at most so many of each pair of references."""
+    pairs = {}
+    for i, j in combinations(range(len(scene.references)), 2):
+        known = [np.where(points >= 0, points, -1 - k) for k, points in enumerate(scene.reference_points)]
+        _, in_first, in_second = np.intersect1d(known[i], known[j], return_indices=True)
+        pairs[i, j] = np.stack([in_first, in_second], axis=1)[:per_pair].astype(np.int32)
+    return Correspondences(pairs, ())
+
+
+def scale_of(
+    scene: SyntheticScene,
+    network: FakeNetwork,
+    options: ScaleOptions | None = None,
+    matches: Correspondences | None = None,
+) -> MetricScale:
+    outcome = estimate_scale(
+        network.reconstruct(scene.query, scene.references), scene.references, matches or true_matches(scene), options
+    )
+    assert isinstance(outcome, MetricScale), outcome
+    return outcome
+
+
+def rejection_of(
+    reconstruction: Reconstruction, scene: SyntheticScene, options: ScaleOptions | None = None
+) -> Rejection:
+    outcome = estimate_scale(reconstruction, scene.references, true_matches(scene), options)
+    assert isinstance(outcome, Rejection), outcome
+    return outcome
+
+
+def assert_same_pose(actual: RigidTransform, expected: RigidTransform, metres: float, degrees: float) -> None:
+    assert np.linalg.norm(actual.translation - expected.translation) < metres
+    assert rotation_angle_deg(actual.rotation @ expected.rotation.T) < degrees
+
+
+def transformed(view: ReconstructedView, similarity: Similarity) -> ReconstructedView:
+    """The same prediction told in another local frame."""
+    point_map = (similarity.scale * view.point_map).astype(np.float32)
+    return replace(view, point_map=point_map, local_from_camera=similarity.transform_pose(view.local_from_camera))
+
+
+SCENE = make_scene(random_for("frames"), SceneOptions(point_count=200, reference_count=4))
+MATCHES = true_matches(SCENE)
+RECONSTRUCTION = FakeNetwork(
+    SCENE, 4, FakeNetworkOptions(depth_noise_m=0.02, pose_noise_m=0.01, pose_noise_deg=0.1)
+).reconstruct(SCENE.query, SCENE.references)
+
+
+# The planted truth comes back.
+
+
+@pytest.mark.parametrize("strategy", list(ScaleStrategy))
+@pytest.mark.parametrize("dense", [False, True])
+def test_exact_without_noise(strategy: ScaleStrategy, dense: bool) -> None:
+    scene = make_scene(random_for("exact"), EXACT)
+    network = FakeNetwork(scene, 1, FakeNetworkOptions(dense=dense))
+    result = scale_of(scene, network, ScaleOptions(strategy=strategy))
+
+    truth = network.world_from_local
+    assert result.metres_per_unit == pytest.approx(truth.scale, rel=1e-6)
+    assert result.deviation < 1e-6
+    assert_same_pose(result.world_from_query, scene.world_from_query, metres=1e-5, degrees=1e-5)
+    corners = np.random.default_rng(0).normal(size=(8, 3))
+    np.testing.assert_allclose(
+        result.world_from_local.inverse().apply(corners), truth.inverse().apply(corners), rtol=1e-4, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_half_a_percent_with_noise_and_bad_depths(seed: int) -> None:
+    scene = make_scene(random_for("noise", seed))
+    network = FakeNetwork(scene, seed, FakeNetworkOptions(depth_noise_m=0.01, bad_depth_share=0.3))
+    result = scale_of(scene, network)
+    assert result.stage is ScaleStage.TRIANGULATION
+    assert result.metres_per_unit == pytest.approx(network.world_from_local.scale, rel=5e-3)
+
+
+def test_a_share_of_the_matches_gives_the_same_scale() -> None:
+    scene = make_scene(random_for("share"))
+    network = FakeNetwork(scene, 2, FakeNetworkOptions(depth_noise_m=0.01))
+    result = scale_of(scene, network, replace(TRIANGULATION, max_matches=500))
+    assert result.metres_per_unit != scale_of(scene, network, TRIANGULATION).metres_per_unit
+    assert result.metres_per_unit == pytest.approx(network.world_from_local.scale, rel=5e-3)
+
+
+def test_wrong_matches_do_not_move_the_median() -> None:
+    scene = make_scene(random_for("wrong matches"))
+    matches = true_matches(scene)
+    random = random_for("wrong matches", "shuffle")
+    for pair in matches.reference_pairs.values():
+        wrong = random.random(len(pair)) < 0.4
+        pair[wrong, 1] = random.permutation(pair[wrong, 1])
+    network = FakeNetwork(scene, 2)
+    result = scale_of(scene, network, TRIANGULATION, matches)
+    assert result.metres_per_unit == pytest.approx(network.world_from_local.scale, rel=2e-3)
+
+
+@pytest.mark.parametrize("strategy", [ScaleStrategy.TWO_STAGE, ScaleStrategy.TRAJECTORY])
+def test_the_initial_pose_is_as_good_as_the_predicted_poses(strategy: ScaleStrategy) -> None:
+    scene = make_scene(random_for("pose noise"))
+    network = FakeNetwork(scene, 3, FakeNetworkOptions(depth_noise_m=0.01, pose_noise_m=0.01, pose_noise_deg=0.2))
+    result = scale_of(scene, network, ScaleOptions(strategy=strategy))
+    assert_same_pose(result.world_from_query, scene.world_from_query, metres=0.08, degrees=1.5)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    scale=st.floats(1e-3, 1e3),
+    turn=st.tuples(*[st.floats(-3, 3)] * 3),
+    shift=st.tuples(*[st.floats(-100, 100)] * 3),
+    strategy=st.sampled_from(ScaleStrategy),
+)
+def test_the_local_frame_does_not_matter(
+    scale: float, turn: tuple[float, ...], shift: tuple[float, ...], strategy: ScaleStrategy
+) -> None:
+    moved = Reconstruction(
+        transformed(RECONSTRUCTION.query, Similarity(scale, rotation_from_vector(turn), np.array(shift))),
+        tuple(
+            transformed(view, Similarity(scale, rotation_from_vector(turn), np.array(shift)))
+            for view in RECONSTRUCTION.references
+        ),
+    )
+    options = ScaleOptions(strategy=strategy)
+    before = estimate_scale(RECONSTRUCTION, SCENE.references, MATCHES, options)
+    after = estimate_scale(moved, SCENE.references, MATCHES, options)
+    assert isinstance(before, MetricScale)
+    assert isinstance(after, MetricScale)
+    assert (after.stage, after.anchor) == (before.stage, before.anchor)
+    assert after.metres_per_unit * scale == pytest.approx(before.metres_per_unit, rel=1e-6)
+    assert_same_pose(after.world_from_query, before.world_from_query, metres=1e-5, degrees=1e-5)
+
+
+def test_the_order_of_references_does_not_matter() -> None:
+    scene = make_scene(random_for("order"))
+    confidences = (0.3, 0.4, 0.9, 0.5, 0.6, 0.7)
+    network = FakeNetwork(scene, 5, FakeNetworkOptions(0.01, pose_noise_m=0.02, reference_confidences=confidences))
+    order = [3, 1, 5, 0, 2, 4]
+    shuffled = replace(
+        scene,
+        references=tuple(scene.references[i] for i in order),
+        reference_points=tuple(scene.reference_points[i] for i in order),
+    )
+    for strategy in ScaleStrategy:
+        options = ScaleOptions(strategy=strategy)
+        before, after = scale_of(scene, network, options), scale_of(shuffled, network, options)
+        assert before.anchor == order[after.anchor] == 2
+        assert after.metres_per_unit == pytest.approx(before.metres_per_unit, rel=1e-12)
+        assert_same_pose(after.world_from_query, before.world_from_query, metres=1e-9, degrees=1e-5)
+
+
+# Which stage decides.
+
+
+def test_the_anchor_has_the_highest_total_confidence() -> None:
+    scene = make_scene(random_for("anchor"), EXACT)
+    for confidences, anchor in [((0.2, 0.3, 0.3, 0.8, 0.1, 0.7), 3), ((0.5, 0.5, 0.5, 0.5, 0.5, 0.5), 0)]:
+        network = FakeNetwork(scene, 6, FakeNetworkOptions(reference_confidences=confidences, dense=True))
+        result = scale_of(scene, network)
+        assert result.anchor == anchor
+        reference = network.reconstruct(scene.query, scene.references).references[anchor]
+        tied = result.world_from_local.transform_pose(reference.local_from_camera)
+        assert_same_pose(tied, scene.references[anchor].world_from_camera, metres=1e-9, degrees=1e-5)
+
+
+def test_few_matches_leave_it_to_the_trajectory() -> None:
+    scene = make_scene(random_for("few"), EXACT)
+    network = FakeNetwork(scene, 7, FakeNetworkOptions(bad_depth_share=1.0))
+    result = scale_of(scene, network, matches=true_matches(scene, per_pair=0))
+    assert result.stage is ScaleStage.TRAJECTORY
+    assert result.metres_per_unit == pytest.approx(network.world_from_local.scale, rel=1e-9)
+    # One match of each of 15 pairs, two ratios a match, against 24.
+    enough = scale_of(scene, FakeNetwork(scene, 7), matches=true_matches(scene, per_pair=1))
+    assert enough.stage is ScaleStage.TRIANGULATION
+
+
+def test_a_wrong_first_stage_loses_by_its_deviation() -> None:
+    scene = make_scene(random_for("biased"))
+    network = FakeNetwork(scene, 8, replace(CONSISTENTLY_WRONG, pose_noise_m=0.01))
+    alone = scale_of(scene, network, TRIANGULATION)
+    assert alone.metres_per_unit < 0.8 * network.world_from_local.scale
+    assert alone.deviation > 0.2
+
+    both = scale_of(scene, network)
+    assert both.stage is ScaleStage.TRAJECTORY
+    assert both.deviation < alone.deviation
+    assert both.metres_per_unit == pytest.approx(network.world_from_local.scale, rel=0.03)
+
+
+def test_a_wrong_second_stage_loses_by_its_deviation() -> None:
+    # One camera predicted a metre away makes the trajectory too large for the scale that suits all others, S_traj.
+    scene = make_scene(random_for("too large"), SceneOptions(reference_count=12, baseline_m=0.1))
+    faults = FakeNetworkOptions(bad_depth_share=1.0, bad_depth_factors=(1.2, 1.2), bad_pose_count=1, bad_pose_m=1.0)
+    network = FakeNetwork(scene, 11, faults)
+    first, second, both = (scale_of(scene, network, ScaleOptions(strategy=strategy)) for strategy in ScaleStrategy)
+    assert ScaleOptions().max_deviation < first.deviation < second.deviation
+    assert (both.stage, both.metres_per_unit) == (ScaleStage.TRIANGULATION, first.metres_per_unit)
+
+
+def test_the_gate_adopts_the_first_stage_although_the_second_fits_better() -> None:
+    scene = make_scene(random_for("gate"))
+    network = FakeNetwork(scene, 10, FakeNetworkOptions(bad_depth_share=1.0, bad_depth_factors=(1.03, 1.03)))
+    both = scale_of(scene, network)
+    assert both.stage is ScaleStage.TRIANGULATION
+    assert both.deviation == pytest.approx(0.03, abs=0.01)
+    strict = scale_of(scene, network, ScaleOptions(max_deviation=0.01))
+    assert strict.stage is ScaleStage.TRAJECTORY
+    assert strict.deviation < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bad_poses_do_not_move_the_second_stage(seed: int) -> None:
+    scene = make_scene(random_for("bad poses", seed), SceneOptions(point_count=200, reference_count=10))
+    network = FakeNetwork(scene, seed, FakeNetworkOptions(pose_noise_m=0.005, bad_pose_count=2, bad_pose_m=0.3))
+    result = scale_of(scene, network, TRAJECTORY)
+    assert result.metres_per_unit == pytest.approx(network.world_from_local.scale, rel=0.02)
+
+
+def test_baselines_out_of_range_are_not_triangulated() -> None:
+    scene = make_scene(random_for("baselines"), SceneOptions(point_count=200, reference_count=4, baseline_m=0.05))
+    network = FakeNetwork(scene, 11)
+    assert scale_of(scene, network).stage is ScaleStage.TRAJECTORY
+    rejection = rejection_of(network.reconstruct(scene.query, scene.references), scene, TRIANGULATION)
+    assert rejection.reason is RejectionReason.SCALE_UNRELIABLE
+    assert "0 depths" in rejection.message
+    assert scale_of(scene, network, replace(TRIANGULATION, min_baseline_m=0.04)).metres_per_unit > 0
+    too_far = ScaleOptions(min_baseline_m=0.01, max_baseline_m=0.04)
+    assert scale_of(scene, network, too_far).stage is ScaleStage.TRAJECTORY
+
+
+def test_distant_points_are_not_triangulated() -> None:
+    # 0.5 m apart and 150 m away: a parallax of 0.2 deg, and depths wrong by a quarter.
+    distant = SceneOptions(point_count=200, box_m=(100.0, 60.0, 50.0), distance_m=150.0, reference_count=2)
+    scene = make_scene(random_for("distant"), distant)
+    network = FakeNetwork(scene, 12)
+    options = ScaleOptions(min_radius_per_depth=0.0, max_deviation=1.0)
+    assert scale_of(scene, network, options).stage is ScaleStage.TRAJECTORY
+    assert scale_of(scene, network, replace(options, min_parallax_deg=0.0)).stage is ScaleStage.TRIANGULATION
+
+
+def test_forty_references() -> None:
+    options = SceneOptions(point_count=120, reference_count=40, baseline_m=0.15, distractor_count=20)
+    scene = make_scene(random_for("forty"), options)
+    network = FakeNetwork(scene, 13, FakeNetworkOptions(0.01, pose_noise_m=0.02, map_width_px=96, map_height_px=72))
+    matches = true_matches(scene)
+    for strategy in ScaleStrategy:
+        first, second = (scale_of(scene, network, ScaleOptions(strategy=strategy), matches) for _ in range(2))
+        assert first.metres_per_unit == second.metres_per_unit
+        assert first.metres_per_unit == pytest.approx(network.world_from_local.scale, rel=0.02)
+
+
+# Rejections.
+
+
+def test_one_reference_is_not_enough() -> None:
+    for count in (0, 1):
+        scene = make_scene(random_for("one"), SceneOptions(point_count=50))
+        scene = replace(scene, references=scene.references[:count])
+        rejection = rejection_of(FakeNetwork(scene).reconstruct(scene.query, scene.references), scene)
+        assert rejection.reason is RejectionReason.NO_USABLE_REFERENCES
+
+
+@pytest.mark.parametrize("strategy", list(ScaleStrategy))
+@pytest.mark.parametrize("pose_noise_m", [0.0, 0.1])
+def test_references_at_one_place(strategy: ScaleStrategy, pose_noise_m: float) -> None:
+    scene = make_scene(random_for("one place"), SceneOptions(point_count=50, baseline_m=1e-3))
+    network = FakeNetwork(scene, 14, FakeNetworkOptions(pose_noise_m=pose_noise_m))
+    options = ScaleOptions(strategy=strategy)
+    rejection = rejection_of(network.reconstruct(scene.query, scene.references), scene, options)
+    assert rejection.reason is RejectionReason.DEGENERATE_REFERENCES
+    assert "0.0017 m" in rejection.message
+
+
+def test_references_too_close_for_the_depth_of_the_scene() -> None:
+    distant = SceneOptions(point_count=50, box_m=(100.0, 60.0, 50.0), distance_m=150.0, reference_count=3)
+    scene = make_scene(random_for("too close"), replace(distant, baseline_m=0.2))
+    rejection = rejection_of(FakeNetwork(scene).reconstruct(scene.query, scene.references), scene)
+    assert rejection.reason is RejectionReason.DEGENERATE_REFERENCES
+
+
+@pytest.mark.parametrize("strategy", list(ScaleStrategy))
+def test_not_finite_is_rejected(strategy: ScaleStrategy) -> None:
+    nowhere = RigidTransform(np.full((3, 3), np.nan), np.full(3, np.nan))
+    good, *others = RECONSTRUCTION.references
+    blind = [replace(view, point_map=np.full_like(view.point_map, np.nan)) for view in RECONSTRUCTION.references]
+    infinite = [replace(view, point_map=np.full_like(view.point_map, np.inf)) for view in RECONSTRUCTION.references]
+    behind = [replace(view, point_map=-view.point_map) for view in RECONSTRUCTION.references]
+    for broken in (
+        replace(RECONSTRUCTION, query=replace(RECONSTRUCTION.query, local_from_camera=nowhere)),
+        replace(RECONSTRUCTION, references=(replace(good, local_from_camera=nowhere), *others)),
+        replace(RECONSTRUCTION, references=tuple(blind)),
+        replace(RECONSTRUCTION, references=tuple(infinite)),
+        replace(RECONSTRUCTION, references=tuple(behind)),
+    ):
+        rejection = rejection_of(broken, SCENE, ScaleOptions(strategy=strategy))
+        assert rejection.reason is RejectionReason.SCALE_UNRELIABLE
+
+
+def test_a_confidence_that_is_not_finite_is_not_the_anchor() -> None:
+    first, *others = RECONSTRUCTION.references
+    first = replace(first, confidence=np.full_like(first.confidence, np.nan))
+    result = estimate_scale(Reconstruction(RECONSTRUCTION.query, (first, *others)), SCENE.references, MATCHES)
+    assert isinstance(result, MetricScale)
+    assert result.anchor != 0
+
+
+def test_misuse_is_refused() -> None:
+    with pytest.raises(ValueError, match="zip"):
+        estimate_scale(RECONSTRUCTION, SCENE.references[:-1], MATCHES)
+    for bad in ({"min_baseline_m": 11.0}, {"min_ratios": 0}, {"max_deviation": float("nan")}, {"max_pair_cameras": 1}):
+        with pytest.raises(ValueError, match="senseless"):
+            ScaleOptions(**bad)
+
+
+# The equations.
+
+
+def test_trajectory_radius_of_a_square() -> None:
+    square = np.array([[1.0, 1, 7], [1, -1, 7], [-1, 1, 7], [-1, -1, 7]])
+    assert trajectory_radius(square) == pytest.approx(np.sqrt(2))
+    assert trajectory_radius(3 * square + 5) == pytest.approx(3 * np.sqrt(2))
+
+
+def test_trajectory_scale_against_a_plain_twin() -> None:
+    random = random_for("twin")
+    for _ in range(20):
+        known = random.normal(size=(7, 3))
+        predicted = (known + random.normal(0.0, 0.06, (7, 3))) / 2.5
+        best = (0, -np.inf, np.nan)
+        for i, j in combinations(range(7), 2):
+            scale = np.linalg.norm(known[i] - known[j]) / np.linalg.norm(predicted[i] - predicted[j])
+            offset = known.mean(axis=0) - (scale * predicted).mean(axis=0)
+            distances = np.linalg.norm(scale * predicted + offset - known, axis=1)
+            agree = distances[distances <= 0.10]
+            rms = float(np.sqrt(np.mean((agree if len(agree) else distances) ** 2)))
+            best = max(best, (len(agree), -rms, float(scale)))
+        assert trajectory_scale(predicted, known, ScaleOptions()) == pytest.approx(best[2])
+
+
+def test_pairs_predicted_at_one_place_propose_nothing() -> None:
+    known = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    predicted = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0]])
+    assert trajectory_scale(predicted, known, ScaleOptions()) in (1.0, 2.0)
+    assert trajectory_scale(np.zeros((3, 3)), known, ScaleOptions()) is None
+
+
+def test_ray_depths_against_a_plain_twin() -> None:
+    random = random_for("rays")
+    centres, rays = random.normal(size=(50, 2, 3)), random.normal(size=(50, 2, 3))
+    depth_m, parallax_deg = triangulate_depths(centres, rays)
+    for centre, ray, depth, parallax in zip(centres, rays, depth_m, parallax_deg, strict=True):
+        nearest = np.linalg.lstsq(np.stack([ray[0], -ray[1]], axis=1), centre[1] - centre[0], rcond=None)[0]
+        np.testing.assert_allclose(depth, nearest, atol=1e-9)
+        cosine = ray[0] @ ray[1] / np.linalg.norm(ray[0]) / np.linalg.norm(ray[1])
+        assert parallax == pytest.approx(np.degrees(np.arccos(cosine)))
+
+
+def test_parallel_rays_have_no_depth() -> None:
+    rays = np.broadcast_to([0.0, 0.0, 1.0], (1, 2, 3))
+    depth_m, parallax_deg = triangulate_depths(np.array([[[0.0, 0, 0], [1, 0, 0]]]), rays)
+    assert np.isnan(depth_m).all()
+    assert parallax_deg == 0

@@ -1,0 +1,100 @@
+"""Flags beat the environment, which beats the file, which beats the default; nothing misspelt passes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pydantic import SecretStr, ValidationError
+
+from mapless_server.settings import ConfigError, LoadedSettings, Settings, load_settings
+
+
+@pytest.fixture(autouse=True)
+def clean_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    import os
+
+    for name in [name for name in os.environ if name.startswith("MAPLESS_")]:
+        monkeypatch.delenv(name)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "mapless.toml"
+    path.write_text('host = "10.0.0.1"\nport = 1000\nmax_waiting = 5\nreflection = false\n')
+    return path
+
+
+def test_precedence_and_origins(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MAPLESS_PORT", "2000")
+    monkeypatch.setenv("MAPLESS_HOST", "10.0.0.2")
+    loaded = load_settings({"host": "10.0.0.3", "workers": None}, config)
+    assert (loaded.settings.host, loaded.settings.port, loaded.settings.max_waiting) == ("10.0.0.3", 2000, 5)
+    assert not loaded.settings.reflection
+    expected = {"host": "flag", "port": "environment", "max_waiting": "file", "workers": "default"}
+    assert {name: loaded.origins[name] for name in expected} == expected
+
+
+def test_the_file_may_be_named_by_the_environment(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MAPLESS_CONFIG", str(config))
+    assert load_settings({}).settings.port == 1000
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("prot = 1", "prot (file)"),
+        ("port = 65536", "port (file)"),
+        ("port = [", "mapless.toml"),
+        ('workers = "many"', "workers (file)"),
+        ("max_image_mib = 33", "max_image_mib must not exceed"),
+        ('log_level = "loud"', "log_level (file)"),
+    ],
+)
+def test_faults_in_the_file(tmp_path: Path, text: str, told: str) -> None:
+    path = tmp_path / "mapless.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load_settings({}, path)
+    assert told in str(caught.value)
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no such file"):
+        load_settings({}, tmp_path / "absent.toml")
+
+
+def test_a_misspelt_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MAPLESS_WORKER", "3")
+    with pytest.raises(ConfigError, match="MAPLESS_WORKER is not a setting"):
+        load_settings({})
+
+
+def test_variables_of_a_kubernetes_service_are_not_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {
+        "MAPLESS_SERVICE_HOST": "10.1.2.3",
+        "MAPLESS_SERVICE_PORT": "50051",
+        "MAPLESS_SERVICE_PORT_GRPC": "50051",
+        "MAPLESS_PORT": "tcp://10.1.2.3:50051",
+        "MAPLESS_PORT_50051_TCP": "tcp://10.1.2.3:50051",
+        "MAPLESS_PORT_50051_TCP_ADDR": "10.1.2.3",
+    }.items():
+        monkeypatch.setenv(name, value)
+    loaded = load_settings({})
+    assert loaded.settings.port == 50051
+    assert loaded.origins["port"] == "default"
+
+
+def test_settings_are_frozen() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        Settings().port = 3
+
+
+def test_secrets_are_hidden_when_settings_are_shown() -> None:
+    class WithSecret(Settings):
+        database_url: SecretStr = SecretStr("postgresql://user:hunter2@host/db")
+
+    shown = str(LoadedSettings(WithSecret(), dict.fromkeys(WithSecret.model_fields, "default")))
+    assert "database_url" in shown
+    assert "hunter2" not in shown
+    assert "port                      50051  (default)" in shown

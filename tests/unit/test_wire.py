@@ -1,0 +1,130 @@
+"""Geometry crosses the wire unchanged, and what breaks the contract is named by its path."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapless import names, wire
+from mapless.geometry import Camera, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
+from mapless.v1 import geometry_pb2 as pb
+from mapless.v1 import localization_service_pb2 as localization_pb
+
+CAMERA = Camera(640, 480, 500.0, 501.5, 319.5, 239.25)
+FINITE = st.floats(-1e7, 1e7)
+
+
+@pytest.mark.parametrize(
+    "distortion", [None, RadialTangential(0.1, -0.2, 1e-3, 2e-3, 0.05), Fisheye(0.1, -0.02, 1e-3, -1e-4)]
+)
+def test_cameras_come_back_as_they_were(distortion: RadialTangential | Fisheye | None) -> None:
+    camera = replace(CAMERA, distortion=distortion)
+    message = pb.CameraIntrinsics.FromString(wire.camera_to_message(camera).SerializeToString())
+    assert wire.camera_from_message(message, "intrinsics") == camera
+
+
+@given(st.lists(FINITE, min_size=3, max_size=3), st.lists(st.floats(-10, 10), min_size=3, max_size=3))
+def test_transforms_come_back_as_they_were(translation: list[float], rotation_vector: list[float]) -> None:
+    transform = RigidTransform(rotation_from_vector(rotation_vector), np.array(translation))
+    message = wire.transform_to_message(transform)
+    assert message.rotation.w >= 0
+    back = wire.transform_from_message(message, "pose")
+    np.testing.assert_array_equal(back.translation, transform.translation)
+    np.testing.assert_allclose(back.rotation, transform.rotation, atol=1e-12)
+
+
+def test_a_quaternion_is_normalized() -> None:
+    message = pb.RigidTransform(rotation=pb.Quaternion(w=1.0005), translation_m=pb.Vector3())
+    np.testing.assert_allclose(wire.transform_from_message(message, "pose").rotation, np.eye(3), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"width_px": 31}, "width_px"),
+        ({"height_px": 16385}, "height_px"),
+        ({"width_px": -640}, "width_px"),
+        ({"focal_x_px": 0.0}, "focal_x_px"),
+        ({"focal_y_px": -500.0}, "focal_y_px"),
+        ({"focal_x_px": math.nan}, "focal_x_px"),
+        ({"focal_y_px": math.inf}, "focal_y_px"),
+        ({"focal_x_px": 64001.0}, "focal_x_px"),
+        ({"principal_x_px": -641.0}, "principal_x_px"),
+        ({"principal_x_px": math.nan}, "principal_x_px"),
+        ({"principal_y_px": 961.0}, "principal_y_px"),
+        ({"radial_tangential": pb.RadialTangentialDistortion(k2=101)}, "radial_tangential.k2"),
+        ({"radial_tangential": pb.RadialTangentialDistortion(p1=math.nan)}, "radial_tangential.p1"),
+        ({"fisheye": pb.FisheyeDistortion(k4=-math.inf)}, "fisheye.k4"),
+    ],
+)
+def test_bad_cameras_are_refused_by_field(change: dict[str, Any], field: str) -> None:
+    message = wire.camera_to_message(CAMERA)
+    message.MergeFrom(pb.CameraIntrinsics(**change))
+    for name, value in change.items():
+        if isinstance(value, int | float):
+            setattr(message, name, value)  # merging leaves out zeros
+    with pytest.raises(wire.FieldError) as caught:
+        wire.camera_from_message(message, "requests[3].reference.intrinsics")
+    assert caught.value.field == f"requests[3].reference.intrinsics.{field}"
+
+
+def test_camera_limits_are_inclusive() -> None:
+    camera = Camera(32, 16384, 100.0 * 16384, 1e-9, -32.0, 2.0 * 16384)
+    assert wire.camera_from_message(wire.camera_to_message(camera), "") == camera
+
+
+@pytest.mark.parametrize(
+    ("message", "field"),
+    [
+        (pb.RigidTransform(translation_m=pb.Vector3()), "rotation"),
+        (pb.RigidTransform(rotation=pb.Quaternion(w=1)), "translation_m"),
+        (pb.RigidTransform(rotation=pb.Quaternion(), translation_m=pb.Vector3()), "rotation"),
+        (pb.RigidTransform(rotation=pb.Quaternion(w=1.002), translation_m=pb.Vector3()), "rotation"),
+        (pb.RigidTransform(rotation=pb.Quaternion(x=math.nan, w=1), translation_m=pb.Vector3()), "rotation"),
+        (pb.RigidTransform(rotation=pb.Quaternion(w=1), translation_m=pb.Vector3(z=math.inf)), "translation_m.z"),
+        (pb.RigidTransform(rotation=pb.Quaternion(w=1), translation_m=pb.Vector3(y=-1.1e7)), "translation_m.y"),
+    ],
+)
+def test_bad_transforms_are_refused_by_field(message: pb.RigidTransform, field: str) -> None:
+    with pytest.raises(wire.FieldError) as caught:
+        wire.transform_from_message(message, "pose", wire.MAX_COORDINATE_M)
+    assert caught.value.field == f"pose.{field}"
+
+
+@pytest.mark.parametrize("good", ["a", "_", "A-b.c_9", "0" * 128, "a.b-c"])
+def test_ids(good: str) -> None:
+    assert names.parse_scene_name(names.scene_name(good)) == good
+    assert names.parse_reference_name(names.reference_name("scene", good)) == ("scene", good)
+
+
+@pytest.mark.parametrize(
+    "bad", ["", ".", "..", "-a", "a-", ".a", "a.", "a..b", "a/b", "a b", "a\n", "ä", "0" * 129, "x" * 10_000, "a\0b"]
+)
+def test_bad_ids(bad: str) -> None:
+    with pytest.raises(ValueError, match=r"\A[ -~]{1,400}\Z"):  # short and printable: it goes into logs and trailers
+        names.check_id(bad)
+    with pytest.raises(wire.FieldError):
+        wire.scene_id_from_name(f"scenes/{bad}", "scene")
+    with pytest.raises(wire.FieldError):
+        wire.reference_ids_from_name(f"scenes/s/references/{bad}", "name")
+
+
+@pytest.mark.parametrize(
+    "bad", ["", "scenes", "scene/a", "scenes/a/references", "a", "/scenes/a", "scenes//references/b"]
+)
+def test_bad_names(bad: str) -> None:
+    with pytest.raises(ValueError, match=r".+"):
+        names.parse_scene_name(bad)
+    with pytest.raises(ValueError, match=r".+"):
+        names.parse_reference_name(bad)
+
+
+def test_enum_prefixes() -> None:
+    assert wire.enum_prefix(localization_pb.ScaleStage) == "SCALE_STAGE_"
+    assert wire.enum_prefix(localization_pb.Variant) == "VARIANT_"
