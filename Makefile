@@ -20,8 +20,9 @@ $(VENV)/.installed: pyproject.toml
 
 setup: $(VENV)/.installed  ## Create .venv with everything
 
-test: setup $(PROTO_VENV)/.installed  ## Run all tests
-	PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(ARGS)
+# The matrices are small: BLAS threads gain nothing, and wait for one another where cores are shared.
+test: setup $(PROTO_VENV)/.installed  ## Run all tests; ARGS=... for pytest
+	OPENBLAS_NUM_THREADS=1 PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(ARGS)
 
 lint: setup  ## Check style, types and protos
 	$(BIN)/ruff check .

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
 import sys
 from collections.abc import Sequence
 from datetime import datetime
@@ -47,8 +48,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with Client(parsed.address, ConnectOptions(timeout_s=parsed.timeout)) as client:
             sys.exit(parsed.run(client, parsed))
     except MaplessError as error:
-        field = f" (field {error.field})" if error.field else ""
+        field = f" (field {error.field})" if error.field and error.field not in error.message else ""
         print(f"mapless: {error}{field}", file=sys.stderr)
+        sys.exit(EXIT_FAILED)
+    except BrokenPipeError:  # whoever reads our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(EXIT_FAILED)
     except (OSError, ValueError) as error:
         print(f"mapless: {error}", file=sys.stderr)
@@ -82,8 +86,8 @@ def _parser() -> argparse.ArgumentParser:
     add.add_argument("scene")
     add.add_argument("photo", type=Path)
     add.add_argument("--id", help="of the reference (default: the file's name without its ending)")
-    add.add_argument("--camera", required=True, help="its camera, see below of `mapless --help`")
-    add.add_argument("--pose", required=True, help="world_from_camera")
+    add.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
+    add.add_argument("--pose", required=True, help="its world_from_camera, likewise")
     add.set_defaults(run=_add_reference)
     listing = reference_actions.add_parser("list")
     listing.add_argument("scene")
@@ -185,7 +189,7 @@ def _read_json(source: str, message: M) -> M:
 
 
 def _print(value: object) -> int:
-    print(json.dumps(_plain(value), indent=2))
+    print(json.dumps(_plain(value), indent=2), flush=True)
     return 0
 
 

@@ -272,8 +272,8 @@ class Camera:
     def resized(self, width_px: int, height_px: int) -> Camera:
         """The camera of the same photograph resampled to another size.
 
-        A pixel covers [-1/2, 1/2] around its centre, so the image's edge, not its first pixel centre, is the fixed point
-        of resizing: c' = s (c + 1/2) - 1/2.
+        A pixel covers [-1/2, 1/2] around its centre, so the image's edge, not its first pixel's centre, is the fixed
+        point of resizing: c' = s (c + 1/2) - 1/2.
         """
         scale_x, scale_y = width_px / self.width_px, height_px / self.height_px
         return replace(

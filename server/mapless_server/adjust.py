@@ -1,4 +1,4 @@
-"""Adjustment: the last refinement of our own, a bundle adjustment of the query, its points and, a little, the references.
+"""Adjustment: our own last refinement, a bundle adjustment of the query, its points and, a little, the references.
 
 The paper fixes the points before it solves for the query, and fixes the references for good. But the query sees the
 points too, and reference poses are never exact: they carry noise of their own, and an imperfect lens model acts like
@@ -35,6 +35,9 @@ class AdjustOptions:
         loss_scale_sigma: of the Cauchy loss, which forgets gross errors rather than merely bounding them.
         prior_share: how far references may move: the standard deviation of the prior, in image pixels, as a share of
             the noise level found in the structure. What the residuals show is an upper bound of what poses are off.
+        error_inflation: factor on the standard deviations of the answer. Errors of neighbouring keypoints and of one
+            reference's points go together, which the sum over residuals does not know; on scenes with known poses true
+            errors were 1.5 to 2.8 times what it says.
         max_error_px: matches further from the pose found so far take no part.
         iterations: at most so many Levenberg-Marquardt steps.
         min_decrease: stop when a step lowers the cost by a smaller share.
@@ -42,6 +45,7 @@ class AdjustOptions:
 
     loss_scale_sigma: float = 1.25
     prior_share: float = 0.2
+    error_inflation: float = 2.0
     max_error_px: float = 8.0
     iterations: int = 8
     min_decrease: float = 1e-5
@@ -161,7 +165,7 @@ class _NormalEquations:
     def step(self, damping: float) -> tuple[Array, Array]:
         """Motions (V, 6) of the cameras and steps (P, 3) of the points."""
         matrix, gradient, inverse = self.reduced(damping)
-        motion = -np.linalg.solve(matrix, gradient)
+        motion = -np.asarray(np.linalg.solve(matrix, gradient), np.float64)
         back = self.point_gradient + np.swapaxes(self.cross, 1, 2) @ motion
         return motion.reshape(-1, 6), -(inverse @ back[:, :, None])[..., 0]
 
@@ -201,7 +205,8 @@ def adjust_pose(
     points = structure.x_in_world.copy()
     points[matches.point[used]] = state.points
     errors_px = reprojection_errors_px(query.camera, pose, points[matches.point], pixels)
-    return replace(estimate, world_from_camera=pose, errors_px=errors_px, covariance=world_covariance(hessian, pose))
+    covariance = options.error_inflation**2 * world_covariance(hessian, pose)
+    return replace(estimate, world_from_camera=pose, errors_px=errors_px, covariance=covariance)
 
 
 def _minimize(problem: _Problem, state: _State, options: AdjustOptions) -> tuple[_State, _NormalEquations]:

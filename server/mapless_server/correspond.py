@@ -1,7 +1,12 @@
 """Which keypoints of different photographs show the same thing.
 
-Between references, whose poses are known, a match must also lie on the epipolar line; these matches depend on nothing but
-the two stored references, so they are remembered. Matches of the query with each reference come from descriptors alone.
+Between references, whose poses are known, a match must also lie on the epipolar line; these matches depend on nothing
+but the two stored references, so they are remembered. Matches of the query with each reference come from descriptors
+alone.
+
+Where references stand far apart, few matches survive the comparison with all keypoints of the other photograph. A wide
+correspondence adds those that survive the comparison along the epipolar line: many more, and more of them wrong, so it
+serves queries that are lost otherwise.
 """
 
 from __future__ import annotations
@@ -28,20 +33,25 @@ class CorrespondOptions:
     """Options of matching.
 
     Attributes:
-        reference_ratio: a match between references is kept when the second-best descriptor is at least this much further
-            away (Lowe's ratio of distances); loose, because the epipolar line filters too.
+        reference_ratio: a match between references is kept when the nearest descriptor is at most this share of the
+            second-nearest's distance away (Lowe's ratio); loose, because the epipolar line filters too.
         query_ratio: the same for matches with the query, which have no other filter.
         epipolar_px: greatest distance from the epipolar line, in both images; keypoints are good to about a pixel.
+        wide_ratio: the ratio among the keypoints along the line, which are few, so it must be stricter.
+        wide_similarity: smallest cosine of descriptors of a match along the line, for the same reason.
         remembered_pairs: how many pairs of references are remembered, about 8 KiB each.
     """
 
     reference_ratio: float = 0.9
     query_ratio: float = 0.85
     epipolar_px: float = 2.0
+    wide_ratio: float = 0.8
+    wide_similarity: float = 0.85
     remembered_pairs: int = 20_000
 
     def __post_init__(self) -> None:
-        if not (0 < self.reference_ratio <= 1 and 0 < self.query_ratio <= 1 and self.epipolar_px > 0):
+        ratios = (self.reference_ratio, self.query_ratio, self.wide_ratio)
+        if not (0 < min(ratios) <= max(ratios) <= 1 and self.epipolar_px > 0 and self.remembered_pairs >= 0):
             raise ValueError(f"senseless options: {self}")
 
 
@@ -63,13 +73,13 @@ class Matcher:
 
     def __init__(self, options: CorrespondOptions | None = None) -> None:
         self.options = options or CorrespondOptions()
-        self._remembered: OrderedDict[tuple[str, str], Matches] = OrderedDict()
+        self._remembered: OrderedDict[tuple[str, str, bool], Matches] = OrderedDict()
         self._lock = Lock()
 
-    def correspond(self, query: View, references: Sequence[PosedView]) -> Correspondences:
-        """Matches between all pairs of references and between the query and each."""
+    def correspond(self, query: View, references: Sequence[PosedView], wide: bool = False) -> Correspondences:
+        """Matches between all pairs of references, widely if so asked, and between the query and each."""
         pairs = {
-            (i, j): self.match_references(references[i], references[j])
+            (i, j): self.match_references(references[i], references[j], wide)
             for i, j in combinations(range(len(references)), 2)
         }
         return Correspondences(pairs, tuple(self.match_query(query, reference) for reference in references))
@@ -78,20 +88,32 @@ class Matcher:
         """Matches (query keypoint, reference keypoint)."""
         return mutual_matches(query.features, reference.view.features, self.options.query_ratio)
 
-    def match_references(self, first: PosedView, second: PosedView) -> Matches:
+    def match_references(self, first: PosedView, second: PosedView, wide: bool = False) -> Matches:
         """Matches between two references, each within `epipolar_px` of the epipolar line of the known poses."""
-        key = (first.key, second.key)
+        key = (first.key, second.key, wide)
         with self._lock:
             if key in self._remembered:
                 self._remembered.move_to_end(key)
                 return self._remembered[key]
-        matches = mutual_matches(first.view.features, second.view.features, self.options.reference_ratio)
-        matches = matches[epipolar_distance_px(first, second, matches) < self.options.epipolar_px]
+        matches = self._match_widely(first, second) if wide else self._match_strictly(first, second)
         with self._lock:
             self._remembered[key] = matches
             while len(self._remembered) > self.options.remembered_pairs:
                 self._remembered.popitem(last=False)
         return matches
+
+    def _match_strictly(self, first: PosedView, second: PosedView) -> Matches:
+        matches = mutual_matches(first.view.features, second.view.features, self.options.reference_ratio)
+        return matches[epipolar_distance_px(first, second, matches) < self.options.epipolar_px]
+
+    def _match_widely(self, first: PosedView, second: PosedView) -> Matches:
+        """The strict matches, and those along the line of keypoints that have none."""
+        strict = self.match_references(first, second)
+        similarity = first.view.features.descriptors @ second.view.features.descriptors.T
+        similarity[epipolar_distances_px(first, second) >= self.options.epipolar_px] = -1.0
+        added = best_of_both(similarity, self.options.wide_ratio, self.options.wide_similarity)
+        taken = np.isin(added[:, 0], strict[:, 0]) | np.isin(added[:, 1], strict[:, 1])
+        return np.concatenate([strict, added[~taken]])
 
 
 def mutual_matches(first: Features, second: Features, ratio: float) -> Matches:
@@ -101,37 +123,62 @@ def mutual_matches(first: Features, second: Features, ratio: float) -> Matches:
     """
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), np.int32)
-    similarity = first.descriptors @ second.descriptors.T  # (N, M)
-    rows = np.arange(len(first))
+    return best_of_both(first.descriptors @ second.descriptors.T, ratio)
+
+
+def best_of_both(similarity: NDArray[np.float32], ratio: float, smallest: float = -1.0) -> Matches:
+    """Where a matrix of cosines (N, M) is the best of its row and column, above `smallest` and clear of its row's rest.
+
+    Overwrites the matrix.
+    """
+    if not similarity.size:
+        return np.empty((0, 2), np.int32)
+    rows = np.arange(len(similarity))
     nearest = similarity.argmax(axis=1)
     best = similarity[rows, nearest]
     # Best of its column too: compared by value, because an argmax along columns costs ten times the maximum.
     mutual = best >= similarity.max(axis=0)[nearest]
     similarity[rows, nearest] = -1.0
     second_best = similarity.max(axis=1)
-    keep = mutual & (1 - best < ratio**2 * (1 - second_best))
+    keep = mutual & (best > smallest) & (1 - best < ratio**2 * (1 - second_best))
     return np.stack([rows[keep], nearest[keep]], axis=1).astype(np.int32)
 
 
 def epipolar_distance_px(first: PosedView, second: PosedView, matches: Matches) -> Array:
-    """Distance (M,) of matches from the epipolar lines of the known poses, the larger of both images; 0 if both stand at
-    one place, where there is no such line.
+    """Distance (M,) of matches from the epipolar lines of the known poses, the larger of both images.
+
+    0 if both stand at one place, where there is no such line.
     """
-    first_from_second = first.world_from_camera.inverse().compose(second.world_from_camera)
-    if np.linalg.norm(first_from_second.translation) < 1e-6:
-        return np.zeros(len(matches))
-    essential = cross_matrix(first_from_second.translation) @ first_from_second.rotation
-    k_first_inv, k_second_inv = (np.linalg.inv(v.view.camera.matrix()) for v in (first, second))
-    fundamental = k_first_inv.T @ essential @ k_second_inv  # x_first^T F x_second = 0
+    fundamental = fundamental_matrix(first, second)
     x_first = _homogeneous(first.view.features.keypoints[matches[:, 0]])
     x_second = _homogeneous(second.view.features.keypoints[matches[:, 1]])
-    line_in_first, line_in_second = x_second @ fundamental.T, x_first @ fundamental
-    algebraic = np.abs((x_first * line_in_first).sum(axis=1))
-    shortest_normal = np.minimum(
-        np.linalg.norm(line_in_first[:, :2], axis=1), np.linalg.norm(line_in_second[:, :2], axis=1)
-    )
-    distance: Array = algebraic / np.maximum(shortest_normal, 1e-12)
-    return distance
+    in_first = (x_first * _lines(x_second @ fundamental.T)).sum(axis=1)
+    in_second = (x_second * _lines(x_first @ fundamental)).sum(axis=1)
+    return np.asarray(np.maximum(np.abs(in_first), np.abs(in_second)))
+
+
+def epipolar_distances_px(first: PosedView, second: PosedView) -> NDArray[np.float32]:
+    """The same (N, M) for every keypoint of the first with every one of the second."""
+    fundamental = fundamental_matrix(first, second)
+    x_first, x_second = (_homogeneous(v.view.features.keypoints) for v in (first, second))
+    in_first = x_first.astype(np.float32) @ _lines(x_second @ fundamental.T).T.astype(np.float32)
+    in_second = _lines(x_first @ fundamental).astype(np.float32) @ x_second.T.astype(np.float32)
+    return np.asarray(np.maximum(np.abs(in_first), np.abs(in_second)))
+
+
+def fundamental_matrix(first: PosedView, second: PosedView) -> Array:
+    """F (3, 3) of the known poses, x_first^T F x_second = 0 in homogeneous pixels; zero if both stand at one place."""
+    first_from_second = first.world_from_camera.inverse().compose(second.world_from_camera)
+    if np.linalg.norm(first_from_second.translation) < 1e-6:
+        return np.zeros((3, 3))
+    essential = cross_matrix(first_from_second.translation) @ first_from_second.rotation
+    k_first_inv, k_second_inv = (np.linalg.inv(v.view.camera.matrix()) for v in (first, second))
+    return np.asarray(k_first_inv.T @ essential @ k_second_inv)
+
+
+def _lines(lines: Array) -> Array:
+    """Lines (N, 3) scaled so that a product with a homogeneous pixel is a distance in pixels."""
+    return np.asarray(lines / np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12))
 
 
 def _homogeneous(pixels: NDArray[np.float32]) -> Array:

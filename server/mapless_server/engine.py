@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -33,6 +33,9 @@ Localize = Callable[[View, Sequence[PosedView], Pipeline, LocalizeOptions], Answ
 
 PRIOR_MARGIN_M = 10.0
 """References further from a prior's sphere than this are not considered: they see other things."""
+
+MAX_LISTINGS = 3
+"""When a reference goes between list and read, the scene is listed again; more often than this it is being emptied."""
 
 
 @dataclass(frozen=True)
@@ -239,9 +242,17 @@ class Engine:
 
     def _load(self, query: Query) -> SceneSnapshot:
         """The references named, or all that come into question."""
-        extractor = self.extractor.name
         if query.reference_ids:
-            return self._store.load_references(query.scene_id, query.reference_ids, extractor)
+            return self._store.load_references(query.scene_id, query.reference_ids, self.extractor.name)
+        for _ in range(MAX_LISTINGS):
+            near = self._list_near(query)
+            # One that was deleted since it was listed was not the caller's choice: the next list is without it.
+            with suppress(NotFound):
+                return self._store.load_references(query.scene_id, near, self.extractor.name)
+        raise Unavailable("the scene's references are being deleted", reason="SCENE_CHANGED", retry_after_s=1.0)
+
+    def _list_near(self, query: Query) -> list[str]:
+        """Ids of the references that come into question."""
         _, poses = self._store.list_poses(query.scene_id)
         prior = query.prior
         near = [
@@ -255,10 +266,7 @@ class Engine:
                 "the references to use, or give a position prior",
                 reason="TOO_MANY_CANDIDATES",
             )
-        try:
-            return self._store.load_references(query.scene_id, near, extractor)
-        except NotFound as error:
-            raise Unavailable(f"the scene changed meanwhile: {error}", reason="SCENE_CHANGED") from error
+        return near
 
 
 def _gated(answer: Answer, prior: PositionPrior | None) -> Answer:

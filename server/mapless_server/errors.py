@@ -1,7 +1,7 @@
 """What can be wrong with a request: exceptions that carry their status and a text fit for the caller.
 
-Nothing here knows grpc: `code` is the name of a gRPC status, and the service alone turns it into one. Everything that is
-not one of these is a fault of ours: the caller is told INTERNAL and nothing else, the log has the rest.
+Nothing here knows grpc: `code` is the name of a gRPC status, and the service alone turns it into one. Everything that
+is not one of these is a fault of ours: the caller is told INTERNAL and nothing else, the log has the rest.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class DeadlineExceeded(RequestError):
 
 
 class Unavailable(RequestError):
-    """The server starts or drains; another try elsewhere or later succeeds."""
+    """The server drains, or the scene changes under the call; another try elsewhere or later succeeds."""
 
     code = "UNAVAILABLE"
     reason = "UNAVAILABLE"

@@ -1,7 +1,7 @@
 """Local features: a photograph becomes a view, a pinhole camera with keypoints and descriptors.
 
-A seam: an extractor is a name and one method. What it finds is stored with the reference under that name, so a change of
-anything that changes the features must change the name.
+A seam: an extractor is a name and one method. What it finds is stored with the reference under that name, so a change
+of anything that changes the features must change the name.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ class FeatureExtractor(Protocol):
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """See the class."""
+        ...
 
     def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
         """The view of a photograph.
@@ -68,8 +70,9 @@ class SiftExtractor:
 
     @property
     def name(self) -> str:
-        """E.g. "sift-2048-1024px"."""
-        return f"sift-{self.options.max_keypoints}-{self.options.max_side_px}px"
+        """E.g. "sift-2048-1024px-0.02"."""
+        options = self.options
+        return f"sift-{options.max_keypoints}-{options.max_side_px}px-{options.contrast_threshold:g}"
 
     def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
         """See FeatureExtractor.extract."""

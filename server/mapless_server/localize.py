@@ -1,7 +1,7 @@
 """The method, on one screen.
 
-Five stages, each knowing the result of the one before: coarse > scale > structure > match > pnp; and a sixth of our own,
-adjust. Beneath them all lie the correspondences between the photographs' features.
+Five stages, each knowing the result of the one before: coarse > scale > structure > match > pnp; and a sixth of our
+own, adjust. Beneath them all lie the correspondences between the photographs' features.
 
 This module knows nothing of grpc, queues or storage.
 """
@@ -51,12 +51,17 @@ class LocalizeOptions:
     """Options of the method; the defaults are the best we know.
 
     Attributes:
-        variant: decides `structure`, `match` and `adjust` unless they are given.
+        variant: decides the options of structure and matching.
         scale_strategy: how the metric scale is found.
+        weak_inliers: an answer of `Variant.BEST` with fewer inliers is computed again from wide correspondences (see
+            `correspond`), and replaced if that finds more. Above a hundred they do not help any more.
+        pnp: of the pose solver.
+        adjust: of the final adjustment.
     """
 
     variant: Variant = Variant.BEST
     scale_strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
+    weak_inliers: int = 100
     pnp: PnpOptions = field(default_factory=PnpOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
 
@@ -153,7 +158,7 @@ class _Progress:
         try:
             yield
         finally:
-            self.stage_seconds[name] = time.perf_counter() - start_s
+            self.stage_seconds[name] = self.stage_seconds.get(name, 0.0) + time.perf_counter() - start_s
 
     def answer(self, outcome: Localization | Rejection) -> Answer:
         none = (0,) * self.reference_count
@@ -173,21 +178,46 @@ def localize(query: View, references: Sequence[PosedView], pipeline: Pipeline, o
     Returns:
         The answer; "no pose" is one, with the first stage that could not do its work.
     """
-    progress = _Progress(len(references))
-    return progress.answer(_stages(query, references, pipeline, options, progress))
+    if not references:
+        return Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, "no references"))
+    if len(query.features) < MIN_FEATURES:
+        message = f"the photograph has {len(query.features)} local features, {MIN_FEATURES} are needed"
+        return Answer(Rejection(RejectionReason.LOW_TEXTURE, message))
+
+    strict = _attempt(query, references, pipeline, options, {}, wide=False)
+    if options.variant is not Variant.BEST or _inlier_count(strict) >= options.weak_inliers:
+        return strict
+    wide = _attempt(query, references, pipeline, options, dict(strict.stage_seconds), wide=True)
+    better = wide if _inlier_count(wide) > _inlier_count(strict) else strict
+    return replace(better, stage_seconds=wide.stage_seconds)
+
+
+def _inlier_count(answer: Answer) -> int:
+    return answer.outcome.inlier_count if isinstance(answer.outcome, Localization) else 0
+
+
+def _attempt(
+    query: View,
+    references: Sequence[PosedView],
+    pipeline: Pipeline,
+    options: LocalizeOptions,
+    stage_seconds: dict[str, float],
+    wide: bool,
+) -> Answer:
+    progress = _Progress(len(references), stage_seconds)
+    return progress.answer(_stages(query, references, pipeline, options, progress, wide))
 
 
 def _stages(
-    query: View, references: Sequence[PosedView], pipeline: Pipeline, options: LocalizeOptions, progress: _Progress
+    query: View,
+    references: Sequence[PosedView],
+    pipeline: Pipeline,
+    options: LocalizeOptions,
+    progress: _Progress,
+    wide: bool,
 ) -> Localization | Rejection:
-    if not references:
-        return Rejection(RejectionReason.NO_USABLE_REFERENCES, "no references")
-    if len(query.features) < MIN_FEATURES:
-        message = f"the photograph has {len(query.features)} local features, {MIN_FEATURES} are needed"
-        return Rejection(RejectionReason.LOW_TEXTURE, message)
-
     with progress.stage("correspond"):
-        correspondences = pipeline.matcher.correspond(query, references)
+        correspondences = pipeline.matcher.correspond(query, references, wide)
         progress.correspondences = correspondences
     with progress.stage("coarse"):
         reconstruction = pipeline.reconstructor.reconstruct(query, references, correspondences)

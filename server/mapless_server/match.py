@@ -1,8 +1,8 @@
 """Matching: which keypoints of the query show which points of the structure.
 
 The paper projects every point with the query's initial pose, u_k = pi(P_q^init, X_k), and takes the nearest descriptor
-within a radius. Ours first takes what the query's matches with each reference say through the tracks, and lets the guided
-search only add to it.
+within a radius. Ours first takes what the query's matches with each reference say through the tracks, and lets the
+guided search only add to it.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class MatchOptions:
 
     Attributes:
         through_tracks: begin with the matches between the query and the references, carried to points by their tracks.
-        radius_px: how far from its projection a point's keypoint is searched; the paper's 20. Ours searches only for points
-            that have no match yet, and near, because the initial pose is good.
-        min_similarity: smallest cosine of descriptors found by the guided search; -1 takes the nearest however far, as the
-            paper does.
+        radius_px: how far from its projection a point's keypoint is searched; the paper's 20. Ours searches only for
+            points that have no match yet, and near, because the initial pose is good.
+        min_similarity: smallest cosine of descriptors found by the guided search; -1 takes the nearest however far, as
+            the paper does.
     """
 
     through_tracks: bool = True
@@ -54,11 +54,13 @@ class PointMatches:
         point: (M,) index into the structure.
         keypoint: (M,) index into the query's keypoints.
         guided: (M,) whether the match was searched for near its projection, rather than found in the whole image.
+        radius_px: how near.
     """
 
     point: NDArray[np.intp]
     keypoint: NDArray[np.intp]
     guided: NDArray[np.bool_]
+    radius_px: float
 
     def __len__(self) -> int:
         return len(self.point)
@@ -83,7 +85,7 @@ def match_points(
         options: `PAPER_MATCH` for the paper's form.
     """
     nothing = np.empty(0, np.intp)
-    known = PointMatches(nothing, nothing, np.empty(0, bool))
+    known = PointMatches(nothing, nothing, np.empty(0, bool), options.radius_px)
     if options.through_tracks:
         known = vote(structure, [len(r.view.features) for r in references], correspondences)
     found = search(query, references, structure, world_from_query, known, options)
@@ -91,6 +93,7 @@ def match_points(
         np.concatenate([known.point, found.point]),
         np.concatenate([known.keypoint, found.keypoint]),
         np.concatenate([known.guided, found.guided]),
+        options.radius_px,
     )
 
 
@@ -106,7 +109,7 @@ def vote(structure: Structure, keypoint_counts: Sequence[int], correspondences: 
     keypoint, point = keypoint[point >= 0], point[point >= 0]
     pairs, votes = np.unique(np.stack([keypoint, point], axis=1), axis=0, return_counts=True)
     keypoint, point = one_to_one(pairs[:, 0], pairs[:, 1], votes.astype(float))
-    return PointMatches(point, keypoint, np.zeros(len(point), bool))
+    return PointMatches(point, keypoint, np.zeros(len(point), bool), 0.0)
 
 
 def search(
@@ -125,8 +128,7 @@ def search(
     projected = query.camera.project(world_from_query.inverse().apply(structure.x_in_world))
     size = np.array([query.camera.width_px, query.camera.height_px])
     inside = ((projected > -options.radius_px) & (projected < size + options.radius_px)).all(axis=1)
-    inside[known.point] = False
-    free_points = np.flatnonzero(inside)
+    free_points = np.setdiff1d(np.flatnonzero(inside), known.point)
     free_keypoints = np.setdiff1d(np.arange(len(keypoints)), known.keypoint)
     near = KDTree(projected[free_points]).sparse_distance_matrix(
         KDTree(keypoints[free_keypoints]), options.radius_px, output_type="ndarray"
@@ -145,7 +147,7 @@ def search(
     best = np.maximum.reduceat(similarity, first) if len(first) else similarity
     good = best > options.min_similarity
     keypoint, point = one_to_one(keypoint[good], point[good], best[good].astype(np.float64))
-    return PointMatches(point, keypoint, np.ones(len(point), bool))
+    return PointMatches(point, keypoint, np.ones(len(point), bool), options.radius_px)
 
 
 def one_to_one(

@@ -55,13 +55,14 @@ def spread_choice(
         options: see there.
     """
     options = options or RetrieveOptions()
-    score: NDArray[np.float64] = np.asarray(match_counts, float).copy()
+    score: NDArray[np.float64] = np.asarray(match_counts, float)
     centre = np.asarray(centres, float).reshape(-1, 3)
     nearby = np.zeros(len(score), bool)
     chosen: list[int] = []
     for _ in range(min(count, len(score))):
-        best = int(np.argmax(np.where(nearby, options.nearby_weight, 1.0) * score))
+        weighted = np.where(nearby, options.nearby_weight, 1.0) * score
+        weighted[chosen] = -1.0
+        best = int(np.argmax(weighted))
         chosen.append(best)
-        score[best] = -np.inf
         nearby |= np.linalg.norm(centre - centre[best], axis=1) < options.apart_m
     return chosen

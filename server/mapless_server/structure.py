@@ -129,9 +129,7 @@ class Observations:
     starts: NDArray[np.intp]
 
     def residuals(self, x_in_world: Array) -> Array:
-        """(O, 2) projection minus observation of points (P, 3), in standard deviations; NaN where a point is not in front
-        of the camera.
-        """
+        """(O, 2) projection minus observation of points (P, 3), in standard deviations; NaN where not in front."""
         ideal = normalize(self.in_camera(x_in_world))
         return (ideal * self.focal_px + self.principal_px - self.pixel) / self.sigma_px[:, None]
 
@@ -196,7 +194,12 @@ def build_structure(
         if options.model_noise:
             noise = estimate_noise(observations, points, noise)
             observations = observe(tracks, references, noise)
-            points = adjust_points(observations, points, options.loss_scale_sigma, options.iterations)
+        if options.max_residual_sigma is not None:
+            # A chain of matches that took a wrong turn has good links too.
+            explained = np.linalg.norm(observations.residuals(points), axis=1) < options.max_residual_sigma
+            tracks, kept = tracks.prune(explained)
+            points, observations = points[kept], observe(tracks, references, noise)
+        points = adjust_points(observations, points, options.loss_scale_sigma, options.iterations)
     keep = trustworthy(observations, points, options)
     return Structure(points[keep], tracks.select(keep), noise)
 
@@ -228,8 +231,9 @@ def observe(tracks: Tracks, references: Sequence[PosedView], noise: KeypointNois
 def predicted_points(
     reconstruction: Reconstruction, scale: MetricScale, references: Sequence[PosedView], tracks: Tracks
 ) -> Array:
-    """Back-projects the first keypoint of each track with its predicted depth at metric scale, (P, 3) world, metres; NaN
-    where the reconstruction knows no depth.
+    """Back-projects the first keypoint of each track with its predicted depth at metric scale, (P, 3) in the world.
+
+    NaN where the reconstruction knows no depth.
     """
     points = np.full((tracks.point_count, 3), np.nan)
     first_view, first_keypoint = tracks.view[tracks.starts], tracks.keypoint[tracks.starts]
@@ -322,10 +326,11 @@ def invert_symmetric(matrices: Array) -> Array:
 
 
 def estimate_noise(observations: Observations, x_in_world: Array, noise: KeypointNoise) -> KeypointNoise:
-    """`noise`, which the observations were weighted with, with the level that the residuals of points with three or more observations show.
+    """`noise`, with which the observations were weighted, at the level that their residuals show.
 
-    The median length of a two-dimensional normal residual is sqrt(2 ln 2) sigma; a point takes 3 of its 2 n degrees of
-    freedom, so residuals come out too small by sqrt(1 - 1.5 / n).
+    Looks at points with three or more observations. The median length of a two-dimensional normal residual is
+    sqrt(2 ln 2) sigma; a point takes 3 of its 2 n degrees of freedom, so residuals come out too small by
+    sqrt(1 - 1.5 / n).
     """
     count = np.bincount(observations.point)[observations.point]
     length_px = np.linalg.norm(observations.residuals(x_in_world), axis=1) * observations.sigma_px

@@ -44,6 +44,13 @@ class Tracks:
         renumbered = np.cumsum(points) - 1
         return Tracks(renumbered[self.point[keep]], self.view[keep], self.keypoint[keep])
 
+    def prune(self, observations: NDArray[np.bool_]) -> tuple[Tracks, NDArray[np.bool_]]:
+        """The tracks with only the chosen observations (O,), and which points (P,) are left, seen at least twice."""
+        count = np.bincount(self.point[observations], minlength=self.point_count)
+        keep = observations & (count[self.point] >= 2)
+        renumbered = np.cumsum(count >= 2) - 1
+        return Tracks(renumbered[self.point[keep]], self.view[keep], self.keypoint[keep]), count >= 2
+
 
 def build_tracks(
     pairs: Mapping[tuple[int, int], Matches], keypoint_counts: Sequence[int], anchor: int | None = None
@@ -53,8 +60,8 @@ def build_tracks(
     Args:
         pairs: matches of views i < j.
         keypoint_counts: number of keypoints of each view.
-        anchor: None merges over all pairs. A view merges that view's pairs alone (the paper), so that every track begins
-            at one of its keypoints.
+        anchor: None merges over all pairs. A view merges that view's pairs alone (the paper), so that every track
+            begins at one of its keypoints.
 
     Returns:
         The tracks. Where a chain of matches reaches two keypoints of one view, the one with more matches is kept.
@@ -70,9 +77,7 @@ def build_tracks(
         return Tracks(nothing, nothing, nothing)
     edges = np.concatenate(used)
     total = int(offsets[-1])
-    graph: Any = coo_array(  # type: ignore[no-untyped-call]
-        (np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(total, total)
-    )
+    graph: Any = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(total, total))
     _, component = connected_components(graph, directed=False)
     degree = np.bincount(edges.ravel(), minlength=total)
     node = np.flatnonzero(degree)

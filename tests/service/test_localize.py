@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from datetime import datetime, timezone
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from servers import CAMERA, COVARIANCE, PHOTO, RunningServer, Stubs, failure_of,
 
 from mapless import (
     Client,
+    ConnectOptions,
     FailedPrecondition,
     InvalidArgument,
     LocalizationResult,
@@ -20,11 +23,13 @@ from mapless import (
     NotFound,
     PositionPrior,
     Rejected,
+    Unavailable,
 )
 from mapless.geometry import Camera
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.decode import ImageLimits, decode_image
+from mapless_server.store import Store
 
 Request = pb.LocalizeRequest
 DEEP = np.random.default_rng(3).integers(0, 65536, (64, 96, 3)).astype(np.uint16)
@@ -79,6 +84,32 @@ def test_without_references_the_server_chooses(client: Client, scene: str) -> No
     answer = localized(client.localize(PHOTO, CAMERA, scene, reference_count=2))
     assert len(answer.diagnostics.references) == 2
     assert "retrieval" in answer.diagnostics.stage_s
+
+
+@pytest.mark.parametrize("deletions", [1, 2, 3])
+def test_references_that_go_while_the_server_chooses(
+    server: RunningServer, client: Client, scene: str, monkeypatch: pytest.MonkeyPatch, deletions: int
+) -> None:
+    listed = Store.list_poses
+    left = iter(range(deletions))
+
+    def list_then_delete(store: Store, scene_id: str) -> Any:
+        poses = listed(store, scene_id)
+        for i in itertools.islice(left, 1):
+            store.delete_reference(scene_id, f"r{i}")
+        return poses
+
+    monkeypatch.setattr(Store, "list_poses", list_then_delete)
+    with Client(server.address, ConnectOptions(max_attempts=1)) as impatient:
+        if deletions < 3:
+            uses = localized(impatient.localize(PHOTO, CAMERA, scene)).diagnostics.references
+            assert [use.name for use in uses] == [f"scenes/{scene}/references/r{i}" for i in range(deletions, 3)]
+        else:
+            with pytest.raises(Unavailable) as caught:
+                impatient.localize(PHOTO, CAMERA, scene)
+            assert caught.value.reason == "SCENE_CHANGED"
+    # The client's own retry finds a scene at rest, be it empty.
+    assert client.localize(PHOTO, CAMERA, scene)
 
 
 def test_an_empty_scene_is_a_rejection(client: Client) -> None:

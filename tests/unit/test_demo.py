@@ -1,8 +1,6 @@
-"""The demo without its server: triangulated points, pictures, errors, the verdict; and that its process always ends."""
+"""The demo without its server: triangulated points, pictures, errors, the verdict."""
 
 import math
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +15,8 @@ from rich.console import Console
 from mapless import Camera, Client, LocalizationResult, Rejected, RigidTransform
 from mapless.geometry import RadialTangential, rotation_from_vector
 from mapless.results import Diagnostics, ReferenceUse
-from mapless_server.demo import process, run
+from mapless_server.child import ChildServer
+from mapless_server.demo import run
 from mapless_server.demo.raycast import Quad, Surface
 from mapless_server.demo.room import Photo, Station, look_at, take, write_folder
 from mapless_server.demo.sparse import Shot, find_in, points_to_draw, triangulate, undistorted
@@ -102,10 +101,10 @@ def folder(photos: list[Photo], tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     FakeClient.truth = {files[photo.name]: (photo.name, photo.world_from_camera) for photo in photos}
 
     @contextmanager
-    def no_server() -> Iterator[str]:
-        yield "127.0.0.1:1"
+    def no_server(data_dir: Path) -> Iterator[ChildServer]:
+        yield ChildServer("127.0.0.1:1", 0)
 
-    monkeypatch.setattr(run, "running_server", no_server)
+    monkeypatch.setattr(run, "child_server", no_server)
     monkeypatch.setattr(run, "Client", FakeClient)
     return tmp_path / "walls"
 
@@ -141,35 +140,3 @@ def test_the_rendered_room_must_reach_its_limits(photos: list[Photo], offset_m: 
     client.rejected = () if math.isfinite(offset_m) else ("x",)
     outcomes = [run.judge(queries[0], client.localize(b"", CAMERA, "demo"))]
     assert run.summarize(Console(quiet=True), place, outcomes) == good
-
-
-def test_a_server_that_does_not_start_is_reported_and_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    real, started = subprocess.Popen, []
-
-    def broken(command: list[str], **options: Any) -> Any:
-        started.append(real([sys.executable, "-c", "import sys; sys.exit('no such luck')"], **options))
-        return started[0]
-
-    monkeypatch.setattr("mapless_server.demo.process.subprocess.Popen", broken)
-    with pytest.raises(RuntimeError, match="no such luck"), process.running_server():
-        pass
-    assert started[0].poll() is not None
-
-
-def test_a_server_is_stopped_when_the_demo_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    real, started = subprocess.Popen, []
-    code = f"import time; print({process.READY!r} + '127.0.0.1:7', flush=True); time.sleep(600)"
-
-    def sleeper(command: list[str], **options: Any) -> Any:
-        started.append(real([sys.executable, "-c", code], **options))
-        return started[0]
-
-    monkeypatch.setattr("mapless_server.demo.process.subprocess.Popen", sleeper)
-
-    def fails() -> None:
-        with process.running_server() as address:
-            raise ValueError(address)
-
-    with pytest.raises(ValueError, match=r"127\.0\.0\.1:7"):
-        fails()
-    assert started[0].poll() is not None

@@ -1,7 +1,7 @@
 """The coarse stage: query and references reconstructed together, up to one common scale.
 
-A seam. The paper calls a feed-forward network here (its equation for Phi); whatever else gives local points, confidences
-and poses in one local frame will do. A backend is one file in this package with a `Reconstructor`.
+A seam. The paper calls a feed-forward network here (its equation for Phi); whatever else gives local points,
+confidences and poses in one local frame will do. A backend is one file in this package with a `Reconstructor`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from ..views import PosedView, View
 
 @dataclass(frozen=True, eq=False)
 class ReconstructedView:
-    """One view's part of a reconstruction. Its maps may be smaller than the view's image; pixel centres correspond as in
-    resizing.
+    """One view's part of a reconstruction.
+
+    Its maps may be smaller than the view's image; pixel centres correspond as in resizing.
 
     Attributes:
         point_map: (H, W, 3) float32, the point seen at each pixel, in this camera's frame, up to the common scale; NaN
@@ -76,10 +77,14 @@ class Reconstructor(Protocol):
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """See the class."""
+        ...
 
     @property
-    def weights_sha256(self) -> str: ...
+    def weights_sha256(self) -> str:
+        """See the class."""
+        ...
 
     def reconstruct(
         self, query: View, references: Sequence[PosedView], correspondences: Correspondences

@@ -1,8 +1,8 @@
 """The coarse stage without a network: the embedded default on a machine without a GPU or weights.
 
-Features matched among the references are triangulated from the references' known poses, and the query is posed by PnP on
-what it matches of them. The sparse points are scattered into the point maps, in a frame of its own with a scale of its
-own, as a network would give them: the stages behind the seam see no difference.
+Features matched among the references are triangulated from the references' known poses, and the query is posed by PnP
+on what it matches of them. The sparse points are scattered into the point maps, in a frame of its own with a scale of
+its own, as a network would give them: the stages behind the seam see no difference.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class GeometricReconstructor:
                 f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references",
             )
         inliers = reprojection_errors_px(query.camera, pose, x_in_world, pixels) < self.options.pnp.inlier_px
-        false_alarms = log10_false_alarms(query.camera, inliers, matches.guided, self.options.pnp)
+        false_alarms = log10_false_alarms(query.camera, matches, inliers, self.options.pnp)
         if false_alarms > self.options.pnp.max_log10_false_alarms:
             return Rejection(
                 RejectionReason.LOW_OVERLAP,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +18,9 @@ from rich.table import Table
 from mapless import Camera, Client, LocalizationResult, NewReference, Rejected, RigidTransform
 from mapless.geometry import Array, rotation_angle_deg
 
+from ..child import child_server
 from ..dataset import Frame, read_folder
 from . import picture, room
-from .process import running_server
 from .sparse import Shot, points_to_draw
 
 SCENE = "demo"
@@ -88,7 +89,7 @@ def run_demo(data: Path | None, output: Path, console: Console | None = None) ->
 
     Raises:
         ValueError: the folder is malformed.
-        RuntimeError: the server did not start.
+        ServerFailed: the server did not start.
         MaplessError: a call failed.
     """
     console = console or Console()
@@ -98,8 +99,12 @@ def run_demo(data: Path | None, output: Path, console: Console | None = None) ->
     if not place.metric:
         console.print("This folder is not metric: errors are in hundredths of its own unit of length, not in cm.")
 
-    with running_server() as address, Client(address) as client:
-        console.print(f"server: own process at {address}")
+    with (
+        tempfile.TemporaryDirectory(prefix="mapless-demo-") as data_dir,
+        child_server(Path(data_dir)) as server,
+        Client(server.address) as client,
+    ):
+        console.print(f"server: own process at {server.address}")
         client.create_scene(SCENE)
         with console.status("adding references"):
             client.add_references(
@@ -155,10 +160,10 @@ def judge(query: Photograph, answer: LocalizationResult | Rejected) -> Outcome:
 def table_of(outcomes: Sequence[Outcome], metric: bool) -> Table:
     """One row a query; the radius is the server's own, not exceeded in 68 % of cases."""
     unit = "cm" if metric else "/100"
-    table = Table(
-        "query", "outcome", f"{unit} off", "deg off", f"radius {unit}", "inliers", "refs", "s", box=SIMPLE_HEAD
-    )
-    for column in table.columns:
+    headings = ("query", "outcome", f"{unit} off", "deg off", f"radius {unit}", "inliers", "refs", "s")
+    table = Table(*headings, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))  # within the 80 columns of a plain terminal
+    table.columns[0].overflow = "ellipsis"
+    for column in table.columns[1:]:  # where room is short, names give way
         column.no_wrap = True
     for column in table.columns[2:]:
         column.justify = "right"

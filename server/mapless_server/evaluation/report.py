@@ -22,8 +22,8 @@ RULES = (
     "references is not in it, nor is the first call in p50 and p95.",
 )
 SCALE_FREE = (
-    "The folder's unit of length is arbitrary: errors are in that unit, and the method's own thresholds, which are in "
-    "metres, do not mean what they say. Compare the relative errors only."
+    "Where a folder's unit of length is arbitrary, errors are in it, and the method's own thresholds, in metres, "
+    "do not mean what they say: compare the relative errors only."
 )
 
 

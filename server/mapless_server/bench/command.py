@@ -1,0 +1,73 @@
+"""Measures everything and reports it."""
+
+from __future__ import annotations
+
+import platform
+from pathlib import Path
+
+from ..dataset import read_folder
+from ..evaluation.command import progress_bars, terminable, usage_errors, write_json
+from ..evaluation.plan import EvaluationOptions, Progress, UsageError
+from ..evaluation.run import Evaluation, evaluate
+from ..settings import available_cores, load_settings
+from .latency import measure_latency
+from .report import BenchResult, as_json, markdown
+from .scenes import KITCHEN, OTHER_FOLDERS, SCENES
+
+OUTPUT = Path("bench-output/bench.json")
+QUICK_QUERIES = 6
+COLD_STARTS = 5
+
+
+def bench(data: Path, quick: bool) -> None:
+    """Measures all scenes in a folder, prints Markdown and writes `OUTPUT`. Absent scenes are named and passed over.
+
+    Raises:
+        UsageError: none of the scenes is there, one is damaged, or a setting is wrong.
+        ServerFailed: the server did not start.
+        MaplessError: a call failed.
+    """
+    folders = [*dict.fromkeys(scene.folder for scene in SCENES), *OTHER_FOLDERS]
+    absent = [folder for folder in folders if not (data / folder / "cameras.json").is_file()]
+    if len(absent) == len(folders):
+        raise UsageError(f"{data} holds none of the scenes: {', '.join(folders)}")
+    with usage_errors():
+        settings = load_settings({}).settings
+        datasets = {folder: read_folder(data / folder) for folder in folders if folder not in absent}
+    query_count = QUICK_QUERIES if quick else None
+    OUTPUT.parent.mkdir(exist_ok=True)
+
+    with terminable(), progress_bars() as progress:
+
+        def measure(folder: str, references: int | None) -> Evaluation:
+            options = EvaluationOptions(reference_count=references, query_count=query_count)
+            label = folder if references is None else f"{folder}, {references} references"
+            return evaluate(datasets[folder], options, settings, _labelled(progress, label))
+
+        scenes = [(scene, measure(scene.folder, scene.references)) for scene in SCENES if scene.folder in datasets]
+        others = [measure(folder, None) for folder in OTHER_FOLDERS if folder in datasets]
+        latency = None
+        if KITCHEN in datasets:
+            cold_count = 2 if quick else COLD_STARTS
+            labelled = _labelled(progress, "latency")
+            latency = measure_latency(datasets[KITCHEN], settings, query_count, cold_count, labelled)
+    machine = f"{cpu_model()}, {available_cores()} cores"
+    result = BenchResult(machine, scenes, others, latency, absent, quick)
+    print("\n".join(markdown(result)))
+    write_json(OUTPUT, as_json(result))
+
+
+def cpu_model() -> str:
+    """The processor's name, as far as the system tells it."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _labelled(progress: Progress, label: str) -> Progress:
+    """The same progress, each step under a label."""
+    return lambda step, done, total: progress(f"{label}: {step}", done, total)

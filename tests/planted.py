@@ -1,0 +1,71 @@
+"""What a stage would be handed if all stages before it were perfect: matches, tracks, structure, scale."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scenes import SyntheticScene
+
+from mapless.geometry import Array, RigidTransform, Similarity
+from mapless_server.correspond import Correspondences, Matches
+from mapless_server.match import PointMatches
+from mapless_server.scale import MetricScale, ScaleStage
+from mapless_server.structure import ONE_PIXEL, KeypointNoise, Structure
+from mapless_server.tracks import Tracks
+from mapless_server.views import PosedView
+
+
+def true_correspondences(scene: SyntheticScene) -> Correspondences:
+    """The matches of keypoints that show the same point."""
+    shown = scene.reference_points
+    return Correspondences(
+        {(i, j): same_points(shown[i], shown[j]) for i, j in combinations(range(len(shown)), 2)},
+        tuple(same_points(scene.query_points, points) for points in shown),
+    )
+
+
+def same_points(first: NDArray[np.int64], second: NDArray[np.int64]) -> Matches:
+    """(M, 2) keypoints that show the same point, of two lists of the point that each keypoint shows (-1: none)."""
+    _, in_first, in_second = np.intersect1d(first, second, return_indices=True)
+    matches = np.stack([in_first, in_second], axis=1).astype(np.int32)
+    return matches[first[in_first] >= 0]
+
+
+def true_tracks(scene: SyntheticScene) -> tuple[Tracks, NDArray[np.intp]]:
+    """The tracks of all points that two references see, and which points (P,) of the scene these are."""
+    seen = [
+        (int(p), view, k) for view, shown in enumerate(scene.reference_points) for k, p in enumerate(shown) if p >= 0
+    ]
+    points, views, keypoints = (np.array(column, np.intp) for column in zip(*sorted(seen), strict=True))
+    often = np.bincount(points, minlength=len(scene.x_in_world)) >= 2
+    keep = often[points]
+    renumbered = np.cumsum(often) - 1
+    return Tracks(renumbered[points[keep]], views[keep], keypoints[keep]), np.flatnonzero(often)
+
+
+def true_structure(scene: SyntheticScene, noise: KeypointNoise = ONE_PIXEL) -> tuple[Structure, PointMatches]:
+    """All points that two references see, where they are, and the query's matches with them."""
+    tracks, points = true_tracks(scene)
+    index = np.full(len(scene.x_in_world), -1)
+    index[points] = np.arange(len(points))
+    matched = np.where(scene.query_points >= 0, index[scene.query_points], -1)
+    keypoint = np.flatnonzero(matched >= 0)
+    matches = PointMatches(matched[keypoint], keypoint, np.zeros(len(keypoint), bool), radius_px=0.0)
+    return Structure(scene.x_in_world[points], tracks, noise), matches
+
+
+def metric_scale(world_from_local: Similarity, world_from_query: RigidTransform) -> MetricScale:
+    """The scale stage's answer when that is the truth."""
+    return MetricScale(world_from_local.scale, ScaleStage.TRIANGULATION, 0.0, 0, world_from_local, world_from_query)
+
+
+def moved_references(references: tuple[PosedView, ...], world: RigidTransform) -> tuple[PosedView, ...]:
+    """The same references, told in another world frame; with keys of their own, as different references have."""
+    return tuple(PosedView(f"{r.key}-moved", r.name, r.view, world.compose(r.world_from_camera)) for r in references)
+
+
+def shifted(pose: RigidTransform, metres: Array) -> RigidTransform:
+    """The pose with its origin elsewhere."""
+    return RigidTransform(pose.rotation, pose.translation + metres)

@@ -1,0 +1,282 @@
+"""Matching of descriptors: against loops, against known epipolar geometry; what is remembered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from planted import same_points
+from scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server import correspond
+from mapless_server.correspond import (
+    CorrespondOptions,
+    Matcher,
+    Matches,
+    epipolar_distance_px,
+    epipolar_distances_px,
+    mutual_matches,
+)
+from mapless_server.views import Features, PosedView, View
+
+
+def features(descriptors: Array, keypoints: Array | None = None) -> Features:
+    n = len(descriptors)
+    return Features(
+        (np.zeros((n, 2)) if keypoints is None else keypoints).astype(np.float32),
+        descriptors.astype(np.float32),
+        np.ones(n, np.float32),
+    )
+
+
+def related(random: np.random.Generator, n: int, m: int, noise: float, size: int = 16) -> tuple[Features, Features]:
+    """Descriptors of which some show the same."""
+    common = unit_rows(random.standard_normal((max(n, m), size)))
+    first = unit_rows(common[random.permutation(len(common))[:n]] + noise * random.standard_normal((n, size)))
+    second = unit_rows(common[:m] + noise * random.standard_normal((m, size)))
+    return features(first), features(second)
+
+
+def slow_mutual_matches(first: Features, second: Features, ratio: float) -> list[list[int]]:
+    """The same by loops over distances."""
+    distance = [[float(np.linalg.norm(a - b)) for b in second.descriptors] for a in first.descriptors]
+    matches = []
+    for i, row in enumerate(distance):
+        j = min(range(len(row)), key=row.__getitem__)
+        back = min(range(len(distance)), key=lambda other: distance[other][j])
+        second_best = min(d for k, d in enumerate(row) if k != j)
+        if back == i and row[j] < ratio * second_best:
+            matches.append([i, j])
+    return matches
+
+
+@pytest.mark.parametrize("ratio", [0.7, 0.85, 1.0])
+@pytest.mark.parametrize(("n", "m", "noise"), [(2, 2, 0.1), (40, 25, 0.1), (25, 40, 0.2), (30, 30, 0.5)])
+def test_mutual_matches_are_those_of_loops(n: int, m: int, noise: float, ratio: float) -> None:
+    first, second = related(random_for("mutual", n, m, noise), n, m, noise)
+    matches = mutual_matches(first, second, ratio)
+    assert matches.dtype == np.int32
+    assert matches.tolist() == slow_mutual_matches(first, second, ratio)
+
+
+def test_no_keypoint_is_matched_twice_and_a_looser_ratio_only_adds() -> None:
+    first, second = related(random_for("nested"), 60, 60, 0.3)
+    previous: set[tuple[int, ...]] = set()
+    for ratio in (0.6, 0.8, 0.9, 1.0):
+        matches = {tuple(m) for m in mutual_matches(first, second, ratio).tolist()}
+        assert previous <= matches
+        for column in zip(*matches, strict=True):
+            assert len(set(column)) == len(column)
+        previous = matches
+    assert previous
+
+
+def test_the_ratio_is_one_of_distances() -> None:
+    """Two candidates at distances d and 2 d: the ratio is a half."""
+    query = np.array([[1.0, 0.0], [-1.0, 0.0]])
+    angles = 2 * np.arcsin(np.array([0.1, 0.2]) / 2)  # chords of 0.1 and 0.2
+    candidates = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    assert [0, 0] in mutual_matches(features(query), features(candidates), 0.51).tolist()
+    assert [0, 0] not in mutual_matches(features(query), features(candidates), 0.49).tolist()
+
+
+def test_the_ambiguous_is_not_matched() -> None:
+    twice = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    assert mutual_matches(features(twice), features(twice), 0.9).tolist() == [[2, 2]]
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 5), (5, 0), (1, 5), (5, 1)])
+def test_few_or_no_features_do_not_match(n: int, m: int) -> None:
+    random = random_for("few", n, m)
+    first, second = (features(unit_rows(random.standard_normal((k, 8)))) for k in (n, m))
+    assert mutual_matches(first, second, 0.9).shape == (0, 2)
+
+
+# Epipolar lines
+
+
+def posed(pose: RigidTransform, keypoints: Array, key: str = "") -> PosedView:
+    return PosedView(key, "", View(CAMERA, features(np.zeros((len(keypoints), 2)), keypoints)), pose)
+
+
+def all_of(count: int) -> Matches:
+    return np.repeat(np.arange(count, dtype=np.int32)[:, None], 2, axis=1)
+
+
+def random_pair(random: np.random.Generator, count: int = 50) -> tuple[PosedView, PosedView]:
+    """Two views of the same points, exact but for the rounding of their keypoints."""
+    x_in_world = random.uniform([-1, -0.7, 3], [1, 0.7, 6], (count, 3))
+    poses = [RigidTransform(rotation_from_vector(random.normal(0, 0.1, 3)), random.normal(0, 0.4, 3)) for _ in range(2)]
+    first, second = (posed(p, CAMERA.project(p.inverse().apply(x_in_world))) for p in poses)
+    return first, second
+
+
+def shifted_keypoints(view: PosedView, shift: NDArray[np.floating]) -> PosedView:
+    return posed(view.world_from_camera, view.view.features.keypoints + shift)
+
+
+def slow_epipolar_distance(first: PosedView, second: PosedView, i: int, j: int) -> float:
+    """The distance of a keypoint from the images of two points on the other's ray; the larger of both directions."""
+    distances = []
+    for here, there, a, b in ((first, second, i, j), (second, first, j, i)):
+        ray = CAMERA.rays(there.view.features.keypoints[b].astype(float))
+        on_ray = there.world_from_camera.apply(np.array([[4.0], [5.0]]) * ray)
+        start, end = CAMERA.project(here.world_from_camera.inverse().apply(on_ray))
+        along, to = end - start, here.view.features.keypoints[a] - start
+        distances.append(abs(along[0] * to[1] - along[1] * to[0]) / float(np.linalg.norm(along)))
+    return float(max(distances))
+
+
+def test_exact_matches_lie_on_their_epipolar_lines() -> None:
+    first, second = random_pair(random_for("epipolar"))
+    assert epipolar_distance_px(first, second, all_of(50)).max() < 1e-3
+
+
+def test_epipolar_distance_is_that_of_loops() -> None:
+    random = random_for("epipolar loops")
+    first, second = random_pair(random)
+    second = shifted_keypoints(second, random.normal(0, 5, (50, 2)))
+    slow = [slow_epipolar_distance(first, second, i, i) for i in range(50)]
+    np.testing.assert_allclose(epipolar_distance_px(first, second, all_of(50)), slow, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(epipolar_distance_px(second, first, all_of(50)), slow, rtol=1e-5, atol=1e-5)
+
+
+def test_beside_one_another_the_distance_is_the_vertical_one() -> None:
+    random = random_for("stereo")
+    x_in_world = random.uniform([-1, -0.7, 3], [1, 0.7, 6], (20, 3))
+    poses = [RigidTransform.identity(), RigidTransform(np.eye(3), np.array([0.4, 0.0, 0.0]))]
+    first, second = (posed(p, CAMERA.project(p.inverse().apply(x_in_world))) for p in poses)
+    shift = random.normal(0, 3, (20, 2))
+    distance = epipolar_distance_px(first, shifted_keypoints(second, shift), all_of(20))
+    np.testing.assert_allclose(distance, np.abs(shift[:, 1]), atol=1e-3)
+
+
+def test_at_one_place_every_match_is_possible() -> None:
+    keypoints = random_for("one place").uniform(0, 700, (10, 2))
+    first, second = (
+        posed(RigidTransform.identity(), keypoints),
+        posed(RigidTransform(rotation_from_vector([0.0, 0.5, 0.0]), np.zeros(3)), keypoints),
+    )
+    np.testing.assert_array_equal(epipolar_distance_px(first, second, all_of(10)), np.zeros(10))
+
+
+def test_all_epipolar_distances_at_once_are_those_one_by_one() -> None:
+    random = random_for("epipolar matrix")
+    first, _ = random_pair(random, 12)
+    second = shifted_keypoints(random_pair(random, 20)[1], random.normal(0, 50, (20, 2)))
+    pairs = np.stack(np.meshgrid(np.arange(12), np.arange(20), indexing="ij"), axis=-1).astype(np.int32)
+    one_by_one = epipolar_distance_px(first, second, pairs.reshape(-1, 2)).reshape(12, 20)
+    np.testing.assert_allclose(epipolar_distances_px(first, second), one_by_one, rtol=1e-4, atol=2e-3)
+
+
+# The matcher
+
+
+def test_references_keep_true_matches_and_drop_wrong_ones() -> None:
+    scene = make_scene(random_for("filter"), SceneOptions(outlier_share=0.3, reference_count=3))
+    correspondences = Matcher().correspond(scene.query, scene.references)
+    assert list(correspondences.reference_pairs) == [(0, 1), (0, 2), (1, 2)]
+    for (i, j), matches in correspondences.reference_pairs.items():
+        first, second = scene.references[i], scene.references[j]
+        assert epipolar_distance_px(first, second, matches).max() < CorrespondOptions().epipolar_px
+        true = same_points(scene.reference_points[i], scene.reference_points[j])
+        found = {tuple(m) for m in matches.tolist()}
+        assert len(found & {tuple(m) for m in true.tolist()}) > 0.95 * len(true)
+        assert len(found) < 1.1 * len(true)
+
+
+def test_wide_matches_are_the_strict_ones_and_more_along_the_lines() -> None:
+    scene = make_scene(random_for("wide"), SceneOptions(descriptor_noise=0.5, distractor_count=1500, reference_count=3))
+    options = CorrespondOptions(reference_ratio=0.6, wide_similarity=0.6)
+    matcher = Matcher(options)
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        first, second = scene.references[i], scene.references[j]
+        strict = {tuple(m) for m in matcher.match_references(first, second).tolist()}
+        wide = matcher.match_references(first, second, wide=True)
+        assert strict < {tuple(m) for m in wide.tolist()}
+        assert epipolar_distance_px(first, second, wide).max() < options.epipolar_px + 1e-3
+        for column in wide.T:
+            assert len(np.unique(column)) == len(column)
+        true = {tuple(m) for m in same_points(scene.reference_points[i], scene.reference_points[j]).tolist()}
+        assert len({tuple(m) for m in wide.tolist()} & true) > 0.95 * len(wide)
+        np.testing.assert_array_equal(matcher.match_references(first, second, wide=True), wide)
+        assert {tuple(m) for m in matcher.match_references(first, second).tolist()} == strict
+
+
+def test_matches_with_the_query_are_query_first() -> None:
+    scene = make_scene(random_for("query first"), SceneOptions(reference_count=2))
+    for matches, shown in zip(
+        Matcher().correspond(scene.query, scene.references).query_matches, scene.reference_points, strict=True
+    ):
+        true = {tuple(m) for m in same_points(scene.query_points, shown).tolist()}
+        assert len(true & {tuple(m) for m in matches.tolist()}) > 0.98 * len(true)
+
+
+def test_without_features_there_are_no_matches() -> None:
+    scene = make_scene(random_for("blank"), SceneOptions(reference_count=2))
+    blank = View(CAMERA, features(np.empty((0, 128)), np.empty((0, 2))))
+    references = (replace(scene.references[0], view=blank), scene.references[1])
+    correspondences = Matcher().correspond(blank, references)
+    assert [len(m) for m in correspondences.query_matches] == [0, 0]
+    assert correspondences.reference_pairs[0, 1].shape == (0, 2)
+    assert Matcher().match_references(*references, wide=True).shape == (0, 2)
+    assert Matcher().match_references(*references[::-1], wide=True).shape == (0, 2)
+
+
+@pytest.fixture
+def matched_pairs(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Features, Features]]:
+    """Every pair whose descriptors have been compared."""
+    calls: list[tuple[Features, Features]] = []
+
+    def spy(first: Features, second: Features, ratio: float) -> Matches:
+        calls.append((first, second))
+        return mutual_matches(first, second, ratio)
+
+    monkeypatch.setattr(correspond, "mutual_matches", spy)
+    return calls
+
+
+def test_pairs_of_references_are_matched_once(matched_pairs: list[tuple[Features, Features]]) -> None:
+    scene = make_scene(random_for("memory"), SceneOptions(reference_count=4, point_count=50))
+    matcher = Matcher()
+    once = matcher.correspond(scene.query, scene.references)
+    assert len(matched_pairs) == 6 + 4
+    again = matcher.correspond(scene.query, scene.references)
+    assert len(matched_pairs) == 10 + 4  # the query's alone
+    for pair, matches in once.reference_pairs.items():
+        np.testing.assert_array_equal(again.reference_pairs[pair], matches)
+
+
+def test_the_order_of_a_pair_is_not_mixed_up() -> None:
+    scene = make_scene(random_for("order"), SceneOptions(reference_count=2))
+    matcher = Matcher()
+    first, second = scene.references
+    forth, back = matcher.match_references(first, second), matcher.match_references(second, first)
+    fresh = Matcher().match_references(second, first)
+    np.testing.assert_array_equal(back, fresh)
+    assert {tuple(m) for m in forth.tolist()} != {tuple(m) for m in back.tolist()}
+
+
+def test_the_memory_is_bounded_and_forgets_the_longest_unused(
+    matched_pairs: list[tuple[Features, Features]],
+) -> None:
+    scene = make_scene(random_for("bounded"), SceneOptions(reference_count=4, point_count=50))
+    a, b, c, d = scene.references
+    matcher = Matcher(CorrespondOptions(remembered_pairs=2))
+    for first, second in ((a, b), (a, c), (a, b), (a, d)):  # forgets (a, c), since (a, b) was used after it
+        matcher.match_references(first, second)
+    assert len(matched_pairs) == 3
+    matcher.match_references(a, b)
+    matcher.match_references(a, d)
+    assert len(matched_pairs) == 3
+    matcher.match_references(a, c)
+    assert len(matched_pairs) == 4
+
+
+def test_senseless_options_are_refused() -> None:
+    for options in ({"reference_ratio": 1.1}, {"query_ratio": 0.0}, {"epipolar_px": float("nan")}, {"wide_ratio": 2.0}):
+        with pytest.raises(ValueError, match="senseless"):
+            CorrespondOptions(**options)  # type: ignore[arg-type]

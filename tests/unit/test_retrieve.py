@@ -1,0 +1,97 @@
+"""The choice of references: the rule on planted counts and places, against a slow twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scenes import SceneOptions, make_scene, random_for
+
+from mapless.geometry import Array
+from mapless_server.retrieve import RetrieveOptions, choose_references, spread_choice
+
+LINE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [1.0, 0, 0], [1.1, 0, 0]])
+
+
+def slow_choice(counts: list[int], centres: Array, count: int, options: RetrieveOptions) -> list[int]:
+    """The rule in words: best score first, where whoever stands near a chosen one is worth less."""
+    chosen: list[int] = []
+    while len(chosen) < min(count, len(counts)):
+        scores = {
+            i: counts[i]
+            * (
+                options.nearby_weight
+                if any(np.linalg.norm(centres[i] - centres[c]) < options.apart_m for c in chosen)
+                else 1.0
+            )
+            for i in range(len(counts))
+            if i not in chosen
+        }
+        chosen.append(max(scores, key=lambda i: (scores[i], -i)))
+    return chosen
+
+
+def test_the_most_similar_comes_first() -> None:
+    assert spread_choice([3, 9, 5], [[0, 0, 0], [10, 0, 0], [20, 0, 0]], 3) == [1, 2, 0]
+
+
+def test_a_neighbour_needs_twice_the_matches() -> None:
+    options = RetrieveOptions(apart_m=0.3, nearby_weight=0.5)
+    assert spread_choice([100, 90, 0, 44, 0], LINE, 2, options) == [0, 1]
+    assert spread_choice([100, 90, 0, 46, 0], LINE, 2, options) == [0, 3]
+
+
+def test_standing_near_several_costs_no_more_than_near_one() -> None:
+    assert spread_choice([100, 90, 80, 30, 0], LINE, 4, RetrieveOptions(nearby_weight=0.5)) == [0, 1, 2, 3]
+
+
+def test_weight_one_looks_at_the_matches_alone() -> None:
+    assert spread_choice([5, 4, 3, 2, 1], LINE, 5, RetrieveOptions(nearby_weight=1.0)) == [0, 1, 2, 3, 4]
+
+
+def test_weight_zero_spreads_at_any_price() -> None:
+    assert spread_choice([500, 400, 300, 1, 0], LINE, 2, RetrieveOptions(nearby_weight=0.0)) == [0, 3]
+    everyone = spread_choice([500, 400, 300, 1, 0], LINE, 5, RetrieveOptions(nearby_weight=0.0))
+    assert sorted(everyone) == [0, 1, 2, 3, 4]
+
+
+def test_ties_go_to_the_first() -> None:
+    assert spread_choice([7, 7, 7], [[0, 0, 0], [5, 0, 0], [9, 0, 0]], 2) == [0, 1]
+    assert spread_choice([0, 0, 0], [[0, 0, 0], [5, 0, 0], [9, 0, 0]], 3) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("count", [0, 2, 5, 6, 1000])
+def test_never_more_than_there_are(count: int) -> None:
+    chosen = spread_choice([1, 2, 3, 4, 5], LINE, count)
+    assert len(chosen) == len(set(chosen)) == min(count, 5)
+    assert spread_choice([], np.empty((0, 3)), count) == []
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 20), st.integers(0, 12)), max_size=8),
+    st.integers(0, 9),
+    st.sampled_from([0.0, 0.25, 0.5, 1.0]),
+    st.sampled_from([0.0, 0.3, 5.0]),
+)
+def test_the_choice_is_that_of_loops(
+    candidates: list[tuple[int, int]], count: int, nearby_weight: float, apart_m: float
+) -> None:
+    counts = [matches for matches, _ in candidates]
+    centres = np.array([[0.1 * place, 0.0, 0.0] for _, place in candidates]).reshape(-1, 3)
+    options = RetrieveOptions(apart_m, nearby_weight)
+    assert spread_choice(counts, centres, count, options) == slow_choice(counts, centres, count, options)
+
+
+def test_references_that_see_more_of_the_query_are_chosen() -> None:
+    scene = make_scene(random_for("retrieve"), SceneOptions(reference_count=4))
+    elsewhere = make_scene(random_for("elsewhere"), SceneOptions(reference_count=4))
+    candidates = [*elsewhere.references, *scene.references]
+    assert set(choose_references(scene.query, candidates, 4)) == {4, 5, 6, 7}
+    assert choose_references(scene.query, [], 4) == []
+
+
+def test_senseless_options_are_refused() -> None:
+    for options in ({"apart_m": -1.0}, {"nearby_weight": 1.5}, {"nearby_weight": float("nan")}):
+        with pytest.raises(ValueError, match="senseless"):
+            RetrieveOptions(**options)

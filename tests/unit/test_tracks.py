@@ -1,0 +1,189 @@
+"""Tracks: planted chains, conflicts, and a slow union-find to compare with."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from planted import true_correspondences, true_tracks
+from scenes import SceneOptions, make_scene, random_for
+
+from mapless_server.correspond import Matches
+from mapless_server.tracks import Tracks, build_tracks
+
+Pairs = Mapping[tuple[int, int], Matches]
+Track = frozenset[tuple[int, int]]
+"""Of (view, keypoint)."""
+
+
+def pairs_of(matches: Mapping[tuple[int, int], Sequence[tuple[int, int]]]) -> Pairs:
+    return {pair: np.array(m, np.int32).reshape(-1, 2) for pair, m in matches.items()}
+
+
+def as_sets(tracks: Tracks) -> set[Track]:
+    """Which keypoints belong together, whatever the numbers of the points."""
+    seen = defaultdict(set)
+    for point, view, keypoint in zip(
+        tracks.point.tolist(), tracks.view.tolist(), tracks.keypoint.tolist(), strict=True
+    ):
+        seen[point].add((view, keypoint))
+    return {frozenset(s) for s in seen.values()}
+
+
+def assert_is_well_formed(tracks: Tracks) -> None:
+    assert len(tracks.point) == len(tracks.view) == len(tracks.keypoint)
+    order = np.lexsort((tracks.view, tracks.point))
+    np.testing.assert_array_equal(order, np.arange(len(order)))
+    np.testing.assert_array_equal(np.unique(tracks.point), np.arange(tracks.point_count))
+    np.testing.assert_array_equal(tracks.point[tracks.starts], np.arange(tracks.point_count))
+    seen_in = np.stack([tracks.point, tracks.view], axis=1)
+    assert len(np.unique(seen_in, axis=0)) == len(seen_in)
+    assert (np.bincount(tracks.point) >= 2).all()
+
+
+def slow_tracks(pairs: Pairs, anchor: int | None) -> list[tuple[Track, Mapping[tuple[int, int], int]]]:
+    """The connected keypoints by union-find, and how many matches each has; conflicts not yet resolved."""
+    parent: dict[tuple[int, int], tuple[int, int]] = {}
+    degree: dict[tuple[int, int], int] = defaultdict(int)
+
+    def root(node: tuple[int, int]) -> tuple[int, int]:
+        while parent.setdefault(node, node) != node:
+            node = parent[node]
+        return node
+
+    for (i, j), matches in pairs.items():
+        if anchor is None or anchor in (i, j):
+            for a, b in matches.tolist():
+                degree[i, a] += 1
+                degree[j, b] += 1
+                parent[root((i, a))] = root((j, b))
+    groups = defaultdict(set)
+    for node in list(parent):
+        groups[root(node)].add(node)
+    return [(frozenset(group), degree) for group in groups.values()]
+
+
+@st.composite
+def random_pairs(draw: st.DrawFn) -> tuple[Pairs, list[int]]:
+    """One-to-one matches among up to five views with up to six keypoints each, many of them in conflict."""
+    counts = draw(st.lists(st.integers(0, 6), min_size=2, max_size=5))
+    pairs: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for j in range(len(counts)):
+        for i in range(j):
+            size = draw(st.integers(0, min(counts[i], counts[j])))
+            first = draw(st.permutations(range(counts[i])))[:size]
+            second = draw(st.permutations(range(counts[j])))[:size]
+            pairs[i, j] = list(zip(first, second, strict=True))
+    return pairs_of(pairs), counts
+
+
+def test_a_chain_of_matches_is_one_track() -> None:
+    tracks = build_tracks(pairs_of({(0, 1): [(5, 2)], (1, 2): [(2, 7)]}), [6, 3, 8])
+    assert as_sets(tracks) == {frozenset({(0, 5), (1, 2), (2, 7)})}
+    assert_is_well_formed(tracks)
+
+
+def test_separate_matches_are_separate_tracks() -> None:
+    tracks = build_tracks(pairs_of({(0, 1): [(0, 1), (1, 0)], (1, 2): [(2, 2)]}), [3, 3, 3])
+    assert as_sets(tracks) == {
+        frozenset({(0, 0), (1, 1)}),
+        frozenset({(0, 1), (1, 0)}),
+        frozenset({(1, 2), (2, 2)}),
+    }
+
+
+def test_a_conflict_keeps_the_better_connected_keypoint() -> None:
+    # Keypoints 0 and 1 of view 0 both reach the same point; 1 by two matches, 0 by one.
+    tracks = build_tracks(
+        pairs_of({(0, 1): [(1, 0)], (0, 2): [(1, 0)], (0, 3): [(0, 0)], (2, 3): [(0, 0)]}), [2, 1, 1, 1]
+    )
+    assert as_sets(tracks) == {frozenset({(0, 1), (1, 0), (2, 0), (3, 0)})}
+
+
+def test_a_track_that_a_conflict_leaves_alone_is_dropped() -> None:
+    # One keypoint of view 1 cannot be matched twice with view 0, but let a caller try.
+    tracks = build_tracks(pairs_of({(0, 1): [(0, 0), (1, 0)]}), [2, 1])
+    assert_is_well_formed(tracks)
+    assert tracks.point_count == 1
+
+
+def test_nothing_matched_gives_no_tracks() -> None:
+    matched_views: list[list[tuple[int, int]]] = [[], [(0, 1)], [(0, 1), (1, 2)]]
+    for views in matched_views:
+        tracks = build_tracks(pairs_of({pair: [] for pair in views}), [3, 0, 2])
+        assert tracks.point_count == 0
+        assert len(tracks.starts) == 0
+        assert tracks.select(np.empty(0, bool)).point_count == 0
+    assert build_tracks(pairs_of({(1, 2): [(0, 0)]}), [1, 1, 1], anchor=0).point_count == 0
+
+
+@given(random_pairs(), st.sampled_from([None, 0, 1]))
+def test_tracks_are_those_of_union_find(drawn: tuple[Pairs, list[int]], anchor: int | None) -> None:
+    pairs, counts = drawn
+    tracks = build_tracks(pairs, counts, anchor)
+    assert_is_well_formed(tracks)
+    groups = [(g, degree) for g, degree in slow_tracks(pairs, anchor) if len({view for view, _ in g}) >= 2]
+    actual = as_sets(tracks)
+    assert len(actual) == len(groups)
+    for group, degree in groups:
+        (track,) = [t for t in actual if t <= group]
+        assert {view for view, _ in track} == {view for view, _ in group}
+        for view, keypoint in track:
+            assert degree[view, keypoint] == max(degree[node] for node in group if node[0] == view)
+
+
+@given(random_pairs(), st.randoms(use_true_random=False))
+def test_the_order_of_pairs_does_not_matter(drawn: tuple[Pairs, list[int]], shuffler: object) -> None:
+    pairs, counts = drawn
+    keys = sorted(pairs, key=lambda _: shuffler.random())  # type: ignore[attr-defined]
+    shuffled = {key: pairs[key][::-1] for key in keys}
+    expected, actual = build_tracks(pairs, counts), build_tracks(shuffled, counts)
+    for name in ("point", "view", "keypoint"):
+        np.testing.assert_array_equal(getattr(actual, name), getattr(expected, name))
+
+
+@given(random_pairs())
+def test_from_an_anchor_every_track_begins_there(drawn: tuple[Pairs, list[int]]) -> None:
+    pairs, counts = drawn
+    tracks = build_tracks(pairs, counts, anchor=0)
+    assert (tracks.view[tracks.starts] == 0).all()
+    without_others = {pair: m for pair, m in pairs.items() if 0 in pair}
+    assert as_sets(tracks) == as_sets(build_tracks(without_others, counts))
+
+
+@given(random_pairs(), st.data())
+def test_select_keeps_the_chosen_and_renumbers(drawn: tuple[Pairs, list[int]], data: st.DataObject) -> None:
+    tracks = build_tracks(*drawn)
+    chosen = np.array([data.draw(st.booleans()) for _ in range(tracks.point_count)], bool)
+    selected = tracks.select(chosen)
+    assert_is_well_formed(selected)
+    for new, old in enumerate(np.flatnonzero(chosen)):
+        for name in ("view", "keypoint"):
+            of_new = getattr(selected, name)[selected.point == new]
+            np.testing.assert_array_equal(of_new, getattr(tracks, name)[tracks.point == old])
+
+
+@given(random_pairs(), st.data())
+def test_prune_drops_observations_and_what_is_left_alone(drawn: tuple[Pairs, list[int]], data: st.DataObject) -> None:
+    tracks = build_tracks(*drawn)
+    good = np.array([data.draw(st.booleans()) for _ in tracks.point], bool)
+    pruned, kept = tracks.prune(good)
+    assert_is_well_formed(pruned)
+    assert kept.shape == (tracks.point_count,)
+    assert pruned.point_count == kept.sum()
+    for new, old in enumerate(np.flatnonzero(kept)):
+        np.testing.assert_array_equal(
+            pruned.keypoint[pruned.point == new], tracks.keypoint[(tracks.point == old) & good]
+        )
+    for old in np.flatnonzero(~kept):
+        assert good[tracks.point == old].sum() < 2
+
+
+def test_true_matches_give_the_points_of_the_scene() -> None:
+    scene = make_scene(random_for("points"), SceneOptions(point_count=100))
+    counts = [len(r.view.features) for r in scene.references]
+    expected, _ = true_tracks(scene)
+    assert as_sets(build_tracks(true_correspondences(scene).reference_pairs, counts)) == as_sets(expected)
