@@ -43,7 +43,7 @@ class AdjustOptions:
         min_decrease: stop when a step lowers the cost by a smaller share.
     """
 
-    loss_scale_sigma: float = 1.25
+    loss_scale_sigma: float = 1.4
     prior_share: float = 0.2
     error_inflation: float = 2.0
     max_error_px: float = 8.0
@@ -192,6 +192,8 @@ def adjust_pose(
         The estimate with another pose and covariance; unchanged when there is nothing to gain.
     """
     used = np.flatnonzero(estimate.errors_px < options.max_error_px)
+    if len(used) < 3:  # two equations each, for six unknowns
+        return estimate
     problem, state = _pose_problem(query, references, structure, matches, used, estimate.world_from_camera, options)
     state, equations = _minimize(problem, state, options)
     matrix, _, _ = equations.reduced(0.0)
@@ -203,7 +205,7 @@ def adjust_pose(
     hessian = matrix[-6:, -6:] - coupling.T @ np.linalg.solve(references_block, coupling)
     pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
     points = structure.x_in_world.copy()
-    points[matches.point[used]] = state.points
+    points[np.unique(matches.point[used])] = state.points
     errors_px = reprojection_errors_px(query.camera, pose, points[matches.point], pixels)
     covariance = options.error_inflation**2 * world_covariance(hessian, pose)
     return replace(estimate, world_from_camera=pose, errors_px=errors_px, covariance=covariance)

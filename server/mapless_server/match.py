@@ -35,7 +35,7 @@ class MatchOptions:
 
     through_tracks: bool = True
     radius_px: float = 6.0
-    min_similarity: float = 0.85
+    min_similarity: float = 0.89
 
     def __post_init__(self) -> None:
         if not (self.radius_px >= 0 and -1 <= self.min_similarity <= 1):

@@ -63,7 +63,12 @@ class PnpOptions:
 
     def __post_init__(self) -> None:
         shares = (self.min_found_share, self.min_hull_share)
-        if not (self.inlier_px > 0 and self.loss_scale_px > 0 and self.min_matches >= 4 and 0 <= min(shares) < 1):
+        if not (
+            self.inlier_px > 0
+            and self.loss_scale_px > 0
+            and self.min_matches >= 4
+            and 0 <= min(shares) <= max(shares) < 1
+        ):
             raise ValueError(f"senseless options: {self}")
         if not 0 < self.min_iterations <= self.max_iterations:
             raise ValueError(f"senseless options: {self}")

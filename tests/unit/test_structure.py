@@ -168,7 +168,7 @@ def test_parallel_rays_do_not_meet() -> None:
 
 def test_the_better_start_wins_point_by_point() -> None:
     _, observations, truth = planted("start", SceneOptions(point_count=40))
-    bad = truth + [0.0, 0.0, 0.5]
+    bad = truth + np.array([0.0, 0.0, 0.5])
     first, second = truth.copy(), bad.copy()
     first[::2], second[::2] = bad[::2], truth[::2]
     first[4] = np.nan
@@ -195,7 +195,7 @@ def test_points_are_those_of_scipys_soft_l1(outlier_share: float) -> None:
             return np.asarray(np.linalg.norm(mine.residuals(x[None]), axis=1))
 
         # rho of SciPy is of each function's square, so one function is the length of one residual.
-        best = least_squares(
+        best = least_squares(  # type: ignore[operator]  # mypy takes it for the module of that name
             lengths, truth[p], loss="soft_l1", f_scale=scale, xtol=1e-12, ftol=1e-14, gtol=1e-12, x_scale="jac"
         )
         reached = cost_by_point(mine, adjusted[p : p + 1], scale)[0]
@@ -256,13 +256,14 @@ def test_nan_stays_nan_and_hurts_no_other() -> None:
 
 
 @pytest.mark.parametrize("level_px", [0.3, 1.0, 3.0])
-@pytest.mark.parametrize("reference_count", [3, 8])
-def test_a_planted_level_of_noise_is_found(level_px: float, reference_count: int) -> None:
+@pytest.mark.parametrize(("reference_count", "tolerance"), [(3, 0.12), (8, 0.05)])
+def test_a_planted_level_of_noise_is_found(level_px: float, reference_count: int, tolerance: float) -> None:
+    # Three views on a line leave more of the residual across the line than along it, which the formula averages.
     guess = KeypointNoise(0.5, 0.0)
     options = SceneOptions(noise_px=level_px, reference_count=reference_count, seen_share=1.0)
     _, observations, truth = planted(f"level {level_px} {reference_count}", options, guess)
     points = adjust_points(observations, truth, 20.0, iterations=10)
-    assert estimate_noise(observations, points, guess).level_px == pytest.approx(level_px, rel=0.07)
+    assert estimate_noise(observations, points, guess).level_px == pytest.approx(level_px, rel=tolerance)
 
 
 def test_the_part_of_size_is_taken_off() -> None:
@@ -461,4 +462,4 @@ def test_senseless_options_are_refused() -> None:
         {"min_parallax_deg": 90.0},
     ):
         with pytest.raises(ValueError, match="senseless"):
-            StructureOptions(**options)  # type: ignore[arg-type]
+            StructureOptions(**options)

@@ -1,0 +1,272 @@
+"""The final adjustment: its derivatives, its elimination of the points, and whether it pays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from compare import assert_pose_close, pose_error
+from jacobians import assert_jacobian
+from planted import true_correspondences, true_structure
+from scenes import SceneOptions, SyntheticScene, make_scene, random_for
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.adjust import AdjustOptions, _pose_problem, _Problem, _State, adjust_pose
+from mapless_server.match import PointMatches
+from mapless_server.pnp import PnpOptions, PoseEstimate, solve_pose
+from mapless_server.structure import KeypointNoise, Structure, adjust_points, estimate_noise, observe, triangulate
+from mapless_server.views import PosedView
+
+NOISE = KeypointNoise(0.5, 0.0)
+
+
+def problem_of(case: str, moved: float = 0.0) -> tuple[_Problem, _State]:
+    """A small problem, at its start or after random motions of about so much."""
+    scene = make_scene(random_for(case), SceneOptions(point_count=25, reference_count=3))
+    structure, matches = true_structure(scene, NOISE)
+    used = np.arange(len(matches))
+    problem, state = _pose_problem(
+        scene.query, scene.references, structure, matches, used, scene.world_from_query, AdjustOptions()
+    )
+    random = random_for(case, "moved")
+    motion = random.normal(0, moved, (len(state.rotation), 6))
+    return problem, state.moved(motion, random.normal(0, moved, state.points.shape))
+
+
+def from_vector(state: _State, vector: Array) -> _State:
+    """The state after the motions and steps in one vector."""
+    split = 6 * len(state.rotation)
+    return state.moved(vector[:split].reshape(-1, 6), vector[split:].reshape(-1, 3))
+
+
+def cheated_estimate(
+    scene: SyntheticScene, matches: PointMatches, pose: RigidTransform, error_px: float
+) -> PoseEstimate:
+    """An estimate at a given pose that claims these errors."""
+    solved = solve_pose(scene.query, true_structure(scene)[0], true_structure(scene)[1], pose, PnpOptions())
+    assert isinstance(solved, PoseEstimate)
+    n = len(matches)
+    return replace(solved, world_from_camera=pose, inliers=np.ones(n, bool), errors_px=np.full(n, error_px))
+
+
+# The problem
+
+
+@pytest.mark.parametrize(("moved", "tolerance"), [(0.0, 1e-6), (1e-3, 2e-3)])
+def test_the_gradient_is_that_of_the_cost(moved: float, tolerance: float) -> None:
+    """Half of it, as in least squares. Away from the start the prior's error is differentiated as if it were small."""
+    problem, state = problem_of("gradient", moved)
+    equations = problem.linearize(state)
+    gradient = np.concatenate([equations.pose_gradient, equations.point_gradient.ravel()])
+    assert_jacobian(
+        2 * gradient, lambda v: problem.cost(from_vector(state, v)), np.zeros(len(gradient)), tolerance=tolerance
+    )
+
+
+def dense_system(problem: _Problem, state: _State) -> tuple[Array, Array]:
+    """The whole matrix and gradient of the normal equations, from derivatives by differences."""
+    observations, options = problem.at(state), problem.options
+    size = 6 * len(state.rotation) + 3 * len(state.points)
+    step = 1e-6
+    columns = []
+    for axis in np.eye(size):
+        ahead, behind = from_vector(state, step * axis), from_vector(state, -step * axis)
+        there, back = problem.at(ahead).residuals(ahead.points), problem.at(behind).residuals(behind.points)
+        prior = problem.prior_error(ahead) - problem.prior_error(behind)
+        columns.append(np.concatenate([(there - back).ravel(), prior.ravel()]) / (2 * step))
+    jacobian = np.stack(columns, axis=1)
+    residual = observations.residuals(state.points)
+    weight = 1 / (1 + (residual**2).sum(axis=1) / options.loss_scale_sigma**2)
+    weights = np.concatenate([np.repeat(weight, 2), problem.information.ravel()])
+    errors = np.concatenate([residual.ravel(), problem.prior_error(state).ravel()])
+    return jacobian.T @ (weights[:, None] * jacobian), jacobian.T @ (weights * errors)
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e-3, 1.0])
+def test_the_step_is_that_of_the_whole_system(damping: float) -> None:
+    problem, state = problem_of("dense", 1e-3)
+    matrix, gradient = dense_system(problem, state)
+    expected = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
+    motion, points = problem.linearize(state).step(damping)
+    actual = np.concatenate([motion.ravel(), points.ravel()])
+    np.testing.assert_allclose(actual, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_what_is_left_after_elimination_inverts_to_the_covariance() -> None:
+    problem, state = problem_of("marginal")
+    matrix, _ = dense_system(problem, state)
+    cameras = 6 * len(state.rotation)
+    reduced, _, _ = problem.linearize(state).reduced(0.0)
+    expected = np.linalg.inv(matrix)[:cameras, :cameras]
+    np.testing.assert_allclose(np.linalg.inv(reduced), expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+
+
+def test_the_prior_measures_the_motion() -> None:
+    problem, state = problem_of("prior")
+    np.testing.assert_allclose(problem.prior_error(state), 0, atol=1e-12)
+    motion = random_for("prior motion").normal(0, 1e-4, (len(state.rotation), 6))
+    error = problem.prior_error(state.moved(motion, np.zeros_like(state.points)))
+    np.testing.assert_allclose(error, motion[:-1], atol=1e-7)
+
+
+def test_a_point_behind_a_camera_has_no_cost() -> None:
+    problem, state = problem_of("behind")
+    points = state.points.copy()
+    points[0] = [0.0, 0.0, -100.0]
+    assert np.isnan(problem.cost(replace(state, points=points)))
+
+
+# The adjustment
+
+
+def stages(scene: SyntheticScene, references: tuple[PosedView, ...]) -> tuple[Structure, PointMatches, PoseEstimate]:
+    """Structure and pose as the stages before would hand them over, from true matches and the given reference poses."""
+    truth, matches = true_structure(scene)
+    observations = observe(truth.tracks, references, NOISE)
+    points = adjust_points(observations, triangulate(observations), 2.0, 8)
+    noise = estimate_noise(observations, points, NOISE)
+    structure = Structure(points, truth.tracks, noise)
+    estimate = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
+    assert isinstance(estimate, PoseEstimate)
+    return structure, matches, estimate
+
+
+def disturbed(
+    references: tuple[PosedView, ...], random: np.random.Generator, metres: float, degrees: float
+) -> tuple[PosedView, ...]:
+    """The references with poses that are not exact."""
+
+    def disturb(pose: RigidTransform) -> RigidTransform:
+        turn = rotation_from_vector(np.radians(random.normal(0, degrees, 3)))
+        return RigidTransform(turn @ pose.rotation, pose.translation + random.normal(0, metres, 3))
+
+    return tuple(replace(r, world_from_camera=disturb(r.world_from_camera)) for r in references)
+
+
+def mean_errors(pose_noise: float, options: SceneOptions, seeds: int) -> tuple[Array, Array]:
+    """Mean errors (metres, degrees) before and after, over seeds; references are off by `pose_noise` px or so."""
+    before, after = [], []
+    for seed in range(seeds):
+        scene = make_scene(random_for("pays", seed), options)
+        noisy_px = pose_noise / options.camera.focal_x_px
+        references = disturbed(
+            scene.references, random_for("noisy", seed), noisy_px * options.distance_m, np.degrees(noisy_px)
+        )
+        structure, matches, estimate = stages(scene, references)
+        adjusted = adjust_pose(scene.query, references, structure, matches, estimate, AdjustOptions())
+        before.append(pose_error(estimate.world_from_camera, scene.world_from_query))
+        after.append(pose_error(adjusted.world_from_camera, scene.world_from_query))
+    return np.mean(before, axis=0), np.mean(after, axis=0)
+
+
+FEW_POINTS = SceneOptions(point_count=120, reference_count=4, distractor_count=0)
+
+
+def test_with_exact_references_it_does_not_get_worse() -> None:
+    before, after = mean_errors(0.0, FEW_POINTS, seeds=12)
+    assert (after <= 1.03 * before).all()
+
+
+def test_with_noisy_references_it_gets_better() -> None:
+    before, after = mean_errors(0.3, replace(FEW_POINTS, noise_px=0.7), seeds=25)
+    assert (after < before).all()
+
+
+def test_a_rough_pose_is_pulled_in() -> None:
+    scene = make_scene(random_for("pulled"), replace(FEW_POINTS, noise_px=0.0))
+    structure, matches = true_structure(scene, NOISE)
+    rough = RigidTransform(scene.world_from_query.rotation, scene.world_from_query.translation + [0.01, -0.01, 0.02])
+    estimate = cheated_estimate(scene, matches, rough, error_px=1.0)
+    adjusted = adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions())
+    assert_pose_close(adjusted.world_from_camera, scene.world_from_query, metres=1e-4, degrees=1e-3)
+    assert np.median(adjusted.errors_px) < 0.01
+
+
+def test_matches_far_off_take_no_part() -> None:
+    scene = make_scene(random_for("far off"), replace(FEW_POINTS, noise_px=0.0))
+    structure, matches = true_structure(scene, NOISE)
+    random = random_for("far off matches")
+    swapped = matches.keypoint.copy()
+    swapped[:20] = random.permutation(swapped[:20])
+    wrong = replace(matches, keypoint=swapped)
+    estimate = solve_pose(scene.query, structure, wrong, scene.world_from_query, PnpOptions())
+    assert isinstance(estimate, PoseEstimate)
+    adjusted = adjust_pose(scene.query, scene.references, structure, wrong, estimate, AdjustOptions())
+    assert_pose_close(adjusted.world_from_camera, scene.world_from_query, metres=1e-3, degrees=0.01)
+
+
+def test_errors_are_as_large_as_the_covariance_says() -> None:
+    """Monte Carlo, with the inflation taken off: it is for what synthetic keypoints do not have."""
+    squares = []
+    options = AdjustOptions(error_inflation=1.0)
+    for seed in range(40):
+        scene = make_scene(random_for("covariance", seed), FEW_POINTS)
+        structure, matches, estimate = stages(scene, scene.references)
+        adjusted = adjust_pose(scene.query, scene.references, structure, matches, estimate, options)
+        turn = adjusted.world_from_camera.rotation @ scene.world_from_query.rotation.T
+        skew = (turn - turn.T) / 2
+        shift = adjusted.world_from_camera.translation - scene.world_from_query.translation
+        error = np.array([*shift, skew[2, 1], skew[0, 2], skew[1, 0]])
+        np.testing.assert_allclose(adjusted.covariance, adjusted.covariance.T)
+        squares.append(error @ np.linalg.solve(adjusted.covariance, error))
+    assert 4 < np.mean(squares) < 9
+
+
+def test_the_inflation_multiplies_standard_deviations() -> None:
+    scene = make_scene(random_for("inflation"), FEW_POINTS)
+    structure, matches, estimate = stages(scene, scene.references)
+    plain, inflated = (
+        adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions(error_inflation=factor))
+        for factor in (1.0, 3.0)
+    )
+    np.testing.assert_allclose(inflated.covariance, 9 * plain.covariance)
+
+
+def test_references_and_points_stay_where_they_were() -> None:
+    scene = make_scene(random_for("untouched"), FEW_POINTS)
+    structure, matches, estimate = stages(scene, scene.references)
+    points = structure.x_in_world.copy()
+    poses = [r.world_from_camera.matrix() for r in scene.references]
+    adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions())
+    np.testing.assert_array_equal(structure.x_in_world, points)
+    for reference, pose in zip(scene.references, poses, strict=True):
+        np.testing.assert_array_equal(reference.world_from_camera.matrix(), pose)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_fewer_matches_than_unknowns_change_nothing(count: int) -> None:
+    scene = make_scene(random_for("too few"), FEW_POINTS)
+    structure, matches = true_structure(scene, NOISE)
+    estimate = cheated_estimate(scene, matches, scene.world_from_query, error_px=100.0)
+    errors_px = estimate.errors_px.copy()
+    errors_px[:count] = 0.5
+    estimate = replace(estimate, errors_px=errors_px)
+    adjusted = adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions())
+    if count < 3:
+        assert adjusted is estimate
+    assert_pose_close(adjusted.world_from_camera, scene.world_from_query, metres=0.5, degrees=10)
+
+
+def test_all_matches_with_one_spot_are_no_exception() -> None:
+    scene = make_scene(random_for("singular"), FEW_POINTS)
+    structure, matches = true_structure(scene, NOISE)
+    estimate = cheated_estimate(scene, matches, scene.world_from_query, error_px=0.5)
+    for points in (np.zeros_like(structure.x_in_world), np.full_like(structure.x_in_world, np.nan)):
+        nowhere = replace(structure, x_in_world=points)
+        adjusted = adjust_pose(scene.query, scene.references, nowhere, matches, estimate, AdjustOptions())
+        assert np.isfinite(adjusted.world_from_camera.matrix()).all()
+        assert np.isfinite(adjusted.covariance).all()
+
+
+def test_true_matches_are_what_these_tests_assume() -> None:
+    scene = make_scene(random_for("assumed"), FEW_POINTS)
+    _, matches = true_structure(scene)
+    shown = {k for m in true_correspondences(scene).query_matches for k in m[:, 0].tolist()}
+    assert set(matches.keypoint.tolist()) <= shown
+
+
+def test_senseless_options_are_refused() -> None:
+    for options in ({"prior_share": 0.0}, {"iterations": 0}, {"loss_scale_sigma": -1.0}):
+        with pytest.raises(ValueError, match="senseless"):
+            AdjustOptions(**options)

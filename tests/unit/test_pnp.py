@@ -1,0 +1,375 @@
+"""The pose solver: planted poses among wrong matches, what it refuses, its covariance, and the library it hides."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from importlib.metadata import version
+
+import numpy as np
+import poselib
+import pytest
+from compare import assert_pose_close
+from jacobians import assert_jacobian, finite_differences
+from planted import shifted, true_structure
+from scenes import CAMERA, SceneOptions, make_scene, random_for
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server import pnp
+from mapless_server.match import PointMatches
+from mapless_server.pnp import (
+    PnpOptions,
+    PoseEstimate,
+    PoseStage,
+    false_alarms,
+    log10_false_alarms,
+    motion_jacobian,
+    pose_hessian,
+    ransac,
+    reprojection_errors_px,
+    solve_pose,
+    world_covariance,
+)
+from mapless_server.rejection import Rejection, RejectionReason
+from mapless_server.structure import ONE_PIXEL, Structure
+from mapless_server.tracks import Tracks
+from mapless_server.views import Features, View
+
+POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
+TRUSTING = PnpOptions(max_log10_false_alarms=math.inf, min_found_share=0.0, min_hull_share=0.0)
+"""Without the gate."""
+
+Problem = tuple[View, Structure, PointMatches]
+
+
+def problem_of(x_in_world: Array, pixels: Array) -> Problem:
+    """Point i matched with keypoint i."""
+    n = len(x_in_world)
+    index = np.arange(n)
+    features = Features(pixels.astype(np.float32), np.ones((n, 1), np.float32), np.ones(n, np.float32))
+    structure = Structure(x_in_world, Tracks(index[:0], index[:0], index[:0]), ONE_PIXEL)
+    return View(CAMERA, features), structure, PointMatches(index, index, np.zeros(n, bool), 0.0)
+
+
+def planted(random: np.random.Generator, count: int, noise_px: float = 0.5, outlier_share: float = 0.0) -> Problem:
+    """Points all over the image of a camera at POSE; the first of their matches are wrong."""
+    pixels = random.uniform([0, 0], [959, 719], (count, 2))
+    x_in_world = POSE.apply(CAMERA.rays(pixels) * random.uniform(3, 6, (count, 1)))
+    pixels += random.normal(0, noise_px, pixels.shape)
+    wrong = np.arange(count) < outlier_share * count
+    return problem_of(x_in_world, np.where(wrong[:, None], random.uniform([0, 0], [959, 719], (count, 2)), pixels))
+
+
+def solve(problem: Problem, initial: RigidTransform = POSE, options: PnpOptions | None = None) -> PoseEstimate:
+    estimate = solve_pose(*problem, initial, options or PnpOptions())
+    assert isinstance(estimate, PoseEstimate), estimate
+    return estimate
+
+
+def rejection_of(problem: Problem, initial: RigidTransform = POSE, options: PnpOptions | None = None) -> Rejection:
+    outcome = solve_pose(*problem, initial, options or PnpOptions())
+    assert isinstance(outcome, Rejection), outcome
+    return outcome
+
+
+# Planted poses
+
+
+@pytest.mark.parametrize("initial_off_m", [0.0, 0.3, 50.0])
+@pytest.mark.parametrize("outlier_share", [0.0, 0.3, 0.6])
+def test_the_planted_pose_is_found(outlier_share: float, initial_off_m: float) -> None:
+    for seed in range(5):
+        problem = planted(random_for("planted", outlier_share, seed), 200, 0.5, outlier_share)
+        estimate = solve(problem, shifted(POSE, np.array([initial_off_m, 0.0, 0.0])))
+        assert_pose_close(estimate.world_from_camera, POSE, metres=0.01, degrees=0.15)
+        assert estimate.stage is PoseStage.REFINED
+        right = np.arange(200) >= outlier_share * 200
+        assert estimate.inliers[right].all()
+        assert estimate.inliers[~right].sum() <= 1
+        assert estimate.errors_px.shape == (200,)
+
+
+def test_without_noise_it_is_exact() -> None:
+    estimate = solve(planted(random_for("exact"), 50, noise_px=0.0))
+    assert_pose_close(estimate.world_from_camera, POSE, metres=1e-6, degrees=1e-5)
+
+
+def test_many_matches_are_thinned_not_cut() -> None:
+    """All right ones stand at the end, where a solver of the first 2000 would never see them."""
+    problem = planted(random_for("many"), 6000, 0.5, outlier_share=0.6)
+    assert_pose_close(solve(problem).world_from_camera, POSE, metres=0.005, degrees=0.05)
+
+
+def test_the_same_matches_give_the_same_bits() -> None:
+    problem = planted(random_for("bits"), 300, 0.5, 0.5)
+    first, second = solve(problem), solve(problem)
+    assert first.world_from_camera.matrix().tobytes() == second.world_from_camera.matrix().tobytes()
+    assert first.covariance.tobytes() == second.covariance.tobytes()
+
+
+def test_on_a_synthetic_scene() -> None:
+    scene = make_scene(random_for("scene"), SceneOptions(outlier_share=0.3))
+    structure, matches = true_structure(scene)
+    estimate = solve((scene.query, structure, matches), scene.world_from_query)
+    assert_pose_close(estimate.world_from_camera, scene.world_from_query, metres=0.01, degrees=0.1)
+
+
+# Refined or initial
+
+
+def with_solver(monkeypatch: pytest.MonkeyPatch, answer: RigidTransform | None) -> None:
+    monkeypatch.setattr(pnp, "ransac", lambda *_: answer)
+
+
+@pytest.mark.parametrize(
+    ("refined_off_m", "initial_off_m", "stage"),
+    [
+        (0.0, 0.1, PoseStage.REFINED),
+        (0.1, 0.0, PoseStage.INITIAL),
+        (0.0, 0.0, PoseStage.REFINED),
+        (None, 0.0, PoseStage.INITIAL),
+    ],
+    ids=["refined is better", "initial is better", "tie", "no refined"],
+)
+def test_the_pose_with_more_inliers_is_kept(
+    monkeypatch: pytest.MonkeyPatch, refined_off_m: float | None, initial_off_m: float, stage: PoseStage
+) -> None:
+    shift = np.array([1.0, 0.0, 0.0])
+    with_solver(monkeypatch, None if refined_off_m is None else shifted(POSE, refined_off_m * shift))
+    estimate = solve(planted(random_for("stage"), 100), shifted(POSE, initial_off_m * shift))
+    assert estimate.stage is stage
+    assert_pose_close(estimate.world_from_camera, POSE, metres=0, degrees=1e-6)
+    assert estimate.inliers.sum() == 100
+
+
+# What is refused
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 5])
+def test_few_matches_are_no_ground(count: int) -> None:
+    rejection = rejection_of(planted(random_for("few", count), count, 0.0))
+    assert rejection.reason is RejectionReason.TOO_FEW_MATCHES
+    assert f"{count} 2D-3D matches" in rejection.message
+
+
+def on_a_line(count: int) -> Problem:
+    x_in_world = np.linspace(-1, 1, count)[:, None] * np.array([1.0, 0.3, 0.2])
+    return problem_of(x_in_world, CAMERA.project(POSE.inverse().apply(x_in_world)))
+
+
+def at_one_point(count: int) -> Problem:
+    x_in_world = np.zeros((count, 3))
+    return problem_of(x_in_world, CAMERA.project(POSE.inverse().apply(x_in_world)))
+
+
+@pytest.mark.parametrize("count", [6, 40, 400])
+def test_degenerate_points_are_rejected(count: int) -> None:
+    for problem in (on_a_line(count), at_one_point(count)):
+        for initial in (POSE, shifted(POSE, np.array([3.0, 1.0, 0.0]))):
+            assert rejection_of(problem, initial).reason in {RejectionReason.PNP_FAILED, RejectionReason.GATE}
+
+
+def test_when_no_pose_explains_anything_the_solver_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = planted(random_for("failed"), 50)
+    behind = RigidTransform(POSE.rotation @ np.diag([-1.0, 1.0, -1.0]), POSE.translation)
+    with_solver(monkeypatch, None)
+    assert rejection_of(problem, behind).reason is RejectionReason.PNP_FAILED
+    with_solver(monkeypatch, behind)
+    assert rejection_of(problem, behind).reason is RejectionReason.PNP_FAILED
+
+
+def test_points_with_no_pose_at_all_are_gated() -> None:
+    """Random matches: no pose is true, and none may be believed."""
+    for seed in range(50):
+        random = random_for("no pose", seed)
+        problem = planted(random, int(random.integers(6, 120)), outlier_share=1.0)
+        reason = rejection_of(problem).reason
+        assert reason in {RejectionReason.GATE, RejectionReason.PNP_FAILED}, seed
+
+
+def test_guided_matches_around_a_wrong_pose_are_gated() -> None:
+    """A search of 20 px finds some keypoint near every projection; that they agree must not count."""
+    for seed in range(20):
+        random = random_for("guided", seed)
+        view, structure, matches = planted(random, 80, 0.0)
+        within = 20 * np.sqrt(random.random(80)) * np.exp(1j * random.uniform(0, 2 * np.pi, 80))
+        keypoints = view.features.keypoints + np.stack([within.real, within.imag], axis=1).astype(np.float32)
+        searched = PointMatches(matches.point, matches.keypoint, np.ones(80, bool), radius_px=20.0)
+        query = replace(view, features=replace(view.features, keypoints=keypoints))
+        assert rejection_of((query, structure, searched)).reason is RejectionReason.GATE, seed
+
+
+def test_agreement_in_one_corner_is_doubted() -> None:
+    random = random_for("corner")
+    pixels = random.uniform([100, 100], [180, 160], (60, 2))
+    x_in_world = POSE.apply(CAMERA.rays(pixels) * random.uniform(3, 6, (60, 1)))
+    problem = problem_of(x_in_world, pixels)
+    rejection = rejection_of(problem)
+    assert rejection.reason is RejectionReason.GATE
+    assert "cover only" in rejection.message
+    solve(problem, options=replace(PnpOptions(), min_hull_share=0.0))
+
+
+def test_agreement_of_few_of_many_visible_points_is_doubted() -> None:
+    random = random_for("share")
+    view, structure, matches = planted(random, 1000)
+    few = PointMatches(matches.point[:30], matches.keypoint[:30], matches.guided[:30], 0.0)
+    rejection = rejection_of((view, structure, few))
+    assert rejection.reason is RejectionReason.GATE
+    behind = replace(structure, x_in_world=structure.x_in_world.copy())
+    behind.x_in_world[30:] = POSE.apply([0.0, 0.0, -5.0])  # what is not in front need not be found
+    solve((view, behind, few))
+
+
+# False alarms
+
+
+def test_false_alarms_are_the_formula() -> None:
+    for n in (4, 5, 10, 60):
+        for k in range(4, n + 1):
+            for p in (1e-4, 0.01, 0.3):
+                expected = math.log10((n - 3) * math.comb(n, k) * math.comb(k, 3) * p ** (k - 3))
+                assert false_alarms(n, k, p) == pytest.approx(expected, abs=1e-8)
+
+
+def test_three_matches_agree_with_a_pose_by_construction() -> None:
+    for k in range(4):
+        assert false_alarms(50, k, 1e-6) == math.inf
+    assert false_alarms(50, 20, 1.0) == math.inf
+
+
+def test_false_alarms_fall_with_inliers_and_rise_with_matches_and_chance() -> None:
+    of_inliers = [false_alarms(100, k, 1e-3) for k in range(4, 101)]
+    assert np.all(np.diff(of_inliers) < 0)
+    assert np.all(np.diff([false_alarms(n, 10, 1e-3) for n in range(10, 2000, 50)]) > 0)
+    assert np.all(np.diff([false_alarms(100, 10, p) for p in np.geomspace(1e-5, 0.9, 20)]) > 0)
+
+
+def test_each_group_of_matches_is_judged_by_its_own_chance() -> None:
+    inliers = np.arange(100) < 40
+    options = PnpOptions()
+    disc = options.inlier_px**2
+    index = np.arange(100)
+    free = PointMatches(index, index, np.zeros(100, bool), 0.0)
+    share = math.pi * disc / (CAMERA.width_px * CAMERA.height_px)
+    assert log10_false_alarms(CAMERA, free, inliers, options) == pytest.approx(false_alarms(100, 40, share))
+    guided = PointMatches(index, index, np.ones(100, bool), 20.0)
+    assert log10_false_alarms(CAMERA, guided, inliers, options) == pytest.approx(false_alarms(100, 40, disc / 400))
+    both = PointMatches(index, index, index % 2 == 0, 20.0)
+    assert log10_false_alarms(CAMERA, both, inliers, options) == pytest.approx(
+        min(false_alarms(50, 20, share), false_alarms(50, 20, disc / 400))
+    )
+
+
+# Covariance
+
+
+def moved_in_world(pose: RigidTransform, error: Array) -> RigidTransform:
+    """The pose after a shift (x, y, z) and a turn (rx, ry, rz) about fixed world axes."""
+    return RigidTransform(rotation_from_vector(error[3:]) @ pose.rotation, pose.translation + error[:3])
+
+
+def test_motion_jacobian() -> None:
+    for x in random_for("motion").normal(size=(5, 3)):
+
+        def moved(motion: Array, x: Array = x) -> Array:
+            return np.asarray(rotation_from_vector(motion[3:]) @ x + motion[:3])
+
+        assert_jacobian(motion_jacobian(x), moved, np.zeros(6), tolerance=1e-7)
+
+
+def test_the_covariance_is_that_of_errors_in_the_world() -> None:
+    """The inverse of J^T J, where J is by differences in the very coordinates that the covariance is told in."""
+    view, structure, _ = planted(random_for("covariance"), 60)
+    x_in_world = structure.x_in_world
+
+    def projections(error: Array) -> Array:
+        return CAMERA.project(moved_in_world(POSE, error).inverse().apply(x_in_world)).ravel()
+
+    jacobian = finite_differences(projections, np.zeros(6))
+    covariance = world_covariance(pose_hessian(view.camera, POSE, x_in_world) / 0.5**2, POSE)
+    expected = 0.5**2 * np.linalg.inv(jacobian.T @ jacobian)
+    np.testing.assert_allclose(covariance, expected, atol=1e-5 * np.abs(expected).max())
+    np.testing.assert_array_equal(covariance, covariance.T)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+def test_errors_are_as_large_as_the_covariance_says() -> None:
+    """Monte Carlo: errors in units of the covariance have the square sum of six standard normal numbers."""
+    squares, stated, errors = [], [], []
+    rng = random_for("monte carlo")
+    _, structure, matches = planted(rng, 120)
+    exact = CAMERA.project(POSE.inverse().apply(structure.x_in_world))
+    for _ in range(250):
+        view = problem_of(structure.x_in_world, exact + rng.normal(0, 0.6, exact.shape))[0]
+        estimate = solve((view, structure, matches))
+        turn = estimate.world_from_camera.rotation @ POSE.rotation.T
+        skew = (turn - turn.T) / 2
+        error = [*(estimate.world_from_camera.translation - POSE.translation), skew[2, 1], skew[0, 2], skew[1, 0]]
+        errors.append(error)
+        squares.append(error @ np.linalg.solve(estimate.covariance, error))
+        stated.append(np.sqrt(np.diag(estimate.covariance)))
+    np.testing.assert_allclose(np.std(errors, axis=0), np.mean(stated, axis=0), rtol=0.2)
+    assert np.mean(squares) == pytest.approx(6, rel=0.25)
+
+
+# The adapter
+
+
+def test_the_version_of_poselib_is_the_one_whose_signature_is_known() -> None:
+    assert version("poselib") == "2.0.5"
+
+
+def test_poselib_knows_the_options_that_are_given_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would take misspelt ones without a word."""
+    given: list[dict[str, object]] = []
+
+    def spy(*arguments: object) -> tuple[poselib.CameraPose, dict[str, object]]:
+        given.extend(a for a in arguments[3:5] if isinstance(a, dict))
+        return poselib.CameraPose(), {}
+
+    monkeypatch.setattr(poselib, "estimate_absolute_pose", spy)
+    ransac(CAMERA, np.zeros((6, 3)), np.zeros((6, 2)), None, PnpOptions())
+    assert len(given) == 2
+    assert given[0].keys() <= poselib.RansacOptions({}).keys()
+    assert given[1].keys() <= poselib.BundleOptions({}).keys()
+
+
+def test_poselibs_pose_is_camera_from_world_with_w_first() -> None:
+    camera_from_world = POSE.inverse()
+    pose = pnp._poselib_pose(POSE)
+    np.testing.assert_allclose(pose.R, camera_from_world.rotation, atol=1e-12)
+    np.testing.assert_allclose(pose.t, camera_from_world.translation, atol=1e-12)
+
+
+def test_an_initial_pose_is_started_from() -> None:
+    """So few iterations find a pose among 90 % wrong matches only when they begin at it."""
+    view, structure, _ = planted(random_for("start"), 200, 0.5, outlier_share=0.9)
+    options = PnpOptions(min_iterations=1, max_iterations=1)
+    pixels = view.features.keypoints.astype(float)
+    begun = ransac(CAMERA, structure.x_in_world, pixels, POSE, options)
+    assert begun is not None
+    assert_pose_close(begun, POSE, metres=0.05, degrees=0.5)
+
+
+def test_no_finite_pose_is_none() -> None:
+    _, structure, _ = at_one_point(20)
+    assert ransac(CAMERA, structure.x_in_world, np.full((20, 2), 300.0), None, PnpOptions()) is None
+
+
+def test_reprojection_errors() -> None:
+    x_in_world = POSE.apply(np.array([[0.0, 0.0, 2.0], [0.1, 0.0, 2.0], [0.0, 0.0, -2.0]]))
+    errors_px = reprojection_errors_px(CAMERA, POSE, x_in_world, np.array([[479.5, 359.5], [479.5, 359.5], [0, 0]]))
+    np.testing.assert_allclose(errors_px, [0.0, 0.1 / 2 * 816.0, np.nan], atol=1e-9)
+
+
+def test_senseless_options_are_refused() -> None:
+    for options in (
+        {"inlier_px": 0.0},
+        {"loss_scale_px": float("nan")},
+        {"min_matches": 3},
+        {"min_iterations": 10, "max_iterations": 5},
+        {"min_hull_share": 1.5},
+    ):
+        with pytest.raises(ValueError, match="senseless"):
+            PnpOptions(**options)
