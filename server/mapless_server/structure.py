@@ -34,7 +34,7 @@ class StructureOptions:
             reference's pairs alone.
         optimize: move the points. Without, they stay where the reconstruction put them (the paper's ablation).
         model_noise: weigh observations by the expected error of their keypoint; the paper gives all the same weight.
-        iterations: Levenberg-Marquardt steps; half a dozen converge from a good start.
+        iterations: Levenberg-Marquardt steps, twice; four converge from a good start.
         loss_scale_sigma: residual, in standard deviations, at which the loss turns from square to linear.
         max_residual_sigma: points with a larger residual in any view are dropped; None keeps all.
         min_parallax_deg: points whose rays meet at less are dropped, because their depth is a guess.
@@ -43,7 +43,7 @@ class StructureOptions:
     all_references: bool = True
     optimize: bool = True
     model_noise: bool = True
-    iterations: int = 6
+    iterations: int = 4
     loss_scale_sigma: float = 2.0
     max_residual_sigma: float | None = 4.0
     min_parallax_deg: float = 0.5

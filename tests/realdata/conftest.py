@@ -1,4 +1,4 @@
-"""Photographs that are not part of the repository: beside it, or in the folder of MAPLESS_TEST_DATA."""
+"""Photographs that are not part of the repository: beside it, or in the folder of TEST_DATA."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from mapless_server.dataset import Dataset, read_folder
 
-DATA = Path(os.environ.get("MAPLESS_TEST_DATA") or Path(__file__).parents[3] / "shared" / "data")
+DATA = Path(os.environ.get("TEST_DATA") or Path(__file__).parents[3] / "shared" / "data")
 
 
 @pytest.fixture(scope="session")
@@ -19,7 +19,7 @@ def photographs() -> Callable[[str], Dataset]:
 
     def read(folder: str) -> Dataset:
         if not (DATA / folder / "cameras.json").is_file():
-            pytest.skip(f"needs real photographs, {DATA / folder} is absent (MAPLESS_TEST_DATA names another place)")
+            pytest.skip(f"needs real photographs, {DATA / folder} is absent (TEST_DATA names another place)")
         return read_folder(DATA / folder)
 
     return read
