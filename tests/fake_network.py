@@ -76,7 +76,7 @@ class FakeNetwork:
             reference.key,
             reference.view,
             self._scene.reference_points[index],
-            reference.world_from_camera,
+            self._scene.references[index].world_from_camera,
             confidence=0.9 if options.reference_confidences is None else options.reference_confidences[index],
             offset_m=options.bad_pose_m if index < options.bad_pose_count else 0.0,
         )

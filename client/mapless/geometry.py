@@ -162,6 +162,10 @@ class RigidTransform:
             self.rotation @ source_from_other.translation + self.translation,
         )
 
+    def shifted(self, offset: ArrayLike) -> RigidTransform:
+        """The same motion seen from a target frame in which everything lies ``offset`` (3,) further."""
+        return RigidTransform(self.rotation, self.translation + np.asarray(offset, float))
+
     def apply(self, x_in_source: ArrayLike) -> Array:
         """Points (..., 3) in the target frame."""
         return np.asarray(x_in_source, float) @ self.rotation.T + self.translation

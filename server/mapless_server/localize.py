@@ -184,12 +184,28 @@ def localize(query: View, references: Sequence[PosedView], pipeline: Pipeline, o
         message = f"the photograph has {len(query.features)} local features, {MIN_FEATURES} are needed"
         return Answer(Rejection(RejectionReason.LOW_TEXTURE, message))
 
-    strict = _attempt(query, references, pipeline, options, {}, wide=False)
-    if options.variant is not Variant.BEST or _inlier_count(strict) >= options.weak_inliers:
-        return strict
-    wide = _attempt(query, references, pipeline, options, dict(strict.stage_seconds), wide=True)
-    better = wide if _inlier_count(wide) > _inlier_count(strict) else strict
-    return replace(better, stage_seconds=wide.stage_seconds)
+    # World coordinates may be millions of metres (UTM, ECEF), too long for the digits of differences of squares.
+    origin = references[0].world_from_camera.translation
+    nearby = [replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references]
+    answer = _attempt(query, nearby, pipeline, options, {}, wide=False)
+    if options.variant is Variant.BEST and _inlier_count(answer) < options.weak_inliers:
+        wide = _attempt(query, nearby, pipeline, options, dict(answer.stage_seconds), wide=True)
+        better = wide if _inlier_count(wide) > _inlier_count(answer) else answer
+        answer = replace(better, stage_seconds=wide.stage_seconds)
+    return _shifted(answer, origin)
+
+
+def _shifted(answer: Answer, offset: Array) -> Answer:
+    """The answer in a world in which everything lies `offset` (3,) further."""
+    outcome, scale = answer.outcome, answer.scale
+    if isinstance(outcome, Localization):
+        outcome = replace(outcome, world_from_camera=outcome.world_from_camera.shifted(offset))
+    if scale:
+        world_from_local = replace(scale.world_from_local, translation=scale.world_from_local.translation + offset)
+        scale = replace(
+            scale, world_from_local=world_from_local, world_from_query=scale.world_from_query.shifted(offset)
+        )
+    return replace(answer, outcome=outcome, scale=scale)
 
 
 def _inlier_count(answer: Answer) -> int:

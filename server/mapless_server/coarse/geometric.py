@@ -68,7 +68,8 @@ class GeometricReconstructor:
         matches = vote(structure, [len(r.view.features) for r in references], correspondences)
         x_in_world = structure.x_in_world[matches.point]
         pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
-        pose = ransac(query.camera, x_in_world, pixels, None, self.options.pnp) if len(matches) >= 4 else None
+        enough = len(matches) >= self.options.pnp.min_matches
+        pose = ransac(query.camera, x_in_world, pixels, None, self.options.pnp) if enough else None
         if pose is None:
             return Rejection(
                 RejectionReason.LOW_OVERLAP,

@@ -1,0 +1,177 @@
+"""The geometric backend: what a network would say of a planted scene, and what it refuses to say anything of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from compare import assert_pose_close
+from planted import moved_references, true_correspondences
+from scenes import SceneOptions, SyntheticScene, make_scene, random_for
+
+from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
+from mapless_server.coarse import ReconstructedView, Reconstruction
+from mapless_server.coarse.geometric import GeometricOptions, GeometricReconstructor
+from mapless_server.correspond import Correspondences, Matcher
+from mapless_server.rejection import Rejection, RejectionReason
+from mapless_server.views import PosedView, View
+
+EXACT = SceneOptions(noise_px=0.0, point_count=300, reference_count=4)
+
+
+def reconstruct(scene: SyntheticScene, references: tuple[PosedView, ...] | None = None) -> Reconstruction:
+    outcome = GeometricReconstructor().reconstruct(
+        scene.query, references or scene.references, true_correspondences(scene)
+    )
+    assert isinstance(outcome, Reconstruction), outcome
+    return outcome
+
+
+def rejection_of(query: View, references: tuple[PosedView, ...], correspondences: Correspondences) -> Rejection:
+    outcome = GeometricReconstructor().reconstruct(query, references, correspondences)
+    assert isinstance(outcome, Rejection)
+    return outcome
+
+
+def world_from_local(scene: SyntheticScene, reconstruction: Reconstruction) -> Similarity:
+    """From the first reference and the distance to the last."""
+    local = [view.local_from_camera for view in reconstruction.references]
+    world = [reference.world_from_camera for reference in scene.references]
+    scale = float(
+        np.linalg.norm(world[-1].translation - world[0].translation)
+        / np.linalg.norm(local[-1].translation - local[0].translation)
+    )
+    rotation = world[0].rotation @ local[0].rotation.T
+    return Similarity(scale, rotation, world[0].translation - scale * rotation @ local[0].translation)
+
+
+def depths_at_keypoints(part: ReconstructedView, view: View) -> Array:
+    return part.depth_at(view.features.keypoints, view.camera.width_px, view.camera.height_px)
+
+
+def test_poses_and_depths_are_the_truth_at_one_common_scale() -> None:
+    scene = make_scene(random_for("truth"), EXACT)
+    reconstruction = reconstruct(scene)
+    similarity = world_from_local(scene, reconstruction)
+    parts = [(reconstruction.query, scene.query, scene.query_points, scene.world_from_query)]
+    parts += [
+        (part, r.view, shown, r.world_from_camera)
+        for part, r, shown in zip(reconstruction.references, scene.references, scene.reference_points, strict=True)
+    ]
+    for part, view, shown, world_from_camera in parts:
+        assert_pose_close(
+            similarity.transform_pose(part.local_from_camera), world_from_camera, metres=1e-4, degrees=1e-3
+        )
+        depth_m = similarity.scale * depths_at_keypoints(part, view)
+        known = np.isfinite(depth_m) & (shown >= 0)
+        assert known.sum() > 0.8 * (shown >= 0).sum()
+        true_m = world_from_camera.inverse().apply(scene.x_in_world[shown[known]])[:, 2]
+        assert np.median(np.abs(depth_m[known] - true_m)) < 1e-4
+        assert np.mean(np.abs(depth_m[known] - true_m) < 1e-3) > 0.97  # now and then two keypoints share a cell
+
+
+def test_maps_are_nan_where_nothing_is_known() -> None:
+    scene = make_scene(random_for("maps"), EXACT)
+    reconstruction = reconstruct(scene)
+    for part in (reconstruction.query, *reconstruction.references):
+        assert part.point_map.shape == (360, 480, 3)
+        assert part.point_map.dtype == part.confidence.dtype == np.float32
+        known = np.isfinite(part.point_map).all(axis=2)
+        np.testing.assert_array_equal(part.confidence, known.astype(np.float32))
+        np.testing.assert_array_equal(np.isfinite(part.point_map).any(axis=2), known)
+        assert 100 < known.sum() < 300
+        assert (part.point_map[known][:, 2] > 0).all()
+
+
+def test_the_frame_is_that_of_the_first_reference_and_its_unit_the_median_distance() -> None:
+    scene = make_scene(random_for("frame"), EXACT)
+    first = reconstruct(scene).references[0]
+    assert_pose_close(first.local_from_camera, RigidTransform.identity(), metres=1e-12, degrees=1e-10)
+    distances = np.linalg.norm(first.point_map[np.isfinite(first.point_map[..., 2])], axis=1)
+    assert np.median(distances) == pytest.approx(1, abs=0.05)
+
+
+def test_the_world_does_not_show() -> None:
+    scene = make_scene(random_for("world"), EXACT)
+    moved = RigidTransform(rotation_from_vector([1.0, -2.0, 0.5]), np.array([300.0, -100.0, 20.0]))
+    here, there = reconstruct(scene), reconstruct(scene, moved_references(scene.references, moved))
+    for a, b in zip((here.query, *here.references), (there.query, *there.references), strict=True):
+        assert_pose_close(b.local_from_camera, a.local_from_camera, metres=1e-6, degrees=1e-5)
+        np.testing.assert_allclose(b.point_map, a.point_map, atol=1e-4)
+
+
+def test_wrong_matches_are_survived() -> None:
+    scene = make_scene(random_for("outliers"), SceneOptions(outlier_share=0.4))
+    reconstruction = GeometricReconstructor().reconstruct(
+        scene.query, scene.references, Matcher().correspond(scene.query, scene.references)
+    )
+    assert isinstance(reconstruction, Reconstruction)
+    pose = world_from_local(scene, reconstruction).transform_pose(reconstruction.query.local_from_camera)
+    assert_pose_close(pose, scene.world_from_query, metres=0.02, degrees=0.2)
+
+
+# Rejections
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_depth_takes_two_references(count: int) -> None:
+    scene = make_scene(random_for("count"), EXACT)
+    rejection = rejection_of(scene.query, scene.references[:count], true_correspondences(scene))
+    assert rejection.reason is RejectionReason.NO_USABLE_REFERENCES
+
+
+def test_references_at_one_place_are_degenerate() -> None:
+    scene = make_scene(random_for("one place"), EXACT)
+    where = scene.references[0].world_from_camera
+    turned = tuple(
+        replace(r, world_from_camera=RigidTransform(r.world_from_camera.rotation, where.translation + 0.001 * i))
+        for i, r in enumerate(scene.references)
+    )
+    rejection = rejection_of(scene.query, turned, true_correspondences(scene))
+    assert rejection.reason is RejectionReason.DEGENERATE_REFERENCES
+
+
+def test_references_that_share_nothing_are_of_no_use() -> None:
+    scene = make_scene(random_for("share nothing"), EXACT)
+    correspondences = true_correspondences(scene)
+    alone = {pair: np.empty((0, 2), np.int32) for pair in correspondences.reference_pairs}
+    rejection = rejection_of(scene.query, scene.references, replace(correspondences, reference_pairs=alone))
+    assert rejection.reason is RejectionReason.NO_USABLE_REFERENCES
+
+
+def test_a_query_that_matches_nothing_has_no_overlap() -> None:
+    scene = make_scene(random_for("matches nothing"), EXACT)
+    correspondences = true_correspondences(scene)
+    for kept in (0, 3, 4, 5):
+        few = tuple(m[:kept] for m in correspondences.query_matches[:1])
+        none = tuple(m[:0] for m in correspondences.query_matches[1:])
+        rejection = rejection_of(scene.query, scene.references, replace(correspondences, query_matches=few + none))
+        assert rejection.reason is RejectionReason.LOW_OVERLAP, kept
+
+
+def test_a_query_of_somewhere_else_has_no_overlap() -> None:
+    options = SceneOptions(point_count=250, reference_count=3)
+    for seed in range(8):
+        here, elsewhere = (make_scene(random_for("elsewhere", seed, k), options) for k in (0, 1))
+        correspondences = Matcher().correspond(elsewhere.query, here.references)
+        rejection = rejection_of(elsewhere.query, here.references, correspondences)
+        assert rejection.reason is RejectionReason.LOW_OVERLAP, seed
+
+
+def test_matches_at_random_have_no_overlap() -> None:
+    scene = make_scene(random_for("at random"), EXACT)
+    correspondences = true_correspondences(scene)
+    for seed in range(10):
+        random = random_for("shuffled", seed)
+        shuffled = tuple(
+            np.stack([random.permutation(m[:, 0]), m[:, 1]], axis=1) for m in correspondences.query_matches
+        )
+        wrong = replace(correspondences, query_matches=shuffled)
+        assert rejection_of(scene.query, scene.references, wrong).reason is RejectionReason.LOW_OVERLAP, seed
+
+
+def test_senseless_options_are_refused() -> None:
+    for options in ({"min_baseline_m": 0.0}, {"cell_px": 0}):
+        with pytest.raises(ValueError, match="senseless"):
+            GeometricOptions(**options)

@@ -1,0 +1,372 @@
+"""The whole method on planted scenes, over a fake network and over the geometric backend."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from compare import assert_pose_close, pose_error
+from fake_network import FakeNetwork, FakeNetworkOptions
+from planted import moved_references, shifted
+from scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for, unit_rows
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server import pnp
+from mapless_server.coarse import Reconstruction, Reconstructor
+from mapless_server.coarse.geometric import GeometricReconstructor
+from mapless_server.correspond import Correspondences, Matcher
+from mapless_server.localize import (
+    MIN_FEATURES,
+    Answer,
+    Localization,
+    LocalizeOptions,
+    Pipeline,
+    Variant,
+    localize,
+    make_pipeline,
+)
+from mapless_server.pnp import PoseStage
+from mapless_server.rejection import Rejection, RejectionReason
+from mapless_server.scale import ScaleStage, ScaleStrategy
+from mapless_server.views import Features, PosedView, View
+
+SCENE = make_scene(random_for("localize"), SceneOptions(point_count=400, reference_count=5))
+MATCHER = Matcher()
+ROUGH = FakeNetworkOptions(depth_noise_m=0.03, pose_noise_m=0.01, pose_noise_deg=0.2)
+LATER_STAGES = ["structure", "match", "pnp"]
+
+
+def pipeline_of(backend: str, scene: SyntheticScene = SCENE, options: FakeNetworkOptions | None = None) -> Pipeline:
+    reconstructor: Reconstructor = FakeNetwork(scene, 0, options) if backend == "network" else GeometricReconstructor()
+    return Pipeline(reconstructor, MATCHER if scene is SCENE else Matcher())
+
+
+def answer_of(pipeline: Pipeline, options: LocalizeOptions | None = None, query: View | None = None) -> Answer:
+    return localize(query or SCENE.query, SCENE.references, pipeline, options or LocalizeOptions())
+
+
+def pose_of(answer: Answer) -> Localization:
+    assert isinstance(answer.outcome, Localization), answer.outcome
+    return answer.outcome
+
+
+def reason_of(answer: Answer) -> RejectionReason:
+    assert isinstance(answer.outcome, Rejection), answer.outcome
+    return answer.outcome.reason
+
+
+def without_meaning(view: View) -> View:
+    """The same keypoints, but their descriptors are like nothing else."""
+    random = random_for("without meaning")
+    descriptors = unit_rows(random.standard_normal(view.features.descriptors.shape)).astype(np.float32)
+    return replace(view, features=replace(view.features, descriptors=descriptors))
+
+
+# Accuracy
+
+
+@pytest.mark.parametrize("strategy", ScaleStrategy)
+@pytest.mark.parametrize("variant", Variant)
+@pytest.mark.parametrize("backend", ["geometric", "network"])
+def test_every_form_of_the_method_finds_the_pose(backend: str, variant: Variant, strategy: ScaleStrategy) -> None:
+    answer = answer_of(pipeline_of(backend), LocalizeOptions(variant, strategy))
+    found = pose_of(answer)
+    assert_pose_close(found.world_from_camera, SCENE.world_from_query, metres=0.01, degrees=0.1)
+    assert answer.scale is not None
+    if strategy is not ScaleStrategy.TWO_STAGE:
+        assert answer.scale.stage is ScaleStage(strategy.value)
+    if variant is Variant.COARSE:
+        assert found.covariance is None
+        assert found.pose_stage is PoseStage.INITIAL
+    else:
+        assert found.covariance is not None
+        assert np.linalg.eigvalsh(found.covariance).min() > 0
+        assert 0.8 * found.match_count < found.inlier_count <= found.match_count
+        assert 0.2 < found.reprojection_error_px < 2
+
+
+def test_refinement_makes_a_rough_pose_fine() -> None:
+    errors = {
+        variant: pose_error(
+            pose_of(answer_of(pipeline_of("network", options=ROUGH), LocalizeOptions(variant))).world_from_camera,
+            SCENE.world_from_query,
+        )
+        for variant in Variant
+    }
+    assert errors[Variant.COARSE][0] > 0.01
+    assert errors[Variant.FULL][0] < 0.5 * errors[Variant.COARSE][0]
+    assert errors[Variant.BEST][0] < 0.5 * errors[Variant.COARSE][0]
+    assert max(errors[Variant.FULL][1], errors[Variant.BEST][1]) < 0.5 * errors[Variant.COARSE][1]
+
+
+def test_our_form_is_better_than_the_papers_where_reference_poses_are_noisy() -> None:
+    errors: dict[Variant, list[float]] = {Variant.FULL: [], Variant.BEST: []}
+    for seed in range(6):
+        scene = make_scene(random_for("average", seed), SceneOptions(point_count=300))
+        random = random_for("reference noise", seed)
+        references = [
+            replace(reference, world_from_camera=disturbed(reference.world_from_camera, random, 0.003, 0.06))
+            for reference in scene.references
+        ]
+        for variant, mine in errors.items():
+            found = pose_of(localize(scene.query, references, Pipeline(), LocalizeOptions(variant)))
+            mine.append(pose_error(found.world_from_camera, scene.world_from_query)[0])
+    assert np.mean(errors[Variant.BEST]) < 0.7 * np.mean(errors[Variant.FULL])
+
+
+def disturbed(pose: RigidTransform, random: np.random.Generator, metres: float, degrees: float) -> RigidTransform:
+    """The pose with normal noise on its centre and rotation."""
+    turn = rotation_from_vector(random.normal(0.0, np.radians(degrees), 3))
+    return RigidTransform(pose.rotation @ turn, pose.translation + random.normal(0.0, metres, 3))
+
+
+def test_wrong_keypoints_and_few_points_are_survived() -> None:
+    for seed in range(4):
+        scene = make_scene(
+            random_for("hard", seed),
+            SceneOptions(point_count=200, outlier_share=0.35, reference_count=4, seen_share=0.7),
+        )
+        found = pose_of(localize(scene.query, scene.references, pipeline_of("geometric", scene), LocalizeOptions()))
+        assert_pose_close(found.world_from_camera, scene.world_from_query, metres=0.03, degrees=0.3)
+
+
+def test_a_flat_scene_is_no_problem() -> None:
+    scene = make_scene(random_for("flat"), SceneOptions(box_m=(4.0, 2.4, 0.0), reference_count=4))
+    found = pose_of(localize(scene.query, scene.references, pipeline_of("geometric", scene), LocalizeOptions()))
+    assert_pose_close(found.world_from_camera, scene.world_from_query, metres=0.02, degrees=0.2)
+
+
+# What comes with the answer
+
+
+def test_stages_run_in_order_and_are_timed() -> None:
+    before = ["correspond", "coarse", "scale"]
+    for variant, after in (
+        (Variant.COARSE, []),
+        (Variant.NO_STRUCTURE, LATER_STAGES),
+        (Variant.FULL, LATER_STAGES),
+        (Variant.BEST, [*LATER_STAGES, "adjust"]),
+    ):
+        seconds = answer_of(pipeline_of("network"), LocalizeOptions(variant)).stage_seconds
+        assert list(seconds) == before + after
+        assert all(0 < s < 10 for s in seconds.values())
+
+
+def test_counts_by_reference() -> None:
+    answer = answer_of(pipeline_of("geometric"))
+    found = pose_of(answer)
+    matches = MATCHER.correspond(SCENE.query, SCENE.references).query_matches
+    assert answer.reference_match_counts == tuple(len(m) for m in matches)
+    assert len(answer.reference_inlier_counts) == len(SCENE.references)
+    assert max(answer.reference_inlier_counts) <= found.inlier_count
+    assert sum(answer.reference_inlier_counts) >= 2 * found.inlier_count  # every point is seen at least twice
+
+
+def test_the_covariance_tells_how_large_errors_are() -> None:
+    """Within the factor it is inflated by, and no promise beyond."""
+    squares = []
+    for seed in range(12):
+        scene = make_scene(random_for("honest", seed), SceneOptions(point_count=150, reference_count=4))
+        found = pose_of(localize(scene.query, scene.references, pipeline_of("geometric", scene), LocalizeOptions()))
+        assert found.covariance is not None
+        shift = found.world_from_camera.translation - scene.world_from_query.translation
+        squares.append(shift @ np.linalg.solve(found.covariance[:3, :3], shift))
+    assert 0.3 < np.mean(squares) < 4.5  # 3 if it were exact
+
+
+# Wide correspondences
+
+
+def test_a_weak_answer_is_computed_again_from_wide_correspondences(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[bool] = []
+    correspond = Matcher.correspond
+
+    def spy(self: Matcher, query: View, references: Sequence[PosedView], wide: bool = False) -> Correspondences:
+        asked.append(wide)
+        return correspond(self, query, references, wide)
+
+    monkeypatch.setattr(Matcher, "correspond", spy)
+    strong = pose_of(answer_of(pipeline_of("geometric"), LocalizeOptions(weak_inliers=10)))
+    assert asked == [False]
+    again = answer_of(pipeline_of("geometric"), LocalizeOptions(weak_inliers=10**6))
+    assert asked == [False, False, True]
+    assert pose_of(again).inlier_count >= strong.inlier_count
+    assert list(again.stage_seconds) == ["correspond", "coarse", "scale", *LATER_STAGES, "adjust"]
+    assert_pose_close(pose_of(again).world_from_camera, SCENE.world_from_query, metres=0.01, degrees=0.1)
+
+    for variant in (Variant.COARSE, Variant.NO_STRUCTURE, Variant.FULL):  # the paper's forms stay the paper's
+        asked.clear()
+        answer_of(pipeline_of("geometric"), LocalizeOptions(variant, weak_inliers=10**6))
+        assert asked == [False]
+
+
+# What must not matter
+
+
+@pytest.mark.parametrize("backend", ["geometric", "network"])
+def test_the_same_query_has_the_same_answer_to_the_bit(backend: str) -> None:
+    first, second = (
+        pose_of(answer_of(replace(pipeline_of(backend), matcher=matcher))) for matcher in (Matcher(), Matcher())
+    )
+    assert first.world_from_camera.matrix().tobytes() == second.world_from_camera.matrix().tobytes()
+    assert first.covariance is not None
+    assert second.covariance is not None
+    assert first.covariance.tobytes() == second.covariance.tobytes()
+    assert (first.inlier_count, first.match_count) == (second.inlier_count, second.match_count)
+
+
+@pytest.mark.parametrize("variant", [Variant.COARSE, Variant.FULL, Variant.BEST])
+def test_the_answer_moves_with_the_world(variant: Variant) -> None:
+    moved = RigidTransform(rotation_from_vector([0.7, -1.5, 2.0]), np.array([120.0, -40.0, 7.0]))
+    options = LocalizeOptions(variant)
+    here = pose_of(answer_of(pipeline_of("geometric"), options))
+    there = pose_of(localize(SCENE.query, moved_references(SCENE.references, moved), pipeline_of("geometric"), options))
+    assert_pose_close(there.world_from_camera, moved.compose(here.world_from_camera), metres=1e-4, degrees=1e-3)
+    if here.covariance is not None and there.covariance is not None:
+        turn = np.kron(np.eye(2), moved.rotation)
+        expected: Array = turn @ here.covariance @ turn.T
+        np.testing.assert_allclose(there.covariance, expected, atol=0.01 * np.abs(expected).max())
+
+
+def test_the_order_of_references_hardly_matters_to_our_form() -> None:
+    answers = [
+        pose_of(localize(SCENE.query, references, pipeline_of("geometric"), LocalizeOptions()))
+        for references in (SCENE.references, SCENE.references[::-1])
+    ]
+    assert_pose_close(answers[0].world_from_camera, answers[1].world_from_camera, metres=1e-3, degrees=0.01)
+
+
+# The initial pose
+
+
+@pytest.mark.parametrize("variant", [Variant.NO_STRUCTURE, Variant.FULL])
+def test_the_initial_pose_stays_when_refinement_explains_less(
+    monkeypatch: pytest.MonkeyPatch, variant: Variant
+) -> None:
+    worse = shifted(SCENE.world_from_query, np.array([0.2, 0.0, 0.0]))
+    monkeypatch.setattr(pnp, "ransac", lambda *_: worse)
+    answer = answer_of(pipeline_of("network"), LocalizeOptions(variant))
+    found = pose_of(answer)
+    assert found.pose_stage is PoseStage.INITIAL
+    assert answer.scale is not None
+    np.testing.assert_array_equal(found.world_from_camera.matrix(), answer.scale.world_from_query.matrix())
+
+
+def test_refinement_wins_when_it_explains_more() -> None:
+    rough = FakeNetworkOptions(pose_noise_m=0.02, pose_noise_deg=0.2)
+    found = pose_of(answer_of(pipeline_of("network", options=rough), LocalizeOptions(Variant.FULL)))
+    assert found.pose_stage is PoseStage.REFINED
+
+
+# Rejections
+
+
+@dataclass(frozen=True)
+class BlindNetwork:
+    """A network whose activations overflowed."""
+
+    network: FakeNetwork
+    name: str = "blind"
+    weights_sha256: str = ""
+
+    def reconstruct(
+        self, query: View, references: Sequence[PosedView], correspondences: Correspondences
+    ) -> Reconstruction:
+        reconstruction = self.network.reconstruct(query, references, correspondences)
+        nowhere = RigidTransform(np.full((3, 3), np.nan), np.full(3, np.nan))
+        return Reconstruction(
+            replace(reconstruction.query, local_from_camera=nowhere),
+            tuple(
+                replace(r, local_from_camera=nowhere, point_map=np.full_like(r.point_map, np.nan))
+                for r in reconstruction.references
+            ),
+        )
+
+
+@pytest.mark.parametrize("backend", ["geometric", "network"])
+@pytest.mark.parametrize("count", [0, 1])
+def test_no_usable_references(backend: str, count: int) -> None:
+    answer = localize(SCENE.query, SCENE.references[:count], pipeline_of(backend), LocalizeOptions())
+    assert reason_of(answer) is RejectionReason.NO_USABLE_REFERENCES
+    assert answer.scale is None
+    assert "adjust" not in answer.stage_seconds
+
+
+@pytest.mark.parametrize("backend", ["geometric", "network"])
+def test_degenerate_references(backend: str) -> None:
+    where = SCENE.references[0].world_from_camera.translation
+    stacked = tuple(
+        replace(r, key=f"{r.key}-stacked", world_from_camera=RigidTransform(r.world_from_camera.rotation, where))
+        for r in SCENE.references
+    )
+    pipeline = pipeline_of(backend)
+    if backend == "network":
+        keys = replace(SCENE, references=stacked)
+        pipeline = Pipeline(FakeNetwork(keys), Matcher())
+    assert (
+        reason_of(localize(SCENE.query, stacked, pipeline, LocalizeOptions())) is RejectionReason.DEGENERATE_REFERENCES
+    )
+
+
+@pytest.mark.parametrize("count", [0, MIN_FEATURES - 1])
+def test_low_texture(count: int) -> None:
+    f = SCENE.query.features
+    bare = View(CAMERA, Features(f.keypoints[:count], f.descriptors[:count], f.sizes_px[:count]))
+    answer = answer_of(pipeline_of("geometric"), query=bare)
+    assert reason_of(answer) is RejectionReason.LOW_TEXTURE
+    assert not answer.stage_seconds
+
+
+def test_low_overlap() -> None:
+    for seed in range(3):
+        elsewhere = make_scene(random_for("elsewhere", seed), SceneOptions(point_count=400))
+        answer = answer_of(pipeline_of("geometric"), query=elsewhere.query)
+        assert reason_of(answer) is RejectionReason.LOW_OVERLAP
+        assert list(answer.stage_seconds) == ["correspond", "coarse"]
+
+
+def test_scale_unreliable() -> None:
+    answer = answer_of(Pipeline(BlindNetwork(FakeNetwork(SCENE)), MATCHER))
+    assert reason_of(answer) is RejectionReason.SCALE_UNRELIABLE
+    assert list(answer.stage_seconds) == ["correspond", "coarse", "scale"]
+
+
+def test_too_few_matches() -> None:
+    answer = answer_of(pipeline_of("network"), query=without_meaning(SCENE.query))
+    assert reason_of(answer) is RejectionReason.TOO_FEW_MATCHES
+    assert answer.scale is not None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_gate(seed: int) -> None:
+    """The paper's search matches anything near; where the network is wrong and nothing is alike, chance must not do."""
+    wrong = FakeNetwork(SCENE, seed, FakeNetworkOptions(pose_noise_m=0.5, pose_noise_deg=2.0))
+    options = LocalizeOptions(Variant.FULL, ScaleStrategy.TRIANGULATION)
+    answer = answer_of(Pipeline(wrong, MATCHER), options, without_meaning(SCENE.query))
+    assert reason_of(answer) is RejectionReason.GATE
+
+
+def test_pnp_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    behind = SCENE.world_from_query.compose(RigidTransform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)))
+    monkeypatch.setattr(pnp, "ransac", lambda *_: None)
+    turned = replace(SCENE, world_from_query=behind)
+    network = FakeNetwork(SCENE)
+    true = network.reconstruct(SCENE.query, SCENE.references)
+
+    class LookingBack(FakeNetwork):
+        def reconstruct(
+            self, query: View, references: Sequence[PosedView], correspondences: Correspondences | None = None
+        ) -> Reconstruction:
+            pose = self.world_from_local.inverse().transform_pose(turned.world_from_query)
+            return replace(true, query=replace(true.query, local_from_camera=pose))
+
+    answer = answer_of(Pipeline(LookingBack(SCENE), MATCHER))
+    assert reason_of(answer) is RejectionReason.PNP_FAILED
+
+
+def test_pipelines_are_made_by_name() -> None:
+    assert make_pipeline("geometric").reconstructor.name == "geometric"
+    with pytest.raises(ValueError, match="unknown backend 'magic'"):
+        make_pipeline("magic")
