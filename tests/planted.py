@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scenes import SyntheticScene
 
-from mapless.geometry import Array, RigidTransform, Similarity
+from mapless.geometry import RigidTransform, Similarity
 from mapless_server.correspond import Correspondences, Matches
 from mapless_server.match import PointMatches
 from mapless_server.scale import MetricScale, ScaleStage
@@ -64,8 +64,3 @@ def metric_scale(world_from_local: Similarity, world_from_query: RigidTransform)
 def moved_references(references: tuple[PosedView, ...], world: RigidTransform) -> tuple[PosedView, ...]:
     """The same references, told in another world frame; with keys of their own, as different references have."""
     return tuple(PosedView(f"{r.key}-moved", r.name, r.view, world.compose(r.world_from_camera)) for r in references)
-
-
-def shifted(pose: RigidTransform, metres: Array) -> RigidTransform:
-    """The pose with its origin elsewhere."""
-    return RigidTransform(pose.rotation, pose.translation + metres)

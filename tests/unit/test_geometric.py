@@ -143,7 +143,7 @@ def test_references_that_share_nothing_are_of_no_use() -> None:
 def test_a_query_that_matches_nothing_has_no_overlap() -> None:
     scene = make_scene(random_for("matches nothing"), EXACT)
     correspondences = true_correspondences(scene)
-    for kept in (0, 3, 4, 5):
+    for kept in (0, 1, 3):
         few = tuple(m[:kept] for m in correspondences.query_matches[:1])
         none = tuple(m[:0] for m in correspondences.query_matches[1:])
         rejection = rejection_of(scene.query, scene.references, replace(correspondences, query_matches=few + none))

@@ -180,6 +180,11 @@ def test_translation_is_the_source_origin(transform: RigidTransform) -> None:
     np.testing.assert_array_equal(transform.apply(np.zeros(3)), transform.translation)
 
 
+@given(rigid, point, point)
+def test_shifted_moves_the_target_frame(transform: RigidTransform, offset: Array, x: Array) -> None:
+    np.testing.assert_allclose(transform.shifted(offset).apply(x), transform.apply(x) + offset, atol=1e-10)
+
+
 @given(similarity, point)
 def test_similarity_is_its_matrix(transform: Similarity, x: Array) -> None:
     expected = transform.scale * transform.rotation @ x + transform.translation

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from compare import assert_pose_close, pose_error
 from fake_network import FakeNetwork, FakeNetworkOptions
-from planted import moved_references, shifted
+from planted import moved_references
 from scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
@@ -230,6 +230,15 @@ def test_the_answer_moves_with_the_world(variant: Variant) -> None:
         np.testing.assert_allclose(there.covariance, expected, atol=0.01 * np.abs(expected).max())
 
 
+def test_coordinates_of_millions_of_metres_cost_no_accuracy() -> None:
+    moved = RigidTransform(np.eye(3), np.array([4_000_000.0, -3_000_000.0, 2_000_000.0]))
+    for variant in Variant:
+        options = LocalizeOptions(variant)
+        there = localize(SCENE.query, moved_references(SCENE.references, moved), pipeline_of("geometric"), options)
+        here = pose_of(answer_of(pipeline_of("geometric"), options)).world_from_camera
+        assert_pose_close(pose_of(there).world_from_camera, moved.compose(here), metres=1e-3, degrees=1e-3)
+
+
 def test_the_order_of_references_hardly_matters_to_our_form() -> None:
     answers = [
         pose_of(localize(SCENE.query, references, pipeline_of("geometric"), LocalizeOptions()))
@@ -245,13 +254,11 @@ def test_the_order_of_references_hardly_matters_to_our_form() -> None:
 def test_the_initial_pose_stays_when_refinement_explains_less(
     monkeypatch: pytest.MonkeyPatch, variant: Variant
 ) -> None:
-    worse = shifted(SCENE.world_from_query, np.array([0.2, 0.0, 0.0]))
-    monkeypatch.setattr(pnp, "ransac", lambda *_: worse)
-    answer = answer_of(pipeline_of("network"), LocalizeOptions(variant))
-    found = pose_of(answer)
+    monkeypatch.setattr(pnp, "ransac", lambda *_: RigidTransform.identity())
+    found = pose_of(answer_of(pipeline_of("network"), LocalizeOptions(variant)))
     assert found.pose_stage is PoseStage.INITIAL
-    assert answer.scale is not None
-    np.testing.assert_array_equal(found.world_from_camera.matrix(), answer.scale.world_from_query.matrix())
+    coarse = pose_of(answer_of(pipeline_of("network"), LocalizeOptions(Variant.COARSE)))
+    np.testing.assert_array_equal(found.world_from_camera.matrix(), coarse.world_from_camera.matrix())
 
 
 def test_refinement_wins_when_it_explains_more() -> None:
@@ -348,22 +355,27 @@ def test_gate(seed: int) -> None:
     assert reason_of(answer) is RejectionReason.GATE
 
 
+@dataclass(frozen=True)
+class NetworkLookingBack:
+    """A network that is right but for the query, which it turns around."""
+
+    network: FakeNetwork
+    name: str = "looking back"
+    weights_sha256: str = ""
+
+    def reconstruct(
+        self, query: View, references: Sequence[PosedView], correspondences: Correspondences
+    ) -> Reconstruction:
+        true = self.network.reconstruct(query, references, correspondences)
+        turned = true.query.local_from_camera.compose(RigidTransform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)))
+        return replace(true, query=replace(true.query, local_from_camera=turned))
+
+
 def test_pnp_failed(monkeypatch: pytest.MonkeyPatch) -> None:
-    behind = SCENE.world_from_query.compose(RigidTransform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)))
     monkeypatch.setattr(pnp, "ransac", lambda *_: None)
-    turned = replace(SCENE, world_from_query=behind)
-    network = FakeNetwork(SCENE)
-    true = network.reconstruct(SCENE.query, SCENE.references)
-
-    class LookingBack(FakeNetwork):
-        def reconstruct(
-            self, query: View, references: Sequence[PosedView], correspondences: Correspondences | None = None
-        ) -> Reconstruction:
-            pose = self.world_from_local.inverse().transform_pose(turned.world_from_query)
-            return replace(true, query=replace(true.query, local_from_camera=pose))
-
-    answer = answer_of(Pipeline(LookingBack(SCENE), MATCHER))
+    answer = answer_of(Pipeline(NetworkLookingBack(FakeNetwork(SCENE)), MATCHER))
     assert reason_of(answer) is RejectionReason.PNP_FAILED
+    assert list(answer.stage_seconds)[-1] == "pnp"
 
 
 def test_pipelines_are_made_by_name() -> None:

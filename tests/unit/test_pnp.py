@@ -11,7 +11,7 @@ import poselib
 import pytest
 from compare import assert_pose_close
 from jacobians import assert_jacobian, finite_differences
-from planted import shifted, true_structure
+from planted import true_structure
 from scenes import CAMERA, SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
@@ -80,7 +80,7 @@ def rejection_of(problem: Problem, initial: RigidTransform = POSE, options: PnpO
 def test_the_planted_pose_is_found(outlier_share: float, initial_off_m: float) -> None:
     for seed in range(5):
         problem = planted(random_for("planted", outlier_share, seed), 200, 0.5, outlier_share)
-        estimate = solve(problem, shifted(POSE, np.array([initial_off_m, 0.0, 0.0])))
+        estimate = solve(problem, POSE.shifted(np.array([initial_off_m, 0.0, 0.0])))
         assert_pose_close(estimate.world_from_camera, POSE, metres=0.01, degrees=0.15)
         assert estimate.stage is PoseStage.REFINED
         right = np.arange(200) >= outlier_share * 200
@@ -135,8 +135,8 @@ def test_the_pose_with_more_inliers_is_kept(
     monkeypatch: pytest.MonkeyPatch, refined_off_m: float | None, initial_off_m: float, stage: PoseStage
 ) -> None:
     shift = np.array([1.0, 0.0, 0.0])
-    with_solver(monkeypatch, None if refined_off_m is None else shifted(POSE, refined_off_m * shift))
-    estimate = solve(planted(random_for("stage"), 100), shifted(POSE, initial_off_m * shift))
+    with_solver(monkeypatch, None if refined_off_m is None else POSE.shifted(refined_off_m * shift))
+    estimate = solve(planted(random_for("stage"), 100), POSE.shifted(initial_off_m * shift))
     assert estimate.stage is stage
     assert_pose_close(estimate.world_from_camera, POSE, metres=0, degrees=1e-6)
     assert estimate.inliers.sum() == 100
@@ -165,7 +165,7 @@ def at_one_point(count: int) -> Problem:
 @pytest.mark.parametrize("count", [6, 40, 400])
 def test_degenerate_points_are_rejected(count: int) -> None:
     for problem in (on_a_line(count), at_one_point(count)):
-        for initial in (POSE, shifted(POSE, np.array([3.0, 1.0, 0.0]))):
+        for initial in (POSE, POSE.shifted(np.array([3.0, 1.0, 0.0]))):
             assert rejection_of(problem, initial).reason in {RejectionReason.PNP_FAILED, RejectionReason.GATE}
 
 
