@@ -37,7 +37,7 @@ class NewReference:
         camera: in pixels of that image.
         world_from_camera: its pose, metric.
         view: processed camera and features; float32 arrays.
-        extractor: name of what computed the features, "sift-2048-1024px".
+        extractor: name of what computed the features, "sift-2048-1024px-0.02".
     """
 
     reference_id: str
