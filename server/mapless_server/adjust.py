@@ -39,6 +39,7 @@ class AdjustOptions:
             reference's points go together, which the sum over residuals does not know; on scenes with known poses true
             errors were 1.5 to 2.8 times what it says.
         inlier_px: as of the pose solver; the inliers of the answer are those of its own pose.
+        min_kept_share: an adjustment that loses more of the inliers has run off, and is not answered.
         max_error_px: matches further from the pose found so far take no part.
         iterations: at most so many Levenberg-Marquardt steps.
         min_decrease: stop when a step lowers the cost by a smaller share.
@@ -48,6 +49,7 @@ class AdjustOptions:
     prior_share: float = 0.2
     error_inflation: float = 2.0
     inlier_px: float = 4.0
+    min_kept_share: float = 0.8
     max_error_px: float = 8.0
     iterations: int = 8
     min_decrease: float = 1e-5
@@ -55,6 +57,7 @@ class AdjustOptions:
     def __post_init__(self) -> None:
         positive = (
             self.inlier_px,
+            self.min_kept_share,
             self.loss_scale_sigma,
             self.prior_share,
             self.max_error_px,
@@ -218,6 +221,8 @@ def adjust_pose(
     errors_px = reprojection_errors_px(query.camera, pose, points[matches.point], pixels)
     covariance = options.error_inflation**2 * world_covariance(hessian, pose)
     inliers = errors_px < options.inlier_px
+    if inliers.sum() < options.min_kept_share * estimate.inliers.sum():
+        return estimate
     return replace(estimate, world_from_camera=pose, inliers=inliers, errors_px=errors_px, covariance=covariance)
 
 
