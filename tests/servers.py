@@ -82,7 +82,12 @@ class StandInMethod:
     call_count: int = 0
 
     def __call__(
-        self, query: View, references: Sequence[PosedView], pipeline: Pipeline, options: LocalizeOptions
+        self,
+        query: View,
+        references: Sequence[PosedView],
+        pipeline: Pipeline,
+        options: LocalizeOptions,
+        check: Callable[[], None],
     ) -> Answer:
         self.call_count += 1
         self.started.release()

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 
 from .match import PointMatches
-from .pnp import PoseEstimate, motion_jacobian, reprojection_errors_px, world_covariance
+from .pnp import PoseEstimate, PoseStage, motion_jacobian, reprojection_errors_px, world_covariance
 from .structure import Observations, Structure, invert_symmetric, observe
 from .tracks import Tracks
 from .views import PosedView, View
@@ -223,7 +223,7 @@ def adjust_pose(
     inliers = errors_px < options.inlier_px
     if inliers.sum() < options.min_kept_share * estimate.inliers.sum():
         return estimate
-    return replace(estimate, world_from_camera=pose, inliers=inliers, errors_px=errors_px, covariance=covariance)
+    return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, covariance)
 
 
 def _minimize(problem: _Problem, state: _State, options: AdjustOptions) -> tuple[_State, _NormalEquations]:

@@ -165,11 +165,10 @@ def bench_command(
 def _configure_libraries(settings: Settings) -> None:
     """Sets what libraries read from the environment once, when they are imported; what is set already stays."""
     environment = {
-        # A call computes in one thread, and calls run side by side. The matrices are small, and BLAS threads wait for
-        # one another in a busy loop: with two, on two cores of which one was taken, a call took 1.9 s instead of 0.4.
+        # Calls run side by side, and matching shares out its own work. The matrices are small, and BLAS threads wait
+        # for one another in a busy loop: with two, on two cores of which one was taken, a call took 1.9 s, not 0.4.
         "OPENBLAS_NUM_THREADS": "1",
         "MKL_NUM_THREADS": "1",
-        "OPENCV_FOR_THREADS_NUM": "1",
         # Stands behind our own reading of headers.
         "OPENCV_IO_MAX_IMAGE_PIXELS": str(round(settings.max_image_megapixels * 1_000_000)),
         # What is wrong with a file or an address, we say ourselves.

@@ -11,9 +11,8 @@ serves queries that are lost otherwise.
 
 from __future__ import annotations
 
-import os
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations
@@ -73,22 +72,44 @@ class Correspondences:
 class Matcher:
     """Matches views; remembers pairs of references. Safe to use from several threads.
 
-    A query's pairs are shared out over all cores: alone it is answered in half the time on two, and among others it
-    takes no more of the machine, because every product is computed by one thread.
+    A query's pairs are shared out over `threads`: alone it is answered in half the time on two, and among others it
+    takes no more processor time, because every product is computed by one thread.
     """
 
-    def __init__(self, options: CorrespondOptions | None = None) -> None:
+    def __init__(self, options: CorrespondOptions | None = None, threads: int = 1) -> None:
         self.options = options or CorrespondOptions()
-        self._pool = ThreadPoolExecutor(os.cpu_count(), "match")
+        self._pool = ThreadPoolExecutor(threads, "match")
         self._remembered: OrderedDict[tuple[str, str, bool], Matches] = OrderedDict()
         self._lock = Lock()
 
-    def correspond(self, query: View, references: Sequence[PosedView], wide: bool = False) -> Correspondences:
-        """Matches between all pairs of references, widely if so asked, and between the query and each."""
+    def correspond(
+        self,
+        query: View,
+        references: Sequence[PosedView],
+        wide: bool = False,
+        check: Callable[[], None] = lambda: None,
+    ) -> Correspondences:
+        """Matches between all pairs of references, widely if so asked, and between the query and each.
+
+        Calls `check` before each pair, and lets what it raises through.
+        """
+
+        def of_query(reference: PosedView) -> Matches:
+            check()
+            return self.match_query(query, reference)
+
+        def of_pair(pair: tuple[int, int]) -> Matches:
+            check()
+            return self.match_references(references[pair[0]], references[pair[1]], wide)
+
         pairs = list(combinations(range(len(references)), 2))
-        of_query = self._pool.map(lambda reference: self.match_query(query, reference), references)
-        of_pairs = self._pool.map(lambda ij: self.match_references(references[ij[0]], references[ij[1]], wide), pairs)
-        return Correspondences(dict(zip(pairs, of_pairs, strict=True)), tuple(of_query))
+        query_matches = self._pool.map(of_query, references)
+        pair_matches = self._pool.map(of_pair, pairs)
+        return Correspondences(dict(zip(pairs, pair_matches, strict=True)), tuple(query_matches))
+
+    def close(self) -> None:
+        """Ends the threads."""
+        self._pool.shutdown()
 
     def match_query(self, query: View, reference: PosedView) -> Matches:
         """Matches (query keypoint, reference keypoint)."""

@@ -10,6 +10,7 @@ sensor.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import cv2
@@ -22,6 +23,7 @@ from .errors import InvalidArgument
 # keeps the high byte of 16, drops alpha, repeats grey and converts CMYK.
 _DECODE_FLAGS = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 _MAX_JPEG_SEGMENTS = 2000  # 64 KiB each; bounds the walk through a file of nothing but empty ones
+_JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd9-\xfe]", re.DOTALL)
 _MAX_JPEG_SCANS = 100  # a progressive file has about ten; thousands make a small file decode for minutes
 
 # Start-of-frame markers: C0 to CF without DHT (C4), JPG (C8) and DAC (CC).
@@ -89,8 +91,7 @@ def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDAr
         InvalidArgument: what `image_size` refuses, or the decoder cannot read the file to its end; names `field`.
     """
     width, height = image_size(data, limits, field)
-    # Within a scan's data FF is always followed by 00 or a restart marker: this counts scans, and those of thumbnails.
-    if data.startswith(b"\xff\xd8") and data.count(b"\xff\xda") > _MAX_JPEG_SCANS:
+    if data.startswith(b"\xff\xd8") and _has_many_scans(data):
         raise InvalidArgument("the JPEG has too many scans", reason="IMAGE_TOO_COMPLEX", field=field)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), _DECODE_FLAGS)
@@ -107,6 +108,19 @@ def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDAr
             field=field,
         )
     return np.asarray(pixels, np.uint8)
+
+
+def _has_many_scans(data: bytes) -> bool:
+    """Whether a JPEG has more than _MAX_JPEG_SCANS, read from marker to marker up to the end of its image."""
+    position, scans = 2, 0
+    while scans <= _MAX_JPEG_SCANS:
+        # Within a scan's data FF is always followed by 00 or a restart marker.
+        marker = _JPEG_MARKER.search(data, position)
+        if marker is None or marker[0][-1] == 0xD9:
+            return False
+        scans += marker[0][-1] == 0xDA
+        position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
+    return True
 
 
 class _Malformed(Exception):

@@ -29,7 +29,7 @@ from .store import SceneSnapshot, Store
 from .views import PosedView, View
 
 T = TypeVar("T")
-Localize = Callable[[View, Sequence[PosedView], Pipeline, LocalizeOptions], Answer]
+Localize = Callable[[View, Sequence[PosedView], Pipeline, LocalizeOptions, Callable[[], None]], Answer]
 
 PRIOR_MARGIN_M = 10.0
 """References further from a prior's sphere than this are not considered: they see other things."""
@@ -150,6 +150,7 @@ class Engine:
         self._store = store
         self._localize_views = localize
         self._pool = ThreadPoolExecutor(options.workers, thread_name_prefix="engine")
+        self._turns: set[_Turn] = set()
         self._admitted_count = 0
         self._typical_call_s = 1.0
 
@@ -188,8 +189,11 @@ class Engine:
                 await asyncio.gather(*tasks, return_exceptions=True)
 
     def close(self) -> None:
-        """Waits for what is being computed; what waits is dropped."""
+        """Ends what is being computed at its next step, and drops what waits."""
+        for turn in list(self._turns):
+            turn.abandoned.set()
         self._pool.shutdown(wait=True, cancel_futures=True)
+        self.pipeline.matcher.close()
 
     @contextmanager
     def _place(self) -> Iterator[None]:
@@ -209,11 +213,13 @@ class Engine:
 
     async def _run(self, work: Callable[[_Turn], T], deadline_s: float) -> T:
         turn = _Turn(deadline_s)
+        self._turns.add(turn)
         try:
             # Cancelling the wrapper takes work that has not begun out of the pool's queue.
             return await asyncio.wrap_future(self._pool.submit(work, turn))
         finally:
             turn.abandoned.set()
+            self._turns.discard(turn)
 
     def _extract(self, photo: Photo, turn: _Turn) -> View:
         with turn.stage("decode"):
@@ -233,7 +239,7 @@ class Engine:
             references = tuple(references[i] for i in chosen)
         turn.check()
         if references:
-            answer = self._localize_views(view, references, self.pipeline, query.options)
+            answer = self._localize_views(view, references, self.pipeline, query.options, turn.check)
         else:
             where = "the scene has no references" if query.prior is None else "no reference is near the position prior"
             answer = Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, where), None)

@@ -134,11 +134,13 @@ def undistort_pixels(pixels: Array, camera: Camera) -> Array:
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
     points = np.ascontiguousarray(pixels, np.float64)[:, None]
     if isinstance(d, RadialTangential):
-        coefficients = np.array([d.k1, d.k2, d.p1, d.p2, d.k3])
+        coefficients = np.array([d.k1, d.k2, d.p1, d.p2, d.k3], float)
         ideal = cv2.undistortPoints(points, k, coefficients, R=None, P=k, criteria=criteria).reshape(-1, 2)
     else:
         assert isinstance(d, Fisheye)
-        ideal = cv2.fisheye.undistortPoints(points, k, np.array([d.k1, d.k2, d.k3, d.k4]), P=k, criteria=criteria)[:, 0]
+        ideal = cv2.fisheye.undistortPoints(
+            points, k, np.array([d.k1, d.k2, d.k3, d.k4], float), P=k, criteria=criteria
+        )[:, 0]
     # The iteration may run off where the model folds over; what does not come back to where it started is no solution.
     rays = camera.rays(ideal)
     returned = camera.project(rays)

@@ -9,7 +9,7 @@ This module knows nothing of grpc, queues or storage.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -131,14 +131,18 @@ class Pipeline:
     matcher: Matcher = field(default_factory=Matcher)
 
 
-def make_pipeline(backend: str) -> Pipeline:
+def make_pipeline(backend: str, matching_threads: int = 1) -> Pipeline:
     """The pipeline that a setting names.
+
+    Args:
+        backend: of the coarse stage.
+        matching_threads: see Matcher.
 
     Raises:
         ValueError: unknown name.
     """
     if backend == "geometric":
-        return Pipeline()
+        return Pipeline(matcher=Matcher(threads=matching_threads))
     raise ValueError(f"unknown backend {backend!r}; known: geometric")
 
 
@@ -147,6 +151,7 @@ class _Progress:
     """What is known of an answer while its stages run."""
 
     reference_count: int
+    check: Callable[[], None]
     stage_seconds: dict[str, float] = field(default_factory=dict)
     correspondences: Correspondences | None = None
     scale: MetricScale | None = None
@@ -154,6 +159,7 @@ class _Progress:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
+        self.check()
         start_s = time.perf_counter()
         try:
             yield
@@ -166,7 +172,13 @@ class _Progress:
         return Answer(outcome, self.scale, self.stage_seconds, matches, self.inlier_counts or none)
 
 
-def localize(query: View, references: Sequence[PosedView], pipeline: Pipeline, options: LocalizeOptions) -> Answer:
+def localize(
+    query: View,
+    references: Sequence[PosedView],
+    pipeline: Pipeline,
+    options: LocalizeOptions,
+    check: Callable[[], None] = lambda: None,
+) -> Answer:
     """Localizes a query among posed references.
 
     Args:
@@ -174,6 +186,7 @@ def localize(query: View, references: Sequence[PosedView], pipeline: Pipeline, o
         references: the most similar first.
         pipeline: what to run on.
         options: see there.
+        check: called between the steps; raises when nobody wants the answer any more.
 
     Returns:
         The answer; "no pose" is one, with the first stage that could not do its work.
@@ -187,9 +200,10 @@ def localize(query: View, references: Sequence[PosedView], pipeline: Pipeline, o
     # World coordinates may be millions of metres (UTM, ECEF), too long for the digits of differences of squares.
     origin = references[0].world_from_camera.translation
     nearby = [replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references]
-    answer = _attempt(query, nearby, pipeline, options, {}, wide=False)
-    if options.variant is Variant.BEST and _inlier_count(answer) < options.weak_inliers:
-        wide = _attempt(query, nearby, pipeline, options, dict(answer.stage_seconds), wide=True)
+    answer = _attempt(query, nearby, pipeline, options, _Progress(len(references), check), wide=False)
+    if options.variant is Variant.BEST and _is_weak(answer, options) and len(references) > 1:
+        progress = _Progress(len(references), check, dict(answer.stage_seconds))
+        wide = _attempt(query, nearby, pipeline, options, progress, wide=True)
         better = wide if _inlier_count(wide) > _inlier_count(answer) else answer
         answer = replace(better, stage_seconds=wide.stage_seconds)
     return _shifted(answer, origin)
@@ -208,6 +222,13 @@ def _shifted(answer: Answer, offset: Array) -> Answer:
     return replace(answer, outcome=outcome, scale=scale)
 
 
+def _is_weak(answer: Answer, options: LocalizeOptions) -> bool:
+    """Whether wide correspondences could make the answer better."""
+    if isinstance(answer.outcome, Rejection):
+        return answer.outcome.reason is not RejectionReason.DEGENERATE_REFERENCES
+    return answer.outcome.inlier_count < options.weak_inliers
+
+
 def _inlier_count(answer: Answer) -> int:
     return answer.outcome.inlier_count if isinstance(answer.outcome, Localization) else 0
 
@@ -217,10 +238,9 @@ def _attempt(
     references: Sequence[PosedView],
     pipeline: Pipeline,
     options: LocalizeOptions,
-    stage_seconds: dict[str, float],
+    progress: _Progress,
     wide: bool,
 ) -> Answer:
-    progress = _Progress(len(references), stage_seconds)
     return progress.answer(_stages(query, references, pipeline, options, progress, wide))
 
 
@@ -233,7 +253,7 @@ def _stages(
     wide: bool,
 ) -> Localization | Rejection:
     with progress.stage("correspond"):
-        correspondences = pipeline.matcher.correspond(query, references, wide)
+        correspondences = pipeline.matcher.correspond(query, references, wide, progress.check)
         progress.correspondences = correspondences
     with progress.stage("coarse"):
         reconstruction = pipeline.reconstructor.reconstruct(query, references, correspondences)

@@ -47,6 +47,8 @@ class PnpOptions:
             from wrong matches.
         min_found_share: least share of the points inside the image that are inliers. Of 200 photographs posed rightly,
             hard ones among them, the worst had 0.10; of those posed wrongly by chance or repetition most had 0.01.
+        enough_inliers: so many are believed whatever else should be visible: with many references the structure reaches
+            far beyond what one photograph can show. Repetition has fooled no more than 23.
         min_hull_share: least share of the image that the inliers' convex hull covers. On the same photographs the worst
             right one had 0.08; a repeated floor tile that fooled 16 matches had 0.03.
     """
@@ -59,6 +61,7 @@ class PnpOptions:
     min_matches: int = 6
     max_log10_false_alarms: float = -3.0
     min_found_share: float = 0.08
+    enough_inliers: int = 100
     min_hull_share: float = 0.04
 
     def __post_init__(self) -> None:
@@ -192,7 +195,7 @@ def doubts(
     size = np.array([query.camera.width_px, query.camera.height_px])
     projected = query.camera.project(world_from_camera.inverse().apply(structure.x_in_world))
     visible = int(((projected >= -0.5) & (projected < size - 0.5)).all(axis=1).sum())
-    if inliers.sum() < options.min_found_share * visible:
+    if inliers.sum() < min(options.min_found_share * visible, options.enough_inliers):
         return f"{count}, but it should show {visible} points: repeated structure somewhere else, most likely"
     pixels = query.features.keypoints[matches.keypoint[inliers]]
     hull_share = ConvexHull(pixels, qhull_options="QJ").volume / size.prod()

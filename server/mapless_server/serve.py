@@ -27,7 +27,7 @@ from .localize import make_pipeline
 from .reference_service import ReferenceService
 from .rpc import CallInterceptor
 from .service import LocalizationService
-from .settings import Settings
+from .settings import Settings, available_cores
 from .store import Store, StoreError
 
 log = logging.getLogger(__name__)
@@ -66,7 +66,8 @@ def make_engine(settings: Settings, store: Store) -> Engine:
         image_limits=image_limits(settings),
     )
     try:
-        return Engine(store, make_extractor(settings.features), make_pipeline(settings.backend), options)
+        pipeline = make_pipeline(settings.backend, matching_threads=available_cores())
+        return Engine(store, make_extractor(settings.features), pipeline, options)
     except ValueError as error:
         raise StartupError(str(error)) from error
 

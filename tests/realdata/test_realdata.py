@@ -39,7 +39,9 @@ def ignore(step: str, done: int, total: int) -> None:
     [
         ("fountain-P11", None, None, 0.24, 0.020),
         ("herz-jesus-P8", None, None, 0.45, 0.020),
+        (KITCHEN, 30, None, 0.19, 0.065),
         (KITCHEN, 10, 15, 0.45, 0.13),
+        ("kitti-drive-a", None, None, 1.15, 0.035),
         (OFFICE, None, None, 0.50, 0.21),
     ],
 )

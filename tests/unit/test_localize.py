@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -183,9 +183,11 @@ def test_a_weak_answer_is_computed_again_from_wide_correspondences(monkeypatch: 
     asked: list[bool] = []
     correspond = Matcher.correspond
 
-    def spy(self: Matcher, query: View, references: Sequence[PosedView], wide: bool = False) -> Correspondences:
+    def spy(
+        self: Matcher, query: View, references: Sequence[PosedView], wide: bool, check: Callable[[], None]
+    ) -> Correspondences:
         asked.append(wide)
-        return correspond(self, query, references, wide)
+        return correspond(self, query, references, wide, check)
 
     monkeypatch.setattr(Matcher, "correspond", spy)
     strong = pose_of(answer_of(pipeline_of("geometric"), LocalizeOptions(weak_inliers=10)))
@@ -200,6 +202,31 @@ def test_a_weak_answer_is_computed_again_from_wide_correspondences(monkeypatch: 
         asked.clear()
         answer_of(pipeline_of("geometric"), LocalizeOptions(variant, weak_inliers=10**6))
         assert asked == [False]
+
+
+class NobodyWaits(Exception):
+    """What a check raises."""
+
+
+@pytest.mark.parametrize("steps", [0, 1, 10, 20])
+def test_work_stops_at_the_next_step_when_nobody_waits(steps: int) -> None:
+    asked = iter(range(steps))
+
+    def check() -> None:
+        if next(asked, None) is None:
+            raise NobodyWaits
+
+    with pytest.raises(NobodyWaits):
+        localize(SCENE.query, SCENE.references, Pipeline(), LocalizeOptions(), check)
+
+
+@pytest.mark.parametrize("metres", [1e6, 1e7])
+def test_coordinates_of_millions_of_metres_cost_no_digits(metres: float) -> None:
+    offset = np.array([metres, -metres, 1e3])
+    far = moved_references(SCENE.references, RigidTransform(np.eye(3), offset))
+    near_pose = pose_of(localize(SCENE.query, SCENE.references, Pipeline(), LocalizeOptions())).world_from_camera
+    far_pose = pose_of(localize(SCENE.query, far, Pipeline(), LocalizeOptions())).world_from_camera
+    np.testing.assert_allclose(far_pose.translation - offset, near_pose.translation, rtol=0, atol=1e-6)
 
 
 # What must not matter
