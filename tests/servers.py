@@ -138,7 +138,7 @@ def serving(data_dir: Path, **options: Any) -> Iterator[RunningServer]:
         max_candidates=settings.retrieval_max_references,
         image_limits=ImageLimits(),
     )
-    pipeline = Pipeline(cast(Any, StandInReconstructor()), cast(Any, None))
+    pipeline = Pipeline(cast(Any, StandInReconstructor()))
     engine = Engine(store, extractor, pipeline, engine_options, localize=method)
     address: Future[str] = Future()
     loop = asyncio.new_event_loop()
