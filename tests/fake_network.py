@@ -96,6 +96,7 @@ class FakeNetwork:
         depth_m = self._spoil_depths(random, depth_m)
         point_map = self._scatter(view, view.features.keypoints[known], depth_m / self.world_from_local.scale)
         return ReconstructedView(
+            view.camera.resized(self._options.map_width_px, self._options.map_height_px),
             point_map.astype(np.float32),
             np.where(np.isfinite(point_map[..., 2]), confidence, 0.0).astype(np.float32),
             self.world_from_local.inverse().transform_pose(self._spoil_pose(random, world_from_camera, offset_m)),

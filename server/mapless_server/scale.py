@@ -197,8 +197,7 @@ class _Candidate:
 
 def _depths_at_keypoints(prediction: ReconstructedView, reference: PosedView) -> Array:
     """Predicted depth (N,) at each keypoint of a reference, reconstruction units; NaN where there is none."""
-    camera = reference.view.camera
-    depth = prediction.depth_at(reference.view.features.keypoints, camera.width_px, camera.height_px)
+    depth = prediction.depth_at(reference.view.features.keypoints, reference.view.camera)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
 
 

@@ -241,7 +241,7 @@ def predicted_points(
         reference, mine = references[index], np.flatnonzero(first_view == index)
         camera = reference.view.camera
         pixels = reference.view.features.keypoints[first_keypoint[mine]]
-        depth = reconstruction.references[index].depth_at(pixels, camera.width_px, camera.height_px)
+        depth = reconstruction.references[index].depth_at(pixels, camera)
         x_in_camera = camera.rays(pixels) * (scale.metres_per_unit * depth)[:, None]
         points[mine] = reference.world_from_camera.apply(x_in_camera)
     return points

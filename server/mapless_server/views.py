@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,16 +37,33 @@ class Features:
 
 
 @dataclass(frozen=True, eq=False)
+class Photograph:
+    """The picture behind a view, for whoever looks at pixels. Reading it may mean a database and a decoder.
+
+    Attributes:
+        sha256: of the encoded image, hexadecimal; what caches of anything computed from the pixels are keyed by.
+        camera: in pixels of the picture, with its lens distortion.
+        read: gives the pixels, (H, W, 3) uint8 RGB, of the camera's size.
+    """
+
+    sha256: str
+    camera: Camera
+    read: Callable[[], NDArray[np.uint8]]
+
+
+@dataclass(frozen=True, eq=False)
 class View:
     """A photograph as the pipeline sees it: processed size, no distortion.
 
     Attributes:
         camera: pinhole, in pixels of the processed (reduced) image.
         features: in the same pixels.
+        photograph: the picture itself; None where nothing looks at it.
     """
 
     camera: Camera
     features: Features
+    photograph: Photograph | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,7 +47,7 @@ def world_from_local(scene: SyntheticScene, reconstruction: Reconstruction) -> S
 
 
 def depths_at_keypoints(part: ReconstructedView, view: View) -> Array:
-    return part.depth_at(view.features.keypoints, view.camera.width_px, view.camera.height_px)
+    return part.depth_at(view.features.keypoints, view.camera)
 
 
 def test_poses_and_depths_are_the_truth_at_one_common_scale() -> None:

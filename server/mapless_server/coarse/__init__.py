@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import RigidTransform, resized_pixel
+from mapless.geometry import Camera, RigidTransform
 
 from ..correspond import Correspondences
 from ..rejection import Rejection
@@ -24,35 +24,35 @@ from ..views import PosedView, View
 class ReconstructedView:
     """One view's part of a reconstruction.
 
-    Its maps may be smaller than the view's image; pixel centres correspond as in resizing.
-
     Attributes:
+        camera: pinhole, in pixels of the maps below; the view's own camera, moved and scaled along the axes.
         point_map: (H, W, 3) float32, the point seen at each pixel, in this camera's frame, up to the common scale; NaN
             where unknown.
         confidence: (H, W) float32, 0 to 1; 0 where unknown.
         local_from_camera: the camera's pose in the reconstruction's frame, up to the common scale.
     """
 
+    camera: Camera
     point_map: NDArray[np.float32]
     confidence: NDArray[np.float32]
     local_from_camera: RigidTransform
 
-    def depth_at(self, pixels: NDArray[np.floating], width_px: int, height_px: int) -> NDArray[np.float64]:
-        """Depth (N,) at pixels (N, 2) of the view's image of the given size, nearest neighbour; NaN where unknown."""
-        rows, columns = self.cells(pixels, width_px, height_px)
-        return np.asarray(self.point_map[rows, columns, 2], np.float64)
+    def depth_at(self, pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.float64]:
+        """Depth (N,) at pixels (N, 2) of the view's camera, nearest neighbour; NaN where unknown."""
+        rows, columns, inside = self.cells(pixels, camera)
+        depth = np.full(len(pixels), np.nan)
+        depth[inside] = self.point_map[rows[inside], columns[inside], 2]
+        return depth
 
     def cells(
-        self, pixels: NDArray[np.floating], width_px: int, height_px: int
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows and columns (N,) of the maps' cells that hold pixels (N, 2) of the view's image."""
+        self, pixels: NDArray[np.floating], camera: Camera
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
+        """Rows and columns (N,) of the maps' cells that hold pixels (N, 2) of the view's camera, and which exist."""
+        mapped = np.rint(self.camera.project(camera.rays(pixels)))
         height, width = self.confidence.shape
-        columns = resized_pixel(pixels[:, 0], width / width_px)
-        rows = resized_pixel(pixels[:, 1], height / height_px)
-        return (
-            np.clip(np.rint(rows), 0, height - 1).astype(np.intp),
-            np.clip(np.rint(columns), 0, width - 1).astype(np.intp),
-        )
+        inside = np.asarray(((mapped >= 0) & (mapped < (width, height))).all(axis=1))
+        columns, rows = np.where(inside[:, None], mapped, 0).astype(np.intp).T
+        return rows, columns, inside
 
 
 @dataclass(frozen=True, eq=False)

@@ -134,13 +134,15 @@ class GeometricReconstructor:
     ) -> ReconstructedView:
         shape = (-(-view.camera.height_px // self.options.cell_px), -(-view.camera.width_px // self.options.cell_px))
         maps = ReconstructedView(
+            view.camera.resized(shape[1], shape[0]),
             np.full((*shape, 3), np.nan, np.float32),
             np.zeros(shape, np.float32),
             local_from_world.transform_pose(world_from_camera),
         )
-        rows, columns = maps.cells(pixels, view.camera.width_px, view.camera.height_px)
-        maps.point_map[rows, columns] = local_from_world.scale * world_from_camera.inverse().apply(points)
-        maps.confidence[rows, columns] = 1.0
+        rows, columns, inside = maps.cells(pixels, view.camera)
+        x_in_camera = world_from_camera.inverse().apply(points[inside])
+        maps.point_map[rows[inside], columns[inside]] = local_from_world.scale * x_in_camera
+        maps.confidence[rows[inside], columns[inside]] = 1.0
         return maps
 
 
