@@ -1,0 +1,159 @@
+"""What Pi3X may be told beside the images: rays, depths and poses of some of the views.
+
+Poses enter through attention whose queries, keys and values are moved by the cameras (PRoPE, Li et al. 2025), among the
+views that have one; rays and depths are added to the patch tokens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from .blocks import BLOCK_EPS, Attention, LayerNorm, LayerScale, Mlp
+
+MIN_MOTION = 0.02
+"""Scenes whose views all lie nearer to the first one than this, in the caller's unit, keep their scale."""
+
+
+def rays_from_intrinsics(intrinsics: Tensor, height_px: int, width_px: int) -> Tensor:
+    """Rays (V, 2, H, W), x and y at depth 1, of the pixels' centres.
+
+    Args:
+        intrinsics: (V, 3, 3), where the top-left pixel's centre is (0.5, 0.5): half a pixel more than elsewhere here.
+        height_px: of the images.
+        width_px: of the images.
+    """
+    columns = torch.arange(width_px, device=intrinsics.device) + 0.5
+    rows = torch.arange(height_px, device=intrinsics.device) + 0.5
+    pixels = torch.stack(
+        [*torch.meshgrid(columns, rows, indexing="xy"), torch.ones_like(rows)[:, None].expand(-1, width_px)]
+    )
+    # 3x3 inverses by cofactors: a library's inverse makes the host wait.
+    rays = torch.einsum("vij,jhw->vihw", invert_small(intrinsics), pixels)
+    return rays[:, :2] / rays[:, 2:]
+
+
+def rays_from_directions(directions: Tensor) -> Tensor:
+    """The same (V, 2, H, W) from directions (V, H, W, 3)."""
+    return (directions[..., :2] / (directions[..., 2:] + 1e-6)).permute(0, 3, 1, 2)
+
+
+def invert_small(matrices: Tensor) -> Tensor:
+    """Inverses of (..., 3, 3)."""
+    a, b, c = matrices.unbind(-2)
+    adjugate = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
+    return adjugate / (a * adjugate[..., 0]).sum(-1)[..., None, None]
+
+
+def invert_poses(poses: Tensor) -> Tensor:
+    """Inverses of rigid motions (..., 4, 4)."""
+    rotation, translation = poses[..., :3, :3].mT, poses[..., :3, 3:]
+    return torch.cat([torch.cat([rotation, -rotation @ translation], dim=-1), poses[..., 3:, :]], dim=-2)
+
+
+def mean_depth(depths: Tensor) -> Tensor:
+    """Mean (B,) of the positive depths (B, N, H, W) of each scene, whether or not a view's are used; 1 without any."""
+    known = depths > 0
+    count = known.sum((1, 2, 3))
+    return torch.where(count > 0, (depths * known).sum((1, 2, 3)) / count.clamp_min(1), 1.0)
+
+
+def normalize_poses(poses: Tensor, unit: Tensor, uses_depth: Tensor) -> Tensor:
+    """Poses of each scene's views relative to its first, at a scale that the network knows.
+
+    Where depths are used, the mean depth is 1. Where none are, the mean distance of the other views from the first is;
+    of all of them, also of those whose pose is then not used (so what stands in for an unknown pose matters).
+
+    Args:
+        poses: (B, N, 4, 4) world_from_camera.
+        unit: (B,) mean depth, in the unit of the poses.
+        uses_depth: (B,) whether the depth of any view is used.
+
+    Returns:
+        (B, N, 4, 4), the first of each scene the identity.
+    """
+    relative = invert_poses(poses[:, :1]) @ poses
+    translation = relative[..., :3, 3] / (unit[:, None, None] + 1e-8)
+    if poses.shape[1] > 1:
+        distance = translation[:, 1:].norm(dim=-1)
+        moves = distance.amax(1) >= MIN_MOTION
+        scale = torch.where(moves & ~uses_depth, distance.mean(1) + 1e-8, 1.0)
+        translation = translation / scale[:, None, None]
+    normalized = relative.clone()
+    normalized[..., :3, 3] = translation
+    return normalized
+
+
+@dataclass(frozen=True, eq=False)
+class Prope:
+    """Camera-relative positions of M posed views with P patches each.
+
+    A head's first d/2 channels, four by four, are moved between cameras; the next d/4 turn with the patch's column and
+    the last d/4 with its row. Queries meet keys and values in the world of the first view; outputs return from it.
+
+    Attributes:
+        camera_from_world, world_from_camera: (B, M, 4, 4) of the views.
+        cos, sin: (P, 2, d/8); axis 1 is column and row.
+    """
+
+    camera_from_world: Tensor
+    world_from_camera: Tensor
+    cos: Tensor
+    sin: Tensor
+
+    def query(self, x: Tensor) -> Tensor:
+        """E^T q and the rotation, of (B, heads, M * P, d)."""
+        return self._apply(x, self.camera_from_world.mT, self.sin)
+
+    def key(self, x: Tensor) -> Tensor:
+        """E^-1 k, also for values."""
+        return self._apply(x, self.world_from_camera, self.sin)
+
+    def output(self, x: Tensor) -> Tensor:
+        """E o, and the rotation back."""
+        return self._apply(x, self.camera_from_world, -self.sin)
+
+    def _apply(self, x: Tensor, matrices: Tensor, sin: Tensor) -> Tensor:
+        views = matrices.shape[1]
+        moved, turned = x.float().unflatten(2, (views, -1)).chunk(2, dim=-1)  # (B, heads, M, P, d/2)
+        moved = torch.einsum("bmij,bhmpcj->bhmpci", matrices, moved.unflatten(-1, (-1, 4))).flatten(-2)
+        a, b = turned.unflatten(-1, (2, 2, -1)).unbind(-2)
+        turned = torch.stack([a * self.cos + b * sin, b * self.cos - a * sin], dim=-2).flatten(-3)
+        return torch.cat([moved, turned], dim=-1).flatten(2, 3)
+
+
+def prope(poses: Tensor, grid: tuple[int, int], head_width: int) -> Prope:
+    """Positions of views with poses (B, M, 4, 4), world_from_camera, and a grid (rows, columns) of patches."""
+    count = head_width // 8
+    frequency = 100.0 ** (-torch.arange(count, dtype=torch.float64, device=poses.device) / count)
+    rows = torch.arange(grid[0], device=poses.device)
+    columns = torch.arange(grid[1], device=poses.device)
+    row_column = torch.cartesian_prod(rows, columns)
+    angle = row_column.flip(1)[..., None] * frequency
+    return Prope(invert_poses(poses), poses, angle.cos().float(), angle.sin().float())
+
+
+class PoseInjection(nn.Module):
+    """What the posed views' patches learn from one another's cameras, to be added to them.
+
+    Attention and MLP read the same input, side by side.
+    """
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.norm1 = LayerNorm(width, eps=BLOCK_EPS)
+        self.attn = Attention(width, heads, normalize_qk=True)
+        self.ls1 = LayerScale(width)
+        self.norm2 = LayerNorm(width, eps=BLOCK_EPS)
+        self.mlp = Mlp(width)
+        self.ls2 = LayerScale(width)
+
+    def forward(self, patches: Tensor, positions: Prope) -> Tensor:
+        """Patches (B, M * P, C) of M posed views to (B, M * P, C)."""
+        q, k, v = self.attn.project(self.norm1(patches))
+        moved_v = positions.key(v).to(v.dtype)
+        attended = self.attn.attend(positions.query(q), positions.key(k), moved_v)
+        attention = self.attn.merge(positions.output(attended))
+        return self.ls1(attention) + self.ls2(self.mlp(self.norm2(patches)))

@@ -1,0 +1,74 @@
+"""The main decoder: blocks that attend within each view and over all views in turn (Wang et al. 2025, pi^3).
+
+No view is special: the network is equivariant to their order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from .blocks import Block, Rope, rope_table
+
+SPECIALS = 5
+"""Learned tokens in front of each view's patches."""
+
+Injection = Callable[[int, Tensor], Tensor]
+"""Takes the index of a block and its output (B, N, T, C), and gives what the next one gets."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """How the T = 5 + P tokens of one view lie; the same for all views of a scene. Made once for each size of images.
+
+    Attributes:
+        grid: rows and columns of patches.
+        rope: special tokens stand at (0, 0), patches at (row + 1, column + 1).
+    """
+
+    grid: tuple[int, int]
+    rope: Rope
+
+
+def make_layout(grid: tuple[int, int], head_width: int, device: torch.device) -> Layout:
+    """The layout of a grid (rows, columns) of patches."""
+    rows = torch.arange(1, grid[0] + 1, device=device)
+    columns = torch.arange(1, grid[1] + 1, device=device)
+    patches = torch.cartesian_prod(rows, columns)
+    return Layout(grid, rope_table(torch.cat([patches.new_zeros(SPECIALS, 2), patches]), head_width))
+
+
+class AlternatingDecoder(nn.ModuleList):
+    """An even number of blocks; those with an even index see one view, those with an odd one the whole scene."""
+
+    def __init__(self, width: int, heads: int, depth: int) -> None:
+        super().__init__(Block(width, heads, normalize_qk=True) for _ in range(depth))
+
+    def begin(self, tokens: Tensor, rope: Rope) -> Tensor:
+        """Block 0: tokens (V, T, C) to (V, T, C). It depends on each view alone, so its result can be kept."""
+        return self[0](tokens, rope)
+
+    def forward(self, tokens: Tensor, rope: Rope, inject: Injection | None = None) -> Tensor:
+        """The other blocks.
+
+        Args:
+            tokens: (B, N, T, C) of B scenes with N views, after `begin`.
+            rope: of one view.
+            inject: changes what a block over the whole scene gives; None changes nothing.
+
+        Returns:
+            (B, N, T, 2 C): the last block within views, then the last one over the scene.
+        """
+        scenes, views = tokens.shape[:2]
+        x = within = tokens
+        for index in range(1, len(self)):
+            if index % 2 == 1:
+                x = self[index](x.flatten(1, 2), rope).unflatten(1, (views, -1))
+                if inject is not None:
+                    x = inject(index, x)
+            else:
+                x = within = self[index](x.flatten(0, 1), rope).unflatten(0, (scenes, views))
+        return torch.cat([within, x], dim=-1)

@@ -1,0 +1,70 @@
+"""The image encoder: DINOv2 ViT-L/14 with registers (Oquab, Darcet et al. 2023). It sees one view at a time."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from .blocks import BLOCK_EPS, Block, LayerNorm
+
+PATCH_PX = 14
+POSITION_SIDE = 37
+"""The learned position grid has 37 x 37 cells, for images of 518 x 518."""
+REGISTERS = 4
+
+
+class PatchEmbedding(nn.Module):
+    """A linear map of each 14 x 14 patch."""
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(channels, width, PATCH_PX, PATCH_PX)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Images (V, channels, H, W) to patches (V, P, C), row by row."""
+        patches: Tensor = self.proj(images.to(self.proj.weight.dtype))
+        return patches.flatten(2).transpose(1, 2)
+
+
+class Encoder(nn.Module):
+    """Normalized images to patch tokens."""
+
+    def __init__(self, width: int, heads: int, depth: int, channels: int = 3) -> None:
+        super().__init__()
+        self.cls_token = nn.Parameter(torch.empty(1, 1, width))
+        self.pos_embed = nn.Parameter(torch.empty(1, 1 + POSITION_SIDE**2, width))
+        self.register_tokens = nn.Parameter(torch.empty(1, REGISTERS, width))
+        self.patch_embed = PatchEmbedding(channels, width)
+        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
+        self.norm = LayerNorm(width, eps=BLOCK_EPS)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Images (V, channels, H, W), sides multiples of 14, to tokens (V, P, C) float32, P = H/14 * W/14, by rows."""
+        grid = (images.shape[2] // PATCH_PX, images.shape[3] // PATCH_PX)
+        of_class, of_patches = self.positions(grid).split([1, grid[0] * grid[1]], dim=1)
+        views = len(images)
+        x = torch.cat(
+            [
+                (self.cls_token + of_class).expand(views, -1, -1),
+                self.register_tokens.expand(views, -1, -1),
+                self.patch_embed(images) + of_patches,
+            ],
+            dim=1,
+        )
+        for block in self.blocks:
+            x = block(x)
+        tokens: Tensor = self.norm(x)
+        return tokens[:, 1 + REGISTERS :]
+
+    def positions(self, grid: tuple[int, int]) -> Tensor:
+        """Position embeddings (1, 1 + P, C): of the class token, and of the patches of a grid (rows, columns).
+
+        The learned grid is resized bicubically with antialiasing, to the size itself rather than by a factor.
+        """
+        if grid == (POSITION_SIDE, POSITION_SIDE):
+            return self.pos_embed
+        of_class, of_patches = self.pos_embed.split([1, POSITION_SIDE**2], dim=1)
+        learned = of_patches.transpose(1, 2).unflatten(2, (POSITION_SIDE, POSITION_SIDE))
+        resized = F.interpolate(learned, grid, mode="bicubic", antialias=True, align_corners=False)
+        return torch.cat([of_class, resized.flatten(2).transpose(1, 2)], dim=1)

@@ -1,0 +1,220 @@
+"""The heads: what is read off the decoded tokens of a view. Their decoders see one view at a time.
+
+`HeadDecoder` prepares tokens for a head; `CameraHead` gives a pose; `LinearHead` (Pi3) and `ConvHead` (Pi3X, as in
+MoGe, Wang et al. 2024) give a value for each pixel; `MetricDecoder` (Pi3X) gives one for the scene. Heads compute in
+float32, and their decoders, which have no LayerScale, carry their residual stream in the type of their weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from .blocks import BLOCK_EPS, Block, LayerNorm, Linear, Mlp, Rope
+from .decoder import SPECIALS
+from .encoder import PATCH_PX
+from .rotation import nearest_rotation
+
+
+class HeadDecoder(nn.Module):
+    """Blocks within each view, between two linear layers."""
+
+    def __init__(self, width_in: int, width: int, width_out: int, heads: int, depth: int) -> None:
+        super().__init__()
+        self.projects = Linear(width_in, width)
+        self.blocks = nn.ModuleList(Block(width, heads, layer_scale=False) for _ in range(depth))
+        self.linear_out = Linear(width, width_out)
+
+    def forward(self, decoded: Tensor, rope: Rope) -> Tensor:
+        """Decoded tokens (V, T, 2 C) to patch tokens (V, P, width_out), float32."""
+        x = self.projects(decoded)
+        for block in self.blocks:
+            x = block(x, rope)
+        out: Tensor = self.linear_out(x)
+        return out[:, SPECIALS:].to(torch.float32)
+
+
+class LinearHead(nn.Module):
+    """Channels of every pixel of a patch from its token."""
+
+    def __init__(self, width: int, channels: int) -> None:
+        super().__init__()
+        self.channels = channels
+        self.proj = nn.Linear(width, channels * PATCH_PX**2)
+
+    def forward(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
+        """Patch tokens (V, P, C) of a grid (rows, columns) to (V, H, W, channels)."""
+        pixels = self.proj(tokens).unflatten(2, (self.channels, PATCH_PX, PATCH_PX)).unflatten(1, grid)
+        # (V, rows, columns, channels, y, x)
+        return pixels.permute(0, 1, 4, 2, 5, 3).flatten(3, 4).flatten(1, 2)
+
+
+class ResidualMlp(nn.Module):
+    """x + relu(L3 relu(L2 relu(L1 x)))."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.res_conv1 = nn.Linear(width, width)
+        self.res_conv2 = nn.Linear(width, width)
+        self.res_conv3 = nn.Linear(width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., C) to (..., C)."""
+        inner = x
+        for layer in (self.res_conv1, self.res_conv2, self.res_conv3):
+            inner = F.relu(layer(inner))
+        return x + inner
+
+
+class CameraHead(nn.Module):
+    """A pose from the mean of a view's patch tokens."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.res_conv = nn.ModuleList(ResidualMlp(width) for _ in range(2))
+        self.more_mlps = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
+        self.fc_t = nn.Linear(width, 3)
+        self.fc_rot = nn.Linear(width, 9)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Patch tokens (V, P, C) to poses (V, 4, 4), local_from_camera, up to the scene's scale.
+
+        Nine numbers fill a matrix row by row, each row is scaled to length 1, and the nearest rotation is taken.
+        """
+        for block in self.res_conv:
+            tokens = block(tokens)
+        feature = self.more_mlps(tokens.mean(dim=1))
+        rows = F.normalize(self.fc_rot(feature).unflatten(-1, (3, 3)), dim=-1)
+        pose = torch.cat([nearest_rotation(rows), self.fc_t(feature)[..., None]], dim=-1)
+        last = torch.zeros_like(pose[:, :1])
+        last[..., 3] = 1
+        return torch.cat([pose, last], dim=1)
+
+
+class MapUpsampling(nn.Sequential):
+    """Twice the size: transposed convolution, then two residual blocks."""
+
+    def __init__(self, width_in: int, width: int) -> None:
+        super().__init__(
+            nn.Sequential(nn.ConvTranspose2d(width_in + 2, width, 2, 2), _convolution(width, width)),
+            ResidualConvolution(width),
+            ResidualConvolution(width),
+        )
+
+
+class ResidualConvolution(nn.Module):
+    """x + two normalized convolutions, twice as wide between."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        hidden = 2 * width
+        self.layers = nn.Sequential(
+            nn.GroupNorm(1, width),
+            nn.ReLU(),
+            _convolution(width, hidden),
+            nn.GroupNorm(hidden // 32, hidden),
+            nn.ReLU(),
+            _convolution(hidden, width),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(V, C, H, W) to (V, C, H, W)."""
+        return x + self.layers(x)
+
+
+class ConvHead(nn.Module):
+    """Maps from patch tokens, by convolutions; one or more outputs with a common trunk."""
+
+    def __init__(self, width: int, stages: Sequence[int], last_width: int, channels: Sequence[int]) -> None:
+        super().__init__()
+        widths = [width, *stages]
+        self.upsample_blocks = nn.ModuleList(MapUpsampling(*pair) for pair in zip(widths, stages, strict=False))
+        self.output_block = nn.ModuleList(
+            nn.Sequential(_convolution(stages[-1] + 2, last_width), nn.ReLU(), nn.Conv2d(last_width, count, 1))
+            for count in channels
+        )
+
+    def forward(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
+        """Patch tokens (V, P, C) of a grid (rows, columns) to (V, H, W, channels of all outputs)."""
+        x = tokens.transpose(1, 2).unflatten(2, grid)
+        for block in self.upsample_blocks:
+            x = block(_with_uv(x, grid))
+        size = (grid[0] * PATCH_PX, grid[1] * PATCH_PX)
+        x = _with_uv(F.interpolate(x, size, mode="bilinear", align_corners=False), grid)
+        return torch.cat([output(x) for output in self.output_block], dim=1).permute(0, 2, 3, 1)
+
+
+def _convolution(width_in: int, width_out: int) -> nn.Conv2d:
+    return nn.Conv2d(width_in, width_out, 3, padding=1, padding_mode="replicate")
+
+
+def _with_uv(x: Tensor, grid: tuple[int, int]) -> Tensor:
+    """A map (V, C, H, W) with two more channels, u along x and v along y; the image's corners are at radius 1."""
+    height, width = x.shape[2:]
+    diagonal = (grid[0] ** 2 + grid[1] ** 2) ** 0.5
+    u_end = grid[1] / diagonal * (width - 1) / width
+    v_end = grid[0] / diagonal * (height - 1) / height
+    u = torch.linspace(-u_end, u_end, width, dtype=x.dtype, device=x.device)
+    v = torch.linspace(-v_end, v_end, height, dtype=x.dtype, device=x.device)
+    uv = torch.stack(torch.meshgrid(u, v, indexing="xy"))
+    return torch.cat([x, uv.expand(len(x), -1, -1, -1)], dim=1)
+
+
+class CrossAttention(nn.Module):
+    """Attention of queries to a context."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.q_proj = Linear(width, width)
+        self.k_proj = Linear(width, width)
+        self.v_proj = Linear(width, width)
+        self.proj = Linear(width, width)
+
+    def forward(self, queries: Tensor, context: Tensor, context_rope: Rope) -> Tensor:
+        """(B, Q, C) and (B, M, C) to (B, Q, C). Queries stand at position (0, 0), which turns nothing."""
+        q, k, v = (
+            projection(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+            for projection, x in ((self.q_proj, queries), (self.k_proj, context), (self.v_proj, context))
+        )
+        x = F.scaled_dot_product_attention(q, context_rope.rotate(k).to(v.dtype), v)
+        return self.proj(x.transpose(1, 2).flatten(2))
+
+
+class MetricBlock(nn.Module):
+    """Cross-attention and MLP on the query; the context stays what it is."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.norm_y = LayerNorm(width, eps=BLOCK_EPS)
+        self.norm2 = LayerNorm(width, eps=BLOCK_EPS)
+        self.cross_attn = CrossAttention(width, heads)
+        self.norm3 = LayerNorm(width, eps=BLOCK_EPS)
+        self.mlp = Mlp(width)
+
+    def forward(self, query: Tensor, context: Tensor, context_rope: Rope) -> Tensor:
+        """(B, 1, C) and (B, M, C) to (B, 1, C)."""
+        query = query + self.cross_attn(self.norm2(query), self.norm_y(context), context_rope)
+        return query + self.mlp(self.norm3(query))
+
+
+class MetricDecoder(nn.Module):
+    """One learned query looks at all tokens of the scene."""
+
+    def __init__(self, width_in: int, width: int, heads: int, depth: int) -> None:
+        super().__init__()
+        self.projects_x = Linear(width_in, width)
+        self.projects_y = Linear(width_in, width)
+        self.blocks = nn.ModuleList(MetricBlock(width, heads) for _ in range(depth))
+        self.linear_out = Linear(width, width)
+
+    def forward(self, query: Tensor, decoded: Tensor, rope: Rope) -> Tensor:
+        """The query (1, 1, 2 C) and the decoded tokens (B, N * T, 2 C) to (B, width), float32."""
+        x, context = self.projects_x(query.expand(len(decoded), -1, -1)), self.projects_y(decoded)
+        for block in self.blocks:
+            x = block(x, context, rope)
+        out: Tensor = self.linear_out(x)
+        return out[:, 0].to(torch.float32)

@@ -1,0 +1,58 @@
+"""pi^3 (Wang et al. 2025): points, confidence and poses from images alone."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .decoder import Layout
+from .heads import LinearHead
+from .network import Network, NetworkOutput, Sizes, patch_grid
+
+
+class Pi3(Network):
+    """The paper's network."""
+
+    conditioned = False
+
+    def __init__(self, sizes: Sizes | None = None) -> None:
+        sizes = sizes or Sizes()
+        super().__init__(sizes)
+        self.point_head = LinearHead(sizes.width, 3)
+        self.conf_head = LinearHead(sizes.width, 1)
+
+    def embed(self, images: Tensor, intrinsics: Tensor | None = None) -> Tensor:
+        """See Network.embed; ``intrinsics`` must be None."""
+        if intrinsics is not None:
+            raise ValueError("Pi3 takes no intrinsics")
+        return self.encode_images(images)
+
+    def reconstruct(
+        self,
+        tokens: Tensor,
+        layout: Layout,
+        mapped: int,
+        poses: Tensor | None = None,
+        posed: Tensor | None = None,
+    ) -> NetworkOutput:
+        """See Network.reconstruct; ``poses`` and ``posed`` must be None."""
+        if poses is not None or posed is not None:
+            raise ValueError("Pi3 takes no poses")
+        decoded = self.decode(tokens, layout)
+        points, logits = self._maps(decoded[:, :mapped].flatten(0, 1), layout)
+        maps = (len(tokens), mapped)
+        return NetworkOutput(points.unflatten(0, maps), logits.unflatten(0, maps), self.cameras(decoded, layout))
+
+    def forward(self, images: Tensor) -> NetworkOutput:
+        """Everything of images (B, N, 3, H, W) in [0, 1]."""
+        scenes, views = images.shape[:2]
+        layout = self.layout(patch_grid(images))
+        tokens = self.encode(images.flatten(0, 1), layout).unflatten(0, (scenes, views))
+        return self.reconstruct(tokens, layout, views)
+
+    def _maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
+        """Local points (V, H, W, 3) and confidence logits (V, H, W)."""
+        x, y, log_z = self.point_head(self.point_decoder(decoded, layout.rope), layout.grid).unbind(-1)
+        z = torch.exp(log_z)
+        confidence = self.conf_head(self.conf_decoder(decoded, layout.rope), layout.grid)
+        return torch.stack([x * z, y * z, z], dim=-1), confidence[..., 0]

@@ -1,0 +1,241 @@
+"""A loaded network on a device, run by one thread, in the precision and with the kernels that the device is best at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch.nn.attention import SDPBackend, sdpa_kernel
+
+from .conditions import normalize_poses
+from .decoder import Layout
+from .encoder import PATCH_PX
+from .network import Network, NetworkOutput
+
+T = TypeVar("T")
+
+ENCODE_SIZES = (8, 4, 2, 1)
+"""Views that are encoded at a time when the network is compiled: few sizes, of which any number is made."""
+MAX_COMPILED_SHAPES = 64
+"""Torch gives up compiling after eight shapes; grids and numbers of views make more."""
+
+
+@dataclass(frozen=True)
+class Bucket:
+    """Shapes that are compiled before the first query.
+
+    Attributes:
+        grid: rows and columns of patches.
+        views: of a scene, the query among them; all but it are mapped.
+        scenes: reconstructed at a time.
+    """
+
+    grid: tuple[int, int]
+    views: int
+    scenes: int = 1
+
+
+@dataclass(frozen=True)
+class RunnerOptions:
+    """Options of a runner.
+
+    Attributes:
+        dtype: what transformer blocks compute in; None is bfloat16 on CUDA, like the official code, else float32.
+        compile_backend: of torch.compile, for the shapes that `warm_up` is given; None compiles nothing. "inductor"
+            fuses what lies between the matrix products, about a third of the time on a large GPU.
+        attention: kernels that scaled_dot_product_attention may choose. In bfloat16 on CUDA the flash kernel alone: if
+            it cannot run, that is an error, where torch would silently take one of a quarter of the speed.
+    """
+
+    dtype: torch.dtype | None = None
+    compile_backend: str | None = None
+    attention: tuple[SDPBackend, ...] | None = None
+
+
+class NetworkRunner:
+    """Runs a network. Safe to call from several threads; one thread of its own does the work, in order of arrival.
+
+    Attributes:
+        name: "pi3" or "pi3x".
+        weights_sha256: of the checkpoint.
+        device: where.
+        dtype: what transformer blocks compute in, and the type of tokens.
+        patch_px: side of a patch; sides of images are multiples of it.
+        conditioned: whether the network takes intrinsics and poses.
+    """
+
+    patch_px = PATCH_PX
+
+    def __init__(
+        self,
+        network: Network,
+        name: str,
+        weights_sha256: str,
+        device: torch.device | str = "cpu",
+        options: RunnerOptions | None = None,
+    ) -> None:
+        options = options or RunnerOptions()
+        self.name = name
+        self.weights_sha256 = weights_sha256
+        self.device = torch.device(device)
+        cuda = self.device.type == "cuda"
+        self.dtype = options.dtype or (torch.bfloat16 if cuda else torch.float32)
+        self.conditioned = network.conditioned
+        self.network = network.eval().requires_grad_(False)
+        self.network.set_compute_type(self.dtype)
+        self.network.to(self.device)
+        fast = cuda and self.dtype is torch.bfloat16
+        self._attention = options.attention or ((SDPBackend.FLASH_ATTENTION,) if fast else None)
+        self._warm: set[object] = set()
+        self._layouts: dict[tuple[int, int], Layout] = {}
+        # CUDA graphs belong to the thread that recorded them.
+        self._thread = ThreadPoolExecutor(1, f"network {name}")
+        self._encode, self._reconstruct = self._compiled(options.compile_backend)
+
+    def _compiled(self, backend: str | None) -> tuple[Callable[..., Tensor], Callable[..., NetworkOutput]]:
+        if backend is None:
+            return self.network.encode, self.network.reconstruct
+        # Graphs of kernels take the launches off the host; other backends and devices know no such mode.
+        graphs = backend == "inductor" and self.device.type == "cuda"
+        compiled = partial(
+            torch.compile,
+            backend=backend,
+            fullgraph=True,
+            dynamic=False,
+            options={"triton.cudagraphs": True} if graphs else None,
+        )
+        return compiled(self.network.encode), compiled(self.network.reconstruct)
+
+    def close(self) -> None:
+        """Ends the thread."""
+        self._thread.shutdown()
+
+    def warm_up(self, buckets: Sequence[Bucket]) -> None:
+        """Runs, and compiles, the shapes of these buckets; others are run as they are, never compiled later."""
+        for bucket in buckets:
+            self._thread.submit(self._warm_up, bucket).result()
+
+    def encode(self, images: Tensor, intrinsics: Tensor | None = None) -> Tensor:
+        """Tokens of views, each by itself, so that they can be kept.
+
+        Args:
+            images: (V, 3, H, W) float32 in [0, 1].
+            intrinsics: (V, 3, 3) in pixels of the images, (0.5, 0.5) the centre of the top-left one; None for a network
+                that is not conditioned.
+
+        Returns:
+            (V, T, C) on the device, in the compute type. Rounding here, and not only where tokens are kept, makes no
+            difference between those that were and those that were not.
+        """
+        return self._run(self._encode_views, images, intrinsics)
+
+    def reconstruct(
+        self,
+        tokens: Tensor,
+        grid: tuple[int, int],
+        mapped: int,
+        poses: Tensor | None = None,
+        posed: Tensor | None = None,
+    ) -> NetworkOutput:
+        """Poses of all views of each scene, and maps of the first ``mapped`` ones.
+
+        Args:
+            tokens: (B, N, T, C) from `encode`.
+            grid: rows and columns of patches.
+            mapped: M; see Network.reconstruct.
+            poses: (B, N, 4, 4) world_from_camera in any unit and frame, for a conditioned network; plausible ones for
+                views without a pose, which count for the scale.
+            posed: (B, N) bool on the CPU, which views have one; as many in each scene. A single one counts as none.
+
+        Raises:
+            ValueError: scenes with different numbers of posed views.
+        """
+        return self._run(self._reconstruct_scenes, tokens, grid, mapped, poses, posed)
+
+    def _run(self, work: Callable[..., T], *arguments: Any) -> T:
+        return self._thread.submit(self._prepared, work, *arguments).result()
+
+    def _prepared(self, work: Callable[..., T], *arguments: Any) -> T:
+        # Not inference_mode: its tensors are of another kind, for which everything would be compiled a second time.
+        with torch.no_grad(), self._kernels():
+            return work(*arguments)
+
+    @contextmanager
+    def _kernels(self) -> Iterator[None]:
+        if self._attention is None:
+            yield
+        else:
+            with sdpa_kernel(list(self._attention)):
+                yield
+
+    def _layout(self, grid: tuple[int, int]) -> Layout:
+        if grid not in self._layouts:
+            self._layouts[grid] = self.network.layout(grid)
+        return self._layouts[grid]
+
+    def _encode_views(self, images: Tensor, intrinsics: Tensor | None) -> Tensor:
+        images = images.to(self.device, non_blocking=True)
+        if intrinsics is not None:
+            intrinsics = intrinsics.to(self.device, torch.float32, non_blocking=True)
+        grid = (images.shape[2] // PATCH_PX, images.shape[3] // PATCH_PX)
+        parts, start = [], 0
+        while start < len(images):
+            size = next(size for size in ENCODE_SIZES if size <= len(images) - start)
+            chosen = slice(start, start + size)
+            encode = self._encode if ("encode", grid, size) in self._warm else self.network.encode
+            tokens = encode(images[chosen], self._layout(grid), None if intrinsics is None else intrinsics[chosen])
+            # Recorded graphs write into the same memory again and again; `to` alone copies only if the type changes.
+            parts.append(tokens.to(self.dtype, copy=True))
+            start += size
+        return torch.cat(parts)
+
+    def _reconstruct_scenes(
+        self, tokens: Tensor, grid: tuple[int, int], mapped: int, poses: Tensor | None, posed: Tensor | None
+    ) -> NetworkOutput:
+        tokens = tokens.to(self.device, non_blocking=True)
+        normalized, indices = self._conditions(poses, posed)
+        count = 0 if indices is None else indices.shape[1]
+        shape = ("reconstruct", grid, *tokens.shape[:2], mapped, count)
+        reconstruct = self._reconstruct if shape in self._warm else self.network.reconstruct
+        output = reconstruct(tokens, self._layout(grid), mapped, normalized, indices)
+        return NetworkOutput(*(tensor.clone() for tensor in vars(output).values()))
+
+    def _conditions(self, poses: Tensor | None, posed: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+        """Normalized poses, and the indices (B, M') of the views that have one."""
+        if poses is None or posed is None:
+            return None, None
+        counts = posed.sum(1)
+        if (counts != counts[0]).any():
+            raise ValueError(f"scenes with different numbers of posed views in one batch: {counts.tolist()}")
+        if counts[0] < 2:
+            return None, None
+        indices = posed.nonzero()[:, 1].view(len(posed), -1)
+        poses = poses.to(self.device, torch.float32, non_blocking=True)
+        none = torch.zeros(len(poses), dtype=torch.bool, device=self.device)
+        normalized = normalize_poses(poses, torch.ones(len(poses), device=self.device), none)
+        return normalized, indices.to(self.device, non_blocking=True)
+
+    def _warm_up(self, bucket: Bucket) -> None:
+        height, width = (side * PATCH_PX for side in bucket.grid)
+        sizes = [size for size in ENCODE_SIZES if size <= bucket.views]
+        self._warm.update(("encode", bucket.grid, size) for size in sizes)
+        references = bucket.views - 1
+        posed = torch.arange(bucket.views).expand(bucket.scenes, -1) < references if self.conditioned else None
+        count = references if self.conditioned and references > 1 else 0
+        self._warm.add(("reconstruct", bucket.grid, bucket.scenes, bucket.views, references, count))
+        poses = torch.eye(4).repeat(bucket.scenes, bucket.views, 1, 1)
+        poses[..., 0, 3] = torch.arange(bucket.views)
+        with torch._dynamo.config.patch(recompile_limit=MAX_COMPILED_SHAPES):
+            for _ in range(3):  # compiles, records, replays
+                for size in sizes:
+                    images = torch.rand(size, 3, height, width)
+                    intrinsics = torch.eye(3).repeat(size, 1, 1) if self.conditioned else None
+                    tokens = self._prepared(self._encode_views, images, intrinsics)
+                tokens = tokens[:1].expand(bucket.scenes, bucket.views, -1, -1).contiguous()
+                self._prepared(self._reconstruct_scenes, tokens, bucket.grid, references, poses, posed)
