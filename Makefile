@@ -3,6 +3,8 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
+# On its own first, so that a build for this machine's device can be chosen (TORCH="torch --index-url ...").
+TORCH  ?= torch==2.13.0
 # An old generator, so that robots are free in their protobuf and grpcio versions (1.71.2 emits code for protobuf >= 5.29).
 # It pins an old protobuf itself, hence its own environment.
 PROTO_TOOLS := grpcio-tools==1.71.2 setuptools==80.9.0
@@ -15,7 +17,8 @@ help:  ## List the targets
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[server,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check $(TORCH)
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[server,networks,dev]'
 	touch $@
 
 setup: $(VENV)/.installed  ## Create .venv with everything

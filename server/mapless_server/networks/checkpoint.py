@@ -1,0 +1,121 @@
+"""A network's weights from a safetensors file: every tensor, every shape, nothing else; never a pickle."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from io import BufferedReader
+from pathlib import Path
+
+import torch
+
+from ..weights.errors import CheckpointError
+from ..weights.safetensors_header import Entry, check_fit, opened, read_header
+
+IMAGE_NORMALIZATION: Mapping[str, Sequence[float]] = {
+    "image_mean": (0.485, 0.456, 0.406),
+    "image_std": (0.229, 0.224, 0.225),
+}
+"""ImageNet's constants, red, green, blue, for images in 0..1: buffers of Pi3 and Pi3X that a checkpoint may lack."""
+
+TRAINING_ONLY = ("omega", "flow_decoder.", "flow_head.", "global_points_decoder.", "global_point_head.")
+"""Beginnings of names that only the training of Pi3 and Pi3X uses."""
+
+_DTYPES = {
+    "F64": torch.float64,
+    "F32": torch.float32,
+    "F16": torch.float16,
+    "BF16": torch.bfloat16,
+    "I64": torch.int64,
+    "I32": torch.int32,
+    "I16": torch.int16,
+    "I8": torch.int8,
+    "U8": torch.uint8,
+    "BOOL": torch.bool,
+}
+
+
+def load_strictly(
+    module: torch.nn.Module,
+    file: Path,
+    *,
+    optional: Mapping[str, Sequence[float] | None] = IMAGE_NORMALIZATION,
+    ignored_prefixes: tuple[str, ...] = (),
+    device: torch.device | str = "cpu",
+) -> str:
+    """Replaces all parameters and persistent buffers of a module by those of a file; other buffers stay as they are.
+
+    The file is read once: what is hashed is what is loaded, so the identity cannot be that of another file, which a
+    digest kept beside the file could (copying tools keep sizes and times). Tensors are read one at a time, so a module
+    built on the meta device (`with torch.device("meta")`) costs its own size and one tensor more. Numbers are converted
+    to the dtype that the module has for them.
+
+    Args:
+        module: on any device; on the meta device best.
+        file: safetensors, of any floating-point type.
+        optional: names that the file may lack, with the values they then get; None leaves the module's own.
+        ignored_prefixes: names that begin so may be surplus, and are read (to be hashed) but not kept.
+        device: where the tensors go.
+
+    Returns:
+        The weights' identity: SHA-256 of the file, 64 hexadecimal digits.
+
+    Raises:
+        CheckpointError: the file cannot be read, is no safetensors file or a damaged one, holds other tensors than the
+            module, or numbers that are not finite. The module is then as it was.
+    """
+    state = module.state_dict()
+    with opened(file) as stream:
+        header = read_header(stream, str(file))
+        who = f"{file} does not fit {type(module).__name__}"
+        check_fit(header, expected_tensors(module), optional.keys(), ignored_prefixes, who)
+        digest = hashlib.sha256(header.raw)
+        loaded = {name: tensor.to(device) for name, tensor in _defaults(state, header.entries, optional).items()}
+        for name, entry in header.entries.items():
+            tensor = _read(stream, entry, file)
+            digest.update(_bytes_of(tensor))
+            if name in state:
+                if not _is_finite(tensor):
+                    raise CheckpointError(f"{file} holds numbers that are not finite, in {name}")
+                loaded[name] = tensor.to(device, state[name].dtype)
+    module.load_state_dict(loaded, strict=True, assign=True)
+    return digest.hexdigest()
+
+
+def expected_tensors(module: torch.nn.Module) -> dict[str, tuple[tuple[int, ...], bool]]:
+    """Shape, and whether it is a floating-point number, of every tensor that a file must hold, by name."""
+    return {name: (tuple(tensor.shape), tensor.is_floating_point()) for name, tensor in module.state_dict().items()}
+
+
+def _defaults(
+    state: Mapping[str, torch.Tensor], entries: Mapping[str, Entry], optional: Mapping[str, Sequence[float] | None]
+) -> dict[str, torch.Tensor]:
+    """Values for what the file lacks."""
+    values: dict[str, torch.Tensor] = {}
+    for name, given in optional.items():
+        if name not in state or name in entries:
+            continue
+        own = state[name]
+        if given is None and own.is_meta:
+            raise ValueError(f"{name} is on the meta device and has no value to keep")
+        values[name] = own if given is None else torch.tensor(given, dtype=own.dtype).reshape(own.shape)
+    return values
+
+
+def _read(stream: BufferedReader, entry: Entry, file: Path) -> torch.Tensor:
+    tensor = torch.empty(entry.shape, dtype=_DTYPES[entry.dtype], device="cpu")
+    view = _bytes_of(tensor)
+    if stream.readinto(view) != len(view):
+        raise CheckpointError(f"{file} became shorter while it was read")
+    return tensor
+
+
+def _is_finite(tensor: torch.Tensor) -> bool:
+    """Whether all numbers are; by their extremes, which costs a thirtieth of torch.isfinite."""
+    return not tensor.is_floating_point() or tensor.numel() == 0 or all(map(math.isfinite, tensor.aminmax()))
+
+
+def _bytes_of(tensor: torch.Tensor) -> memoryview:
+    """The tensor's own memory."""
+    return tensor.reshape(-1).view(torch.uint8).numpy().data

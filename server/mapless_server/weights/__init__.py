@@ -1,0 +1,20 @@
+"""Weights of networks: which there are, where they lie, how they get there. Imports no torch."""
+
+from __future__ import annotations
+
+from .catalogue import CATALOGUE, Weights, named
+from .errors import CheckpointError, FetchError, FolderError, UnknownWeights, WeightsError, WeightsMissing
+from .folder import find_weights
+
+__all__ = [
+    "CATALOGUE",
+    "CheckpointError",
+    "FetchError",
+    "FolderError",
+    "UnknownWeights",
+    "Weights",
+    "WeightsError",
+    "WeightsMissing",
+    "find_weights",
+    "named",
+]

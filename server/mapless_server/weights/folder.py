@@ -1,0 +1,136 @@
+"""The weights folder: one safetensors file for each name, and beside it its digest as sha256sum writes it."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+from .catalogue import Weights, named
+from .errors import FolderError, WeightsMissing
+
+_RECORD_SUFFIX = ".sha256"
+_RECORD = re.compile(r"([0-9a-f]{64})  \S+\n?")
+
+
+class Status(Enum):
+    """What is known of a file without reading it."""
+
+    ABSENT = "absent"
+    OFFICIAL = "official"
+    """Its recorded digest is the one that the catalogue knows."""
+    OWN = "own"
+    """Its recorded digest is another."""
+    RECORDED = "present"
+    """It has a recorded digest, and the catalogue knows none."""
+    UNCHECKED = "not checked"
+    """Somebody put it there, or changed it since its digest was recorded."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What the folder holds under a name.
+
+    Attributes:
+        path: of the file, whether it is there or not.
+        status: what is known of it.
+    """
+
+    path: Path
+    status: Status
+
+
+def find_weights(name: str, weights_dir: Path) -> Path:
+    """The file of some weights.
+
+    Raises:
+        WeightsMissing: it is not there.
+        UnknownWeights: there are no weights of this name.
+    """
+    weights = named(name)
+    path = weights_dir / weights.file_name
+    if not os.path.isfile(path):  # False also where a folder may not be read
+        raise WeightsMissing(
+            f"the weights of {name} are not in {weights_dir}: run `mapless-server weights fetch {name}` "
+            f"(licence {weights.licence})"
+        )
+    return path
+
+
+def look_up(weights: Weights, weights_dir: Path) -> Stored:
+    """What is there, from the record alone: a digest over gigabytes is for `check`."""
+    path = weights_dir / weights.file_name
+    if not os.path.isfile(path):
+        return Stored(path, Status.ABSENT)
+    sha256 = recorded(path) if _is_fresh(path) else None
+    if sha256 is None:
+        status = Status.UNCHECKED
+    elif weights.sha256 is None:
+        status = Status.RECORDED
+    else:
+        status = Status.OFFICIAL if sha256 == weights.sha256 else Status.OWN
+    return Stored(path, status)
+
+
+@contextmanager
+def workplace(weights_dir: Path) -> Iterator[Path]:
+    """A temporary folder inside the weights folder, which is made if need be.
+
+    What is ready there is renamed into place. However the block is left, the folder goes: nothing half stays.
+
+    Raises:
+        FolderError: the weights folder cannot be made or written.
+    """
+    try:
+        weights_dir.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=".incoming-", dir=weights_dir))
+    except OSError as error:
+        raise FolderError(f"the weights folder {weights_dir} cannot be written: {error.strerror}") from None
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def put_in_place(ready: Path, weights: Weights, weights_dir: Path, sha256: str) -> Path:
+    """Renames a file of the `workplace` to its name, and records its digest."""
+    path = weights_dir / weights.file_name
+    if not ready.is_symlink():
+        ready.chmod(0o644)  # the server may be another user
+        with ready.open("rb") as stream:
+            os.fsync(stream.fileno())
+    os.replace(ready, path)
+    record(path, sha256)
+    return path
+
+
+def record(path: Path, sha256: str) -> None:
+    """Writes a file's digest beside it."""
+    _record_of(path).write_text(f"{sha256}  {path.name}\n", encoding="ascii")
+
+
+def recorded(path: Path) -> str | None:
+    """The digest beside a file; None if there is none that can be read."""
+    try:
+        match = _RECORD.fullmatch(_record_of(path).read_text(encoding="ascii"))
+    except (OSError, UnicodeDecodeError):
+        return None
+    return match[1] if match else None
+
+
+def _record_of(path: Path) -> Path:
+    return path.with_name(path.name + _RECORD_SUFFIX)
+
+
+def _is_fresh(path: Path) -> bool:
+    """Whether the record was written after the file's last change (ctime: copying tools keep mtime)."""
+    try:
+        return _record_of(path).stat().st_mtime_ns >= path.stat().st_ctime_ns
+    except OSError:
+        return False

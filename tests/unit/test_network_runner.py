@@ -1,0 +1,145 @@
+"""The runner changes how a network is run, never what it answers."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+import torch
+from parity_rule import images, ruled_network, weights
+from torch import Tensor
+from torch._dynamo.utils import counters
+from torch.nn.attention import SDPBackend
+
+from mapless_server.networks.network import Network, NetworkOutput, Sizes
+from mapless_server.networks.pi3 import Pi3
+from mapless_server.networks.pi3x import Pi3X
+from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions
+
+GRID = (2, 3)
+
+
+def some_images(views: int, grid: tuple[int, int] = GRID) -> Tensor:
+    return torch.from_numpy(images("runner", (views, 3, grid[0] * 14, grid[1] * 14)))
+
+
+def intrinsics(views: int) -> Tensor:
+    return torch.tensor([[40.0, 0.0, 21.0], [0.0, 40.0, 14.0], [0.0, 0.0, 1.0]]).repeat(views, 1, 1)
+
+
+def line(views: int) -> Tensor:
+    poses = torch.eye(4).repeat(1, views, 1, 1)
+    poses[0, :, 0, 3] = torch.arange(views)
+    return poses
+
+
+def localize(runner: NetworkRunner, views: int, grid: tuple[int, int] = GRID) -> NetworkOutput:
+    """What a backend asks for: the last view is the query."""
+    if not runner.conditioned:
+        return runner.reconstruct(runner.encode(some_images(views, grid))[None], grid, views - 1)
+    tokens = runner.encode(some_images(views, grid), intrinsics(views))
+    return runner.reconstruct(tokens[None], grid, views - 1, line(views), torch.arange(views)[None] < views - 1)
+
+
+def shallow_network(name: str) -> Network:
+    """Every kind of block once; tracing takes its time."""
+    sizes = Sizes(32, 2, 1, 2, 1, 16, (16,), 4, metric_width=16, metric_heads=1, metric_depth=1)
+    network: Network = Pi3(sizes) if name == "pi3" else Pi3X(sizes)
+    state = {key: torch.from_numpy(weights(key, value.shape)) for key, value in network.state_dict().items()}
+    network.load_state_dict(state)
+    return network
+
+
+@pytest.fixture(params=["pi3", "pi3x"])
+def name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def runner(name: str) -> Iterator[NetworkRunner]:
+    runner = NetworkRunner(ruled_network(name), name, "sha")
+    yield runner
+    runner.close()
+
+
+def test_it_answers_as_the_network_does() -> None:
+    network = ruled_network("pi3")
+    runner = NetworkRunner(network, "pi3", "sha")
+    expected, found = network(some_images(4)[None]), localize(runner, 4)
+    for field in ("camera_poses", "local_points", "confidence_logits"):
+        values = vars(found)[field]
+        torch.testing.assert_close(values, vars(expected)[field][:, : values.shape[1]], rtol=0, atol=2e-5)
+    runner.close()
+
+
+def test_compiled_it_answers_the_same_and_compiles_nothing_after_warming_up(name: str) -> None:
+    """That it compiles as a whole also shows that nothing in it waits for the device: that would break the graph."""
+    plain = NetworkRunner(shallow_network(name), name, "sha")
+    compiled = NetworkRunner(shallow_network(name), name, "sha", options=RunnerOptions(compile_backend="eager"))
+    compiled.warm_up([Bucket(GRID, 3), Bucket((3, 2), 3)])
+    counters.clear()
+    # The last one was not warmed up, and is run as it is.
+    for views, grid in ((3, GRID), (3, (3, 2)), (3, GRID), (4, (3, 3))):
+        expected, found = localize(plain, views, grid), localize(compiled, views, grid)
+        for field, values in vars(expected).items():
+            torch.testing.assert_close(vars(found)[field], values, rtol=0, atol=1e-5)
+    assert dict(counters["stats"]) == {}
+    assert dict(counters["recompiles"]) == {}
+    plain.close()
+    compiled.close()
+
+
+def test_tokens_are_rounded_to_the_compute_type_whether_kept_or_not() -> None:
+    runner = NetworkRunner(ruled_network("pi3"), "pi3", "sha", options=RunnerOptions(dtype=torch.bfloat16))
+    tokens = runner.encode(some_images(3))
+    assert tokens.dtype is torch.bfloat16
+    kept = tokens.clone()
+    first, second = (runner.reconstruct(t[None], GRID, 2) for t in (tokens, kept))
+    for field, values in vars(first).items():
+        assert values.dtype is torch.float32
+        assert torch.equal(values, vars(second)[field])
+    runner.close()
+
+
+def test_threads_get_their_own_answers(runner: NetworkRunner) -> None:
+    expected = {views: localize(runner, views).camera_poses for views in (2, 3, 4)}
+    found: dict[int, Tensor] = {}
+
+    def work(views: int) -> None:
+        for _ in range(3):
+            found[views] = localize(runner, views).camera_poses
+
+    threads = [threading.Thread(target=work, args=(views,)) for views in expected]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(torch.equal(found[views], expected[views]) for views in expected)
+
+
+def test_kernels_that_are_not_allowed_are_not_taken_in_silence() -> None:
+    """The CPU has no cuDNN kernel, as a GPU may lack the flash kernel: an error, not another kernel."""
+    options = RunnerOptions(attention=(SDPBackend.CUDNN_ATTENTION,))
+    runner = NetworkRunner(ruled_network("pi3"), "pi3", "sha", options=options)
+    with pytest.raises(RuntimeError, match="kernel"):
+        runner.encode(some_images(1))
+    runner.close()
+
+
+def test_a_single_posed_view_counts_as_none() -> None:
+    runner = NetworkRunner(ruled_network("pi3x"), "pi3x", "sha")
+    tokens = runner.encode(some_images(2), intrinsics(2))[None]
+    without = runner.reconstruct(tokens, GRID, 1)
+    single = runner.reconstruct(tokens, GRID, 1, line(2), torch.tensor([[True, False]]))
+    assert torch.equal(single.camera_poses, without.camera_poses)
+    runner.close()
+
+
+def test_scenes_with_different_numbers_of_posed_views_are_misuse() -> None:
+    runner = NetworkRunner(ruled_network("pi3x"), "pi3x", "sha")
+    tokens = runner.encode(some_images(3), intrinsics(3)).expand(2, -1, -1, -1)
+    posed = torch.tensor([[True, True, False], [True, True, True]])
+    with pytest.raises(ValueError, match=r"\[2, 3\]"):
+        runner.reconstruct(tokens, GRID, 2, line(3).repeat(2, 1, 1, 1), posed)
+    runner.close()

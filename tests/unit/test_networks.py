@@ -1,0 +1,235 @@
+"""Laws of the networks that hold for any weights."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from parity_rule import images, ruled_network
+from torch import Tensor
+
+from mapless_server.networks.blocks import rope_table
+from mapless_server.networks.conditions import invert_poses, mean_depth, normalize_poses
+from mapless_server.networks.network import Network, NetworkOutput, patch_grid
+from mapless_server.networks.pi3x import Conditions, Pi3X
+from mapless_server.networks.rotation import nearest_rotation
+
+GRID = (4, 5)
+
+
+@pytest.fixture(scope="module", params=["pi3", "pi3x"])
+def network(request: pytest.FixtureRequest) -> Network:
+    return ruled_network(request.param)
+
+
+def some_images(views: int, grid: tuple[int, int] = GRID) -> Tensor:
+    return torch.from_numpy(images("laws", (views, 3, grid[0] * 14, grid[1] * 14)))
+
+
+def reconstruct(network: Network, given: Tensor, mapped: int) -> NetworkOutput:
+    layout = network.layout(patch_grid(given))
+    return network.reconstruct(network.encode(given, layout)[None], layout, mapped)
+
+
+def assert_close(found: Tensor, expected: Tensor, tolerance: float = 1e-5) -> None:
+    assert (found - expected).abs().max() <= tolerance * expected.abs().max()
+
+
+def test_no_view_is_special(network: Network) -> None:
+    given, order = some_images(4), torch.tensor([2, 0, 3, 1])
+    plain, permuted = reconstruct(network, given, 4), reconstruct(network, given[order], 4)
+    assert_close(permuted.local_points, plain.local_points[:, order], 5e-5)
+    assert_close(permuted.confidence_logits, plain.confidence_logits[:, order], 5e-5)
+    assert_close(permuted.camera_poses, plain.camera_poses[:, order], 5e-5)
+
+
+def test_tokens_of_a_view_depend_on_it_alone(network: Network) -> None:
+    given = some_images(3)
+    layout = network.layout(GRID)
+    one_by_one = torch.cat([network.encode(image[None], layout) for image in given])
+    assert_close(one_by_one, network.encode(given, layout), 1e-6)
+
+
+def test_maps_that_are_not_asked_for_change_nothing_else(network: Network) -> None:
+    given = some_images(4)
+    everything, some = reconstruct(network, given, 4), reconstruct(network, given, 2)
+    assert some.local_points.shape[1] == some.confidence_logits.shape[1] == 2
+    assert_close(some.local_points, everything.local_points[:, :2])
+    assert_close(some.confidence_logits, everything.confidence_logits[:, :2])
+    torch.testing.assert_close(some.camera_poses, everything.camera_poses, rtol=0, atol=0)
+    assert reconstruct(network, given, 0).local_points.shape[1] == 0
+
+
+def test_scenes_of_a_batch_do_not_see_each_other(network: Network) -> None:
+    given = some_images(6)
+    layout = network.layout(GRID)
+    tokens = network.encode(given, layout).unflatten(0, (2, 3))
+    together = network.reconstruct(tokens, layout, 3)
+    for scene in range(2):
+        alone = network.reconstruct(tokens[scene : scene + 1], layout, 3)
+        assert_close(together.local_points[scene : scene + 1], alone.local_points)
+        assert_close(together.camera_poses[scene : scene + 1], alone.camera_poses)
+
+
+def test_forward_is_encode_then_reconstruct(network: Network) -> None:
+    given = some_images(3)
+    assert_close(network(given[None]).camera_poses, reconstruct(network, given, 3).camera_poses)
+
+
+def test_nan_in_one_view_is_nan_out(network: Network) -> None:
+    given = some_images(3)
+    given[1, 0, 0, 0] = torch.nan
+    output = reconstruct(network, given, 3)
+    assert output.camera_poses[..., :3, :].isnan().all()
+    assert output.local_points.isnan().all()
+
+
+def test_sides_that_are_no_multiples_of_a_patch_are_refused() -> None:
+    with pytest.raises(ValueError, match="multiples of 14, not 70x57"):
+        patch_grid(torch.zeros(1, 3, 57, 70))
+
+
+def test_in_low_precision_the_main_residual_stream_stays_float32_and_that_of_head_decoders_does_not() -> None:
+    network = ruled_network("pi3")
+    network.set_compute_type(torch.bfloat16)
+    seen: dict[str, torch.dtype] = {}
+    for name, module in network.named_modules():
+        if name in (
+            "encoder.blocks.1",
+            "decoder.2",
+            "decoder.3",
+            "point_decoder.blocks.1",
+            "point_head",
+            "camera_head",
+        ):
+            module.register_forward_hook(lambda _m, _i, out, name=name: seen.update({name: out.dtype}))
+    given = some_images(3)
+    low = reconstruct(network, given, 3)
+    assert seen.pop("point_decoder.blocks.1") is torch.bfloat16
+    assert set(seen.values()) == {torch.float32}
+    assert len(seen) == 5
+    high = reconstruct(ruled_network("pi3"), given, 3)
+    assert 1e-5 < (low.local_points - high.local_points).norm() / high.local_points.norm() < 0.05
+
+
+def test_rotary_positions_turn_products_by_the_difference_of_positions_alone() -> None:
+    rope = rope_table(torch.tensor([[0, 0], [1, 0], [3, 5], [4, 5]]), 16)
+    vectors = torch.from_numpy(images("rope", (2, 16)))
+    q, k = (rope.rotate(v.expand(4, -1)) for v in vectors)
+    products = q @ k.T
+    torch.testing.assert_close(products[0, 1], products[2, 3])
+    torch.testing.assert_close(products.diagonal(), (vectors[0] @ vectors[1]).expand(4))
+    assert (products[0, 1] - products[1, 0]).abs() > 1e-3
+
+
+def random_matrices(count: int) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(0).normal(size=(count, 3, 3)))
+
+
+def test_the_nearest_rotation_is_that_of_the_singular_value_decomposition() -> None:
+    matrices = random_matrices(2000)
+    u, s, vt = torch.linalg.svd(matrices)
+    sign = torch.det(u @ vt)
+    expected = u @ torch.diag_embed(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)) @ vt
+    assert (sign < 0).sum() > 500, "mirrored ones among them"
+    unique = s[:, 1] + sign * s[:, 2] > 1e-3 * s[:, 0]
+    torch.testing.assert_close(nearest_rotation(matrices)[unique], expected[unique], rtol=0, atol=1e-9)
+
+
+def test_a_rotation_is_its_own_nearest_one_and_scale_does_not_matter() -> None:
+    rotations = nearest_rotation(random_matrices(100))
+    torch.testing.assert_close(torch.det(rotations), torch.ones(100, dtype=torch.float64))
+    torch.testing.assert_close(nearest_rotation(7.5 * rotations), rotations)
+
+
+def poses_at(*positions: tuple[float, float, float]) -> Tensor:
+    poses = torch.eye(4).repeat(1, len(positions), 1, 1)
+    poses[0, :, :3, :3] = nearest_rotation(random_matrices(len(positions))).float()
+    poses[0, :, :3, 3] = torch.tensor(positions)
+    return poses
+
+
+NO_DEPTH = (torch.ones(1), torch.tensor([False]))
+
+
+def test_normalized_poses_do_not_depend_on_frame_or_unit() -> None:
+    poses = poses_at((1, 2, 3), (2, 2, 3), (1, 5, 3))
+    moved = poses_at((9, -4, 0))[:, :1] @ poses
+    moved[..., :3, 3] *= 30
+    expected = normalize_poses(poses, *NO_DEPTH)
+    torch.testing.assert_close(normalize_poses(moved, *NO_DEPTH), expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(expected[0, 0], torch.eye(4), rtol=0, atol=1e-6)
+    torch.testing.assert_close(expected[0, 1:, :3, 3].norm(dim=-1).mean(), torch.tensor(1.0))
+
+
+def test_what_stands_in_for_an_unknown_pose_counts_for_the_scale() -> None:
+    known = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
+    alone = normalize_poses(known, *NO_DEPTH)
+
+    def with_placeholder(distance: float) -> Tensor:
+        placeholder = torch.eye(4)[None, None].clone()
+        placeholder[..., 0, 3] = distance
+        return normalize_poses(torch.cat([known, placeholder], dim=1), *NO_DEPTH)[:, :3]
+
+    torch.testing.assert_close(with_placeholder(2.0), alone)  # the mean of 1 and 3
+    far = with_placeholder(200.0)
+    torch.testing.assert_close(far[..., :3, 3] * 34, alone[..., :3, 3])  # (1 + 3 + 200) / 3 instead of 2
+
+
+def test_views_that_stand_still_keep_their_scale() -> None:
+    poses = poses_at((0, 0, 0), (0.01, 0, 0))
+    torch.testing.assert_close(normalize_poses(poses, *NO_DEPTH)[0, 1, :3, 3].norm(), torch.tensor(0.01))
+
+
+def test_with_depths_the_mean_depth_is_the_unit() -> None:
+    depths = torch.tensor([2.0, 0.0, 4.0, 0.0]).view(1, 2, 1, 2)
+    assert mean_depth(depths) == 3
+    assert mean_depth(torch.zeros(1, 2, 1, 2)) == 1
+    normalized = normalize_poses(poses_at((0, 0, 0), (6, 0, 0)), mean_depth(depths), torch.tensor([True]))
+    torch.testing.assert_close(normalized[0, 1, :3, 3].norm(), torch.tensor(2.0))
+
+
+def test_a_rigid_change_of_all_poses_changes_nothing() -> None:
+    network = ruled_network("pi3x")
+    given = some_images(3)[None]
+    poses = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
+    posed = torch.tensor([[True, True, True]])
+    plain = network(given, Conditions(poses=poses, has_pose=posed))
+    moved = network(given, Conditions(poses=poses_at((5, 5, 5)) @ poses, has_pose=posed))
+    without = network(given)
+    assert_close(moved.camera_poses, plain.camera_poses, 1e-4)
+    assert (without.camera_poses - plain.camera_poses).abs().max() > 1e-2
+
+
+def test_the_pose_of_an_unposed_view_is_not_looked_at_beyond_the_scale() -> None:
+    network = ruled_network("pi3x")
+    assert isinstance(network, Pi3X)
+    layout = network.layout(GRID)
+    tokens = network.encode(some_images(3), layout)[None]
+    posed = torch.tensor([[0, 1]])
+    poses = normalize_poses(poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0)), *NO_DEPTH)
+    other = poses.clone()
+    other[0, 2] = poses_at((7, 7, 7))[0, 0]
+    first, second = (network.reconstruct(tokens, layout, 2, p, posed) for p in (poses, other))
+    torch.testing.assert_close(first.camera_poses, second.camera_poses, rtol=0, atol=0)
+
+
+def test_inverse_poses() -> None:
+    poses = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
+    torch.testing.assert_close(invert_poses(poses) @ poses, torch.eye(4).expand_as(poses), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["pi3", "pi3x"])
+def test_every_parameter_has_a_say(name: str) -> None:
+    network = ruled_network(name).requires_grad_(True)
+    given = some_images(3)[None]
+    if isinstance(network, Pi3X):
+        posed = torch.ones(1, 3, dtype=torch.bool)
+        depths, rays = torch.rand(1, 3, 56, 70), torch.rand(1, 3, 2, 56, 70)
+        poses = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
+        output = network(given, Conditions(rays, posed, depths, posed, poses, posed))
+    else:
+        output = network(given)
+    sum((tensor * torch.rand(tensor.shape)).sum() for tensor in vars(output).values()).backward()
+    silent = [key for key, p in network.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
+    assert silent == []
