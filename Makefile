@@ -10,7 +10,7 @@ TORCH  ?= torch==2.13.0
 PROTO_TOOLS := grpcio-tools==1.71.2 setuptools==80.9.0
 PROTO_VENV  := $(VENV)/proto-tools
 
-.PHONY: help setup test lint format proto demo bench clean
+.PHONY: help setup test lint format proto demo bench bench-gpu clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -51,6 +51,9 @@ demo: setup  ## Localize photographs end to end; DATA=folder for real ones
 
 bench: setup  ## Measure accuracy and latency on the real scenes; DATA=folder with the scenes
 	$(BIN)/mapless-server bench $(if $(DATA),'$(DATA)',../shared/data)
+
+bench-gpu: setup  ## Measure the networks and whole queries on a CUDA device; without one, what a CPU can tell
+	$(BIN)/mapless-server bench-network $(ARGS)
 
 clean:  ## Remove the environment and caches
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache build *.egg-info

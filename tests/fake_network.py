@@ -55,6 +55,7 @@ class FakeNetwork:
 
     name = "fake"
     weights_sha256 = ""
+    uses_correspondences = False
 
     def __init__(self, scene: SyntheticScene, seed: int = 0, options: FakeNetworkOptions | None = None) -> None:
         self.world_from_local = random_similarity(random_for("fake network", seed))
@@ -62,6 +63,9 @@ class FakeNetwork:
         self._seed = seed
         self._options = options or FakeNetworkOptions()
         self._index = {reference.key: i for i, reference in enumerate(scene.references)}
+
+    def close(self) -> None:
+        """Nothing to give back."""
 
     def reconstruct(
         self, query: View, references: Sequence[PosedView], correspondences: Correspondences | None = None

@@ -11,8 +11,9 @@ from scenes import SyntheticScene
 from mapless.geometry import RigidTransform, Similarity
 from mapless_server.correspond import Correspondences, Matches
 from mapless_server.match import PointMatches
+from mapless_server.observations import ONE_PIXEL, KeypointNoise
 from mapless_server.scale import MetricScale, ScaleStage
-from mapless_server.structure import ONE_PIXEL, KeypointNoise, Structure
+from mapless_server.structure import Structure
 from mapless_server.tracks import Tracks
 from mapless_server.views import PosedView
 

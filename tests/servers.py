@@ -31,6 +31,7 @@ from mapless_server.scale import MetricScale, ScaleStage
 from mapless_server.serve import running_server
 from mapless_server.settings import Settings
 from mapless_server.store import Store
+from mapless_server.tiers import Tier
 from mapless_server.views import Features, PosedView, View
 
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
@@ -61,6 +62,10 @@ class StandInExtractor:
 class StandInReconstructor:
     name: str = "geometric"
     weights_sha256: str = ""
+    uses_correspondences: bool = True
+
+    def close(self) -> None:
+        pass
 
     def reconstruct(self, *_: Any) -> Any:
         raise NotImplementedError
@@ -71,11 +76,13 @@ class StandInMethod:
     """Answers the first reference's pose.
 
     Attributes:
+        inlier_count: that it claims.
         gate: calls wait here; open unless a test closes it.
         started: released by every call that begins.
         failure: raised instead of an answer.
     """
 
+    inlier_count: int = 90
     gate: threading.Event = field(default_factory=threading.Event)
     started: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
     failure: Exception | None = None
@@ -94,7 +101,9 @@ class StandInMethod:
         assert self.gate.wait(60)
         if self.failure is not None:
             raise self.failure
-        found = Localization(references[0].world_from_camera, COVARIANCE, PoseStage.REFINED, 90, 120, 0.7)
+        found = Localization(
+            references[0].world_from_camera, COVARIANCE, PoseStage.REFINED, self.inlier_count, 120, 0.7
+        )
         counts = tuple(range(len(references)))
         return Answer(
             found,
@@ -120,17 +129,20 @@ class RunningServer:
 
     address: str
     method: StandInMethod
-    extractor: StandInExtractor
+    extractors: Sequence[StandInExtractor]
     engine: Engine
     stop: Callable[[], None]
 
 
 @contextmanager
-def serving(data_dir: Path, **options: Any) -> Iterator[RunningServer]:
-    """A server with the given settings until the block is left, or `stop` is called, which begins to drain it."""
+def serving(data_dir: Path, features: Sequence[str] = ("stand-in",), **options: Any) -> Iterator[RunningServer]:
+    """A server with the given settings until the block is left, or `stop` is called, which begins to drain it.
+
+    It has a tier for each of the `features`.
+    """
     settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, **({"workers": 2, "max_waiting": 2} | options))
     store = Store.open(data_dir)
-    method, extractor = StandInMethod(), StandInExtractor()
+    method, extractors = StandInMethod(), [StandInExtractor(name) for name in features]
     method.gate.set()
     engine_options = EngineOptions(
         workers=settings.workers,
@@ -138,8 +150,8 @@ def serving(data_dir: Path, **options: Any) -> Iterator[RunningServer]:
         max_candidates=settings.retrieval_max_references,
         image_limits=ImageLimits(),
     )
-    pipeline = Pipeline(cast(Any, StandInReconstructor()))
-    engine = Engine(store, extractor, pipeline, engine_options, localize=method)
+    tiers = [Tier(extractor, Pipeline(cast(Any, StandInReconstructor()))) for extractor in extractors]
+    engine = Engine(store, tiers, engine_options, localize=method)
     address: Future[str] = Future()
     loop = asyncio.new_event_loop()
     stopping = asyncio.Event()
@@ -156,7 +168,7 @@ def serving(data_dir: Path, **options: Any) -> Iterator[RunningServer]:
         loop.call_soon_threadsafe(stopping.set)
 
     try:
-        yield RunningServer(address.result(30), method, extractor, engine, stop)
+        yield RunningServer(address.result(30), method, extractors, engine, stop)
     finally:
         method.gate.set()
         stop()

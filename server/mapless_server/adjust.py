@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 
 from .match import PointMatches
+from .observations import Observations, invert_symmetric
 from .pnp import PoseEstimate, PoseStage, motion_jacobian, reprojection_errors_px, world_covariance
-from .structure import Observations, Structure, invert_symmetric, observe
+from .structure import Structure, observe
 from .tracks import Tracks
 from .views import PosedView, View
 

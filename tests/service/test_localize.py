@@ -173,7 +173,7 @@ def test_unusual_images_are_read_as_stored(
 ) -> None:
     localized(client.localize(image, CAMERA, scene))
     expected = decode_image(same_as or image, ImageLimits())
-    np.testing.assert_array_equal(server.extractor.seen[-1], expected)
+    np.testing.assert_array_equal(server.extractors[0].seen[-1], expected)
 
 
 def test_exif_orientation_does_not_turn_the_intrinsics(client: Client, scene: str) -> None:

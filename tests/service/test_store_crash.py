@@ -35,7 +35,7 @@ def make_reference(reference_id: str) -> NewReference:
         generator.random(200, np.float32),
     )
     pose = RigidTransform(np.eye(3), generator.normal(size=3))
-    return NewReference(reference_id, generator.bytes(100_000), CAMERA, pose, View(CAMERA, features), EXTRACTOR)
+    return NewReference(reference_id, generator.bytes(100_000), CAMERA, pose, {EXTRACTOR: View(CAMERA, features)})
 
 
 def change_until_killed(data_dir: Path, prefix: str) -> None:
@@ -84,14 +84,16 @@ def apply(stored: set[str], change: str) -> set[str]:
 def assert_whole(store: Store, data_dir: Path, expected: set[str]) -> None:
     """Every reference is there with all its parts, and no part is there without its reference."""
     snapshot = store.load_references(SCENE, None, EXTRACTOR)
-    assert {it.name.rsplit("/", 1)[-1] for it in snapshot.references} == expected
+    assert {it.record.reference_id for it in snapshot.references} == expected
+    assert not snapshot.undescribed
     for loaded in snapshot.references:
-        reference_id = loaded.name.rsplit("/", 1)[-1]
+        reference_id = loaded.record.reference_id
         made = make_reference(reference_id)
+        features, expected_features = loaded.view.features, made.views[EXTRACTOR].features
         assert store.read_image(SCENE, reference_id) == made.image
-        assert loaded.view.features.keypoints.tobytes() == made.view.features.keypoints.tobytes()
-        assert loaded.view.features.descriptors.tobytes() == made.view.features.descriptors.tobytes()
-        assert loaded.world_from_camera.translation.tobytes() == made.world_from_camera.translation.tobytes()
+        assert features.keypoints.tobytes() == expected_features.keypoints.tobytes()
+        assert features.descriptors.tobytes() == expected_features.descriptors.tobytes()
+        assert loaded.record.world_from_camera.translation.tobytes() == made.world_from_camera.translation.tobytes()
     connection = choose_library().connect(data_dir / DATABASE_FILE)
     try:
         for table in ("reference", "image", "features"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,13 +14,16 @@ from scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server import correspond
 from mapless_server.correspond import (
+    OPTIONS,
     CorrespondOptions,
     Matcher,
     Matches,
     epipolar_distance_px,
     epipolar_distances_px,
+    make_matcher,
     mutual_matches,
 )
+from mapless_server.features import FEATURES
 from mapless_server.views import Features, PosedView, View
 
 
@@ -276,7 +280,68 @@ def test_the_memory_is_bounded_and_forgets_the_longest_unused(
     assert len(matched_pairs) == 4
 
 
+# The seam
+
+
+class Fixed:
+    """Matches keypoint 0 with keypoint 0."""
+
+    calls = 0
+
+    def match(self, query: View, references: Sequence[PosedView], check: Callable[[], None]) -> Sequence[Matches]:
+        check()
+        self.calls += 1
+        return [np.zeros((1, 2), np.int32)] * len(references)
+
+
+def test_another_query_matching_leaves_the_references_to_the_matcher() -> None:
+    scene = make_scene(random_for("seam"), SceneOptions(reference_count=3))
+    fixed = Fixed()
+    matcher = Matcher(query_matching=fixed)
+    ours, usual = matcher.correspond(scene.query, scene.references), Matcher().correspond(scene.query, scene.references)
+    assert [m.tolist() for m in ours.query_matches] == [[[0, 0]]] * 3
+    assert ours.reference_pairs.keys() == usual.reference_pairs.keys()
+    for pair, matches in usual.reference_pairs.items():
+        np.testing.assert_array_equal(ours.reference_pairs[pair], matches)
+
+
+def test_known_matches_of_the_query_are_not_sought_again() -> None:
+    scene = make_scene(random_for("known"), SceneOptions(reference_count=3))
+    fixed = Fixed()
+    matcher = Matcher(query_matching=fixed)
+    first = matcher.correspond(scene.query, scene.references)
+    second = matcher.correspond(scene.query, scene.references, wide=True, query_matches=first.query_matches)
+    assert fixed.calls == 1
+    assert second.query_matches == first.query_matches
+
+
+def test_the_check_ends_the_matching_of_the_query() -> None:
+    scene = make_scene(random_for("ends"), SceneOptions(reference_count=3))
+    calls = iter(range(5))
+
+    def check() -> None:
+        if next(calls) == 4:
+            raise TimeoutError
+
+    with pytest.raises(TimeoutError):
+        Matcher().correspond(scene.query, scene.references, check=check)
+
+
+def test_every_extractor_has_its_options() -> None:
+    assert set(OPTIONS) == set(FEATURES)
+    for name in FEATURES:
+        assert make_matcher(name).options == OPTIONS[name]
+    with pytest.raises(ValueError, match="unknown features 'surf'"):
+        make_matcher("surf")
+
+
 def test_senseless_options_are_refused() -> None:
-    for options in ({"reference_ratio": 1.1}, {"query_ratio": 0.0}, {"epipolar_px": float("nan")}, {"wide_ratio": 2.0}):
+    for options in (
+        {"reference_ratio": 1.1},
+        {"query_ratio": 0.0},
+        {"epipolar_px": float("nan")},
+        {"wide_ratio": 2.0},
+        {"guided_similarity": -2.0},
+    ):
         with pytest.raises(ValueError, match="senseless"):
             CorrespondOptions(**options)  # type: ignore[arg-type]

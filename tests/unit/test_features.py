@@ -119,6 +119,26 @@ def test_small_and_thin_images_are_not_enlarged_nor_lost() -> None:
     assert thin.shape == (camera.height_px, camera.width_px) == (1, 1000)
 
 
+@pytest.mark.parametrize(
+    ("size", "max_side_px", "expected"),
+    [
+        ((1600, 1067), 1024, (1024, 672)),
+        ((640, 480), 1024, (640, 480)),
+        ((400, 300), 1024, (384, 288)),
+        ((20, 2000), 1024, (32, 1024)),
+    ],
+)
+def test_sides_can_be_multiples(size: tuple[int, int], max_side_px: int, expected: tuple[int, int]) -> None:
+    width, height = size
+    image, centres = np.zeros((height, width, 3), np.uint8), np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
+    camera = Camera(width, height, 500.0, 500.0, (width - 1) / 2, (height - 1) / 2)
+    reduced, reduced_camera = reduce_image(image, camera, max_side_px, multiple_px=32)
+    assert (reduced.shape[1], reduced.shape[0]) == (reduced_camera.width_px, reduced_camera.height_px) == expected
+    # Outer edges stay outer edges: half a pixel outside of the corner pixels' centres.
+    corners = reduced_camera.project(camera.rays(centres + np.array([[-0.5, -0.5], [0.5, 0.5]])))
+    np.testing.assert_allclose(corners, [[-0.5, -0.5], [expected[0] - 0.5, expected[1] - 0.5]], atol=1e-9)
+
+
 @pytest.mark.parametrize("name", LENSES)
 def test_undistortion_and_projection_are_inverse(name: str) -> None:
     camera = replace(CAMERA, distortion=LENSES[name])

@@ -15,7 +15,8 @@ from scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.correspond import Correspondences
 from mapless_server.match import PAPER_MATCH, MatchOptions, PointMatches, match_points, one_to_one, search, vote
-from mapless_server.structure import ONE_PIXEL, Structure
+from mapless_server.observations import ONE_PIXEL
+from mapless_server.structure import Structure
 from mapless_server.tracks import Tracks
 from mapless_server.views import Features, View
 

@@ -17,6 +17,7 @@ from scenes import CAMERA, SceneOptions, make_scene, random_for
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server import pnp
 from mapless_server.match import PointMatches
+from mapless_server.observations import ONE_PIXEL
 from mapless_server.pnp import (
     PnpOptions,
     PoseEstimate,
@@ -31,7 +32,7 @@ from mapless_server.pnp import (
     world_covariance,
 )
 from mapless_server.rejection import Rejection, RejectionReason
-from mapless_server.structure import ONE_PIXEL, Structure
+from mapless_server.structure import Structure
 from mapless_server.tracks import Tracks
 from mapless_server.views import Features, View
 

@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import SceneOptions, make_scene, random_for
+from scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
-from mapless.geometry import Array
+from mapless.geometry import Array, RigidTransform
 from mapless_server.retrieve import RetrieveOptions, choose_references, spread_choice
+from mapless_server.views import Features, PosedView, View
 
 LINE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [1.0, 0, 0], [1.1, 0, 0]])
+
+
+def bare_view(descriptors: Array) -> View:
+    n = len(descriptors)
+    return View(CAMERA, Features(np.zeros((n, 2), np.float32), descriptors.astype(np.float32), np.ones(n, np.float32)))
 
 
 def slow_choice(counts: list[int], centres: Array, count: int, options: RetrieveOptions) -> list[int]:
@@ -89,6 +95,21 @@ def test_references_that_see_more_of_the_query_are_chosen() -> None:
     candidates = [*elsewhere.references, *scene.references]
     assert set(choose_references(scene.query, candidates, 4)) == {4, 5, 6, 7}
     assert choose_references(scene.query, [], 4) == []
+
+
+def test_the_ratio_decides_what_counts_as_a_match() -> None:
+    """One reference shows little, clearly; another shows much, faintly: behind many that look nearly the same."""
+    random = random_for("ratio")
+    query = unit_rows(random.standard_normal((60, 32)))
+    clear = np.concatenate([query[:20], unit_rows(random.standard_normal((100, 32)))])
+    faint = np.concatenate([query, unit_rows(query + 0.03 * random.standard_normal(query.shape))])
+    faint = unit_rows(faint + 0.03 * random.standard_normal(faint.shape))
+    posed = [
+        PosedView(str(i), str(i), bare_view(d), RigidTransform(np.eye(3), np.array([i, 0.0, 0.0])))
+        for i, d in enumerate((clear, faint))
+    ]
+    assert choose_references(bare_view(query), posed, 1, ratio=0.5) == [0]
+    assert choose_references(bare_view(query), posed, 1, ratio=1.0) == [1]
 
 
 def test_senseless_options_are_refused() -> None:

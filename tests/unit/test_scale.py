@@ -16,16 +16,8 @@ from mapless.geometry import RigidTransform, Similarity, rotation_angle_deg, rot
 from mapless_server.coarse import ReconstructedView, Reconstruction
 from mapless_server.correspond import Correspondences
 from mapless_server.rejection import Rejection, RejectionReason
-from mapless_server.scale import (
-    MetricScale,
-    ScaleOptions,
-    ScaleStage,
-    ScaleStrategy,
-    estimate_scale,
-    trajectory_radius,
-    trajectory_scale,
-    triangulate_depths,
-)
+from mapless_server.scale import MetricScale, ScaleOptions, ScaleStage, ScaleStrategy, estimate_scale
+from mapless_server.scale_equations import pairs_of, trajectory_radius, trajectory_scale, triangulate_depths
 
 EXACT = SceneOptions(noise_px=0.0)
 TRIANGULATION = ScaleOptions(strategy=ScaleStrategy.TRIANGULATION)
@@ -369,14 +361,19 @@ def test_trajectory_scale_against_a_plain_twin() -> None:
             agree = distances[distances <= 0.10]
             rms = float(np.sqrt(np.mean((agree if len(agree) else distances) ** 2)))
             best = max(best, (len(agree), -rms, float(scale)))
-        assert trajectory_scale(predicted, known, ScaleOptions()) == pytest.approx(best[2])
+        assert trajectory_scale(predicted, known, pairs_of(7, 32), 0.10) == pytest.approx(best[2])
 
 
 def test_pairs_predicted_at_one_place_propose_nothing() -> None:
     known = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     predicted = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0]])
-    assert trajectory_scale(predicted, known, ScaleOptions()) in (1.0, 2.0)
-    assert trajectory_scale(np.zeros((3, 3)), known, ScaleOptions()) is None
+    assert trajectory_scale(predicted, known, pairs_of(3, 32), 0.10) in (1.0, 2.0)
+    assert np.isnan(trajectory_scale(np.zeros((3, 3)), known, pairs_of(3, 32), 0.10))
+
+
+def test_pairs_are_all_of_evenly_chosen_cameras() -> None:
+    assert [tuple(pair) for pair in pairs_of(5, 32)] == list(combinations(range(5), 2))
+    assert [tuple(pair) for pair in pairs_of(9, 3)] == [(0, 4), (0, 8), (4, 8)]
 
 
 def test_ray_depths_against_a_plain_twin() -> None:

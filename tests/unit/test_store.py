@@ -11,12 +11,14 @@ import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sqlalchemy.exc import IntegrityError
 
 from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
 from mapless_server import errors
@@ -35,9 +37,13 @@ def make_reference(
     focal_x_px, focal_y_px, principal_x_px, principal_y_px = random.uniform(300, 900, 4).tolist()
     camera = Camera(640, 480, focal_x_px, focal_y_px, principal_x_px, principal_y_px, distortion)
     pose = RigidTransform(rotation_from_vector(random.normal(size=3)), random.normal(size=3) * 1e3)
-    return NewReference(
-        reference_id, random.bytes(5000), camera, pose, View(camera.pinhole(), make_features(random, count)), EXTRACTOR
-    )
+    image = random.bytes(5000)
+    view = View(camera.pinhole(), make_features(random, count))
+    return NewReference(reference_id, image, camera, pose, {EXTRACTOR: view})
+
+
+def view_of(new: NewReference) -> View:
+    return new.views[EXTRACTOR]
 
 
 def make_features(random: np.random.Generator, count: int) -> Features:
@@ -108,7 +114,6 @@ class TestScenes:
             lambda: store.get_scene("nowhere"),
             lambda: store.delete_scene("nowhere"),
             lambda: store.add_references("nowhere", [make_reference("a")]),
-            lambda: store.add_features("nowhere", "a", EXTRACTOR, make_reference("a").view),
             lambda: store.get_reference("nowhere", "a"),
             lambda: store.read_image("nowhere", "a"),
             lambda: store.list_references("nowhere", 10),
@@ -138,14 +143,18 @@ class TestScenes:
 class TestGenerations:
     def test_every_change_raises_and_nothing_else_does(self, store: Store) -> None:
         store.create_scene("office")
-        view = make_reference("a").view
         changes = (
             lambda: store.add_references("office", [make_reference("a"), make_reference("b")]),
             lambda: store.add_references("office", [make_reference("c")]),
-            lambda: store.add_features("office", "a", "other", view),
             lambda: store.delete_reference("office", "b"),
         )
+        view = view_of(make_reference("a"))
+
+        def add_features(extractor: str) -> None:
+            store.add_features(store.get_reference("office", "a").key, extractor, view)
+
         others = (
+            lambda: add_features("other"),
             lambda: store.get_reference("office", "a"),
             lambda: store.load_references("office", None, EXTRACTOR),
             lambda: store.create_scene("hall"),
@@ -153,7 +162,8 @@ class TestGenerations:
         refused = (
             lambda: store.create_scene("office"),
             lambda: store.add_references("office", [make_reference("a")]),
-            lambda: store.add_features("office", "a", EXTRACTOR, view),
+            lambda: add_features(EXTRACTOR),
+            lambda: store.add_features("no such key", EXTRACTOR, view),
             lambda: store.delete_reference("office", "z"),
         )
         generation = 1
@@ -184,7 +194,7 @@ class TestGenerations:
         for seed in range(3):
             keys.add(store.add_references("office", [make_reference("a", seed)])[0].key)
             snapshot = store.load_references("office", ["a"], EXTRACTOR)
-            assert_same_view(snapshot.references[0].view, make_reference("a", seed).view)
+            assert_same_view(snapshot.references[0].view, view_of(make_reference("a", seed)))
             store.delete_reference("office", "a")
         assert len(keys) == 3
 
@@ -206,21 +216,22 @@ class TestReferences:
         with Store.open(data_dir) as store:
             read = store.get_reference("office", "a")
             image = store.read_image("office", "a")
-            (posed_view,) = store.load_references("office", ["a"], EXTRACTOR).references
+            assert store.read_image_of(created.key) == image
+            (loaded,) = store.load_references("office", ["a"], EXTRACTOR).references
             _, (pose,) = store.list_poses("office")
         assert image == new.image
         assert read.camera == new.camera
         assert repr(read.camera) == repr(new.camera)  # tells -0.0 from 0.0
-        for record in (created, read):
-            assert record.key == posed_view.key == pose.key
+        for record in (created, read, loaded.record):
+            assert record.key == pose.key
             assert record.feature_count == 20
             assert record.create_time == created.create_time
             assert record.image_sha256 == created.image_sha256
-        for transform in (read.world_from_camera, posed_view.world_from_camera, pose.world_from_camera):
+        for transform in (read.world_from_camera, loaded.record.world_from_camera, pose.world_from_camera):
             assert_same_bits(transform.rotation, new.world_from_camera.rotation)
             assert_same_bits(transform.translation, new.world_from_camera.translation)
-        assert posed_view.name == "scenes/office/references/a"
-        assert_same_view(posed_view.view, new.view)
+        assert (loaded.record.scene_id, loaded.record.reference_id) == ("office", "a")
+        assert_same_view(loaded.view, view_of(new))
 
     def test_no_features_and_odd_floats_survive(self, store: Store) -> None:
         store.create_scene("office")
@@ -229,19 +240,20 @@ class TestReferences:
         none = Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32))
         camera = make_reference("x").camera
         for reference_id, features in (("odd", odd), ("none", none)):
-            new = NewReference(reference_id, b"", camera, RigidTransform.identity(), View(camera, features), EXTRACTOR)
+            views = {EXTRACTOR: View(camera, features)}
+            new = NewReference(reference_id, b"", camera, RigidTransform.identity(), views)
             store.add_references("office", [new])
             (read,) = store.load_references("office", [reference_id], EXTRACTOR).references
-            assert_same_view(read.view, new.view)
+            assert_same_view(read.view, view_of(new))
 
     def test_what_cannot_be_kept_exactly_is_refused(self, store: Store) -> None:
         store.create_scene("office")
         good = make_reference("a")
-        double = Features(good.view.features.keypoints.astype(float), np.zeros((20, 4), np.float32), np.zeros(20, "f4"))
+        double = replace(view_of(good).features, keypoints=view_of(good).features.keypoints.astype(float))
         lost = RigidTransform(np.eye(3), np.array([0.0, np.nan, 0.0]))
         for bad in (
-            NewReference("a", b"", good.camera, good.world_from_camera, View(good.camera, double), EXTRACTOR),
-            NewReference("a", b"", good.camera, lost, good.view, EXTRACTOR),
+            NewReference("a", b"", good.camera, good.world_from_camera, {EXTRACTOR: View(good.camera, double)}),
+            NewReference("a", b"", good.camera, lost, good.views),
         ):
             with pytest.raises(ValueError, match="float"):
                 store.add_references("office", [make_reference("b"), bad])
@@ -263,7 +275,7 @@ class TestReferences:
         store.add_references("office", [make_reference(it, seed) for seed, it in enumerate("cab")])
         for ids, expected in ((["b", "c", "a"], "bca"), (["c"], "c"), ([], ""), (None, "abc"), (["b", "a"], "ba")):
             snapshot = store.load_references("office", ids, EXTRACTOR)
-            assert [it.name.rsplit("/", 1)[-1] for it in snapshot.references] == list(expected)
+            assert [it.record.reference_id for it in snapshot.references] == list(expected)
             assert snapshot.generation == store.get_scene("office").generation
         with pytest.raises(errors.NotFound, match="'z'") as caught:
             store.load_references("office", ["a", "z"], EXTRACTOR)
@@ -272,15 +284,70 @@ class TestReferences:
     def test_features_are_kept_per_extractor(self, store: Store) -> None:
         store.create_scene("office")
         new = make_reference("a")
-        other = View(new.view.camera.resized(320, 240), make_features(np.random.default_rng(9), 7))
+        other = View(view_of(new).camera.resized(320, 240), make_features(np.random.default_rng(9), 7))
         store.add_references("office", [new])
-        with pytest.raises(errors.FailedPrecondition, match="'a'") as caught:
-            store.load_references("office", None, "aliked")
-        assert caught.value.reason == "FEATURES_MISSING"
-        store.add_features("office", "a", "aliked", other)
-        for extractor, expected in (("aliked", other), (EXTRACTOR, new.view)):
-            (read,) = store.load_references("office", None, extractor).references
-            assert_same_view(read.view, expected)
+        snapshot = store.load_references("office", None, "aliked")
+        (lacking,) = snapshot.undescribed
+        assert (snapshot.references, lacking.reference_id, lacking.camera) == ((), "a", new.camera)
+        assert not store.has_features(lacking.key, "aliked")
+        store.add_features(lacking.key, "aliked", other)
+        assert store.has_features(lacking.key, "aliked")
+        for extractor, expected in (("aliked", other), (EXTRACTOR, view_of(new))):
+            snapshot = store.load_references("office", None, extractor)
+            assert_same_view(snapshot.references[0].view, expected)
+            assert not snapshot.undescribed
+
+    def test_those_without_features_are_told_apart_in_the_order_asked(self, store: Store) -> None:
+        store.create_scene("office")
+        both = {"cheap": view_of(make_reference("x")), "strong": view_of(make_reference("x", 1))}
+        news = [replace(make_reference(it, count=1), views=both) for it in "ac"]
+        store.add_references("office", [*news, replace(make_reference("b"), views={"cheap": both["cheap"]})])
+        for _ in range(2):  # from the database, then from memory
+            snapshot = store.load_references("office", ["c", "b", "a"], "strong")
+            assert [it.record.reference_id for it in snapshot.references] == ["c", "a"]
+            assert [it.reference_id for it in snapshot.undescribed] == ["b"]
+
+    def test_features_of_all_extractors_are_stored_with_the_reference_or_not_at_all(
+        self, store: Store, data_dir: Path
+    ) -> None:
+        store.create_scene("office")
+        good, other = make_reference("a", 1), make_reference("a", 2, count=7)
+        double = replace(view_of(other).features, sizes_px=np.ones(7))  # type: ignore[arg-type]
+        both = replace(good, views={"cheap": view_of(good), "strong": view_of(other)})
+        half = replace(good, views={"cheap": view_of(good), "strong": View(good.camera, double)})
+        none = replace(good, views={})
+        for bad in (half, none):
+            with pytest.raises(ValueError, match=r"float32|no features"):
+                store.add_references("office", [bad])
+        # Even a failure in the middle of the transaction leaves nothing.
+        execute(
+            data_dir,
+            "CREATE TRIGGER deny BEFORE INSERT ON features WHEN NEW.extractor = 'strong' "
+            "BEGIN SELECT RAISE(ABORT, 'denied'); END",
+        )
+        with pytest.raises(IntegrityError, match="denied"):
+            store.add_references("office", [both])
+        execute(data_dir, "DROP TRIGGER deny")
+        assert (store.get_scene("office").generation, store.list_references("office", 10)) == (1, [])
+        (record,) = store.add_references("office", [both])
+        assert (record.feature_count, store.get_scene("office").generation) == (20, 2)
+        for name, view in both.views.items():
+            (loaded,) = store.load_references("office", None, name).references
+            assert_same_view(loaded.view, view)
+
+    def test_a_key_is_for_one_image_for_ever(self, store: Store) -> None:
+        store.create_scene("office")
+        (old,) = store.add_references("office", [make_reference("a", 1)])
+        store.delete_reference("office", "a")
+        store.add_references("office", [make_reference("a", 2)])
+        for call in (
+            lambda: store.read_image_of(old.key),
+            lambda: store.add_features(old.key, "other", view_of(make_reference("a", 1))),
+        ):
+            with pytest.raises(errors.NotFound, match="deleted"):
+                call()
+        assert not store.has_features(old.key, EXTRACTOR)
+        assert len(store.load_references("office", None, "other").undescribed) == 1
 
     def test_more_references_than_one_statement_takes(self, store: Store) -> None:
         store.create_scene("office")
@@ -352,7 +419,7 @@ class TestMemory:
         for array in (
             loaded.view.features.keypoints,
             loaded.view.features.descriptors,
-            loaded.world_from_camera.translation,
+            loaded.record.world_from_camera.translation,
         ):
             with pytest.raises(ValueError, match="read-only"):
                 array[:] = 0
@@ -471,7 +538,7 @@ class TestDamage:
             with pytest.raises(errors.DataLoss, match="'bad'"):
                 store.load_references("office", ids, EXTRACTOR)
         (good,) = store.load_references("office", ["good"], EXTRACTOR).references
-        assert_same_view(good.view, make_reference("good", 2).view)
+        assert_same_view(good.view, view_of(make_reference("good", 2)))
         assert store.read_image("office", "bad") == make_reference("bad", 1).image
         store.delete_reference("office", "bad")
         assert len(store.load_references("office", None, EXTRACTOR).references) == 1
@@ -482,10 +549,12 @@ class TestDamage:
         execute(data_dir, "UPDATE image SET data = zeroblob(5000) WHERE reference_key = ?", bad.key)
         with pytest.raises(errors.DataLoss, match="'bad'"):
             store.read_image("office", "bad")
+        with pytest.raises(errors.DataLoss, match="'bad'"):
+            store.read_image_of(bad.key)
         assert store.read_image("office", "good") == make_reference("good").image
 
     def test_every_single_bit_flip_is_noticed(self) -> None:
-        blob = codec.encode_view(make_reference("a", count=1).view)
+        blob = codec.encode_view(view_of(make_reference("a", count=1)))
         sha256 = codec.sha256_for("owner", blob)
         codec.decode_view("owner", blob, sha256)
         for position in range(0, len(blob), 7):
@@ -495,7 +564,7 @@ class TestDamage:
                 codec.decode_view("owner", bytes(flipped), sha256)
 
     def test_a_later_format_is_not_misread(self) -> None:
-        blob = bytearray(codec.encode_view(make_reference("a", count=1).view))
+        blob = bytearray(codec.encode_view(view_of(make_reference("a", count=1))))
         struct.pack_into("<B", blob, 0, codec.VIEW_FORMAT_VERSION + 1)
         with pytest.raises(codec.Damaged, match="format 2"):
             codec.decode_view("owner", bytes(blob), codec.sha256_for("owner", bytes(blob)))

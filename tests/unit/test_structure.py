@@ -15,26 +15,28 @@ from scipy.optimize import least_squares
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.correspond import Correspondences
-from mapless_server.structure import (
+from mapless_server.observations import (
     MIN_NOISE_LEVEL_PX,
     ONE_PIXEL,
-    PAPER_STRUCTURE,
     KeypointNoise,
     Observations,
-    Structure,
-    StructureOptions,
     adjust_points,
     better_start,
-    build_structure,
     estimate_noise,
     invert_symmetric,
-    observe,
-    predicted_points,
     soft_l1,
     soft_l1_weight,
     solve_symmetric,
     triangulate,
     trustworthy,
+)
+from mapless_server.structure import (
+    PAPER_STRUCTURE,
+    Structure,
+    StructureOptions,
+    build_structure,
+    observe,
+    predicted_points,
 )
 from mapless_server.tracks import Tracks
 from mapless_server.views import Features, PosedView, View
@@ -62,14 +64,14 @@ def one_point(observations: Observations, point: int) -> Observations:
     """The observations of one point alone."""
     mine = observations.point == point
     return Observations(
-        np.zeros(mine.sum(), np.intp),
+        Tracks(np.zeros(mine.sum(), np.intp), np.arange(mine.sum()), np.zeros(mine.sum(), np.intp)),
         observations.pixel[mine],
+        observations.size_px[mine],
         observations.sigma_px[mine],
         observations.rotation[mine],
         observations.translation[mine],
         observations.focal_px[mine],
         observations.principal_px[mine],
-        np.zeros(1, np.intp),
     )
 
 
@@ -233,7 +235,7 @@ def test_points_return_in_spite_of_a_wrong_observation() -> None:
     _, observations, truth = planted("robust", SceneOptions(noise_px=0.0, seen_share=1.0, reference_count=7))
     full = np.bincount(observations.point) == 7
     wrong = np.zeros(len(observations.point), bool)
-    wrong[observations.starts] = True
+    wrong[observations.tracks.starts] = True
     pixel = observations.pixel + np.where(wrong[:, None], 40.0, 0.0)
     adjusted = adjust_points(replace(observations, pixel=pixel), truth + random.normal(0, 0.05, truth.shape), 0.1, 40)
     assert np.median(np.linalg.norm(adjusted - truth, axis=1)[full]) < 2e-3
@@ -302,7 +304,7 @@ def test_points_with_little_parallax_are_not_trusted() -> None:
 def test_points_that_do_not_fit_are_not_trusted() -> None:
     _, observations, truth = planted("unfit", SceneOptions(noise_px=0.0, point_count=60))
     wrong = np.zeros(len(observations.point), bool)
-    wrong[observations.starts[[3, 9]]] = True
+    wrong[observations.tracks.starts[[3, 9]]] = True
     spoilt = replace(observations, pixel=observations.pixel + np.where(wrong[:, None], 5.0, 0.0))
     points = truth.copy()
     points[5] = np.nan

@@ -170,9 +170,11 @@ def test_select_keeps_the_chosen_and_renumbers(drawn: tuple[Pairs, list[int]], d
 def test_prune_drops_observations_and_what_is_left_alone(drawn: tuple[Pairs, list[int]], data: st.DataObject) -> None:
     tracks = build_tracks(*drawn)
     good = np.array([data.draw(st.booleans()) for _ in tracks.point], bool)
-    pruned, kept = tracks.prune(good)
+    pruned, rows, kept = tracks.prune(good)
     assert_is_well_formed(pruned)
     assert kept.shape == (tracks.point_count,)
+    assert rows.shape == tracks.point.shape
+    np.testing.assert_array_equal(tracks.keypoint[rows], pruned.keypoint)
     assert pruned.point_count == kept.sum()
     for new, old in enumerate(np.flatnonzero(kept)):
         np.testing.assert_array_equal(

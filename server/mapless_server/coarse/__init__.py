@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from mapless.geometry import Camera, RigidTransform
 from ..correspond import Correspondences
 from ..rejection import Rejection
 from ..views import PosedView, View
+
+if TYPE_CHECKING:  # it needs torch
+    from .device import DeviceReconstruction
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +51,17 @@ class ReconstructedView:
         self, pixels: NDArray[np.floating], camera: Camera
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
         """Rows and columns (N,) of the maps' cells that hold pixels (N, 2) of the view's camera, and which exist."""
-        mapped = np.rint(self.camera.project(camera.rays(pixels)))
-        height, width = self.confidence.shape
-        inside = np.asarray(((mapped >= 0) & (mapped < (width, height))).all(axis=1))
-        columns, rows = np.where(inside[:, None], mapped, 0).astype(np.intp).T
-        return rows, columns, inside
+        return map_cells(self.camera, pixels, camera)
+
+
+def map_cells(
+    map_camera: Camera, pixels: NDArray[np.floating], camera: Camera
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
+    """Rows and columns (N,) of the cells of one camera's maps that hold pixels (N, 2) of another; and which exist."""
+    mapped = np.rint(map_camera.project(camera.rays(pixels)))
+    inside = np.asarray(((mapped >= 0) & (mapped < (map_camera.width_px, map_camera.height_px))).all(axis=1))
+    columns, rows = np.where(inside[:, None], mapped, 0).astype(np.intp).T
+    return rows, columns, inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +83,8 @@ class Reconstructor(Protocol):
     Attributes:
         name: "geometric", "pi3", ...
         weights_sha256: of the network's weights; empty without any.
+        uses_correspondences: whether the answer depends on them. A network's does not, so it is asked once for a query,
+            whatever else is tried with it.
     """
 
     @property
@@ -86,9 +97,18 @@ class Reconstructor(Protocol):
         """See the class."""
         ...
 
+    @property
+    def uses_correspondences(self) -> bool:
+        """See the class."""
+        ...
+
+    def close(self) -> None:
+        """Gives back threads and devices; nothing follows."""
+        ...
+
     def reconstruct(
         self, query: View, references: Sequence[PosedView], correspondences: Correspondences
-    ) -> Reconstruction | Rejection:
+    ) -> Reconstruction | DeviceReconstruction | Rejection:
         """Reconstructs the query and its references together, or says why it cannot.
 
         A network looks at the images and ignores the correspondences; the geometric backend lives on them.

@@ -16,9 +16,10 @@ from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..correspond import Correspondences
 from ..match import vote
+from ..observations import FIRST_GUESS, adjust_points, triangulate, trustworthy
 from ..pnp import PnpOptions, log10_false_alarms, ransac, reprojection_errors_px
 from ..rejection import Rejection, RejectionReason
-from ..structure import FIRST_GUESS, Structure, StructureOptions, adjust_points, observe, triangulate, trustworthy
+from ..structure import Structure, StructureOptions, observe
 from ..tracks import build_tracks
 from ..views import PosedView, View
 from . import ReconstructedView, Reconstruction
@@ -52,6 +53,10 @@ class GeometricReconstructor:
     options: GeometricOptions = field(default_factory=GeometricOptions)
     name: str = "geometric"
     weights_sha256: str = ""
+    uses_correspondences: bool = True
+
+    def close(self) -> None:
+        """Nothing to give back."""
 
     def reconstruct(
         self, query: View, references: Sequence[PosedView], correspondences: Correspondences

@@ -147,12 +147,17 @@ def check_images(frames: Iterable[Frame], limits: ImageLimits) -> None:
 
 
 def make_plan(
-    dataset: Dataset, options: EvaluationOptions, extractor: FeatureExtractor, limits: ImageLimits, progress: Progress
+    dataset: Dataset,
+    options: EvaluationOptions,
+    extractor: FeatureExtractor,
+    ratio: float,
+    limits: ImageLimits,
+    progress: Progress,
 ) -> Plan:
     """Chooses references and queries, and ranks the references of each query by their feature matches with it.
 
-    The ranking does not look at the query's true pose. It is the server's own (`retrieve`), done here because a query
-    that is left out must not be offered itself.
+    The ranking does not look at the query's true pose. It is the server's own (`retrieve`) with the extractor and ratio
+    of its first features, done here because a query that is left out must not be offered itself.
 
     Raises:
         UsageError: too few frames, or an image is missing, damaged or of another size than its camera.
@@ -177,7 +182,7 @@ def make_plan(
             PosedView(frame.name, frame.name, views[i], frame.world_from_camera)
             for i, frame in zip(candidates, frames, strict=True)
         ]
-        chosen = choose_references(views[query], posed, options.k)
+        chosen = choose_references(views[query], posed, options.k, ratio=ratio)
         return PlannedQuery(dataset.frames[query], tuple(frames[i] for i in chosen))
 
     queries = _map(planned, split.queries, "choosing references", progress)

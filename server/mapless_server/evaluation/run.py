@@ -12,13 +12,15 @@ import numpy as np
 
 from mapless import Client, ConnectOptions, LocalizationResult, NewReference
 
+from ..assembly import make_first_features
 from ..child import child_server
+from ..correspond import OPTIONS
 from ..dataset import Dataset
-from ..features import make_extractor
 from ..serve import image_limits
 from ..settings import Settings
+from ..weights import WeightsError
 from .metrics import QueryResult, pose_error, trajectory_radius
-from .plan import EvaluationOptions, Plan, PlannedQuery, Progress, make_plan
+from .plan import EvaluationOptions, Plan, PlannedQuery, Progress, UsageError, make_plan
 
 SCENE = "evaluation"
 
@@ -61,8 +63,17 @@ def evaluate(dataset: Dataset, options: EvaluationOptions, settings: Settings, p
 
 
 def plan_for(dataset: Dataset, options: EvaluationOptions, settings: Settings, progress: Progress) -> Plan:
-    """The plan, with the features that a server of these settings has; UsageError as `make_plan`."""
-    return make_plan(dataset, options, make_extractor(settings.features), image_limits(settings), progress)
+    """The plan, chosen with the first features that a server of these settings has.
+
+    Raises:
+        UsageError: as `make_plan`, or the settings ask for features that are not there.
+    """
+    try:
+        features, extractor = make_first_features(settings)
+    except (ValueError, ImportError, WeightsError) as error:
+        raise UsageError(str(error)) from error
+    ratio = OPTIONS[features].query_ratio
+    return make_plan(dataset, options, extractor, ratio, image_limits(settings), progress)
 
 
 def upload(client: Client, plan: Plan, progress: Progress) -> None:

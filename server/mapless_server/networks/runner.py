@@ -20,8 +20,6 @@ from .network import Network, NetworkOutput
 
 T = TypeVar("T")
 
-ENCODE_SIZES = (8, 4, 2, 1)
-"""Views that are encoded at a time when the network is compiled: few sizes, of which any number is made."""
 MAX_COMPILED_SHAPES = 64
 """Torch gives up compiling after eight shapes; grids and numbers of views make more."""
 
@@ -131,7 +129,8 @@ class NetworkRunner:
 
         Returns:
             (V, T, C) on the device, in the compute type. Rounding here, and not only where tokens are kept, makes no
-            difference between those that were and those that were not.
+            difference between those that were and those that were not. Nor does the company: views are encoded one by
+            one, because kernels round differently for batches of another size, and a thousand tokens fill a device.
         """
         return self._run(self._encode_views, images, intrinsics)
 
@@ -184,15 +183,13 @@ class NetworkRunner:
         if intrinsics is not None:
             intrinsics = intrinsics.to(self.device, torch.float32, non_blocking=True)
         grid = (images.shape[2] // PATCH_PX, images.shape[3] // PATCH_PX)
-        parts, start = [], 0
-        while start < len(images):
-            size = next(size for size in ENCODE_SIZES if size <= len(images) - start)
-            chosen = slice(start, start + size)
-            encode = self._encode if ("encode", grid, size) in self._warm else self.network.encode
-            tokens = encode(images[chosen], self._layout(grid), None if intrinsics is None else intrinsics[chosen])
+        encode = self._encode if ("encode", grid) in self._warm else self.network.encode
+        parts = []
+        for view in range(len(images)):
+            of_view = None if intrinsics is None else intrinsics[view : view + 1]
+            tokens = encode(images[view : view + 1], self._layout(grid), of_view)
             # Recorded graphs write into the same memory again and again; `to` alone copies only if the type changes.
             parts.append(tokens.to(self.dtype, copy=True))
-            start += size
         return torch.cat(parts)
 
     def _reconstruct_scenes(
@@ -223,8 +220,7 @@ class NetworkRunner:
 
     def _warm_up(self, bucket: Bucket) -> None:
         height, width = (side * PATCH_PX for side in bucket.grid)
-        sizes = [size for size in ENCODE_SIZES if size <= bucket.views]
-        self._warm.update(("encode", bucket.grid, size) for size in sizes)
+        self._warm.add(("encode", bucket.grid))
         references = bucket.views - 1
         posed = torch.arange(bucket.views).expand(bucket.scenes, -1) < references if self.conditioned else None
         count = references if self.conditioned and references > 1 else 0
@@ -233,9 +229,7 @@ class NetworkRunner:
         poses[..., 0, 3] = torch.arange(bucket.views)
         with torch._dynamo.config.patch(recompile_limit=MAX_COMPILED_SHAPES):
             for _ in range(3):  # compiles, records, replays
-                for size in sizes:
-                    images = torch.rand(size, 3, height, width)
-                    intrinsics = torch.eye(3).repeat(size, 1, 1) if self.conditioned else None
-                    tokens = self._prepared(self._encode_views, images, intrinsics)
-                tokens = tokens[:1].expand(bucket.scenes, bucket.views, -1, -1).contiguous()
+                intrinsics = torch.eye(3)[None] if self.conditioned else None
+                tokens = self._prepared(self._encode_views, torch.rand(1, 3, height, width), intrinsics)
+                tokens = tokens.expand(bucket.scenes, bucket.views, -1, -1).contiguous()
                 self._prepared(self._reconstruct_scenes, tokens, bucket.grid, references, poses, posed)

@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, Select, func, select, update
 
 from mapless_server.errors import AlreadyExists, NotFound
-from mapless_server.store.tables import features, reference, scene, scene_generation
+from mapless_server.store.tables import features, image, reference, scene, scene_generation
 
 _IDS_PER_STATEMENT = 500
 """Databases bound the number of parameters of a statement."""
@@ -99,6 +99,16 @@ def refuse_taken_ids(connection: Connection, scene_id: str, reference_ids: Seque
         taken.add(reference_id)
 
 
+def rows_by_key(connection: Connection, keys: Sequence[str]) -> dict[str, Row[Any]]:
+    """Rows of ``reference``, by key."""
+    statement = select(reference)
+    return {
+        row.key: row
+        for portion in _portions(keys)
+        for row in connection.execute(statement.where(reference.c.key.in_(portion)))
+    }
+
+
 def features_by_key(connection: Connection, keys: Sequence[str], extractor: str) -> dict[str, Row[Any]]:
     """Rows of ``reference`` joined with ``features``, by key, of those that have features of this extractor."""
     statement: Select[Any] = (
@@ -113,9 +123,41 @@ def features_by_key(connection: Connection, keys: Sequence[str], extractor: str)
     }
 
 
+def find_id(connection: Connection, key: str) -> str:
+    """Id of the reference with this key. Raises NotFound if it was deleted."""
+    reference_id: str | None = connection.scalar(select(reference.c.reference_id).where(reference.c.key == key))
+    if reference_id is None:
+        raise _reference_deleted()
+    return reference_id
+
+
+def find_image(connection: Connection, key: str) -> Row[Any]:
+    """Columns ``reference_id``, ``image_sha256`` and ``data`` of a reference. Raises NotFound if it was deleted."""
+    statement: Select[Any] = (
+        select(reference.c.reference_id, reference.c.image_sha256, image.c.data)
+        .outerjoin(image, image.c.reference_key == reference.c.key)
+        .where(reference.c.key == key)
+    )
+    row = connection.execute(statement).one_or_none()
+    if row is None:
+        raise _reference_deleted()
+    return row
+
+
+def has_features(connection: Connection, key: str, extractor: str) -> bool:
+    """Whether there are features of this extractor."""
+    column = features.c
+    statement = select(column.extractor).where(column.reference_key == key, column.extractor == extractor)
+    return connection.scalar(statement) is not None
+
+
 def reference_not_found(scene_id: str, reference_id: str, field: str) -> NotFound:
     """The answer for a reference that does not exist."""
     return NotFound(f"there is no reference {reference_id!r} in scene {scene_id!r}", field=field)
+
+
+def _reference_deleted() -> NotFound:
+    return NotFound("a reference was deleted while it was used")
 
 
 def _scene_not_found(scene_id: str) -> NotFound:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.views import PosedView, View
+from mapless_server.views import View
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,8 @@ class SceneRecord:
     Attributes:
         scene_id: unique among the scenes that exist.
         generation: raised by every change of the scene or its references. A scene that is deleted and created again
-            counts on, so (scene_id, generation) never means two different contents.
+            counts on, so (scene_id, generation) never means two different contents. Features of one more extractor
+            are no change: they follow from the image and the extractor's name, and answers are named after both.
         reference_count: number of references.
         create_time: UTC.
     """
@@ -36,16 +38,15 @@ class NewReference:
         image: the file's bytes as they came.
         camera: in pixels of that image.
         world_from_camera: its pose, metric.
-        view: processed camera and features; float32 arrays.
-        extractor: name of what computed the features, "sift-2048-1024px-0.02".
+        views: by the name of the extractor, "sift-2048-1024px-0.02": processed camera and features, float32 arrays. At
+            least one; the first one's features are those that are counted.
     """
 
     reference_id: str
     image: bytes
     camera: Camera
     world_from_camera: RigidTransform
-    view: View
-    extractor: str
+    views: Mapping[str, View]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,7 @@ class ReferenceRecord:
         camera: in pixels of the stored image.
         world_from_camera: its pose, metric.
         image_sha256: of the image's bytes, hexadecimal.
-        feature_count: number of features it was added with.
+        feature_count: number of features that the first extractor found when it was added.
         create_time: UTC.
     """
 
@@ -82,8 +83,23 @@ class ReferencePose:
 
 
 @dataclass(frozen=True, eq=False)
+class DescribedReference:
+    """A stored reference and what one extractor found in its image; read-only arrays."""
+
+    record: ReferenceRecord
+    view: View
+
+
+@dataclass(frozen=True, eq=False)
 class SceneSnapshot:
-    """References and the generation of their scene, read at one moment."""
+    """References and the generation of their scene, read at one moment.
+
+    Attributes:
+        generation: of the scene.
+        references: those that have features of the extractor asked for, in the order asked for.
+        undescribed: those that have none, likewise.
+    """
 
     generation: int
-    references: tuple[PosedView, ...]
+    references: tuple[DescribedReference, ...]
+    undescribed: tuple[ReferenceRecord, ...] = ()

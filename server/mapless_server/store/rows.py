@@ -11,8 +11,8 @@ from sqlalchemy import Row
 
 from mapless_server.errors import DataLoss
 from mapless_server.store import codec
-from mapless_server.store.records import NewReference, ReferenceRecord, SceneRecord
-from mapless_server.views import PosedView, View
+from mapless_server.store.records import DescribedReference, NewReference, ReferenceRecord, SceneRecord
+from mapless_server.views import View
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _MICROSECOND = timedelta(microseconds=1)
@@ -29,7 +29,9 @@ def scene_record(row: Row[Any]) -> SceneRecord:
 
 
 def new_record(scene_id: str, new: NewReference, create_time: datetime) -> ReferenceRecord:
-    """The record of a reference about to be stored, with a key nobody had before."""
+    """The record of a reference about to be stored, with a key nobody had before; ValueError if it has no features."""
+    if not new.views:
+        raise ValueError(f"reference {new.reference_id!r} has no features of any extractor")
     return ReferenceRecord(
         scene_id=scene_id,
         reference_id=new.reference_id,
@@ -37,7 +39,7 @@ def new_record(scene_id: str, new: NewReference, create_time: datetime) -> Refer
         camera=new.camera,
         world_from_camera=new.world_from_camera,
         image_sha256=hashlib.sha256(new.image).hexdigest(),
-        feature_count=len(new.view.features),
+        feature_count=len(next(iter(new.views.values())).features),
         create_time=create_time,
     )
 
@@ -86,14 +88,22 @@ def features_row(key: str, extractor: str, view: View) -> dict[str, Any]:
     }
 
 
-def posed_view(row: Row[Any]) -> PosedView:
+def described_reference(row: Row[Any]) -> DescribedReference:
     """From a row of ``queries.features_by_key``. Raises DataLoss if it is damaged."""
+    record = reference_record(row)
     try:
-        _, world_from_camera = codec.decode_geometry(row.key, row.geometry, row.geometry_sha256)
         view = codec.decode_view(f"{row.key}/{row.extractor}", row.data, row.sha256)
     except codec.Damaged as error:
         raise data_loss(row.reference_id, str(error)) from error
-    return PosedView(row.key, f"scenes/{row.scene_id}/references/{row.reference_id}", view, world_from_camera)
+    return DescribedReference(record, view)
+
+
+def image(row: Row[Any]) -> bytes:
+    """From a row of ``queries.find_image``. Raises DataLoss if it is damaged."""
+    data: object = row.data
+    if not isinstance(data, bytes) or hashlib.sha256(data).hexdigest() != row.image_sha256:
+        raise data_loss(row.reference_id, "image")
+    return data
 
 
 def data_loss(reference_id: str, what: str) -> DataLoss:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
@@ -10,12 +9,19 @@ from types import TracebackType
 
 from sqlalchemy import delete, insert, select
 
-from mapless_server.errors import AlreadyExists, FailedPrecondition
+from mapless_server.errors import AlreadyExists
 from mapless_server.store import queries, rows, tables
 from mapless_server.store.cache import LruCache
-from mapless_server.store.records import NewReference, ReferencePose, ReferenceRecord, SceneRecord, SceneSnapshot
+from mapless_server.store.records import (
+    DescribedReference,
+    NewReference,
+    ReferencePose,
+    ReferenceRecord,
+    SceneRecord,
+    SceneSnapshot,
+)
 from mapless_server.store.sqlite import SqliteDatabase
-from mapless_server.views import PosedView, View
+from mapless_server.views import View
 
 DEFAULT_CACHE_BYTES = 512 * 2**20
 """About 500 references with 2048 SIFT features each; 0 reads the database every time."""
@@ -32,10 +38,10 @@ class Store:
     the damaged one can be deleted.
     """
 
-    def __init__(self, database: SqliteDatabase, views: LruCache[PosedView]) -> None:
+    def __init__(self, database: SqliteDatabase, described: LruCache[DescribedReference]) -> None:
         self._database = database
         # By (key, extractor): references never change and keys are never reused, so no entry is ever stale.
-        self._views = views
+        self._described = described
         # By (scene_id, generation), which are never reused either.
         self._poses: LruCache[tuple[ReferencePose, ...]] = LruCache(POSE_CACHE_BYTES)
 
@@ -51,8 +57,8 @@ class Store:
             StoreError: the folder or the database cannot be used, with one sentence that says why.
             ValueError: cache_bytes is negative.
         """
-        views: LruCache[PosedView] = LruCache(cache_bytes)
-        return Store(SqliteDatabase.open(data_dir), views)
+        described: LruCache[DescribedReference] = LruCache(cache_bytes)
+        return Store(SqliteDatabase.open(data_dir), described)
 
     def close(self) -> None:
         """Release the data folder; no call may be in progress or follow."""
@@ -108,7 +114,7 @@ class Store:
             connection.execute(delete(tables.scene).where(tables.scene.c.scene_id == scene_id))
 
     def add_references(self, scene_id: str, references: Sequence[NewReference]) -> list[ReferenceRecord]:
-        """Add references, all or none; one change of the scene.
+        """Add references, all or none, each with the features of all its extractors; one change of the scene.
 
         Returns:
             The new references in the order given.
@@ -116,7 +122,8 @@ class Store:
         Raises:
             NotFound: there is no such scene.
             AlreadyExists: an id is taken or stands twice; the field is "requests[i].reference_id".
-            ValueError: features are not float32, a number of a camera or pose is not finite, or no reference is given.
+            ValueError: features are not float32, a number of a camera or pose is not finite, no reference is given, or
+                one without any features.
         """
         if not references:
             raise ValueError("no reference to add")
@@ -127,7 +134,7 @@ class Store:
         image_rows, features_rows = [], []
         for record, new in zip(records, references, strict=True):
             image_rows.append({"reference_key": record.key, "data": new.image})
-            features_rows.append(rows.features_row(record.key, new.extractor, new.view))
+            features_rows += [rows.features_row(record.key, *described) for described in new.views.items()]
         with self._database.write() as connection:
             queries.begin_change(connection, scene_id)
             queries.refuse_taken_ids(connection, scene_id, [new.reference_id for new in references])
@@ -136,20 +143,30 @@ class Store:
             connection.execute(insert(tables.features), features_rows)
         return records
 
-    def add_features(self, scene_id: str, reference_id: str, extractor: str, view: View) -> None:
-        """Store what another extractor found in a reference's image.
+    def add_features(self, key: str, extractor: str, view: View) -> None:
+        """Store what another extractor found in a reference's image; no change of the scene, see SceneRecord.
+
+        Args:
+            key: of the reference. An id would not do: by now it may be that of another image.
+            extractor: whose features.
+            view: processed camera and features.
 
         Raises:
-            NotFound: there is no such scene or reference.
+            NotFound: the reference was deleted.
             AlreadyExists: the reference has features of this extractor.
             ValueError: features are not float32, or a number of the camera is not finite.
         """
+        row = rows.features_row(key, extractor, view)
         with self._database.write() as connection:
-            queries.begin_change(connection, scene_id)
-            key = queries.find_key(connection, scene_id, reference_id)
-            if queries.features_by_key(connection, [key], extractor):
+            reference_id = queries.find_id(connection, key)
+            if queries.has_features(connection, key, extractor):
                 raise AlreadyExists(f"reference {reference_id!r} has features of {extractor!r} already")
-            connection.execute(insert(tables.features).values(rows.features_row(key, extractor, view)))
+            connection.execute(insert(tables.features).values(row))
+
+    def has_features(self, key: str, extractor: str) -> bool:
+        """Whether a reference has features of this extractor; False if it was deleted."""
+        with self._database.read() as connection:
+            return queries.has_features(connection, key, extractor)
 
     def get_reference(self, scene_id: str, reference_id: str) -> ReferenceRecord:
         """A reference without its image.
@@ -170,14 +187,20 @@ class Store:
             NotFound: there is no such scene or reference.
             DataLoss: the bytes are damaged.
         """
-        reference, image = tables.reference, tables.image
         with self._database.read() as connection:
-            key = queries.find_key(connection, scene_id, reference_id)
-            sha256 = connection.scalar(select(reference.c.image_sha256).where(reference.c.key == key))
-            data: object = connection.scalar(select(image.c.data).where(image.c.reference_key == key))
-        if not isinstance(data, bytes) or hashlib.sha256(data).hexdigest() != sha256:
-            raise rows.data_loss(reference_id, "image")
-        return data
+            row = queries.find_image(connection, queries.find_key(connection, scene_id, reference_id))
+        return rows.image(row)
+
+    def read_image_of(self, key: str) -> bytes:
+        """The image's bytes as they came, by the reference's key: the very image that a snapshot spoke of.
+
+        Raises:
+            NotFound: the reference was deleted.
+            DataLoss: the bytes are damaged.
+        """
+        with self._database.read() as connection:
+            row = queries.find_image(connection, key)
+        return rows.image(row)
 
     def list_references(self, scene_id: str, limit: int, after: str = "") -> list[ReferenceRecord]:
         """At most ``limit`` references of a scene, by id, of those whose id is greater than ``after``.
@@ -225,7 +248,7 @@ class Store:
         return generation, poses
 
     def load_references(self, scene_id: str, reference_ids: Sequence[str] | None, extractor: str) -> SceneSnapshot:
-        """References with their features, and the generation they belong to, read at one moment.
+        """References with their features, which of them have none, and the generation, all read at one moment.
 
         References that were loaded before come from memory.
 
@@ -236,7 +259,6 @@ class Store:
 
         Raises:
             NotFound: there is no such scene (field "scene") or reference (field "references[i]").
-            FailedPrecondition: a reference has no features of this extractor (reason "FEATURES_MISSING").
             DataLoss: features, camera or pose of one of them are damaged.
         """
         with self._database.read() as connection:
@@ -249,21 +271,20 @@ class Store:
             for index, reference_id in enumerate(reference_ids):
                 if reference_id not in keys:
                     raise queries.reference_not_found(scene_id, reference_id, field=f"references[{index}]")
-            views = {key: self._views.get((key, extractor)) for key in keys.values()}
-            absent = [key for key, view in views.items() if view is None]
-            found = queries.features_by_key(connection, absent, extractor)
+            wanted = [keys[reference_id] for reference_id in reference_ids]
+            remembered = {key: self._described.get((key, extractor)) for key in wanted}
+            described = {key: it for key, it in remembered.items() if it is not None}
+            found = queries.features_by_key(connection, [key for key in wanted if key not in described], extractor)
+            lacking = [key for key in wanted if key not in described and key not in found]
+            undescribed = queries.rows_by_key(connection, lacking)
         for key, row in found.items():
-            loaded = views[key] = rows.posed_view(row)
-            self._views.put((key, extractor), loaded, len(row.data) + POSE_BYTES)
-        references = []
-        for reference_id in reference_ids:
-            view = views[keys[reference_id]]
-            if view is None:
-                raise FailedPrecondition(
-                    f"reference {reference_id!r} has no features of {extractor!r}", reason="FEATURES_MISSING"
-                )
-            references.append(view)
-        return SceneSnapshot(generation, tuple(references))
+            described[key] = rows.described_reference(row)
+            self._described.put((key, extractor), described[key], len(row.data) + POSE_BYTES)
+        return SceneSnapshot(
+            generation,
+            tuple(described[key] for key in wanted if key in described),
+            tuple(rows.reference_record(undescribed[key]) for key in lacking),
+        )
 
 
 def _now() -> datetime:

@@ -1,0 +1,82 @@
+"""Arrays say where they are computed.
+
+The equations of scale and structure are written once, for NumPy's arrays on the host and torch's tensors on a device.
+Most of them are operators, methods and indexing, which both have. For the rest, `namespace(array)` is NumPy or torch,
+whose functions agree in names and order of arguments, if not in keywords. Here stands what does not agree.
+
+On a device nothing here waits for it: no value is looked at, no shape depends on one.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+
+AnyArray: TypeAlias = Any
+"""A NumPy array or a torch tensor; all arguments of a call are of one kind, on one device."""
+
+
+def namespace(array: AnyArray) -> Any:
+    """The module, numpy or torch, whose functions take `array`."""
+    if isinstance(array, np.ndarray | np.generic):
+        return np
+    import torch  # a server without a network runs without it
+
+    return torch
+
+
+def median(values: AnyArray, where: AnyArray) -> AnyArray:
+    """Median of the `values` (N,) that are chosen by the mask `where` (N,), NaN if none is."""
+    xp = namespace(values)
+    if xp is np:
+        return np.median(values[where]) if where.any() else np.float64(np.nan)
+    # To select would be to wait for their number. The infinity at the end is for the index of none.
+    count = where.sum()
+    ordered = xp.sort(xp.cat([values.masked_fill(~where, np.inf), values.new_full((1,), np.inf)])).values
+    middle = ordered[xp.stack([(count - 1).clip(0) // 2, count // 2])]
+    return xp.where(count > 0, middle.mean(), np.nan)
+
+
+def identity(like: AnyArray) -> AnyArray:
+    """The identity (3, 3) of the kind and type of `like`, and where it is."""
+    xp = namespace(like)
+    return np.eye(3, dtype=like.dtype) if xp is np else xp.eye(3, dtype=like.dtype, device=like.device)
+
+
+def length(vectors: AnyArray) -> AnyArray:
+    """Euclidean length (...) of vectors (..., D)."""
+    return (vectors**2).sum(-1) ** 0.5
+
+
+def apply(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
+    """Many small matrices (N, I, J) times vectors (N, J), (N, I).
+
+    NumPy's own product takes three times as long. A GPU's library launches a group of threads for each matrix.
+    """
+    if namespace(matrices) is np:
+        return np.einsum("nij,nj->ni", matrices, vectors)
+    return (matrices * vectors[:, None, :]).sum(-1)
+
+
+def multiply(first: AnyArray, second: AnyArray) -> AnyArray:
+    """Many small matrices (N, I, J) times others (N, J, K), (N, I, K)."""
+    if namespace(first) is np:
+        return first @ second
+    return (first[:, :, :, None] * second[:, None, :, :]).sum(2)
+
+
+def normalize(x_in_camera: AnyArray) -> AnyArray:
+    """`mapless.geometry.normalize` for any array; robots, who install that, shall not need to know of torch."""
+    depth = x_in_camera[..., 2:]
+    return x_in_camera[..., :2] / namespace(depth).where(depth > 0, depth, np.nan)
+
+
+def normalize_jacobian(x_in_camera: AnyArray) -> AnyArray:
+    """`mapless.geometry.normalize_jacobian` for any array."""
+    xp, depth = namespace(x_in_camera), x_in_camera[..., 2]
+    inverse_depth = 1 / xp.where(depth > 0, depth, np.nan)
+    jacobian = xp.stack([xp.zeros_like(x_in_camera)] * 2, -2)
+    jacobian[..., 0, 0] = jacobian[..., 1, 1] = inverse_depth
+    jacobian[..., :, 2] = -normalize(x_in_camera) * inverse_depth[..., None]
+    return jacobian

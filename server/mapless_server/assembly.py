@@ -1,0 +1,124 @@
+"""From settings to tiers: which features, matchers and backend serve, and what does without where something is missing.
+
+Nothing here imports torch unless the settings ask for a network.
+"""
+
+from __future__ import annotations
+
+import logging
+
+from .coarse.make import make_reconstructor
+from .correspond import Matcher, make_matcher
+from .features import FeatureExtractor, make_extractor
+from .localize import Pipeline
+from .settings import Settings, available_cores
+from .tiers import Tier
+from .weights import CATALOGUE, WeightsMissing, find_weights
+
+log = logging.getLogger(__name__)
+
+CHEAP_FEATURES, STRONG_FEATURES = "sift", "aliked"
+"""What `auto` chooses from; both may be used for any purpose.
+
+On a CPU the first answers, and the second where the first is in doubt: of 159 photographs, 120 of them with 3 to 5
+references far apart, SIFT loses 16 at 0.1 s a photograph, ALIKED 3 at 1 to 3 s, and ALIKED after SIFT the same 3 though
+only 53 need it. On a GPU the second is as quick as the first, and answers alone.
+"""
+
+
+WITH_WEIGHTS = frozenset(entry.name for entry in CATALOGUE)
+
+
+def feature_names(features: str, device: str) -> tuple[str, ...]:
+    """The features that a setting means on "cpu" or "cuda...", the cheapest first."""
+    if features != "auto":
+        return (features,)
+    return (CHEAP_FEATURES, STRONG_FEATURES) if device == "cpu" else (STRONG_FEATURES,)
+
+
+def make_tiers(settings: Settings) -> tuple[Tier, ...]:
+    """The tiers that the settings ask for, the cheapest first.
+
+    Of the features that `auto` means, those without weights or packages are left out, and the log says so; at the worst
+    the cheap ones serve alone.
+
+    Raises:
+        ValueError: unknown features or backend, or there is no such device.
+        WeightsError: weights are not there, or do not fit.
+        ImportError: a package that a network needs is not installed.
+    """
+    device = choose_device(settings.device)
+    extractors = _make_extractors(settings, device)
+    reconstructor = make_reconstructor(
+        settings.backend, settings.weights_dir, device, compiled_views=settings.compiled_views
+    )
+    return tuple(
+        Tier(extractor, Pipeline(reconstructor, _make_matcher(name, settings, device)))
+        for name, extractor in extractors.items()
+    )
+
+
+def make_first_features(settings: Settings) -> tuple[str, FeatureExtractor]:
+    """The first tier's features, and their extractor; errors as `make_tiers`."""
+    return next(iter(_make_extractors(settings, choose_device(settings.device)).items()))
+
+
+def what_is_missing(error: ImportError | WeightsMissing) -> str:
+    """What is not there and what to do about it, for the operator."""
+    if isinstance(error, ImportError) and error.name:
+        return f"the Python package {error.name} is not installed: pip install 'mapless[server,networks]'"
+    return str(error)
+
+
+def choose_device(device: str) -> str:
+    """What networks run on; `auto` is a CUDA device if torch is there and finds one, else the CPU.
+
+    Raises:
+        ValueError: there is no such device.
+    """
+    if device == "cpu":
+        return device
+    try:
+        import torch
+    except ImportError:
+        if device == "auto":
+            return "cpu"
+        raise
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if torch.device(device).index not in (None, *range(torch.cuda.device_count())) or not torch.cuda.is_available():
+        raise ValueError(f"there is no device {device}: torch finds {torch.cuda.device_count()} CUDA devices")
+    return device
+
+
+def _make_extractors(settings: Settings, device: str) -> dict[str, FeatureExtractor]:
+    *cheaper, last = feature_names(settings.features, device)
+    extractors = {name: _make_extractor(name, settings, device) for name in cheaper}
+    try:
+        return extractors | {last: _make_extractor(last, settings, device)}
+    except (ImportError, WeightsMissing) as error:
+        if settings.features != "auto":
+            raise
+        log.warning("features auto: %s serves without %s: %s", CHEAP_FEATURES, last, what_is_missing(error))
+    return extractors or {CHEAP_FEATURES: make_extractor(CHEAP_FEATURES)}
+
+
+def _make_extractor(name: str, settings: Settings, device: str) -> FeatureExtractor:
+    if name not in WITH_WEIGHTS:
+        return make_extractor(name)
+    return make_extractor(name, find_weights(name, settings.weights_dir), device)
+
+
+def _make_matcher(name: str, settings: Settings, device: str) -> Matcher:
+    """Nearest neighbours, or on a GPU LightGlue if its weights are there.
+
+    On a CPU LightGlue takes two seconds a pair and gains nothing measurable.
+    """
+    network = f"{name}-lightglue"
+    if device == "cpu" or network not in WITH_WEIGHTS:
+        return make_matcher(name, available_cores())
+    try:
+        return make_matcher(name, available_cores(), find_weights(network, settings.weights_dir), device)
+    except WeightsMissing as error:
+        log.warning("features %s: matched by nearest neighbours: %s", name, error)
+        return make_matcher(name, available_cores())

@@ -1,0 +1,313 @@
+"""What a network sees of a photograph: a picture of one of few sizes, without lens distortion, and its pinhole camera.
+
+The official loader fits one size to the first photograph of a set. Here the sizes are fixed, one for each usual aspect
+ratio, so that a reference nearly always has the same one, and what was computed from it can be kept.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from mapless.geometry import Array, Camera
+
+from ..features import undistort_pixels
+from ..networks.encoder import PATCH_PX
+
+PIXEL_LIMIT = 37 * 28 * PATCH_PX**2
+"""Of 518x392."""
+OFFICIAL_PIXEL_LIMIT = 255_000
+"""Of the official loader; 574x434 for 4:3."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The size of a network's picture, in patches of `PATCH_PX` pixels."""
+
+    columns: int
+    rows: int
+
+    @property
+    def width_px(self) -> int:
+        """Of the picture."""
+        return self.columns * PATCH_PX
+
+    @property
+    def height_px(self) -> int:
+        """Of the picture."""
+        return self.rows * PATCH_PX
+
+    @property
+    def aspect(self) -> float:
+        """Width over height."""
+        return self.columns / self.rows
+
+
+@dataclass(frozen=True)
+class GridOptions:
+    """Options of the pictures.
+
+    Attributes:
+        pixel_limit: of a picture. 518x392 for 4:3 has a fifth fewer patches than the official loader's 574x434, and
+            attention over all views is quadratic in them; both lie in the range that the networks were trained on,
+            100 000 to 255 000 pixels.
+        aspects: width to height, from one end of the range that the networks were trained on to the other. A
+            photograph is then at most 15 % from its nearest grid, unless it lies beyond the ends.
+        max_stretch: a photograph whose aspect is the grid's within this factor is resized along each axis on its own,
+            as the official loader does; another one is fitted inside, its aspect kept, and the rest is filled.
+        max_distortion_px: a lens that moves nothing in the picture by more than this is treated as a pinhole: depth is
+            read to the nearest pixel, and each resampling costs sharpness.
+        max_half_field_deg: how far to either side of the optical axis an undistorted picture reaches. Beyond it lies
+            what the networks have hardly seen, and a pinhole spends its pixels there: at 50 deg each covers 0.4 of the
+            angle that one on the axis does.
+    """
+
+    pixel_limit: int = PIXEL_LIMIT
+    aspects: tuple[tuple[int, int], ...] = ((2, 1), (16, 9), (3, 2), (4, 3), (1, 1), (3, 4), (2, 3), (9, 16), (1, 2))
+    max_stretch: float = 1.16
+    max_distortion_px: float = 0.5
+    max_half_field_deg: float = 50.0
+
+    def __post_init__(self) -> None:
+        if not (
+            self.pixel_limit >= PATCH_PX**2
+            and self.aspects
+            and all(width > 0 and height > 0 for width, height in self.aspects)
+            and self.max_stretch >= 1
+            and self.max_distortion_px > 0
+            and 0 < self.max_half_field_deg < 80
+        ):
+            raise ValueError(f"senseless options: {self}")
+
+    @cached_property
+    def grids(self) -> tuple[Grid, ...]:
+        """One for each aspect."""
+        return tuple(fitted_grid(width, height, self.pixel_limit) for width, height in self.aspects)
+
+
+def fitted_grid(width_px: float, height_px: float, pixel_limit: int) -> Grid:
+    """The official loader's size for an image: its aspect as nearly as patches allow, and at most so many pixels."""
+    scale = math.sqrt(pixel_limit / (width_px * height_px))
+    columns, rows = round(width_px * scale / PATCH_PX), round(height_px * scale / PATCH_PX)
+    while columns * rows * PATCH_PX**2 > pixel_limit:
+        if columns / rows > width_px / height_px:
+            columns -= 1
+        else:
+            rows -= 1
+    return Grid(max(1, columns), max(1, rows))
+
+
+def natural_grid(camera: Camera, options: GridOptions) -> Grid:
+    """The grid whose aspect is the nearest to a photograph's, by ratio; the first of equals."""
+    ideal = ideal_camera(camera, options)
+    aspect = ideal.width_px / ideal.height_px
+    return min(options.grids, key=lambda grid: abs(math.log(grid.aspect / aspect)))
+
+
+def common_grid(cameras: Sequence[Camera], options: GridOptions) -> Grid:
+    """The natural grid of most photographs; of equally frequent ones that of the first photograph."""
+    return Counter(natural_grid(camera, options) for camera in cameras).most_common(1)[0][0]
+
+
+@lru_cache(maxsize=1024)
+def ideal_camera(camera: Camera, options: GridOptions) -> Camera:
+    """The pinhole that a photograph is undistorted to: the same focal lengths, and the largest field without a gap.
+
+    It is the camera itself, as a pinhole, where distortion does not matter. A lens that shows nothing within
+    `max_half_field_deg` gets a field of that size all the same, in which then nothing is seen.
+    """
+    if not _distortion_matters(camera, options):
+        return camera.pinhole()
+    left, top, right, bottom = _field(camera, options)
+    return replace(
+        camera.pinhole(),
+        width_px=max(1, round((right - left) * camera.focal_x_px)),
+        height_px=max(1, round((bottom - top) * camera.focal_y_px)),
+        principal_x_px=-left * camera.focal_x_px - 0.5,
+        principal_y_px=-top * camera.focal_y_px - 0.5,
+    )
+
+
+def _distortion_matters(camera: Camera, options: GridOptions) -> bool:
+    if camera.distortion is None:
+        return False
+    rays = camera.rays(_lattice(camera.width_px, camera.height_px, 17))
+    moved_px = np.linalg.norm(camera.project(rays) - camera.pinhole().project(rays), axis=-1)
+    scale = math.sqrt(options.pixel_limit / (camera.width_px * camera.height_px))
+    return not moved_px.max() * scale <= options.max_distortion_px
+
+
+def _field(camera: Camera, options: GridOptions) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom at depth 1 of the largest upright field whose sides lie inside the photograph's."""
+    size = np.array([camera.width_px, camera.height_px])
+    limit = math.tan(math.radians(options.max_half_field_deg))
+    along = np.linspace(0, 1, 33)
+    sides = []
+    for axis in (0, 1):
+        ends = []
+        for end in (0.0, 1.0):
+            edge = np.empty((len(along), 2))
+            edge[:, axis], edge[:, 1 - axis] = end, along
+            # Where the lens model has no inverse, the lens sees further than any pinhole.
+            ideal = camera.rays(undistort_pixels(edge * size - 0.5, camera))[:, axis]
+            known = ideal[np.isfinite(ideal)]
+            innermost = (known.max() if end == 0 else known.min()) if len(known) else (-limit if end == 0 else limit)
+            ends.append(float(np.clip(innermost, -limit, limit)))
+        sides.append(ends if ends[0] < ends[1] else [-limit, limit])
+    (left, right), (top, bottom) = sides
+    return left, top, right, bottom
+
+
+def _lattice(width_px: int, height_px: int, count: int) -> Array:
+    """Pixels (count, count, 2) from edge to edge of an image."""
+    columns, rows = (np.linspace(-0.5, side - 0.5, count) for side in (width_px, height_px))
+    return np.stack(np.meshgrid(columns, rows), axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """How a photograph is laid on a grid.
+
+    Attributes:
+        grid: the picture's size.
+        source: the photograph's camera.
+        ideal: the pinhole that the photograph is undistorted to.
+        box: left, top, width and height in pixels of the picture's part that is not filling.
+        options: see there.
+    """
+
+    grid: Grid
+    source: Camera
+    ideal: Camera
+    box: tuple[int, int, int, int]
+    options: GridOptions = field(repr=False)
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The picture's pinhole."""
+        left, top, width, height = self.box
+        inside = self.ideal.resized(width, height)
+        return replace(
+            inside,
+            width_px=self.grid.width_px,
+            height_px=self.grid.height_px,
+            principal_x_px=inside.principal_x_px + left,
+            principal_y_px=inside.principal_y_px + top,
+        )
+
+    @cached_property
+    def undistorts(self) -> bool:
+        """Whether the lens is more than a pinhole."""
+        return _distortion_matters(self.source, self.options)
+
+    @cached_property
+    def intrinsics(self) -> Array:
+        """K (3, 3) of the picture as networks want it: (0.5, 0.5) is the centre of the top-left pixel."""
+        k = self.camera.matrix()
+        k[:2, 2] += 0.5
+        return k
+
+    @cached_property
+    def shown(self) -> NDArray[np.bool_] | None:
+        """Which pixels (H, W) of the picture show the photograph; None if all do."""
+        left, top, width, height = self.box
+        shown = np.zeros((self.grid.height_px, self.grid.width_px), bool)
+        box = shown[top : top + height, left : left + width]
+        box[:] = _covered(self.source, self.ideal.resized(width, height))[1] if self.undistorts else True
+        return None if shown.all() else shown
+
+    def picture(self, photograph: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The picture (3, H, W) in 0 to 1 of a photograph (H, W, 3) RGB; filled with the mean of what it shows.
+
+        Raises:
+            ValueError: the photograph is not of its camera's size.
+        """
+        if photograph.shape != (self.source.height_px, self.source.width_px, 3):
+            raise ValueError(f"a photograph of shape {photograph.shape} does not belong to {self.source}")
+        left, top, width, height = self.box
+        ideal = self._undistorted(photograph) if self.undistorts else photograph
+        inside = _resized(ideal, width, height)
+        shown = self.shown
+        if shown is None:
+            picture = inside
+        else:
+            box = shown[top : top + height, left : left + width]
+            mean = inside[box].mean(axis=0) if box.any() else np.full(3, 127.5)
+            picture = np.empty((*shown.shape, 3), np.uint8)
+            picture[:] = np.rint(mean)
+            picture[top : top + height, left : left + width][box] = inside[box]
+        return np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32) / np.float32(255)
+
+    def _undistorted(self, photograph: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The photograph through the ideal camera, at twice the picture's size: each resampling then costs little."""
+        source, ideal = self._at_twice_the_size()
+        reduced = _resized(photograph, source.width_px, source.height_px)
+        # What lies outside of the photograph repeats its edge, so that nothing foreign bleeds into the inside.
+        columns, rows = _lens_map(source, ideal)
+        return np.asarray(cv2.remap(reduced, columns, rows, cv2.INTER_CUBIC, None, cv2.BORDER_REPLICATE), np.uint8)
+
+    def _at_twice_the_size(self) -> tuple[Camera, Camera]:
+        """Source and ideal camera, reduced alike; as they are if that is no reduction."""
+        _, _, width, height = self.box
+        scale = min(1.0, max(2 * width / self.ideal.width_px, 2 * height / self.ideal.height_px))
+        source, ideal = (
+            camera.resized(max(1, round(camera.width_px * scale)), max(1, round(camera.height_px * scale)))
+            for camera in (self.source, self.ideal)
+        )
+        return source, ideal
+
+
+@lru_cache(maxsize=256)  # with the mask of what is shown, 200 kB each
+def lay_out(camera: Camera, grid: Grid, options: GridOptions) -> Layout:
+    """How a photograph of a camera is laid on a grid."""
+    ideal = ideal_camera(camera, options)
+    stretch = math.log(ideal.width_px / ideal.height_px / grid.aspect)
+    width, height = grid.width_px, grid.height_px
+    if abs(stretch) > math.log(options.max_stretch):
+        scale = min(width / ideal.width_px, height / ideal.height_px)
+        width, height = max(1, round(ideal.width_px * scale)), max(1, round(ideal.height_px * scale))
+    box = ((grid.width_px - width) // 2, (grid.height_px - height) // 2, width, height)
+    return Layout(grid, camera, ideal, box, options)
+
+
+def _resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
+    """An image (H, W, 3) in another size, by the very filter of the official loader: OpenCV's does not antialias.
+
+    Images of more than four times the size are first averaged down to at least twice: of 12 megapixels in a third of
+    the time, at a difference of half a grey level (RMS) on photographs.
+    """
+    resized = Image.fromarray(image).resize((width_px, height_px), Image.Resampling.LANCZOS, reducing_gap=2.0)
+    return np.asarray(resized, np.uint8)
+
+
+@lru_cache(maxsize=8)  # 7 MB each; cameras of robots stay the same, references are prepared once
+def _lens_map(source: Camera, ideal: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """For each pixel of the ideal image its column and row in the distorted one, at most a little outside of it."""
+    pixels, _ = _covered(source, ideal)
+    pixels = np.clip(pixels, -2, (source.width_px + 1, source.height_px + 1)).astype(np.float32)
+    return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
+
+
+def _covered(source: Camera, ideal: Camera) -> tuple[Array, NDArray[np.bool_]]:
+    """Pixels (H, W, 2) of the distorted image that an ideal one's show, and which (H, W) of them exist."""
+    rows, columns = np.indices((ideal.height_px, ideal.width_px))
+    pixels = source.project(ideal.rays(np.stack([columns, rows], axis=-1)))
+    inside = ((pixels >= -0.5) & (pixels <= (source.width_px - 0.5, source.height_px - 0.5))).all(axis=-1)
+    return pixels, inside & _unfolded(pixels)
+
+
+def _unfolded(pixels: Array) -> NDArray[np.bool_]:
+    """Where a lens map (H, W, 2) turns nothing over; beyond that a polynomial shows the image again, mirrored."""
+    if min(pixels.shape[:2]) < 2:
+        return np.ones(pixels.shape[:2], bool)
+    (x_down, x_right), (y_down, y_right) = (np.gradient(pixels[..., i]) for i in (0, 1))
+    # A mirroring through a point keeps the sign of the determinant, but not that of the trace.
+    return np.asarray((x_right * y_down - y_right * x_down > 0) & (x_right + y_down > 0))

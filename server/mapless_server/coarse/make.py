@@ -1,0 +1,115 @@
+"""From the name of a backend to the backend. Imports torch only for a network."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..weights import WeightsMissing, find_weights
+from . import Reconstructor
+from .geometric import GeometricReconstructor
+
+if TYPE_CHECKING:
+    from .network import NetworkOptions
+
+log = logging.getLogger(__name__)
+
+NETWORKS = ("pi3", "pi3x")
+"""Those that `auto` looks for, in this order: the paper's method and figures are pi^3's, and it is the smaller one."""
+
+COMPILED_ASPECTS = ((4, 3), (3, 4))
+"""Of most cameras, lying and standing."""
+
+BACKENDS = ("auto", "geometric", *NETWORKS)
+"""What a setting can name. Networks need weights of the same name, which are licensed for non-commercial use."""
+
+
+def make_reconstructor(
+    backend: str,
+    weights_dir: Path,
+    device: str = "cpu",
+    options: NetworkOptions | None = None,
+    compiled_views: int = 0,
+) -> Reconstructor:
+    """The backend that a setting names.
+
+    `auto` is a network if its weights are there and a CUDA device to run it, on which it takes a fraction of a second
+    where a CPU takes a minute; otherwise it is `geometric`, and the log says why.
+
+    Args:
+        backend: one of `BACKENDS`.
+        weights_dir: where weights lie.
+        device: "cpu" or a CUDA device.
+        options: of a network's backend.
+        compiled_views: how many views, the query among them, a network is compiled for, which takes minutes; of
+            photographs of 4:3, lying or standing. 0 compiles nothing. Other queries are computed as well, only slower.
+
+    Raises:
+        ValueError: unknown name.
+        WeightsMissing: the network's weights are not there; the message names the command that brings them.
+        CheckpointError: they do not fit.
+        ImportError: a package that networks need is not installed.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"unknown backend {backend!r}; known: {', '.join(BACKENDS)}")
+    if backend == "auto":
+        backend = _choose(weights_dir, device)
+    if backend == "geometric":
+        return GeometricReconstructor()
+    return _load(backend, find_weights(backend, weights_dir), device, options, compiled_views)
+
+
+def _choose(weights_dir: Path, device: str) -> str:
+    """What `auto` means here; the log says why."""
+    problem: str | None = "there is no CUDA device, and on a CPU a network takes about a minute for a query"
+    if device != "cpu":
+        missing = {name: _missing(name, weights_dir) for name in NETWORKS}
+        for name, sentence in missing.items():
+            if sentence is None:
+                log.info("backend auto: %s serves, whose weights are licensed for non-commercial use", name)
+                return name
+        problem = missing[NETWORKS[0]]
+    log.warning("backend auto: geometric serves, not a network: %s", problem)
+    return "geometric"
+
+
+def _missing(name: str, weights_dir: Path) -> str | None:
+    """What to do about weights that are not there; None if they are."""
+    try:
+        find_weights(name, weights_dir)
+    except WeightsMissing as error:
+        return str(error)
+    return None
+
+
+def _load(
+    backend: str,
+    weights: Path,
+    device: str,
+    options: NetworkOptions | None,
+    compiled_views: int,
+) -> Reconstructor:
+    import torch
+
+    from ..networks.checkpoint import TRAINING_ONLY, load_strictly
+    from ..networks.pi3 import Pi3
+    from ..networks.pi3x import Pi3X
+    from ..networks.runner import Bucket, NetworkRunner, RunnerOptions
+    from .grids import GridOptions, fitted_grid
+    from .network import NetworkReconstructor
+
+    if device == "cpu":
+        log.warning("backend %s on the CPU: about a minute for a query", backend)
+    with torch.device("meta"):
+        network = Pi3() if backend == "pi3" else Pi3X()
+    # On the host, where the runner reduces the precision before anything goes to the device.
+    weights_sha256 = load_strictly(network, weights, ignored_prefixes=TRAINING_ONLY)
+    runner_options = RunnerOptions(compile_backend="inductor" if compiled_views else None)
+    runner = NetworkRunner(network, backend, weights_sha256, device, runner_options)
+    if compiled_views:
+        log.info("backend %s: compiling for %d views", backend, compiled_views)
+        limit = (options.grids if options else GridOptions()).pixel_limit
+        grids = (fitted_grid(width, height, limit) for width, height in COMPILED_ASPECTS)
+        runner.warm_up([Bucket((grid.rows, grid.columns), compiled_views) for grid in grids])
+    return NetworkReconstructor(runner, options)

@@ -1,0 +1,292 @@
+"""The coarse stage by a network: pi^3, the paper's, or Pi3X, which is also told intrinsics and the references' poses.
+
+    photographs > pictures > tokens > network > DeviceReconstruction
+      (views)    (grids)  (kept for             (scale and the rest,
+                           references)           on either side)
+
+What a network says holds up to a similarity, also when it was told poses: the scale stage aligns it in any case.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mapless.geometry import Array, RigidTransform
+
+from ..correspond import Correspondences
+from ..networks.network import NetworkOutput
+from ..networks.runner import NetworkRunner
+from ..rejection import Rejection, RejectionReason
+from ..views import Photograph, PosedView, View
+from . import Reconstruction
+from .device import DeviceReconstruction
+from .grids import Grid, GridOptions, Layout, common_grid, lay_out
+from .token_cache import TokenCache, TokenCacheOptions, TokenKey
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+Outcome = Reconstruction | DeviceReconstruction | Rejection
+Request = tuple[View, Sequence[PosedView]]
+"""A query and its references."""
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """Options of a network's backend.
+
+    Attributes:
+        grids: of the pictures.
+        cache: of references' tokens.
+        keep_on_device: whether a reconstruction stays where the network left it; None keeps it on CUDA.
+    """
+
+    grids: GridOptions = field(default_factory=GridOptions)
+    cache: TokenCacheOptions = field(default_factory=TokenCacheOptions)
+    keep_on_device: bool | None = None
+
+
+class NetworkReconstructor:
+    """A `Reconstructor`; safe to use from several threads.
+
+    Attributes:
+        cache: tokens of references; its counters are for whoever watches.
+    """
+
+    def __init__(self, runner: NetworkRunner, options: NetworkOptions | None = None) -> None:
+        self._runner = runner
+        self._options = options or NetworkOptions()
+        keep = self._options.keep_on_device
+        self._keeps = runner.device.type == "cuda" if keep is None else keep
+        on_host = runner.device.type == "cpu"
+        cache = self._options.cache
+        self.cache = TokenCache(runner.device, replace(cache, host_bytes=0) if on_host else cache)
+
+    uses_correspondences = False
+
+    @property
+    def name(self) -> str:
+        """Of the network."""
+        return self._runner.name
+
+    @property
+    def weights_sha256(self) -> str:
+        """Of the network."""
+        return self._runner.weights_sha256
+
+    def close(self) -> None:
+        """Ends the network's thread."""
+        self._runner.close()
+
+    def reconstruct(
+        self, query: View, references: Sequence[PosedView], correspondences: Correspondences | None = None
+    ) -> Outcome:
+        """See Reconstructor.reconstruct.
+
+        Raises:
+            ValueError: a view has no photograph.
+            torch.OutOfMemoryError: there is not even room for one query.
+            RequestError: a reference's photograph cannot be read any more.
+        """
+        (outcome,) = self.reconstruct_many([(query, references)])
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
+        """Reconstructs queries, in one go those that have the same grid and number of references.
+
+        When the device's memory does not suffice, tokens that are kept there leave it and the batch is halved.
+
+        Returns:
+            For each request what `reconstruct` returns, or the exception that it raises.
+        """
+        outcomes: list[Outcome | Exception | None] = [None] * len(requests)
+        batches: dict[tuple[Grid, int], list[tuple[int, _EncodedScene]]] = defaultdict(list)
+        for i, (query, references) in enumerate(requests):
+            if not references:
+                outcomes[i] = Rejection(RejectionReason.NO_USABLE_REFERENCES, "no references")
+                continue
+            try:
+                scene = _Scene.of(query, references, self._options.grids)
+                encoded = _EncodedScene(scene, self._with_room(partial(self._encode, scene)))
+            except Exception as error:  # one request's fault is not the others'
+                outcomes[i] = error
+            else:
+                batches[scene.grid, len(references)].append((i, encoded))
+        for batch in batches.values():
+            indices, scenes = zip(*batch, strict=True)
+            for i, outcome in zip(indices, self._solve(scenes), strict=True):
+                outcomes[i] = outcome
+        return [outcome for outcome in outcomes if outcome is not None]
+
+    def _with_room(self, work: Callable[[], T]) -> T:
+        """Does the work, a second time with more room if there was too little."""
+        try:
+            return work()
+        except torch.OutOfMemoryError as error:
+            log.warning("%s: %s", self.name, error)
+        # Out here nothing of the failed attempt is left.
+        self._make_room()
+        return work()
+
+    def _make_room(self) -> None:
+        self.cache.release_device()
+        if self._runner.device.type == "cuda":
+            torch.cuda.empty_cache()
+
+    def _solve(self, scenes: Sequence[_EncodedScene], has_room: bool = False) -> list[Outcome | Exception]:
+        """Outcomes of scenes of one grid and number of views."""
+        try:
+            return [*self._run(scenes)]
+        except torch.OutOfMemoryError as error:
+            log.warning("%s: %d queries at a time: %s", self.name, len(scenes), error)
+            if has_room and len(scenes) == 1:
+                return [error]
+        self._make_room()
+        if len(scenes) == 1:
+            return self._solve(scenes, has_room=True)
+        half = len(scenes) // 2
+        return self._solve(scenes[:half], has_room=True) + self._solve(scenes[half:], has_room=True)
+
+    def _run(self, scenes: Sequence[_EncodedScene]) -> list[Outcome]:
+        grid, references = scenes[0].scene.grid, scenes[0].scene.references
+        poses = posed = None
+        if self._runner.conditioned:
+            known = np.stack([condition_poses([r.world_from_camera for r in it.scene.references]) for it in scenes])
+            poses = torch.from_numpy(known.astype(np.float32))
+            posed = (torch.arange(len(references) + 1) < len(references)).repeat(len(scenes), 1)
+        tokens = torch.stack([it.tokens for it in scenes])
+        output = self._runner.reconstruct(tokens, (grid.rows, grid.columns), len(references), poses, posed)
+        return [self._outcome(it.scene, output, index) for index, it in enumerate(scenes)]
+
+    def _encode(self, scene: _Scene) -> Tensor:
+        """Tokens (N, T, C) of a scene's views; of references those that are kept, and photographs only of the rest."""
+        keys = [self._key(view) for view in scene.views[:-1]]
+        tokens = []
+        for key, view in zip(keys, scene.views, strict=False):
+            kept = self.cache.get(key)
+            if kept is None:
+                kept = self._encode_view(view)
+                self.cache.put(key, kept)
+            tokens.append(kept)
+        return torch.stack([*tokens, self._encode_view(scene.views[-1])])
+
+    def _encode_view(self, view: _LaidOut) -> Tensor:
+        """Tokens (T, C)."""
+        picture = torch.from_numpy(view.layout.picture(view.photograph.read()))
+        intrinsics = None
+        if self._runner.conditioned:
+            intrinsics = torch.from_numpy(view.layout.intrinsics.astype(np.float32))[None]
+        return self._runner.encode(picture[None], intrinsics)[0]
+
+    def _key(self, view: _LaidOut) -> TokenKey:
+        runner, layout, photograph = self._runner, view.layout, view.photograph
+        return TokenKey(
+            runner.name,
+            runner.weights_sha256,
+            runner.dtype,
+            photograph.sha256,
+            photograph.camera,
+            layout.grid,
+            layout.camera,
+        )
+
+    def _outcome(self, scene: _Scene, output: NetworkOutput, index: int) -> Outcome:
+        points, logits, poses = (tensor[index] for tensor in vars(output).values())
+        if not self._keeps and not all(bool(tensor.isfinite().all()) for tensor in (points, logits, poses)):
+            log.warning("%s: the network's output is not finite", self.name)
+            return Rejection(RejectionReason.SCALE_UNRELIABLE, f"the output of the network {self.name} is not finite")
+        *layouts, of_query = (view.layout for view in scene.views)
+        reconstruction = DeviceReconstruction(
+            tuple(layout.camera for layout in layouts),
+            of_query.camera,
+            points,
+            _blanked(logits.sigmoid(), layouts),
+            poses,
+            self.name,
+        )
+        return reconstruction if self._keeps else reconstruction.fetch()
+
+
+@dataclass(frozen=True, eq=False)
+class _LaidOut:
+    """A view's photograph, and how it is laid on the scene's grid."""
+
+    photograph: Photograph
+    layout: Layout
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """One request: its grid, its references and all its views, the query's last."""
+
+    grid: Grid
+    references: Sequence[PosedView]
+    views: tuple[_LaidOut, ...]
+
+    @classmethod
+    def of(cls, query: View, references: Sequence[PosedView], options: GridOptions) -> _Scene:
+        """ValueError if a view has no photograph."""
+        photographs = [
+            *(_photograph(reference.view, reference.name) for reference in references),
+            _photograph(query, "the query"),
+        ]
+        grid = common_grid([photograph.camera for photograph in photographs[:-1]], options)
+        views = (_LaidOut(photograph, lay_out(photograph.camera, grid, options)) for photograph in photographs)
+        return cls(grid, references, tuple(views))
+
+
+@dataclass(frozen=True, eq=False)
+class _EncodedScene:
+    """A scene and the tokens (N, T, C) of its views."""
+
+    scene: _Scene
+    tokens: Tensor
+
+
+def _photograph(view: View, name: str) -> Photograph:
+    if view.photograph is None:
+        raise ValueError(f"{name} has no photograph, which a network looks at")
+    return view.photograph
+
+
+def _blanked(confidence: Tensor, layouts: Sequence[Layout]) -> Tensor:
+    """Confidence (K, H, W) that is 0 where pictures are filled: there is nothing to be confident of."""
+    if all(layout.shown is None for layout in layouts):
+        return confidence
+    everywhere = np.ones(confidence.shape[1:], bool)
+    shown = np.stack([everywhere if layout.shown is None else layout.shown for layout in layouts])
+    return torch.where(torch.from_numpy(shown).to(confidence.device), confidence, 0.0)
+
+
+def condition_poses(world_from_references: Sequence[RigidTransform]) -> Array:
+    """Poses of the references and, last, what stands in for the query's, relative to the first reference.
+
+    Networks normalize by the mean distance of all views from the first, whether their poses are used or not. The
+    stand-in lies at the mean distance of the other references, where it leaves that mean as it is; at which side is
+    all the same, since nothing else is computed from it. A single reference, which conditions nothing, gets it at its
+    own place.
+
+    Args:
+        world_from_references: (K,), one at least.
+
+    Returns:
+        (K + 1, 4, 4), the first the identity. Differences of world coordinates, which may be large, are taken here, in
+        double precision.
+    """
+    first_from_world = world_from_references[0].inverse()
+    relative = [first_from_world.compose(pose) for pose in world_from_references]
+    distances_m = [float(np.linalg.norm(pose.translation)) for pose in relative[1:]]
+    neutral_m = float(np.mean(distances_m)) if distances_m else 0.0
+    stand_in = RigidTransform(np.eye(3), np.array([neutral_m, 0.0, 0.0]))
+    return np.stack([pose.matrix() for pose in (*relative, stand_in)])

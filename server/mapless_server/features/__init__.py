@@ -1,0 +1,59 @@
+"""Local features: a photograph becomes a view, a pinhole camera with keypoints and descriptors.
+
+A seam, one file each. What an extractor finds is stored with the reference under the extractor's name, so a change of
+anything that changes the features must change the name. The learned ones import torch, and only when they are made.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .extractor import FeatureExtractor
+from .image import MAX_INCIDENCE_DEG, reduce_image, undistort_pixels
+from .sift import SiftExtractor, SiftOptions
+
+__all__ = [
+    "FEATURES",
+    "MAX_INCIDENCE_DEG",
+    "FeatureExtractor",
+    "SiftExtractor",
+    "SiftOptions",
+    "make_extractor",
+    "reduce_image",
+    "undistort_pixels",
+]
+
+FEATURES = ("sift", "aliked", "xfeat", "superpoint")
+"""What a setting can name. All but the first need weights of the same name."""
+
+
+def make_extractor(name: str, weights: Path | None = None, device: str = "cpu") -> FeatureExtractor:
+    """The extractor that a setting names.
+
+    Args:
+        name: one of `FEATURES`.
+        weights: the file of its network; `sift` has none.
+        device: "cpu" or a CUDA device, for networks.
+
+    Raises:
+        ValueError: unknown name, or weights missing.
+        CheckpointError: the weights do not fit.
+        ImportError: a package that the network needs is not installed.
+    """
+    if name == "sift":
+        return SiftExtractor()
+    if name not in FEATURES:
+        raise ValueError(f"unknown features {name!r}; known: {', '.join(FEATURES)}")
+    if weights is None:
+        raise ValueError(f"features {name!r} need their network's weights")
+    if name == "aliked":
+        from .aliked import AlikedExtractor
+
+        return AlikedExtractor(weights, device)
+    if name == "xfeat":
+        from .xfeat import XfeatExtractor
+
+        return XfeatExtractor(weights, device)
+    from .superpoint import SuperPointExtractor
+
+    return SuperPointExtractor(weights, device)

@@ -1,0 +1,75 @@
+"""What all extractors share: the image made smaller, and keypoints of it made those of an ideal pinhole camera."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, Camera, Fisheye, RadialTangential
+
+from ..views import Features, View
+
+
+def reduce_image(
+    image: NDArray[np.uint8], camera: Camera, max_side_px: int, multiple_px: int = 1
+) -> tuple[NDArray[np.uint8], Camera]:
+    """The image, its longer side at most `max_side_px`, and its camera.
+
+    Args:
+        image: (H, W) or (H, W, 3).
+        camera: of the same size.
+        max_side_px: of the result, a multiple of `multiple_px`.
+        multiple_px: both sides of the result are multiples of it, the nearest ones that keep the aspect; the image may
+            grow for that by less than one multiple.
+    """
+    height, width = image.shape[:2]
+    scale = min(1.0, max_side_px / max(height, width))
+    columns, rows = (max(1, round(side * scale / multiple_px)) * multiple_px for side in (width, height))
+    if (columns, rows) == (width, height):
+        return image, camera
+    reduced = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(reduced, np.uint8), camera.resized(columns, rows)
+
+
+MAX_INCIDENCE_DEG = 80.0
+"""Rays further from the optical axis are dropped: a pinhole's pixels run to infinity towards 90 degrees."""
+
+
+def undistort_pixels(pixels: Array, camera: Camera) -> Array:
+    """Pixels (N, 2) of the ideal pinhole camera with the same K; NaN where the lens model has no inverse."""
+    if camera.distortion is None:
+        return pixels
+    d, k = camera.distortion, camera.matrix()
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+    points = np.ascontiguousarray(pixels, np.float64)[:, None]
+    if isinstance(d, RadialTangential):
+        coefficients = np.array([d.k1, d.k2, d.p1, d.p2, d.k3], float)
+        ideal = cv2.undistortPoints(points, k, coefficients, R=None, P=k, criteria=criteria).reshape(-1, 2)
+    else:
+        assert isinstance(d, Fisheye)
+        ideal = cv2.fisheye.undistortPoints(
+            points, k, np.array([d.k1, d.k2, d.k3, d.k4], float), P=k, criteria=criteria
+        )[:, 0]
+    # The iteration may run off where the model folds over; what does not come back to where it started is no solution.
+    rays = camera.rays(ideal)
+    returned = camera.project(rays)
+    good = np.linalg.norm(returned - pixels, axis=1) < 0.05
+    good &= np.linalg.norm(rays[:, :2], axis=1) < np.tan(np.radians(MAX_INCIDENCE_DEG))
+    return np.where(good[:, None], ideal, np.nan)
+
+
+def view_of(camera: Camera, pixels: Array, descriptors: NDArray[np.float32], sizes_px: NDArray[np.float32]) -> View:
+    """The view of what was found in an image: undistorted, without what has no undistorted pixel.
+
+    Args:
+        camera: of the image, with its lens distortion.
+        pixels: (N, 2) keypoints in the image.
+        descriptors: (N, D), unit length.
+        sizes_px: (N,), see Features.
+    """
+    if not len(pixels):
+        return View(camera.pinhole(), Features(np.empty((0, 2), np.float32), descriptors, sizes_px))
+    ideal = undistort_pixels(pixels, camera)
+    usable = np.isfinite(ideal).all(axis=1)
+    return View(camera.pinhole(), Features(ideal[usable].astype(np.float32), descriptors[usable], sizes_px[usable]))

@@ -1,0 +1,131 @@
+"""The stored references as the pipeline wants them: with the features asked for and, at hand, the photographs.
+
+Features are computed once, when a reference is added. A store that was filled under other features lacks those of a
+new extractor: they are then computed from the stored photographs by the first calls that need them, and kept.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.names import reference_name
+
+from .decode import ImageLimits, decode_image
+from .errors import AlreadyExists, DataLoss, InvalidArgument
+from .features import FeatureExtractor
+from .store import DescribedReference, ReferenceRecord, Store
+from .turns import Turn
+from .views import Photograph, PosedView
+
+log = logging.getLogger(__name__)
+
+STORED_IMAGES = ImageLimits(max_bytes=2**31, max_pixels=2**30, min_side_px=1, max_side_px=2**20)
+"""Stored photographs were let in under the limits of their time; limits set lower since do not make them unreadable."""
+
+_POLL_S = 0.05
+
+
+class ReferenceLibrary:
+    """Loads references from the store; safe to use from several threads."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._claims = _Claims()
+
+    def load(
+        self, scene_id: str, reference_ids: Sequence[str], extractor: FeatureExtractor, turn: Turn
+    ) -> tuple[int, tuple[PosedView, ...]]:
+        """The scene's generation and references of it, in the order asked for.
+
+        Those without features of the extractor are described now, one by one until the turn is over; what was done by
+        then stays done. Their photographs are read when somebody asks for the pixels, not before.
+
+        Raises:
+            NotFound: there is no such scene (field "scene") or reference (field "references[i]").
+            DeadlineExceeded: the turn is over.
+            DataLoss: what is stored of one of them is damaged.
+        """
+        while True:
+            snapshot = self._store.load_references(scene_id, reference_ids, extractor.name)
+            if not snapshot.undescribed:
+                return snapshot.generation, tuple(map(self._posed_view, snapshot.references))
+            with turn.stage("describe"):
+                self._describe_all(snapshot.undescribed, extractor, turn.check)
+
+    def _describe_all(
+        self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor, check: Callable[[], None]
+    ) -> None:
+        """Describes references, but those that other threads are at: these it waits for, not for their success."""
+        log.info("describing %d references of scene %s with %s", len(records), records[0].scene_id, extractor.name)
+        taken: list[ReferenceRecord] = []
+        for record in records:
+            check()
+            with self._claims.claimed((record.key, extractor.name)) as is_mine:
+                if is_mine:
+                    self._describe(record, extractor)
+                else:
+                    taken.append(record)
+        for record in taken:
+            self._claims.wait((record.key, extractor.name), check)
+
+    def _describe(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
+        # Another thread may have been done with it between our look and our claim.
+        if not self._store.has_features(record.key, extractor.name):
+            view = extractor.extract(self._pixels(record), record.camera)
+            with suppress(AlreadyExists):  # another server on the same store was faster
+                self._store.add_features(record.key, extractor.name, view)
+
+    def _posed_view(self, reference: DescribedReference) -> PosedView:
+        record = reference.record
+        photograph = Photograph(record.image_sha256, record.camera, partial(self._pixels, record))
+        return PosedView(
+            record.key,
+            reference_name(record.scene_id, record.reference_id),
+            replace(reference.view, photograph=photograph),
+            record.world_from_camera,
+        )
+
+    def _pixels(self, record: ReferenceRecord) -> NDArray[np.uint8]:
+        """The reference's photograph, (H, W, 3) RGB; NotFound if it was deleted since, DataLoss if it is damaged."""
+        data = self._store.read_image_of(record.key)
+        try:
+            return decode_image(data, STORED_IMAGES)
+        except InvalidArgument as error:
+            raise DataLoss(f"the photograph of reference {record.reference_id!r} cannot be read: {error}") from error
+
+
+class _Claims:
+    """Who is at what: a thing is claimed by one thread at a time."""
+
+    def __init__(self) -> None:
+        self._held: set[tuple[str, str]] = set()
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def claimed(self, thing: tuple[str, str]) -> Iterator[bool]:
+        """Whether the thing is the caller's while the block runs; False if it is somebody else's."""
+        with self._changed:
+            is_mine = thing not in self._held
+            self._held.add(thing)
+        try:
+            yield is_mine
+        finally:
+            if is_mine:
+                with self._changed:
+                    self._held.remove(thing)
+                    self._changed.notify_all()
+
+    def wait(self, thing: tuple[str, str], check: Callable[[], None]) -> None:
+        """Returns when nobody holds the thing; lets through what `check` raises, which is called again and again."""
+        with self._changed:
+            while thing in self._held:
+                check()
+                self._changed.wait(_POLL_S)

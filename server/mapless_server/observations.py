@@ -1,0 +1,241 @@
+"""Points seen by cameras whose poses are fixed: the equations of the structure.
+
+Everything works on NumPy's arrays and on torch's tensors (see `arrays`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .arrays import AnyArray, apply, identity, length, median, multiply, namespace, normalize, normalize_jacobian
+from .tracks import Grouping
+
+if TYPE_CHECKING:
+    from .structure import StructureOptions
+
+
+@dataclass(frozen=True)
+class KeypointNoise:
+    """How far keypoints lie from where they should: sigma^2 = level^2 + (slope * size)^2.
+
+    Attributes:
+        level_px: what all keypoints share: detection, and what errors of poses and lenses look like in pixels. While it
+            is being estimated, an array of that one number.
+        slope: error per diameter of the patch; a blob of 20 px is found to a pixel, one of 3 px to a fifth. Measured on
+            photographs with surveyed poses.
+    """
+
+    level_px: float
+    slope: float
+
+    def sigma_px(self, sizes_px: AnyArray) -> AnyArray:
+        """Standard deviation (N,) of each coordinate of keypoints of these sizes (N,)."""
+        return (self.level_px**2 + (self.slope * sizes_px) ** 2) ** 0.5
+
+
+ONE_PIXEL = KeypointNoise(1.0, 0.0)
+FIRST_GUESS = KeypointNoise(0.3, 0.06)
+MIN_NOISE_LEVEL_PX = 0.15
+"""No keypoint is better than this: the residuals of surveyed scenes under good light."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Where references see points; row o is one observation.
+
+    Attributes:
+        tracks: which rows belong to which of P points.
+        pixel: (O, 2) observed pixel.
+        size_px: (O,) size of the keypoint.
+        sigma_px: (O,) standard deviation of its coordinates.
+        rotation: (O, 3, 3) camera_from_world of the observing reference.
+        translation: (O, 3) of the same, metres.
+        focal_px: (O, 2) of its camera.
+        principal_px: (O, 2) of its camera.
+    """
+
+    tracks: Grouping
+    pixel: AnyArray
+    size_px: AnyArray
+    sigma_px: AnyArray
+    rotation: AnyArray
+    translation: AnyArray
+    focal_px: AnyArray
+    principal_px: AnyArray
+
+    @property
+    def point(self) -> AnyArray:
+        """(O,) index of each row's point."""
+        return self.tracks.point
+
+    def residuals(self, x_in_world: AnyArray) -> AnyArray:
+        """(O, 2) projection minus observation of points (P, 3), in standard deviations; NaN where not in front."""
+        ideal = normalize(self.in_camera(x_in_world))
+        return (ideal * self.focal_px + self.principal_px - self.pixel) / self.sigma_px[:, None]
+
+    def jacobians(self, x_in_world: AnyArray) -> AnyArray:
+        """(O, 2, 3) derivative of each residual by its own point, per metre."""
+        return multiply(self.camera_jacobians(self.in_camera(x_in_world)), self.rotation)
+
+    def camera_jacobians(self, x_in_camera: AnyArray) -> AnyArray:
+        """(O, 2, 3) derivative of each residual by its point in the camera's frame (O, 3), per metre."""
+        return normalize_jacobian(x_in_camera) * (self.focal_px / self.sigma_px[:, None])[:, :, None]
+
+    def rays(self) -> tuple[AnyArray, AnyArray]:
+        """Camera centres (O, 3) and unit viewing directions (O, 3), world frame."""
+        ideal = (self.pixel - self.principal_px) / self.focal_px
+        world_from_camera = namespace(ideal).swapaxes(self.rotation, 1, 2)
+        direction = apply(world_from_camera[:, :, :2], ideal) + world_from_camera[:, :, 2]
+        return -apply(world_from_camera, self.translation), direction / length(direction)[:, None]
+
+    def sum_by_point(self, values: AnyArray) -> AnyArray:
+        """Sums rows (O, ...) over each point's observations, (P, ...)."""
+        return self.tracks.sum_by_point(values)
+
+    def max_by_point(self, values: AnyArray) -> AnyArray:
+        """Largest of (O,) over each point's observations, (P,); infinite where one is NaN."""
+        xp = namespace(values)
+        return self.tracks.max_by_point(xp.where(xp.isnan(values), np.inf, values))
+
+    def in_camera(self, x_in_world: AnyArray) -> AnyArray:
+        """Each observation's point (O, 3) in the frame of its camera, of points (P, 3)."""
+        return apply(self.rotation, x_in_world[self.point]) + self.translation
+
+    def weighted(self, noise: KeypointNoise) -> Observations:
+        """The same with another noise."""
+        return replace(self, sigma_px=noise.sigma_px(self.size_px))
+
+    def prune(self, chosen: AnyArray, x_in_world: AnyArray) -> tuple[Observations, AnyArray]:
+        """Only the chosen rows (O,), and those of points (P, 3) that are left with at least two of them."""
+        tracks, rows, points = self.tracks.prune(chosen)
+        columns = ("pixel", "size_px", "sigma_px", "rotation", "translation", "focal_px", "principal_px")
+        return Observations(tracks, *(getattr(self, name)[rows] for name in columns)), x_in_world[points]
+
+
+def back_project(centre: AnyArray, ray: AnyArray, depth_m: AnyArray) -> AnyArray:
+    """Points (P, 3) at depths (P,) along rays (P, 3) of depth 1 from camera centres (P, 3), all in one frame."""
+    return centre + ray * depth_m[:, None]
+
+
+def triangulate(observations: Observations) -> AnyArray:
+    """The points (P, 3) nearest to their viewing rays, in the world frame; NaN where the rays are parallel.
+
+    They solve sum_i (I - d_i d_i^T) (X - C_i) = 0 for unit directions d_i and centres C_i.
+    """
+    centre, direction = observations.rays()
+    across = identity(direction) - direction[:, :, None] * direction[:, None, :]
+    offsets = apply(across, centre)
+    return solve_symmetric(observations.sum_by_point(across), observations.sum_by_point(offsets))
+
+
+def better_start(observations: Observations, first: AnyArray, second: AnyArray, loss_scale_sigma: float) -> AnyArray:
+    """Of two guesses (P, 3) each, point by point the one with the lower cost."""
+    xp = namespace(first)
+    cost_first = _cost(observations, observations.residuals(first), loss_scale_sigma)
+    cost_second = _cost(observations, observations.residuals(second), loss_scale_sigma)
+    second_wins = xp.isnan(cost_first) | (cost_second < cost_first)
+    return xp.where(second_wins[:, None], second, first)
+
+
+def adjust_points(
+    observations: Observations, x_in_world: AnyArray, loss_scale_sigma: float, iterations: int
+) -> AnyArray:
+    """Minimizes the soft L1 reprojection error over the points alone, all at once.
+
+    Args:
+        observations: of all points.
+        x_in_world: (P, 3) initial points; rows with NaN stay as they are.
+        loss_scale_sigma: residual at which the loss turns from square to linear, standard deviations.
+        iterations: number of Levenberg-Marquardt steps.
+
+    Returns:
+        (P, 3). No point has a higher cost than it began with.
+    """
+    xp, eye, points = namespace(x_in_world), identity(x_in_world), x_in_world
+    damping = xp.full_like(points[:, 0], 1e-3)
+    residuals = observations.residuals(points)
+    cost = _cost(observations, residuals, loss_scale_sigma)
+    for _ in range(iterations):
+        jacobians = observations.jacobians(points)
+        weight = soft_l1_weight((residuals**2).sum(-1), loss_scale_sigma)
+        weighted = xp.swapaxes(jacobians * weight[:, None, None], 1, 2)
+        hessian = observations.sum_by_point(multiply(weighted, jacobians))
+        gradient = observations.sum_by_point(apply(weighted, residuals))
+        damped = hessian * (1 + damping[:, None, None] * eye)
+        candidate = points - solve_symmetric(damped, gradient)
+        candidate_residuals = observations.residuals(candidate)
+        candidate_cost = _cost(observations, candidate_residuals, loss_scale_sigma)
+        better = candidate_cost <= cost  # False for NaN: behind a camera, or a singular system
+        points = xp.where(better[:, None], candidate, points)
+        residuals = xp.where(better[observations.point][:, None], candidate_residuals, residuals)
+        cost = xp.where(better, candidate_cost, cost)
+        damping = xp.where(better, damping * 0.1, damping * 10)
+    return points
+
+
+def soft_l1(squared: AnyArray, scale: float) -> AnyArray:
+    """rho(s) = 2 c^2 (sqrt(1 + s / c^2) - 1): s for small residuals, 2 c sqrt(s) for large ones."""
+    return 2 * scale**2 * ((1 + squared / scale**2) ** 0.5 - 1)
+
+
+def soft_l1_weight(squared: AnyArray, scale: float) -> AnyArray:
+    """rho'(s), the weight of a squared residual in iteratively reweighted least squares."""
+    return 1 / (1 + squared / scale**2) ** 0.5
+
+
+def solve_symmetric(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
+    """Solves symmetric 3x3 systems (P, 3, 3), (P, 3); NaN where singular."""
+    return apply(invert_symmetric(matrices), vectors)
+
+
+def invert_symmetric(matrices: AnyArray) -> AnyArray:
+    """Inverses of symmetric matrices (P, 3, 3) by the adjugate; NaN where singular.
+
+    Much faster than a LAPACK call per matrix, and exact enough for steps that are checked afterwards.
+    """
+    xp = namespace(matrices)
+
+    def moved(rows: int, columns: int) -> AnyArray:
+        return xp.roll(matrices, (-rows, -columns), (1, 2))
+
+    adjugate = moved(1, 1) * moved(2, 2) - moved(1, 2) * moved(2, 1)
+    determinant = (matrices[:, 0] * adjugate[:, 0]).sum(-1)
+    solvable = abs(determinant) > 1e-14 * xp.amax(abs(matrices), (1, 2)) ** 3
+    return adjugate / xp.where(solvable, determinant, np.nan)[:, None, None]
+
+
+def estimate_noise(observations: Observations, x_in_world: AnyArray, noise: KeypointNoise) -> KeypointNoise:
+    """`noise`, with which the observations were weighted, at the level that their residuals show.
+
+    Looks at points with three or more observations, and says nothing new of fewer than 30 rows. The median length of a
+    two-dimensional normal residual is sqrt(2 ln 2) sigma; a point takes 3 of its 2 n degrees of freedom, so residuals
+    come out too small by sqrt(1 - 1.5 / n).
+    """
+    xp = namespace(x_in_world)
+    count = observations.tracks.length
+    length_px = length(observations.residuals(x_in_world)) * observations.sigma_px
+    used = (count >= 3) & xp.isfinite(length_px)
+    observed_px = median(length_px / (1 - 1.5 / count) ** 0.5, used) / np.sqrt(2 * np.log(2))
+    by_size_squared = median(observations.sigma_px**2 - noise.level_px**2, used)
+    level_px = xp.clip(observed_px**2 - by_size_squared, MIN_NOISE_LEVEL_PX**2, None) ** 0.5
+    return replace(noise, level_px=xp.where(used.sum() < 30, noise.level_px, level_px))
+
+
+def trustworthy(observations: Observations, x_in_world: AnyArray, options: StructureOptions) -> AnyArray:
+    """Which points (P,) are finite, explained by all their observations and seen under enough parallax."""
+    xp = namespace(x_in_world)
+    limit = options.max_residual_sigma
+    explained = observations.max_by_point(length(observations.residuals(x_in_world))) < (limit or np.inf)
+    centre, _ = observations.rays()
+    direction = x_in_world[observations.point] - centre
+    direction = direction / length(direction)[:, None]
+    cosine = (direction * direction[observations.tracks.starts][observations.point]).sum(-1)
+    parallax_deg = xp.rad2deg(xp.arccos(xp.clip(cosine, -1, 1)))
+    return explained & (observations.max_by_point(parallax_deg) >= options.min_parallax_deg)
+
+
+def _cost(observations: Observations, residuals: AnyArray, loss_scale_sigma: float) -> AnyArray:
+    return observations.sum_by_point(soft_l1((residuals**2).sum(-1), loss_scale_sigma))

@@ -1,0 +1,171 @@
+"""Scale, structure and matching where a network left its output: one upload, one download, no waiting in between.
+
+What does not depend on the network is prepared on the host, while the network runs, and queues up behind it. `compute`
+then only launches work: nothing in it looks at a value, so that rejections are numbers too until they are fetched. The
+equations are those of the host (see `arrays`), in float64; the results are what the host's stages give.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Camera
+
+from ..coarse import map_cells
+from ..coarse.device import DeviceReconstruction
+from ..correspond import Correspondences
+from ..match import MatchOptions, PointMatches
+from ..observations import KeypointNoise
+from ..rejection import Rejection, RejectionReason
+from ..scale import MetricScale, ScaleOptions, check_references, judge, not_finite
+from ..scale_equations import gather
+from ..structure import Structure, StructureOptions, tracks_of
+from ..tracks import Tracks
+from ..views import PosedView, View
+from .compute import Inputs, Options, Outputs, Points, compute
+from .match import prepare_match
+from .structure import prepare_structure
+from .transfer import fetch, upload
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """What the three stages found.
+
+    Attributes:
+        scale: and with it the initial pose.
+        structure: None if it was not asked for.
+        matches: of the query with it; None as well.
+    """
+
+    scale: MetricScale
+    structure: Structure | None
+    matches: PointMatches | None
+
+
+def refine_on_device(
+    reconstruction: DeviceReconstruction,
+    query: View,
+    references: Sequence[PosedView],
+    correspondences: Correspondences,
+    scale_options: ScaleOptions | None = None,
+    structure_options: StructureOptions | None = None,
+    match_options: MatchOptions | None = None,
+) -> Refined | Rejection:
+    """The stages scale, structure and match, on the device of the reconstruction.
+
+    Args:
+        reconstruction: query and references up to scale, its references in the order of `references`.
+        query: the query.
+        references: with known poses.
+        correspondences: matches between the references, and of the query with them.
+        scale_options: defaults to the paper's.
+        structure_options: None asks for the scale alone.
+        match_options: None as well.
+
+    Returns:
+        What estimate_scale, build_structure and match_points give. A network output that is not finite, wherever, is
+        rejected with SCALE_UNRELIABLE and a warning in the log, both naming the backend.
+
+    Raises:
+        ValueError: the reconstruction has another number of references, or only one of the last two options is given.
+    """
+    if len(reconstruction.reference_cameras) != len(references):
+        raise ValueError(f"{len(reconstruction.reference_cameras)} reconstructed references of {len(references)}")
+    if (structure_options is None) != (match_options is None):
+        raise ValueError("structure and matches go together")
+    options = Options(scale_options or ScaleOptions(), structure_options, match_options)
+    rejection = check_references(references, options.scale)
+    if rejection is not None:
+        return rejection
+    job = prepare(reconstruction.reference_cameras, query, references, correspondences, options)
+    uploaded = upload(job.inputs, reconstruction.point_maps.device)
+    outputs = fetch(compute(reconstruction, uploaded, query.camera, options))
+
+    broken = _not_finite(outputs, len(references))
+    if broken:
+        message = f"{reconstruction.backend}: {broken}"
+        log.warning("%s", message)
+        return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
+    scale = judge(outputs.weighed, len(references), options.scale)
+    if isinstance(scale, Rejection):
+        return scale
+    if outputs.points is None or structure_options is None or match_options is None:
+        return Refined(scale, None, None)
+    structure = _structure(outputs.points, job, structure_options)
+    return Refined(scale, structure, _matches(outputs.points, len(query.features), match_options.radius_px))
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What the host knows before the network has answered.
+
+    Attributes:
+        inputs: to upload.
+        tracks: that become points.
+        row: (O,) where their observations are among the rows (P, L) on the device.
+    """
+
+    inputs: Inputs
+    tracks: Tracks
+    row: NDArray[np.intp]
+
+
+def prepare(
+    map_cameras: Sequence[Camera],
+    query: View,
+    references: Sequence[PosedView],
+    correspondences: Correspondences,
+    options: Options,
+) -> Job:
+    """Everything that does not depend on the network; `map_cameras` are those of the references' maps."""
+    known, cell = gather(references, correspondences, options.scale), _cells(map_cameras, references)
+    nothing = np.empty(0, np.intp)
+    if options.structure is None or options.match is None:
+        return Job(Inputs(known, cell, None, None), Tracks(nothing, nothing, nothing), nothing)
+    tracks = tracks_of(references, correspondences, options.structure)
+    structure, row = prepare_structure(tracks, references)
+    match = prepare_match(query, references, correspondences, structure.keypoint, options.match)
+    return Job(Inputs(known, cell, structure, match), tracks, row)
+
+
+def _cells(map_cameras: Sequence[Camera], references: Sequence[PosedView]) -> NDArray[np.intp]:
+    cells = []
+    for index, (camera, reference) in enumerate(zip(map_cameras, references, strict=True)):
+        rows, columns, inside = map_cells(camera, reference.view.features.keypoints, reference.view.camera)
+        cells.append(np.where(inside, (index * camera.height_px + rows) * camera.width_px + columns, -1))
+    return np.concatenate(cells)
+
+
+def _not_finite(outputs: Outputs, reference_count: int) -> str | None:
+    """What of the network's output is broken, in one sentence; None if nothing is."""
+    of_poses = not_finite(outputs.weighed, reference_count)
+    if of_poses is None and outputs.broken_pixels:
+        return f"{outputs.broken_pixels:.0f} predicted pixels are not finite"
+    return of_poses
+
+
+def _structure(points: Points, job: Job, options: StructureOptions) -> Structure:
+    """What of the points and tracks is left."""
+    seen = points.seen.astype(bool)
+    keep, rows = seen.any(axis=1), seen.reshape(-1)[job.row]
+    renumbered = np.cumsum(keep) - 1
+    tracks = Tracks(renumbered[job.tracks.point[rows]], job.tracks.view[rows], job.tracks.keypoint[rows])
+    noise = KeypointNoise(float(points.noise_level_px), options.first_noise.slope)
+    return Structure(points.x_in_world[keep], tracks, noise)
+
+
+def _matches(points: Points, keypoint_count: int, radius_px: float) -> PointMatches:
+    """The matches in the order of match_points: those of votes, then those searched for, each by point."""
+    keep = points.seen.any(axis=1)
+    keypoint, guided = points.keypoint[keep].astype(np.intp), points.guided[keep].astype(bool)
+    order = np.argsort(guided, kind="stable")
+    order = order[keypoint[order] < keypoint_count]
+    return PointMatches(order, keypoint[order], guided[order], radius_px)

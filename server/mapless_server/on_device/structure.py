@@ -1,0 +1,142 @@
+"""The structure stage's tracks and observations on a device; its equations are those of `observations`.
+
+Nothing can be taken out of a tensor without waiting for the number of what remains. So every point has the same number
+of rows, and those that observe nothing, or no longer, are blank.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..arrays import AnyArray
+from ..keypoints import keypoint_offsets, keypoint_rays
+from ..observations import KeypointNoise, Observations
+from ..tracks import Tracks
+from ..views import PosedView
+
+
+@dataclass(frozen=True, eq=False)
+class StructureInputs:
+    """What the structure needs beside the reconstruction, of P points in at most L of K references.
+
+    Attributes:
+        keypoint: (P, L) observations, as keypoints counted through all references, from the left; -1 where blank.
+        view: (P, L) their reference; 0 where blank.
+        pixel: (N, 2) float32, of the keypoints.
+        size_px: (N,) float32, of the keypoints.
+        rotation: (K, 3, 3) camera_from_world.
+        translation: (K, 3) of the same, metres.
+        focal_px, principal_px: (K, 2).
+        first_centre, first_ray: (P, 3) camera centre and viewing ray of each point's first observation, in the world.
+    """
+
+    keypoint: AnyArray
+    view: AnyArray
+    pixel: AnyArray
+    size_px: AnyArray
+    rotation: AnyArray
+    translation: AnyArray
+    focal_px: AnyArray
+    principal_px: AnyArray
+    first_centre: AnyArray
+    first_ray: AnyArray
+
+
+def prepare_structure(tracks: Tracks, references: Sequence[PosedView]) -> tuple[StructureInputs, NDArray[np.intp]]:
+    """The inputs, and the row (O,) of each observation of the tracks when the (P, L) are counted through."""
+    place = np.arange(len(tracks.point)) - tracks.starts[tracks.point]
+    shape = (tracks.point_count, int(place.max(initial=0)) + 1)
+    keypoint, view = np.full(shape, -1), np.zeros(shape, np.int64)
+    keypoint[tracks.point, place] = keypoint_offsets(references)[tracks.view] + tracks.keypoint
+    view[tracks.point, place] = tracks.view
+
+    camera_from_world = [r.world_from_camera.inverse() for r in references]
+    cameras = [r.view.camera for r in references]
+    centre, ray = keypoint_rays(references)
+    inputs = StructureInputs(
+        keypoint,
+        view,
+        np.concatenate([r.view.features.keypoints for r in references]),
+        np.concatenate([r.view.features.sizes_px for r in references]),
+        np.stack([c.rotation for c in camera_from_world]),
+        np.stack([c.translation for c in camera_from_world]),
+        np.array([(c.focal_x_px, c.focal_y_px) for c in cameras]),
+        np.array([(c.principal_x_px, c.principal_y_px) for c in cameras]),
+        centre[keypoint[:, 0]],
+        ray[keypoint[:, 0]],
+    )
+    return inputs, tracks.point * shape[1] + place
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceTracks:
+    """What stands for `Tracks` (see tracks.Grouping): L rows for each of P points.
+
+    Sums run over a point's rows in their order, so that an answer is reproducible; atomic additions are not.
+
+    Attributes:
+        seen: (P, L) which rows observe something.
+    """
+
+    seen: Tensor
+
+    @cached_property
+    def point(self) -> Tensor:
+        """See Grouping."""
+        return torch.arange(self.seen.numel(), device=self.seen.device) // self.seen.shape[1]
+
+    @cached_property
+    def starts(self) -> Tensor:
+        """See Grouping; for a point without rows, a blank one."""
+        count, width = self.seen.shape
+        return torch.arange(count, device=self.seen.device) * width + self.seen.byte().argmax(1)
+
+    @cached_property
+    def length(self) -> Tensor:
+        """See Grouping."""
+        return (self.seen * self.seen.sum(1, keepdim=True)).reshape(-1)
+
+    def sum_by_point(self, values: Tensor) -> Tensor:
+        """See Tracks."""
+        return self._by_point(values, 0.0).sum(1)
+
+    def max_by_point(self, values: Tensor) -> Tensor:
+        """See Tracks; minus infinity for a point without rows."""
+        return self._by_point(values, -torch.inf).amax(1)
+
+    def prune(self, observations: Tensor) -> tuple[DeviceTracks, slice, slice]:
+        """See Tracks; everything stays where it is."""
+        seen = self.seen & observations.reshape(self.seen.shape)
+        often = seen.sum(1, keepdim=True) >= 2
+        return DeviceTracks(seen & often), slice(None), slice(None)
+
+    @cached_property
+    def _blank(self) -> Tensor:
+        return ~self.seen
+
+    def _by_point(self, values: Tensor, blank: float) -> Tensor:
+        rows = values.reshape(*self.seen.shape, *values.shape[1:])
+        return rows.masked_fill(self._blank.reshape(*self.seen.shape, *[1] * (values.ndim - 1)), blank)
+
+
+def observe_on_device(inputs: StructureInputs, noise: KeypointNoise) -> Observations:
+    """The observations of the tracks, float64; blank rows hold the first keypoint."""
+    keypoint, view = inputs.keypoint.clip(0).reshape(-1), inputs.view.reshape(-1)
+    size_px = inputs.size_px[keypoint].double()
+    return Observations(
+        DeviceTracks(inputs.keypoint >= 0),
+        inputs.pixel[keypoint].double(),
+        size_px,
+        noise.sigma_px(size_px),
+        inputs.rotation[view],
+        inputs.translation[view],
+        inputs.focal_px[view],
+        inputs.principal_px[view],
+    )

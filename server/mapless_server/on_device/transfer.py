@@ -1,0 +1,54 @@
+"""Between host and device: arrays up without waiting, results down in one piece."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Record = TypeVar("Record")
+
+
+def upload(record: Record, device: torch.device) -> Record:
+    """The dataclass with every NumPy array in it on the device.
+
+    Returns at once: on CUDA the arrays go through pinned memory, so that the copies queue up behind the network's
+    kernels instead of waiting for them.
+    """
+
+    def up(array: Any) -> Tensor:
+        tensor = torch.from_numpy(np.require(array, requirements=("C", "W")))  # torch warns of what it may not write
+        return (tensor.pin_memory() if device.type == "cuda" else tensor).to(device, non_blocking=True)
+
+    return _changed(record, np.ndarray, up)
+
+
+def fetch(record: Record) -> Record:
+    """The dataclass with every tensor in it as a NumPy array, in one transfer.
+
+    As float64, which holds every index and flag exactly.
+    """
+    tensors: list[Tensor] = []
+    _changed(record, Tensor, tensors.append)
+    flat = torch.cat([tensor.double().reshape(-1) for tensor in tensors]).cpu().numpy()
+    parts = iter(np.split(flat, np.cumsum([tensor.numel() for tensor in tensors])[:-1]))
+    return _changed(record, Tensor, lambda tensor: next(parts).reshape(tensor.shape))
+
+
+def byte_count(record: object) -> int:
+    """Size of all NumPy arrays in a dataclass."""
+    sizes: list[int] = []
+    _changed(record, np.ndarray, lambda array: sizes.append(array.nbytes))
+    return sum(sizes)
+
+
+def _changed(record: Record, kind: type, change: Callable[[Any], object]) -> Record:
+    """A dataclass with another value for every one of this kind in it, at any depth; the rest as it is."""
+    values: dict[str, Any] = {field.name: getattr(record, field.name) for field in fields(record)}  # type: ignore[arg-type]
+    changes = {name: change(value) for name, value in values.items() if isinstance(value, kind)}
+    changes |= {name: _changed(value, kind, change) for name, value in values.items() if is_dataclass(value)}
+    return replace(record, **changes)  # type: ignore[type-var]

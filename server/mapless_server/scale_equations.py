@@ -1,0 +1,287 @@
+"""The equations of the scale and of the initial pose.
+
+=====================  ======================================================
+in the paper           here
+=====================  ======================================================
+S                      `metres_per_unit`
+[R^GT | t^GT]          `Known.rotation`, `Known.centre`: world_from_camera
+[R^local | t^local]    `Predicted.rotation`, `Predicted.centre`: local_from_camera
+C^GT, C^local          `Known.centre`, `Predicted.centre`
+r; d                   `trajectory_radius`; `trajectory_deviation`
+S_tri; S_traj          `triangulation_scale`; `trajectory_scale`
+R_align; P_q^init      `alignment_rotation`; `align`
+=====================  ======================================================
+
+What is known is gathered from the references on the host; `weigh`, which compares it with what was predicted, works on
+NumPy's arrays and on torch's tensors (see `arrays`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array
+
+from .arrays import AnyArray, length, median, namespace
+from .coarse import Reconstruction
+from .correspond import Correspondences
+from .keypoints import keypoint_depths, keypoint_offsets, keypoint_rays
+from .views import PosedView
+
+if TYPE_CHECKING:
+    from .scale import ScaleOptions
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of K references before anything is predicted. Keypoints are counted through all references.
+
+    Attributes:
+        rotation: (K, 3, 3) world_from_camera.
+        centre: (K, 3) in the world, metres.
+        pairs: (P, 2) references whose distance proposes a scale.
+        matches: (M, 2) keypoints of the matches that were triangulated.
+        depth_m: (M, 2) their depths, above 0.
+    """
+
+    rotation: AnyArray
+    centre: AnyArray
+    pairs: AnyArray
+    matches: AnyArray
+    depth_m: AnyArray
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """What a reconstruction predicts of the same, float64, in its frame and unit.
+
+    Attributes:
+        rotation: (K + 1, 3, 3) local_from_camera of the references, then of the query.
+        centre: (K + 1, 3) of the same.
+        depth: (N,) at the references' keypoints; NaN where there is none.
+        confidence: (K,) total of each reference.
+    """
+
+    rotation: AnyArray
+    centre: AnyArray
+    depth: AnyArray
+    confidence: AnyArray
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """What the conclusion needs to know; arrays of one number where no shape is given.
+
+    Attributes:
+        broken_poses: number of predicted poses that are not finite.
+        known_depths: number of keypoints with a depth.
+        radius_per_depth: of the predicted trajectory, by the median depth.
+        ratio_count: number of depth ratios.
+        metres_per_unit: S; NaN if the strategy finds none.
+        by_triangulation: whether stage 1 gave it.
+        deviation: d of this scale.
+        anchor: index of the reference with the highest total confidence, the first of equals.
+        local_rotation, local_centre: (3, 3), (3,) world_from_local but for the scale.
+        query_rotation, query_centre: (3, 3), (3,) world_from_query, P_q^init.
+    """
+
+    broken_poses: AnyArray
+    known_depths: AnyArray
+    radius_per_depth: AnyArray
+    ratio_count: AnyArray
+    metres_per_unit: AnyArray
+    by_triangulation: AnyArray
+    deviation: AnyArray
+    anchor: AnyArray
+    local_rotation: AnyArray
+    local_centre: AnyArray
+    query_rotation: AnyArray
+    query_centre: AnyArray
+
+
+def predict(reconstruction: Reconstruction, references: Sequence[PosedView]) -> Predicted:
+    """What the reconstruction says, as far as the scale is concerned."""
+    poses = [view.local_from_camera for view in (*reconstruction.references, reconstruction.query)]
+    return Predicted(
+        np.stack([pose.rotation for pose in poses]),
+        np.stack([pose.translation for pose in poses]),
+        keypoint_depths(reconstruction, references),
+        np.array([np.nansum(view.confidence, dtype=np.float64) for view in reconstruction.references]),
+    )
+
+
+def gather(references: Sequence[PosedView], correspondences: Correspondences, options: ScaleOptions) -> Known:
+    """What is known of two or more references."""
+    poses = [reference.world_from_camera for reference in references]
+    if not options.by_triangulation:
+        correspondences = Correspondences({}, ())
+    matches = _matches_in_range(references, correspondences, options)
+    centre, ray = keypoint_rays(references)
+    depth_m, parallax_deg = triangulate_depths(centre[matches], ray[matches])
+    # A match behind either camera is wrong, whatever the other one says. False for NaN.
+    usable = (depth_m > 0).all(axis=1) & (parallax_deg >= options.min_parallax_deg)
+    return Known(
+        np.stack([pose.rotation for pose in poses]),
+        np.stack([pose.translation for pose in poses]),
+        pairs_of(len(references), options.max_pair_cameras),
+        matches[usable],
+        depth_m[usable],
+    )
+
+
+def _matches_in_range(
+    references: Sequence[PosedView], correspondences: Correspondences, options: ScaleOptions
+) -> NDArray[np.intp]:
+    """Matches (M, 2) of pairs with a baseline in range."""
+    offsets = keypoint_offsets(references)
+    chosen = [np.empty((0, 2), np.intp)]
+    for (i, j), matches in correspondences.reference_pairs.items():
+        between = references[j].world_from_camera.translation - references[i].world_from_camera.translation
+        if options.min_baseline_m <= np.linalg.norm(between) <= options.max_baseline_m:
+            chosen.append(matches + offsets[[i, j]])
+    in_range = np.concatenate(chosen)
+    return in_range[:: 1 + len(in_range) // options.max_matches]
+
+
+def pairs_of(count: int, max_cameras: int) -> NDArray[np.intp]:
+    """The pairs (P, 2) of at most `max_cameras` evenly chosen cameras of `count`."""
+    cameras = np.linspace(0, count - 1, min(count, max_cameras)).round().astype(np.intp)
+    return cameras[np.stack(np.triu_indices(len(cameras), 1), axis=1)]
+
+
+def weigh(known: Known, predicted: Predicted, options: ScaleOptions) -> Weighed:
+    """Compares what is known with what was predicted."""
+    xp, count = namespace(predicted.depth), len(known.centre)
+    finite = xp.isfinite(xp.concatenate([predicted.rotation.reshape(count + 1, 9), predicted.centre], 1)).all(1)
+    has_depth = ~xp.isnan(predicted.depth)
+    centre = predicted.centre[:count]
+    radius, radius_m = trajectory_radius(centre), trajectory_radius(known.centre)
+    anchor = predicted.confidence.argmax()
+    world_from_anchor, local_from_anchor = (
+        (_pick(poses.rotation, anchor), _pick(poses.centre, anchor)) for poses in (known, predicted)
+    )
+    rotation = alignment_rotation(world_from_anchor[0], local_from_anchor[0])
+
+    # In both images of a match, so that the order of the references does not matter.
+    ratios = (known.depth_m / predicted.depth[known.matches]).reshape(-1)
+    usable = xp.isfinite(ratios)
+    enough = (usable.sum() >= options.min_ratios) & options.by_triangulation
+    first = xp.where(enough, triangulation_scale(ratios, usable), np.nan)
+    second = trajectory_scale(centre @ rotation.T, known.centre, known.pairs, options.inlier_distance_m)
+    if not options.by_trajectory:
+        second = second * np.nan
+    of_first, of_second = (trajectory_deviation(scale, radius, radius_m) for scale in (first, second))
+    # d_tri below the gate settles it; otherwise the smaller one, of equals the first stage's.
+    by_triangulation = (of_first < options.max_deviation) | (of_first <= of_second) | xp.isnan(of_second)
+
+    scale = xp.where(by_triangulation, first, second)
+    world_from_local = align(scale, rotation, world_from_anchor[1], local_from_anchor[1])
+    return Weighed(
+        (~finite).sum(),
+        has_depth.sum(),
+        radius / median(predicted.depth, has_depth),
+        usable.sum(),
+        scale,
+        by_triangulation,
+        xp.where(by_triangulation, of_first, of_second),
+        anchor,
+        rotation,
+        world_from_local,
+        rotation @ predicted.rotation[count],
+        scale * (rotation @ predicted.centre[count]) + world_from_local,
+    )
+
+
+def _pick(rows: AnyArray, index: AnyArray) -> AnyArray:
+    """One row; torch would wait for an index that is not in an array."""
+    return rows[index.reshape(1)][0]
+
+
+def triangulate_depths(centre: Array, ray: Array) -> tuple[Array, Array]:
+    """Depths at which the two rays of each match pass nearest to one another.
+
+    They solve z_i r_i - z_j r_j = C_j - C_i in the least squares sense:
+
+        z_i = (C_j - C_i) x r_j . n / |n|^2,   z_j = (C_j - C_i) x r_i . n / |n|^2,   n = r_i x r_j.
+
+    Args:
+        centre: (M, 2, 3) camera centres C_i and C_j in the world, metres.
+        ray: (M, 2, 3) viewing rays r_i and r_j in world axes, of depth 1 in their camera.
+
+    Returns:
+        depth_m: (M, 2) in either camera; negative behind it, NaN for parallel rays.
+        parallax_deg: (M,) angle between the rays, 0 to 180.
+    """
+    baseline = centre[:, 1] - centre[:, 0]
+    normal = np.cross(ray[:, 0], ray[:, 1])
+    squared = (normal**2).sum(axis=1)
+    across = np.cross(baseline[:, None], ray[:, ::-1])  # (M, 2, 3), with the other camera's ray
+    depth_m = (across * normal[:, None]).sum(axis=2) / np.where(squared > 0, squared, np.nan)[:, None]
+    parallax = np.arctan2(np.sqrt(squared), (ray[:, 0] * ray[:, 1]).sum(axis=1))
+    return depth_m, np.degrees(parallax)
+
+
+def trajectory_radius(centres: AnyArray) -> AnyArray:
+    """RMS distance of camera centres (K, 3) from their centroid, in their unit: r = sqrt(1/K sum |C_i - mean C|^2)."""
+    return ((centres - centres.mean(0)) ** 2).sum(1).mean() ** 0.5
+
+
+def trajectory_deviation(metres_per_unit: AnyArray, radius: AnyArray, radius_m: AnyArray) -> AnyArray:
+    """The paper's d = |S r^local / r^GT - 1| of a scale S, by the predicted and the known radius."""
+    return abs(metres_per_unit * radius / radius_m - 1)
+
+
+def alignment_rotation(world_from_anchor: AnyArray, local_from_anchor: AnyArray) -> AnyArray:
+    """Rotation (3, 3) from local to world axes, which needs no scale: R_align = R_anc^GT (R_anc^local)^T."""
+    return world_from_anchor @ local_from_anchor.T
+
+
+def triangulation_scale(ratios: AnyArray, usable: AnyArray) -> AnyArray:
+    """S_tri, the median of those ratios Z^GT / Z^local (N,) that are usable (N,), in metres per unit."""
+    return median(ratios, usable)
+
+
+def trajectory_scale(aligned: AnyArray, centres_world: AnyArray, pairs: AnyArray, inlier_distance_m: float) -> AnyArray:
+    """S_traj: the scale with the most inliers, among equals that with the smallest RMS distance.
+
+    Every pair of cameras proposes the ratio of their known to their predicted distance. The proposal scales the whole
+    trajectory, which is then moved onto the known one by the offset of their centroids; cameras that come near enough
+    to their known centre are inliers.
+
+    Args:
+        aligned: (K, 3) predicted centres in world axes, R_align C^local.
+        centres_world: (K, 3) known centres, metres.
+        pairs: (P, 2) of the cameras, at least one.
+        inlier_distance_m: how near.
+
+    Returns:
+        Metres per unit; NaN when no pair has a distance in both trajectories.
+    """
+    xp = namespace(aligned)
+    predicted, known = (length(centres[pairs[:, 0]] - centres[pairs[:, 1]]) for centres in (aligned, centres_world))
+    # A distance of nothing but rounding proposes nothing but rounding.
+    apart = (predicted > 1e-6 * trajectory_radius(aligned)) & (known > 1e-6 * trajectory_radius(centres_world))
+    proposals = known / xp.where(apart, predicted, np.nan)
+    moved = proposals[:, None, None] * (aligned - aligned.mean(0))  # (P, K, 3)
+    squared = ((moved - (centres_world - centres_world.mean(0))) ** 2).sum(2)  # (P, K) square metres
+    inliers = squared <= inlier_distance_m**2
+    count = xp.where(apart, inliers.sum(1), -1)
+    judges = inliers | (count == 0)[:, None]  # where no camera agrees, all of them judge
+    mean_squared = (squared * judges).sum(1) / judges.sum(1)
+    return _pick(proposals, xp.where(count == count.max(), mean_squared, np.inf).argmin())
+
+
+def align(
+    metres_per_unit: AnyArray, rotation: AnyArray, anchor_in_world: AnyArray, anchor_in_local: AnyArray
+) -> AnyArray:
+    """Translation (3,) of ``world_from_local``, which lays the anchor's predicted centre (3,) on its known one (3,).
+
+    x_in_world = t_anc^GT + S R_align (x_in_local - t_anc^local). Applied to P_q^local it gives the paper's P_q^init:
+    R_q^init = R_align R_q^local,   t_q^init = t_anc^GT + R_align S (t_q^local - t_anc^local).
+    """
+    return anchor_in_world - metres_per_unit * (rotation @ anchor_in_local)

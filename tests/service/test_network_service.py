@@ -1,0 +1,113 @@
+"""The whole service on a small network with random weights: it says nothing true, and must do so without an error."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+pytest.importorskip("torch", reason="the networks' extra is not installed")
+pytest.importorskip("PIL", reason="the networks' extra is not installed")
+
+import torch
+from images import encode, textured
+from small_networks import GRIDS, small_network
+
+from mapless import Client, LocalizationResult, NewReference, Rejected
+from mapless.geometry import Camera, RigidTransform
+from mapless_server.coarse.network import NetworkOptions, NetworkReconstructor
+from mapless_server.engine import Engine, EngineOptions
+from mapless_server.features import SiftExtractor
+from mapless_server.localize import Pipeline
+from mapless_server.networks.network import Network
+from mapless_server.networks.runner import NetworkRunner
+from mapless_server.serve import running_server
+from mapless_server.settings import Settings
+from mapless_server.store import Store
+from mapless_server.tiers import Tier
+
+CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
+DISTANCE_M = 3.0
+WALL = textured(800, 240, seed=8)
+"""Wallpaper: it moves by 100 px when the camera moves by a metre along it."""
+
+
+def photograph_at(x_m: float) -> NDArray[np.uint8]:
+    start = round(x_m * CAMERA.focal_x_px / DISTANCE_M)
+    return WALL[:, start : start + CAMERA.width_px]
+
+
+def pose_at(x_m: float) -> RigidTransform:
+    return RigidTransform(np.eye(3), np.array([x_m, 0.0, 0.0]))
+
+
+@contextmanager
+def serving(data_dir: Path, network: Network, name: str) -> Iterator[tuple[Client, NetworkReconstructor]]:
+    """A client of a server on this network, with the real method and SIFT."""
+    torch.set_num_threads(1)
+    runner = NetworkRunner(network, name, f"sha-of-{name}", "cpu")
+    backend = NetworkReconstructor(runner, NetworkOptions(grids=GRIDS))
+    store = Store.open(data_dir)
+    engine = Engine(store, [Tier(SiftExtractor(), Pipeline(backend))], EngineOptions(workers=2))
+    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, workers=2)
+    address: Future[str] = Future()
+    loop = asyncio.new_event_loop()
+    stopping = asyncio.Event()
+
+    async def run() -> None:
+        async with running_server(settings, engine, store) as bound:
+            address.set_result(bound)
+            await stopping.wait()
+
+    thread = threading.Thread(target=loop.run_until_complete, args=(run(),))
+    thread.start()
+    try:
+        with Client(address.result(30)) as client:
+            client.create_scene("wall")
+            photos = [
+                NewReference(f"r{i}", encode(".png", photograph_at(x_m)), CAMERA, pose_at(x_m))
+                for i, x_m in enumerate((0.0, 0.5, 1.0, 1.5))
+            ]
+            client.add_references("wall", photos)
+            yield client, backend
+    finally:
+        loop.call_soon_threadsafe(stopping.set)
+        thread.join(30)
+        assert not thread.is_alive()
+        loop.close()
+        backend.close()
+
+
+@pytest.mark.parametrize("name", ["pi3", "pi3x"])
+def test_a_random_network_is_answered_for(tmp_path: Path, name: str) -> None:
+    """Nothing but the answer's form is known: the network is random, but matches and poses of references are true."""
+    with serving(tmp_path, small_network(name), name) as (client, backend):
+        names = ["r0", "r1", "r2", "r3"]
+        answers = [client.localize(encode(".png", photograph_at(x_m)), CAMERA, "wall", names) for x_m in (0.7, 1.2)]
+        for answer in answers:
+            assert isinstance(answer, (LocalizationResult, Rejected))
+            used = answer.diagnostics
+            assert (used.backend, used.weights_sha256) == (name, f"sha-of-{name}")
+            assert "coarse" in used.stage_s
+        # The references' tokens were kept from the first query to the second.
+        assert backend.cache.counters.misses == 4
+        assert backend.cache.counters.device_hits >= 4
+
+
+def test_a_network_of_nans_is_a_rejection(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    network = small_network("pi3")
+    for parameter in network.parameters():
+        parameter.data[:] = float("nan")
+    with serving(tmp_path, network, "pi3") as (client, _):
+        answer = client.localize(encode(".png", photograph_at(0.7)), CAMERA, "wall", ["r0", "r1", "r2"])
+    assert isinstance(answer, Rejected)
+    assert answer.reason == "SCALE_UNRELIABLE"
+    assert "pi3" in answer.message
+    assert "pi3: the network's output is not finite" in [record.message for record in caplog.records]

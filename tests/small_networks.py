@@ -1,0 +1,89 @@
+"""Small networks with random weights that say something, and photographs to show them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from images import textured
+from numpy.typing import NDArray
+
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless_server.coarse.grids import GridOptions
+from mapless_server.networks.network import Network, Sizes
+from mapless_server.networks.pi3 import Pi3
+from mapless_server.networks.pi3x import Pi3X
+from mapless_server.networks.runner import NetworkRunner
+from mapless_server.views import Features, Photograph, PosedView, View
+
+SMALL = {
+    "pi3": Sizes(64, 4, encoder_depth=3, decoder_depth=4, head_depth=2, camera_width=32),
+    "pi3x": Sizes(64, 4, 3, 10, 2, 32, (64, 32, 16), 8, metric_width=32, metric_heads=2, metric_depth=2),
+}
+GRIDS = GridOptions(pixel_limit=20 * 14**2)
+"""5 x 4 patches for 4:3."""
+NOTHING = Features(np.empty((0, 2), np.float32), np.empty((0, 4), np.float32), np.empty(0, np.float32))
+
+
+def small_network(name: str, seed: int = 0) -> Network:
+    """A small Pi3 or Pi3X whose every part has its say."""
+    network: Network = Pi3(SMALL[name]) if name == "pi3" else Pi3X(SMALL[name])
+    random = torch.Generator().manual_seed(seed)
+    for key, parameter in network.named_parameters():
+        noise = torch.randn(parameter.shape, generator=random)
+        if key.endswith("gamma"):
+            noise = 0.3 + 0.1 * noise
+        elif "token" in key or "emb" in key.rsplit(".", 1)[-1]:
+            noise = 0.3 * noise
+        elif parameter.ndim == 1:
+            noise = (1.0 if key.endswith("weight") else 0.0) + 0.1 * noise
+        else:
+            noise = noise / parameter[0].numel() ** 0.5
+        parameter.data.copy_(noise)
+    return network
+
+
+def small_runner(name: str, seed: int = 0) -> NetworkRunner:
+    """The network on the CPU."""
+    return NetworkRunner(small_network(name, seed), name, f"sha of {name} {seed}", "cpu")
+
+
+def photograph(image: NDArray[np.uint8], camera: Camera | None = None, reads: list[str] | None = None) -> Photograph:
+    """A photograph; every reading of it is noted in `reads`."""
+    height, width = image.shape[:2]
+    sha256 = hashlib.sha256(image.tobytes()).hexdigest()
+
+    def read() -> NDArray[np.uint8]:
+        if reads is not None:
+            reads.append(sha256)
+        return image
+
+    camera = camera or Camera(width, height, 0.8 * width, 0.8 * width, width / 2 - 0.5, height / 2 - 0.5)
+    return Photograph(sha256, camera, read)
+
+
+def view_of(photo: Photograph) -> View:
+    """A view without features."""
+    return View(photo.camera.pinhole(), NOTHING, photo)
+
+
+def references_of(photos: Sequence[Photograph]) -> tuple[PosedView, ...]:
+    """References half a metre apart, each turned a little more."""
+    poses = (
+        RigidTransform(rotation_from_vector([0.0, 0.05 * i, 0.0]), np.array([0.5 * i + 1.0, 0.1 * i * i, -2.0]))
+        for i in range(len(photos))
+    )
+    return tuple(
+        PosedView(f"key-{i}", f"scenes/s/references/r{i}", view_of(photo), pose)
+        for i, (photo, pose) in enumerate(zip(photos, poses, strict=True))
+    )
+
+
+def small_request(
+    reference_count: int, seed: int = 0, size: tuple[int, int] = (96, 72), reads: list[str] | None = None
+) -> tuple[View, tuple[PosedView, ...]]:
+    """A query and references of one size, every image another one."""
+    photos = [photograph(textured(*size, seed=1000 * seed + i), reads=reads) for i in range(reference_count + 1)]
+    return view_of(photos[0]), references_of(photos[1:])

@@ -1,0 +1,250 @@
+"""What a query costs and what it is answered: one tier where that is enough, the better of two where it is not."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from images import encode, textured
+from servers import CAMERA, PHOTO, StandInExtractor, StandInReconstructor, pose
+
+from mapless.geometry import RigidTransform
+from mapless_server.decode import ImageLimits, decode_image
+from mapless_server.engine import Engine, EngineOptions, Photo, PositionPrior, Query, Result
+from mapless_server.errors import DeadlineExceeded, InvalidArgument
+from mapless_server.localize import Answer, Localization, LocalizeOptions, Pipeline
+from mapless_server.pnp import PoseStage
+from mapless_server.rejection import Rejection, RejectionReason
+from mapless_server.store import NewReference, Store
+from mapless_server.tiers import EscalationOptions, Tier
+from mapless_server.views import PosedView, View
+
+SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
+ESCALATION = EscalationOptions(doubtful_inliers=50, doubtful_radius_m=0.2)
+PIXELS = decode_image(PHOTO, ImageLimits())
+
+
+def localized(inliers: int, at: RigidTransform | None = None) -> Answer:
+    covariance = np.diag([1e-4] * 3 + [1e-6] * 3)
+    found = Localization(at or pose(0.0), covariance, PoseStage.REFINED, inliers, 2 * inliers, 0.7)
+    return Answer(found, None, {"coarse": 0.25}, (1, 2), (3, 4))
+
+
+def rejected(reason: RejectionReason = RejectionReason.TOO_FEW_MATCHES) -> Answer:
+    return Answer(Rejection(reason, "planted"), None, {"correspond": 0.125})
+
+
+Reply = Answer | Callable[[View, Sequence[PosedView], Callable[[], None]], Answer]
+
+
+@dataclass
+class Setting:
+    """An engine of two tiers whose method answers what is planted, and who was asked."""
+
+    store: Store
+    replies: dict[str, Reply] = field(default_factory=dict)
+    asked: list[str] = field(default_factory=list)
+    seen: list[tuple[View, Sequence[PosedView]]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.extractors = {name: StandInExtractor(name) for name in ("cheap", "strong")}
+        pipelines = {name: Pipeline(cast(Any, StandInReconstructor())) for name in self.extractors}
+
+        def method(
+            query: View, references: Sequence[PosedView], pipeline: Pipeline, _: Any, check: Callable[[], None]
+        ) -> Answer:
+            (name,) = (name for name, it in pipelines.items() if it is pipeline)
+            self.asked.append(name)
+            self.seen.append((query, references))
+            reply = self.replies[name]
+            return reply(query, references, check) if callable(reply) else reply
+
+        tiers = [Tier(extractor, pipelines[name]) for name, extractor in self.extractors.items()]
+        self.engine = Engine(self.store, tiers, EngineOptions(escalation=ESCALATION), method)
+
+    def localize(self, deadline_s: float = 60.0, **changes: Any) -> Result:
+        values: dict[str, Any] = {"reference_ids": ("r0", "r1"), "prior": None, "reference_count": 2} | changes
+        query = Query("s", photo=Photo(PHOTO, CAMERA, "image"), options=LocalizeOptions(), **values)
+        return asyncio.run(self.engine.localize(query, time.monotonic() + deadline_s))
+
+
+@pytest.fixture
+def setting(tmp_path: Path) -> Iterator[Setting]:
+    with Store.open(tmp_path) as store:
+        setting = Setting(store)
+        store.create_scene("s")
+        photos = [Photo(encode(".png", textured(seed=i)), CAMERA, "image") for i in range(3)]
+        views = asyncio.run(setting.engine.describe(photos, time.monotonic() + 60))
+        store.add_references(
+            "s",
+            [
+                NewReference(f"r{i}", photo.image, CAMERA, pose(float(i)), its_views)
+                for i, (photo, its_views) in enumerate(zip(photos, views, strict=True))
+            ],
+        )
+        for extractor in setting.extractors.values():
+            extractor.seen.clear()
+        yield setting
+        setting.engine.close()
+
+
+class TestTiers:
+    @pytest.mark.parametrize(
+        "sure", [localized(SURE_INLIERS), rejected(RejectionReason.DEGENERATE_REFERENCES)], ids=["pose", "rejection"]
+    )
+    def test_an_answer_beyond_doubt_costs_one_tier(self, setting: Setting, sure: Answer) -> None:
+        setting.replies["cheap"] = sure
+        result = setting.localize()
+        assert setting.asked == ["cheap"]
+        assert not setting.extractors["strong"].seen
+        assert result.attempt.answer.outcome is sure.outcome
+        assert result.attempt.tier.extractor.name == "cheap"
+        assert list(result.stage_seconds) == ["decode", "features", *sure.stage_seconds]
+
+    @pytest.mark.parametrize(
+        ("first", "second", "answered"),
+        [
+            (rejected(), localized(SURE_INLIERS), "strong"),
+            (rejected(), rejected(RejectionReason.GATE), "strong"),
+            (localized(DOUBTFUL_INLIERS), localized(SURE_INLIERS), "strong"),
+            (localized(DOUBTFUL_INLIERS), rejected(), "cheap"),
+        ],
+    )
+    def test_a_doubtful_answer_is_tried_again_and_the_better_one_given(
+        self, setting: Setting, first: Answer, second: Answer, answered: str
+    ) -> None:
+        setting.replies = {"cheap": first, "strong": second}
+        result = setting.localize()
+        assert setting.asked == ["cheap", "strong"]
+        assert result.attempt.tier.extractor.name == answered
+        assert result.attempt.answer.outcome is {"cheap": first, "strong": second}[answered].outcome
+
+    def test_the_time_of_both_is_told_apart(self, setting: Setting) -> None:
+        setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
+        seconds = setting.localize().stage_seconds
+        assert list(seconds) == [
+            *("decode", "features", "correspond"),
+            *("strong/queue", "strong/features", "strong/coarse"),
+        ]
+        assert (seconds["correspond"], seconds["strong/coarse"]) == (0.125, 0.25)
+
+    def test_contradicting_poses_are_rejected_by_name(self, setting: Setting) -> None:
+        near, far = localized(DOUBTFUL_INLIERS), localized(DOUBTFUL_INLIERS, at=pose(3.0))
+        setting.replies = {"cheap": near, "strong": far}
+        outcome = setting.localize().attempt.answer.outcome
+        assert isinstance(outcome, Rejection)
+        assert outcome.reason is RejectionReason.GATE
+        assert outcome.message.startswith("the features disagree: the pose of cheap (5 inliers) and that of strong (5)")
+
+    def test_a_pose_outside_the_prior_is_doubtful_too(self, setting: Setting) -> None:
+        setting.replies = {"cheap": localized(SURE_INLIERS, at=pose(3.0)), "strong": localized(SURE_INLIERS)}
+        prior = PositionPrior(pose(0.0).translation, 0.5)
+        result = setting.localize(prior=prior)
+        assert isinstance(result.attempt.answer.outcome, Localization)
+        assert setting.asked == ["cheap", "strong"]
+
+    def test_each_tier_works_with_its_own_features_on_one_photograph(self, setting: Setting) -> None:
+        """The photograph is decoded once; the references are those of each tier, the same ones."""
+        setting.replies = {"cheap": rejected(), "strong": rejected()}
+        setting.localize()
+        (first, first_references), (second, second_references) = setting.seen
+        assert first.photograph is second.photograph
+        assert len(setting.extractors["cheap"].seen) == len(setting.extractors["strong"].seen) == 1
+        assert setting.extractors["cheap"].seen[0] is setting.extractors["strong"].seen[0]
+        assert [it.key for it in first_references] == [it.key for it in second_references]
+
+    def test_where_the_server_chooses_each_tier_chooses(self, setting: Setting) -> None:
+        setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
+        seconds = setting.localize(reference_ids=()).stage_seconds
+        assert {"retrieval", "strong/retrieval"} <= set(seconds)
+
+    @pytest.mark.parametrize("steps", ["long", "short"])
+    def test_no_answer_is_lost_because_a_better_one_comes_too_late(self, setting: Setting, steps: str) -> None:
+        """The stronger features are given up before the deadline, even in the middle of a step."""
+        answered = threading.Event()
+
+        def endless(_: View, __: Sequence[PosedView], check: Callable[[], None]) -> Answer:
+            if steps == "long":
+                assert answered.wait(20)
+            while True:
+                check()
+                time.sleep(0.01)
+
+        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": endless}
+        result = setting.localize(deadline_s=0.8)
+        answered.set()
+        assert result.attempt.tier.extractor.name == "cheap"
+        assert isinstance(result.attempt.answer.outcome, Localization)
+        assert list(result.stage_seconds) == ["decode", "features", "coarse", "strong/unfinished"]
+
+    def test_a_deadline_that_passes_in_the_first_tier_is_no_answer(self, setting: Setting) -> None:
+        def slow(_: View, __: Sequence[PosedView], check: Callable[[], None]) -> Answer:
+            time.sleep(0.3)
+            check()
+            return localized(SURE_INLIERS)
+
+        setting.replies = {"cheap": slow}
+        with pytest.raises(DeadlineExceeded):
+            setting.localize(deadline_s=0.2)
+
+    def test_tiers_share_neither_names_nor_what_remembers_matches(self, setting: Setting) -> None:
+        cheap, strong = setting.engine.tiers
+        same_name = Tier(StandInExtractor("cheap"), strong.pipeline)
+        same_matcher = Tier(strong.extractor, cheap.pipeline)
+        for tiers in ([], [cheap, same_name], [cheap, same_matcher]):
+            with pytest.raises(ValueError, match="each with an extractor and a matcher of its own"):
+                Engine(setting.store, tiers, EngineOptions())
+
+
+class TestPhotograph:
+    def test_reaches_the_method_with_the_query_and_every_reference(self, setting: Setting) -> None:
+        setting.replies["cheap"] = localized(SURE_INLIERS)
+        setting.localize()
+        ((query, references),) = setting.seen
+        assert query.photograph is not None
+        assert query.photograph.sha256 == hashlib.sha256(PHOTO).hexdigest()
+        assert query.photograph.camera == CAMERA
+        np.testing.assert_array_equal(query.photograph.read(), PIXELS)
+        for i, reference in enumerate(references):
+            assert reference.view.photograph is not None
+            np.testing.assert_array_equal(reference.view.photograph.read(), textured(seed=i))
+
+    def test_one_that_goes_while_a_network_looks_is_no_candidate_any_more(self, setting: Setting) -> None:
+        """The server chose it, so the caller must not hear of it."""
+
+        def look(_: View, references: Sequence[PosedView], __: Any) -> Answer:
+            if len(setting.asked) == 1:
+                setting.store.delete_reference("s", references[0].name.rpartition("/")[2])
+            for reference in references:
+                assert reference.view.photograph is not None
+                reference.view.photograph.read()
+            return localized(SURE_INLIERS)
+
+        setting.replies["cheap"] = look
+        result = setting.localize(reference_ids=(), reference_count=3)
+        assert setting.asked == ["cheap", "cheap"]
+        assert len(result.attempt.references) == 2
+        assert len(setting.extractors["cheap"].seen) == 1, "the photograph is described once"
+
+
+class TestDescribe:
+    def test_every_tier_once_and_without_pixels(self, setting: Setting) -> None:
+        photos = [Photo(encode(".png", textured(seed=i)), CAMERA, "image") for i in range(5)]
+        described = asyncio.run(setting.engine.describe(photos, time.monotonic() + 60))
+        assert [list(views) for views in described] == [["cheap", "strong"]] * 5
+        assert all(view.photograph is None for views in described for view in views.values())
+        assert [len(it.seen) for it in setting.extractors.values()] == [5, 5]
+
+    def test_a_bad_image_names_its_field(self, setting: Setting) -> None:
+        photos = [Photo(PHOTO, CAMERA, "requests[0].image"), Photo(PHOTO[:-50], CAMERA, "requests[1].image")]
+        with pytest.raises(InvalidArgument) as caught:
+            asyncio.run(setting.engine.describe(photos, time.monotonic() + 60))
+        assert caught.value.field == "requests[1].image"
