@@ -17,8 +17,7 @@ from torch.nn.attention import SDPBackend
 from mapless.geometry import Camera
 from mapless_server.bench_network import host
 from mapless_server.bench_network.command import bench_network
-from mapless_server.bench_network.forward import Forward
-from mapless_server.bench_network.host import max_difference
+from mapless_server.bench_network.forward import Forward, max_difference
 from mapless_server.bench_network.operations import H200, Operations, count_operations
 from mapless_server.bench_network.planted import UNITS_PER_METRE, PlantedReconstructor, true_points
 from mapless_server.bench_network.report import Figure, markdown, table
@@ -70,10 +69,27 @@ def test_bytes_between_products_are_counted_once_read_and_once_written() -> None
 
     def work() -> None:
         y = F.gelu(F.linear(x, weight))
+        F.linear(x.view(2, 4, 16), weight)
         (y.view(4, 64) + y.view(4, 64)).to(torch.float32)  # views and conversions to the same type move nothing
 
     wide, narrow = 8 * 32 * 4, 8 * 16 * 4
-    assert count_operations(work) == Operations(2 * 8 * 16 * 32, 0, 3, 2 * wide + 3 * wide, narrow + wide + 2 * wide)
+    assert count_operations(work) == Operations(
+        flop=2 * (2 * 8 * 16 * 32),
+        float32_flop=2 * (2 * 8 * 16 * 32),
+        kernels=4,
+        eager_bytes=2 * wide + 3 * wide,
+        fused_bytes=2 * (narrow + wide) + 2 * wide,
+    )
+
+
+def test_convolutions_in_single_precision_are_counted_apart() -> None:
+    """Those of Pi3X's heads; what they execute in all is what a counter inside torch says."""
+    x = torch.empty(2, 8, 5, 6, device="meta")
+    kernel, transposed = torch.empty(4, 8, 3, 3, device="meta"), torch.empty(8, 4, 2, 2, device="meta")
+    operations = count_operations(lambda: (F.conv2d(x, kernel, padding=1), F.conv_transpose2d(x, transposed, stride=2)))
+    assert operations.tf32_flop == operations.flop == 2 * 2 * 5 * 6 * 8 * 4 * (9 + 4)
+    low = count_operations(lambda: F.conv2d(x.to(torch.bfloat16), kernel.to(torch.bfloat16)))
+    assert low.tf32_flop == low.float32_flop == 0
 
 
 def test_prediction_is_never_below_the_floor_and_a_compiled_network_is_faster() -> None:

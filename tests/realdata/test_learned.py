@@ -1,0 +1,71 @@
+"""Learned features on real photographs: what they are for, and that the strong ones are asked only where they must."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapless_server.assembly import make_tiers
+from mapless_server.dataset import Dataset
+from mapless_server.decode import ImageLimits, decode_image
+from mapless_server.localize import Answer, Localization, LocalizeOptions, localize
+from mapless_server.settings import Settings, default_weights_dir
+from mapless_server.tiers import EscalationOptions, Tier, is_doubtful
+from mapless_server.views import PosedView, View
+
+pytestmark = [pytest.mark.realdata, pytest.mark.timeout(300)]
+
+SCENE = "7scenes-redkitchen-seq01-first600"
+REFERENCES = (0, 200, 399, 599)
+QUERIES = (18, 125, 398, 459)
+"""With four references SIFT is sure of the first of these, in doubt at the second, and loses the others."""
+
+
+@pytest.fixture(scope="module")
+def tiers(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tier, ...]:
+    pytest.importorskip("torch")
+    weights = Path(os.environ.get("TEST_WEIGHTS") or default_weights_dir())
+    if not (weights / "aliked-n16.safetensors").is_file():
+        pytest.skip(
+            f"needs `mapless-server weights fetch aliked`; {weights} has none (TEST_WEIGHTS names another place)"
+        )
+    settings = Settings(features="auto", device="cpu", weights_dir=weights, data_dir=tmp_path_factory.mktemp("data"))
+    return make_tiers(settings)
+
+
+def test_strong_features_answer_what_cheap_ones_lose(
+    photographs: Callable[[str], Dataset], tiers: tuple[Tier, ...]
+) -> None:
+    cheap, strong = (answers(photographs(SCENE), tier) for tier in tiers)
+    doubtful = [is_doubtful(answer, EscalationOptions()) for answer in cheap]
+    assert doubtful == [False, True, True, True]
+    assert not any(isinstance(answer.outcome, Localization) for answer in cheap[2:])
+    assert [error_m(photographs(SCENE), *pair) < 0.05 for pair in zip(QUERIES, strong, strict=True)] == [True] * 4
+
+
+def answers(dataset: Dataset, tier: Tier) -> list[Answer]:
+    """What one tier says of each query, given all references."""
+    references = [
+        PosedView(
+            dataset.frames[i].name, dataset.frames[i].name, view(dataset, i, tier), dataset.frames[i].world_from_camera
+        )
+        for i in REFERENCES
+    ]
+    return [localize(view(dataset, i, tier), references, tier.pipeline, LocalizeOptions()) for i in QUERIES]
+
+
+def view(dataset: Dataset, index: int, tier: Tier) -> View:
+    frame = dataset.frames[index]
+    return tier.extractor.extract(decode_image(frame.image_path.read_bytes(), ImageLimits()), frame.camera)
+
+
+def error_m(dataset: Dataset, index: int, answer: Answer) -> float:
+    """How far a pose is off; infinite without one."""
+    if not isinstance(answer.outcome, Localization):
+        return float("inf")
+    true = dataset.frames[index].world_from_camera.translation
+    return float(np.linalg.norm(answer.outcome.world_from_camera.translation - true))
