@@ -1,0 +1,64 @@
+"""Times of work, and what a device reaches at most."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+
+from .operations import Rates
+
+PRODUCT_SIDE = 8192
+COPY_BYTES = 4 * 2**30
+"""Much larger than any cache."""
+
+
+def median_s(work: Callable[[], object], device: torch.device, repeats: int, warm_up: int = 3) -> tuple[float, float]:
+    """The median time of `work`, seconds, taken twice: versions that differ by less than these two do not differ."""
+    for _ in range(warm_up):
+        work()
+    first, second = (_median_s(work, device, repeats) for _ in range(2))
+    return first, second
+
+
+def _median_s(work: Callable[[], object], device: torch.device, repeats: int) -> float:
+    if device.type != "cuda":
+        times = []
+        for _ in range(repeats):
+            start_s = time.perf_counter()
+            work()
+            times.append(time.perf_counter() - start_s)
+        return statistics.median(times)
+    events = [(torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)) for _ in range(repeats)]
+    torch.cuda.synchronize(device)
+    for start, end in events:
+        start.record()
+        work()
+        end.record()
+    torch.cuda.synchronize(device)
+    return statistics.median(float(start.elapsed_time(end)) for start, end in events) / 1000
+
+
+def measure_rates(device: torch.device, repeats: int = 20) -> Rates:
+    """The ceilings of a CUDA device, on random numbers: zeros are faster."""
+    a, b = (torch.randn(PRODUCT_SIDE, PRODUCT_SIDE, device=device, dtype=torch.bfloat16) for _ in range(2))
+    product_s = min(median_s(lambda: a @ b, device, repeats))
+    source = torch.randint(0, 255, (COPY_BYTES,), dtype=torch.uint8, device=device)
+    target = torch.empty_like(source)
+    copy_s = min(median_s(lambda: target.copy_(source), device, repeats))
+    name = torch.cuda.get_device_name(device)
+    return Rates(name, 2 * PRODUCT_SIDE**3 / product_s, 2 * COPY_BYTES / copy_s, _launch_s(device), measured=True)
+
+
+def _launch_s(device: torch.device, count: int = 2000) -> float:
+    """The host's time for an operation on a tiny tensor, whose kernel is shorter."""
+    x = torch.ones(1, device=device)
+    torch.cuda.synchronize(device)
+    start_s = time.perf_counter()
+    for _ in range(count):
+        x.add_(1)
+    took_s = time.perf_counter() - start_s
+    torch.cuda.synchronize(device)
+    return took_s / count
