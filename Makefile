@@ -23,9 +23,10 @@ $(VENV)/.installed: pyproject.toml
 
 setup: $(VENV)/.installed  ## Create .venv with everything
 
-# The matrices are small: BLAS threads gain nothing, and wait for one another where cores are shared.
-test: setup $(PROTO_VENV)/.installed  ## Run all tests; ARGS=... for pytest
-	OPENBLAS_NUM_THREADS=1 PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(ARGS)
+# The matrices are small: threads gain nothing, and wait for one another where cores are shared. Not so the full networks.
+THREADS ?= 1
+test: setup $(PROTO_VENV)/.installed  ## Run the tests; ARGS=... for pytest, ARGS="-m slow" THREADS=2 for the slow ones
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=$(THREADS) PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(ARGS)
 
 lint: setup  ## Check style, types and protos
 	$(BIN)/ruff check .
