@@ -76,6 +76,17 @@ def choose_device(device: str) -> str:
     Raises:
         ValueError: there is no such device.
     """
+    chosen = _find_device(device)
+    if chosen != "cpu":
+        import torch
+
+        # On new GPUs torch prefers cuDNN's attention, which plans for half a second whenever LightGlue meets another
+        # number of keypoints; to be set once, before there are threads.
+        torch.backends.cuda.enable_cudnn_sdp(False)
+    return chosen
+
+
+def _find_device(device: str) -> str:
     if device == "cpu":
         return device
     try:

@@ -10,12 +10,12 @@ import torch
 from parity_rule import images, ruled_network, weights
 from torch import Tensor
 from torch._dynamo.utils import counters
-from torch.nn.attention import SDPBackend
 
+from mapless_server.networks.blocks import Attention, flash_attention
 from mapless_server.networks.network import Network, NetworkOutput, Sizes
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.pi3x import Pi3X
-from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions
+from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions, UnsuitableDevice
 
 GRID = (2, 3)
 
@@ -118,13 +118,14 @@ def test_threads_get_their_own_answers(runner: NetworkRunner) -> None:
     assert all(torch.equal(found[views], expected[views]) for views in expected)
 
 
-def test_kernels_that_are_not_allowed_are_not_taken_in_silence() -> None:
-    """The CPU has no cuDNN kernel, as a GPU may lack the flash kernel: an error, not another kernel."""
-    options = RunnerOptions(attention=(SDPBackend.CUDNN_ATTENTION,))
-    runner = NetworkRunner(ruled_network("pi3"), "pi3", "sha", options=options)
-    with pytest.raises(RuntimeError, match="kernel"):
-        runner.encode(some_images(1))
-    runner.close()
+def test_attention_is_flash_or_an_error_where_it_must_be_fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The CPU has no kernel of that name, as a GPU may lack it; another one is not taken in silence."""
+    token = torch.ones(1, 1, 1, 64)
+    with pytest.raises(NotImplementedError, match="flash"):
+        flash_attention(token, token, token)
+    monkeypatch.setattr(Attention, "attend", staticmethod(flash_attention))
+    with pytest.raises(UnsuitableDevice, match="pi3 cannot run on cpu: no flash attention"):
+        NetworkRunner(ruled_network("pi3"), "pi3", "sha")
 
 
 def test_a_single_posed_view_counts_as_none() -> None:

@@ -214,6 +214,15 @@ def test_the_pose_of_an_unposed_view_is_not_looked_at_beyond_the_scale() -> None
     torch.testing.assert_close(first.camera_poses, second.camera_poses, rtol=0, atol=0)
 
 
+def test_without_what_is_there_for_depths_the_rest_answers_the_same() -> None:
+    whole, lean = ruled_network("pi3x"), ruled_network("pi3x")
+    assert isinstance(lean, Pi3X)
+    lean.forget_depths()
+    given = some_images(3)
+    assert torch.equal(reconstruct(lean, given, 2).local_points, reconstruct(whole, given, 2).local_points)
+    assert not [key for key in lean.state_dict() if key.startswith("depth_")]
+
+
 def test_inverse_poses() -> None:
     poses = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
     torch.testing.assert_close(invert_poses(poses) @ poses, torch.eye(4).expand_as(poses), rtol=0, atol=1e-5)

@@ -8,12 +8,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import torch
+import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 from torch._C._autograd import DeviceType
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
+from ..networks.blocks import Attention
 from ..networks.network import Network, NetworkOutput
 from .ceilings import median_s
 from .operations import Rates
@@ -70,9 +73,13 @@ class Forward:
 
     @contextmanager
     def kernels(self) -> Iterator[None]:
-        """The wanted attention alone: where it cannot run, that is an error."""
-        with torch.no_grad(), sdpa_kernel(self.backend):
-            yield
+        """The wanted attention alone: where it cannot run, that is an error. Flash is what the network takes itself."""
+        with torch.no_grad():
+            if self.backend is SDPBackend.FLASH_ATTENTION:
+                yield
+                return
+            with sdpa_kernel(self.backend), patch.object(Attention, "attend", staticmethod(_any_attention)):
+                yield
 
     def run(self, work: Work, compiled: bool = False) -> NetworkOutput:
         """Encodes the last views, the query's the very last, takes the tokens of the others, and reconstructs."""
@@ -85,6 +92,10 @@ class Forward:
             tokens = torch.cat([self.kept[:kept], encoded.to(torch.bfloat16)])[None]
             output: NetworkOutput = reconstruct(tokens, scene.layout, work.mapped, scene.poses, scene.posed)
             return output
+
+
+def _any_attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    return F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
 
 
 def _compiled(network: Network) -> tuple[Callable[..., Any], Callable[..., Any]]:

@@ -105,6 +105,8 @@ def _load(
         network = Pi3() if backend == "pi3" else Pi3X()
     # On the host, where the runner reduces the precision before anything goes to the device.
     weights_sha256 = load_strictly(network, weights, ignored_prefixes=TRAINING_ONLY)
+    if isinstance(network, Pi3X):
+        network.forget_depths()
     runner_options = RunnerOptions(compile_backend="inductor" if compiled_views else None)
     runner = NetworkRunner(network, backend, weights_sha256, device, runner_options)
     if compiled_views:

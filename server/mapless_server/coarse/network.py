@@ -187,7 +187,7 @@ class NetworkReconstructor:
         intrinsics = None
         if self._runner.conditioned:
             intrinsics = torch.from_numpy(view.layout.intrinsics.astype(np.float32))[None]
-        return self._runner.encode(picture[None], intrinsics)[0]
+        return self._runner.encode(_sent(picture[None], self._runner.device), intrinsics)[0]
 
     def _key(self, view: _LaidOut) -> TokenKey:
         runner, layout, photograph = self._runner, view.layout, view.photograph
@@ -266,7 +266,12 @@ def _blanked(confidence: Tensor, layouts: Sequence[Layout]) -> Tensor:
         return confidence
     everywhere = np.ones(confidence.shape[1:], bool)
     shown = np.stack([everywhere if layout.shown is None else layout.shown for layout in layouts])
-    return torch.where(torch.from_numpy(shown).to(confidence.device), confidence, 0.0)
+    return torch.where(_sent(torch.from_numpy(shown), confidence.device), confidence, 0.0)
+
+
+def _sent(tensor: Tensor, device: torch.device) -> Tensor:
+    """On the device; from pinned memory, so that nobody waits for what the device still has to do."""
+    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
 
 
 def condition_poses(world_from_references: Sequence[RigidTransform]) -> Array:

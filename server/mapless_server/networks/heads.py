@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from .blocks import BLOCK_EPS, Block, LayerNorm, Linear, Mlp, Rope
+from .blocks import BLOCK_EPS, Attention, Block, LayerNorm, Linear, Mlp, Rope
 from .decoder import SPECIALS
 from .encoder import PATCH_PX
 from .rotation import nearest_rotation
@@ -180,7 +180,7 @@ class CrossAttention(nn.Module):
             projection(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for projection, x in ((self.q_proj, queries), (self.k_proj, context), (self.v_proj, context))
         )
-        x = F.scaled_dot_product_attention(q, context_rope.rotate(k).to(v.dtype), v)
+        x = Attention.attend(q, context_rope.rotate(k), v)
         return self.proj(x.transpose(1, 2).flatten(2))
 
 

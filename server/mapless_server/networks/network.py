@@ -155,6 +155,19 @@ class Network(nn.Module, ABC):
         poses: Tensor = self.camera_head(tokens)
         return poses.unflatten(0, decoded.shape[:2])
 
+    def maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
+        """Local points (B, M, H, W, 3), confidence logits (B, M, H, W) of decoded tokens (B, M, T, 2 C); M may be 0."""
+        shape = decoded.shape[:2]
+        if not shape.numel():  # which not every kernel takes
+            empty = decoded.new_empty(*shape, *(side * PATCH_PX for side in layout.grid), 3)
+            return empty, empty[..., 0]
+        points, logits = self.read_maps(decoded.flatten(0, 1), layout)
+        return points.unflatten(0, shape), logits.unflatten(0, shape)
+
+    @abstractmethod
+    def read_maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
+        """Local points (V, H, W, 3) and confidence logits (V, H, W) of decoded tokens (V, T, 2 C)."""
+
 
 def patch_grid(images: Tensor) -> tuple[int, int]:
     """Rows and columns of patches of images (..., H, W); ValueError if a side is no multiple of 14."""

@@ -39,9 +39,8 @@ class Pi3(Network):
         if poses is not None or posed is not None:
             raise ValueError("Pi3 takes no poses")
         decoded = self.decode(tokens, layout)
-        points, logits = self._maps(decoded[:, :mapped].flatten(0, 1), layout)
-        maps = (len(tokens), mapped)
-        return NetworkOutput(points.unflatten(0, maps), logits.unflatten(0, maps), self.cameras(decoded, layout))
+        points, logits = self.maps(decoded[:, :mapped], layout)
+        return NetworkOutput(points, logits, self.cameras(decoded, layout))
 
     def forward(self, images: Tensor) -> NetworkOutput:
         """Everything of images (B, N, 3, H, W) in [0, 1]."""
@@ -50,8 +49,8 @@ class Pi3(Network):
         tokens = self.encode(images.flatten(0, 1), layout).unflatten(0, (scenes, views))
         return self.reconstruct(tokens, layout, views)
 
-    def _maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
-        """Local points (V, H, W, 3) and confidence logits (V, H, W)."""
+    def read_maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
+        """See Network.read_maps."""
         x, y, log_z = self.point_head(self.point_decoder(decoded, layout.rope), layout.grid).unbind(-1)
         z = torch.exp(log_z)
         confidence = self.conf_head(self.conf_decoder(decoded, layout.rope), layout.grid)

@@ -67,6 +67,10 @@ class Pi3X(Network):
         self.metric_decoder = MetricDecoder(2 * sizes.width, sizes.metric_width, sizes.metric_heads, sizes.metric_depth)
         self.metric_head = nn.Linear(sizes.metric_width, 1)
 
+    def forget_depths(self) -> None:
+        """Gives back what is there for depths, a fifth of the weights, where none will ever be told."""
+        del self.depth_encoder, self.depth_emb
+
     def embed(self, images: Tensor, intrinsics: Tensor | None = None) -> Tensor:
         """See Network.embed."""
         patches = self.encode_images(images)
@@ -85,13 +89,11 @@ class Pi3X(Network):
         """See Network.reconstruct; what it gives is roughly metric."""
         inject = None if poses is None or posed is None else self._injection(poses, posed, layout.grid)
         decoded = self.decode(tokens, layout, inject)
-        points, logits = self._maps(decoded[:, :mapped].flatten(0, 1), layout)
-        maps = (len(tokens), mapped)
+        points, logits = self.maps(decoded[:, :mapped], layout)
         cameras = self.cameras(decoded, layout)
         metric = self._metric(decoded, layout)
         cameras = torch.cat([cameras[..., :3], cameras[..., 3:] * _scaling_column(metric)], dim=-1)
-        points = points.unflatten(0, maps) * metric[:, None, None, None, None]
-        return NetworkOutput(points, logits.unflatten(0, maps), cameras)
+        return NetworkOutput(points * metric[:, None, None, None, None], logits, cameras)
 
     def forward(self, images: Tensor, conditions: Conditions | None = None) -> NetworkOutput:
         """Everything of images (B, N, 3, H, W) in [0, 1]. Scenes that know different things are done one by one."""
@@ -143,8 +145,8 @@ class Pi3X(Network):
         scale: Tensor = self.metric_head(self.metric_decoder(self.metric_token, decoded.flatten(1, 2), layout.rope))
         return scale.exp()[:, 0]
 
-    def _maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
-        """Local points (V, H, W, 3) before the metric scale, and confidence logits (V, H, W)."""
+    def read_maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
+        """See Network.read_maps; before the metric scale."""
         x, y, log_z = self.point_head(self.point_decoder(decoded, layout.rope), layout.grid).unbind(-1)
         z = torch.exp(log_z.clamp_max(MAX_LOG_DEPTH))
         confidence = self.conf_head(self.conf_decoder(decoded, layout.rope), layout.grid)

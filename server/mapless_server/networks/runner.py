@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.torch_version import TorchVersion
 
+from .blocks import Attention
 from .conditions import normalize_poses
 from .decoder import Layout
 from .encoder import PATCH_PX
 from .network import Network, NetworkOutput
 
 T = TypeVar("T")
+
+
+class UnsuitableDevice(ValueError):
+    """The device cannot run a network; the message is for the operator."""
+
 
 MAX_COMPILED_SHAPES = 64
 """Torch gives up compiling after eight shapes; grids and numbers of views make more."""
@@ -47,13 +54,10 @@ class RunnerOptions:
         dtype: what transformer blocks compute in; None is bfloat16 on CUDA, like the official code, else float32.
         compile_backend: of torch.compile, for the shapes that `warm_up` is given; None compiles nothing. "inductor"
             fuses what lies between the matrix products, about a third of the time on a large GPU.
-        attention: kernels that scaled_dot_product_attention may choose. In bfloat16 on CUDA the flash kernel alone: if
-            it cannot run, that is an error, where torch would silently take one of a quarter of the speed.
     """
 
     dtype: torch.dtype | None = None
     compile_backend: str | None = None
-    attention: tuple[SDPBackend, ...] | None = None
 
 
 class NetworkRunner:
@@ -78,6 +82,7 @@ class NetworkRunner:
         device: torch.device | str = "cpu",
         options: RunnerOptions | None = None,
     ) -> None:
+        """Raises UnsuitableDevice if the device lacks the kernels."""
         options = options or RunnerOptions()
         self.name = name
         self.weights_sha256 = weights_sha256
@@ -88,12 +93,11 @@ class NetworkRunner:
         self.network = network.eval().requires_grad_(False)
         self.network.set_compute_type(self.dtype)
         self.network.to(self.device)
-        fast = cuda and self.dtype is torch.bfloat16
-        self._attention = options.attention or ((SDPBackend.FLASH_ATTENTION,) if fast else None)
         self._warm: set[object] = set()
         self._layouts: dict[tuple[int, int], Layout] = {}
         # CUDA graphs belong to the thread that recorded them.
-        self._thread = ThreadPoolExecutor(1, f"network {name}")
+        self._thread = ThreadPoolExecutor(1, f"network {name}", initializer=_keep_graphs_in_this_thread)
+        self._check_kernels(name)
         self._encode, self._reconstruct = self._compiled(options.compile_backend)
 
     def _compiled(self, backend: str | None) -> tuple[Callable[..., Tensor], Callable[..., NetworkOutput]]:
@@ -109,6 +113,14 @@ class NetworkRunner:
             options={"triton.cudagraphs": True} if graphs else None,
         )
         return compiled(self.network.encode), compiled(self.network.reconstruct)
+
+    def _check_kernels(self, name: str) -> None:
+        """One tiny attention now tells what would otherwise fail every query."""
+        token = torch.ones(1, 1, 1, 64, device=self.device, dtype=self.dtype)
+        try:
+            Attention.attend(token, token, token)
+        except RuntimeError as error:
+            raise UnsuitableDevice(f"{name} cannot run on {self.device}: no flash attention there ({error})") from error
 
     def close(self) -> None:
         """Ends the thread."""
@@ -162,16 +174,8 @@ class NetworkRunner:
 
     def _prepared(self, work: Callable[..., T], *arguments: Any) -> T:
         # Not inference_mode: its tensors are of another kind, for which everything would be compiled a second time.
-        with torch.no_grad(), self._kernels():
+        with torch.no_grad():
             return work(*arguments)
-
-    @contextmanager
-    def _kernels(self) -> Iterator[None]:
-        if self._attention is None:
-            yield
-        else:
-            with sdpa_kernel(list(self._attention)):
-                yield
 
     def _layout(self, grid: tuple[int, int]) -> Layout:
         if grid not in self._layouts:
@@ -233,3 +237,11 @@ class NetworkRunner:
                 tokens = self._prepared(self._encode_views, torch.rand(1, 3, height, width), intrinsics)
                 tokens = tokens.expand(bucket.scenes, bucket.views, -1, -1).contiguous()
                 self._prepared(self._reconstruct_scenes, tokens, bucket.grid, references, poses, posed)
+
+
+def _keep_graphs_in_this_thread() -> None:
+    """Before torch 2.13 only the thread that happens to import torch's CUDA graphs first can use them."""
+    if TorchVersion(torch.__version__) < "2.13" and torch.cuda.is_available():
+        from torch._inductor.cudagraph_trees import local
+
+        local.tree_manager_containers, local.tree_manager_locks = {}, defaultdict(threading.Lock)
