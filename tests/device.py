@@ -17,14 +17,14 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from mapless.geometry import Array
-from mapless_server.coarse import Reconstruction
-from mapless_server.coarse.device import DeviceReconstruction
-from mapless_server.correspond import Correspondences, Matches
-from mapless_server.match import PAPER_MATCH, MatchOptions, PointMatches, match_points
-from mapless_server.on_device import Refined, refine_on_device
-from mapless_server.rejection import Rejection
-from mapless_server.scale import MetricScale, ScaleOptions, estimate_scale
-from mapless_server.structure import PAPER_STRUCTURE, Structure, StructureOptions, build_structure
+from mapless_server.method.coarse import Reconstruction
+from mapless_server.method.coarse.device import DeviceReconstruction
+from mapless_server.method.correspond import Correspondences, Matches
+from mapless_server.method.match import PAPER_MATCH, MatchOptions, PointMatches, match_points
+from mapless_server.method.on_device import Refined, refine_on_device
+from mapless_server.method.rejection import Rejection
+from mapless_server.method.scale import MetricScale, ScaleOptions, estimate_scale
+from mapless_server.method.structure import PAPER_STRUCTURE, Structure, StructureOptions, build_structure
 
 VARIANTS: dict[str, tuple[StructureOptions | None, MatchOptions | None]] = {
     "coarse": (None, None),

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scenes import SyntheticScene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, resized_pixel, rotation_from_vector
-from mapless_server.coarse import ReconstructedView, Reconstruction
-from mapless_server.correspond import Correspondences
-from mapless_server.views import PosedView, View
+from mapless_server.method.coarse import ReconstructedView, Reconstruction
+from mapless_server.method.correspond import Correspondences
+from mapless_server.method.views import PosedView, View
 
 
 @dataclass(frozen=True)

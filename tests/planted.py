@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from scenes import SyntheticScene
 
 from mapless.geometry import RigidTransform, Similarity
-from mapless_server.correspond import Correspondences, Matches
-from mapless_server.match import PointMatches
-from mapless_server.observations import ONE_PIXEL, KeypointNoise
-from mapless_server.scale import MetricScale, ScaleStage
-from mapless_server.structure import Structure
-from mapless_server.tracks import Tracks
-from mapless_server.views import PosedView
+from mapless_server.method.correspond import Correspondences, Matches
+from mapless_server.method.match import PointMatches
+from mapless_server.method.observations import ONE_PIXEL, KeypointNoise
+from mapless_server.method.scale import MetricScale, ScaleStage
+from mapless_server.method.structure import Structure
+from mapless_server.method.tracks import Tracks
+from mapless_server.method.views import PosedView
 
 
 def true_correspondences(scene: SyntheticScene) -> Correspondences:

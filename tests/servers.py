@@ -25,14 +25,14 @@ from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.decode import ImageLimits
 from mapless_server.engine import Engine, EngineOptions
-from mapless_server.localize import Answer, Localization, LocalizeOptions, Pipeline
-from mapless_server.pnp import PoseStage
-from mapless_server.scale import MetricScale, ScaleStage
+from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline
+from mapless_server.method.pnp import PoseStage
+from mapless_server.method.scale import MetricScale, ScaleStage
+from mapless_server.method.views import Features, PosedView, View
 from mapless_server.serve import running_server
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_server.tiers import Tier
-from mapless_server.views import Features, PosedView, View
 
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
 PHOTO = encode(".png", textured())

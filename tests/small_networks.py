@@ -11,12 +11,12 @@ from images import textured
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
-from mapless_server.coarse.grids import GridOptions
+from mapless_server.method.coarse.grids import GridOptions
+from mapless_server.method.views import Features, Photograph, PosedView, View
 from mapless_server.networks.network import Network, Sizes
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.pi3x import Pi3X
 from mapless_server.networks.runner import NetworkRunner
-from mapless_server.views import Features, Photograph, PosedView, View
 
 SMALL = {
     "pi3": Sizes(64, 4, encoder_depth=3, decoder_depth=4, head_depth=2, camera_width=32),

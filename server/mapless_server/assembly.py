@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import logging
 
-from .coarse.make import make_reconstructor
-from .correspond import Matcher, make_matcher
-from .features import FeatureExtractor, make_extractor
-from .localize import Pipeline
+from .method.coarse.make import make_reconstructor
+from .method.correspond import Matcher, make_matcher
+from .method.features import FeatureExtractor, make_extractor
+from .method.localize import Pipeline
 from .settings import Settings, available_cores
 from .tiers import Tier
 from .weights import CATALOGUE, WeightsMissing, find_weights

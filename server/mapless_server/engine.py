@@ -18,15 +18,15 @@ from mapless.geometry import Array, Camera
 
 from .decode import ImageLimits, decode_image
 from .errors import DeadlineExceeded, FailedPrecondition, NotFound, Unavailable
-from .features import FeatureExtractor
 from .library import ReferenceLibrary
-from .localize import Answer, Localization, LocalizeOptions, Pipeline, localize
-from .rejection import Rejection, RejectionReason
-from .retrieve import choose_references
+from .method.features import FeatureExtractor
+from .method.localize import Answer, Localization, LocalizeOptions, Pipeline, localize
+from .method.rejection import Rejection, RejectionReason
+from .method.retrieve import choose_references
+from .method.views import Photograph, PosedView, View
 from .store import Store
 from .tiers import Attempt, EscalationOptions, Tier, better_of, is_doubtful
 from .turns import Turn, Turns
-from .views import Photograph, PosedView, View
 
 Localize = Callable[[View, Sequence[PosedView], Pipeline, LocalizeOptions, Callable[[], None]], Answer]
 

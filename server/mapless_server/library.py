@@ -20,10 +20,10 @@ from mapless.names import reference_name
 
 from .decode import ImageLimits, decode_image
 from .errors import AlreadyExists, DataLoss, InvalidArgument
-from .features import FeatureExtractor
+from .method.features import FeatureExtractor
+from .method.views import Photograph, PosedView
 from .store import DescribedReference, ReferenceRecord, Store
 from .turns import Turn
-from .views import Photograph, PosedView
 
 log = logging.getLogger(__name__)
 

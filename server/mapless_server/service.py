@@ -13,14 +13,14 @@ from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
 
 from . import __version__
-from .accuracy import accuracy_from_covariance
 from .decode import ImageLimits
 from .engine import Engine, PositionPrior, Query, Result
-from .localize import Localization, LocalizeOptions
+from .method.accuracy import accuracy_from_covariance
+from .method.localize import Localization, LocalizeOptions
+from .method.rejection import Rejection
+from .method.scale import MetricScale
 from .photos import photo_from_message
-from .rejection import Rejection
 from .rpc import Call
-from .scale import MetricScale
 
 MAX_REFERENCES = 64
 DEFAULT_REFERENCE_COUNT = 10

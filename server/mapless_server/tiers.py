@@ -14,11 +14,11 @@ import numpy as np
 
 from mapless.geometry import Camera, rotation_angle_deg
 
-from .accuracy import Accuracy, accuracy_from_covariance
-from .features import FeatureExtractor
-from .localize import Answer, Localization, Pipeline
-from .rejection import Rejection, RejectionReason
-from .views import PosedView
+from .method.accuracy import Accuracy, accuracy_from_covariance
+from .method.features import FeatureExtractor
+from .method.localize import Answer, Localization, Pipeline
+from .method.rejection import Rejection, RejectionReason
+from .method.views import PosedView
 
 UNMENDABLE = frozenset({RejectionReason.NO_USABLE_REFERENCES, RejectionReason.DEGENERATE_REFERENCES})
 """Rejections for what the references are, whatever is seen in them."""

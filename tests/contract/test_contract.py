@@ -20,11 +20,11 @@ import mapless
 import mapless_server
 from mapless import Client, NewReference, wire
 from mapless.v1 import localization_service_pb2, reference_service_pb2
-from mapless_server.localize import Variant
-from mapless_server.pnp import PoseStage
+from mapless_server.method.localize import Variant
+from mapless_server.method.pnp import PoseStage
+from mapless_server.method.rejection import RejectionReason
+from mapless_server.method.scale import ScaleStage, ScaleStrategy
 from mapless_server.reference_service import ReferenceService
-from mapless_server.rejection import RejectionReason
-from mapless_server.scale import ScaleStage, ScaleStrategy
 from mapless_server.service import LocalizationService
 
 ROOT = Path(__file__).parents[2]

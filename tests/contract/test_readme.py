@@ -9,8 +9,8 @@ import pytest
 from images import encode, textured
 from servers import pose, serving
 
-from mapless_server.localize import Variant
-from mapless_server.rejection import RejectionReason
+from mapless_server.method.localize import Variant
+from mapless_server.method.rejection import RejectionReason
 from mapless_server.settings import Settings
 
 README = (Path(__file__).parents[2] / "README.md").read_text()

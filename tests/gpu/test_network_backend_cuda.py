@@ -14,9 +14,9 @@ pytest.importorskip("PIL", reason="the networks' extra is not installed")
 import torch
 from small_networks import GRIDS, small_network, small_request
 
-from mapless_server.coarse.device import DeviceReconstruction
-from mapless_server.coarse.network import NetworkOptions, NetworkReconstructor, Outcome
-from mapless_server.coarse.token_cache import TokenCacheOptions
+from mapless_server.method.coarse.device import DeviceReconstruction
+from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor, Outcome
+from mapless_server.method.coarse.token_cache import TokenCacheOptions
 from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.runner import NetworkRunner
 

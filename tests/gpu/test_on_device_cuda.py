@@ -11,10 +11,10 @@ pytest.importorskip("torch", reason="the networks' extra is not installed")
 import torch
 from device import CASES, VARIANTS, Case, assert_same
 
-from mapless_server.on_device import Refined, prepare
-from mapless_server.on_device.compute import Options, compute
-from mapless_server.on_device.transfer import upload
-from mapless_server.scale import ScaleOptions
+from mapless_server.method.on_device import Refined, prepare
+from mapless_server.method.on_device.compute import Options, compute
+from mapless_server.method.on_device.transfer import upload
+from mapless_server.method.scale import ScaleOptions
 
 pytestmark = [
     pytest.mark.gpu,

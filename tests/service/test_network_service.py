@@ -22,10 +22,10 @@ from small_networks import GRIDS, small_network
 
 from mapless import Client, LocalizationResult, NewReference, Rejected
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.engine import Engine, EngineOptions
-from mapless_server.features import SiftExtractor
-from mapless_server.localize import Pipeline
+from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
+from mapless_server.method.features import SiftExtractor
+from mapless_server.method.localize import Pipeline
 from mapless_server.networks.network import Network
 from mapless_server.networks.runner import NetworkRunner
 from mapless_server.serve import running_server

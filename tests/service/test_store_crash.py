@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from mapless.geometry import Camera, RigidTransform
+from mapless_server.method.views import Features, View
 from mapless_server.store import NewReference, Store
 from mapless_server.store.sqlite import DATABASE_FILE, choose_library
-from mapless_server.views import Features, View
 
 ROUNDS = 15
 LIMIT_S = 30.0

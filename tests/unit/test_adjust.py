@@ -12,12 +12,12 @@ from planted import true_correspondences, true_structure
 from scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.adjust import AdjustOptions, _pose_problem, _Problem, _State, adjust_pose
-from mapless_server.match import PointMatches
-from mapless_server.observations import KeypointNoise, adjust_points, estimate_noise, triangulate
-from mapless_server.pnp import PnpOptions, PoseEstimate, solve_pose
-from mapless_server.structure import Structure, observe
-from mapless_server.views import PosedView
+from mapless_server.method.adjust import AdjustOptions, _pose_problem, _Problem, _State, adjust_pose
+from mapless_server.method.match import PointMatches
+from mapless_server.method.observations import KeypointNoise, adjust_points, estimate_noise, triangulate
+from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
+from mapless_server.method.structure import Structure, observe
+from mapless_server.method.views import PosedView
 
 NOISE = KeypointNoise(0.5, 0.0)
 

@@ -11,7 +11,7 @@ from scenes import random_for
 
 from mapless import geometry
 from mapless.geometry import Array
-from mapless_server.arrays import (
+from mapless_server.method.arrays import (
     AnyArray,
     apply,
     identity,

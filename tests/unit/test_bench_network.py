@@ -23,12 +23,12 @@ from mapless_server.bench_network.planted import UNITS_PER_METRE, PlantedReconst
 from mapless_server.bench_network.report import Figure, markdown, table
 from mapless_server.bench_network.subject import Work, make_network, operations_of
 from mapless_server.bench_network.variants import with_low_precision_stream
-from mapless_server.coarse import Reconstruction
-from mapless_server.coarse.device import DeviceReconstruction
-from mapless_server.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.demo.room import Photo
+from mapless_server.method.coarse import Reconstruction
+from mapless_server.method.coarse.device import DeviceReconstruction
+from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
+from mapless_server.method.views import Features, View
 from mapless_server.networks.network import Sizes
-from mapless_server.views import Features, View
 
 GRID = (3, 4)
 SIZES = SMALL["pi3"]

@@ -12,8 +12,8 @@ from planted import same_points
 from scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server import correspond
-from mapless_server.correspond import (
+from mapless_server.method import correspond
+from mapless_server.method.correspond import (
     OPTIONS,
     CorrespondOptions,
     Matcher,
@@ -23,8 +23,8 @@ from mapless_server.correspond import (
     make_matcher,
     mutual_matches,
 )
-from mapless_server.features import FEATURES
-from mapless_server.views import Features, PosedView, View
+from mapless_server.method.features import FEATURES
+from mapless_server.method.views import Features, PosedView, View
 
 
 def features(descriptors: Array, keypoints: Array | None = None) -> Features:

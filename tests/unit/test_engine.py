@@ -20,12 +20,12 @@ from mapless.geometry import RigidTransform
 from mapless_server.decode import ImageLimits, decode_image
 from mapless_server.engine import Engine, EngineOptions, Photo, PositionPrior, Query, Result
 from mapless_server.errors import DeadlineExceeded, InvalidArgument
-from mapless_server.localize import Answer, Localization, LocalizeOptions, Pipeline
-from mapless_server.pnp import PoseStage
-from mapless_server.rejection import Rejection, RejectionReason
+from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline
+from mapless_server.method.pnp import PoseStage
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.views import PosedView, View
 from mapless_server.store import NewReference, Store
 from mapless_server.tiers import EscalationOptions, Tier
-from mapless_server.views import PosedView, View
 
 SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
 ESCALATION = EscalationOptions(doubtful_inliers=50, doubtful_radius_m=0.2)

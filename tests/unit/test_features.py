@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scenes import random_for
 
 from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential
-from mapless_server.features import (
+from mapless_server.method.features import (
     MAX_INCIDENCE_DEG,
     SiftExtractor,
     SiftOptions,
@@ -20,7 +20,7 @@ from mapless_server.features import (
     reduce_image,
     undistort_pixels,
 )
-from mapless_server.views import Features
+from mapless_server.method.views import Features
 
 CAMERA = Camera(400, 300, 350.0, 350.0, 199.5, 149.5)
 LENSES = {

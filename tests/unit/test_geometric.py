@@ -11,11 +11,11 @@ from planted import moved_references, true_correspondences
 from scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
-from mapless_server.coarse import ReconstructedView, Reconstruction
-from mapless_server.coarse.geometric import GeometricOptions, GeometricReconstructor
-from mapless_server.correspond import Correspondences, Matcher
-from mapless_server.rejection import Rejection, RejectionReason
-from mapless_server.views import PosedView, View
+from mapless_server.method.coarse import ReconstructedView, Reconstruction
+from mapless_server.method.coarse.geometric import GeometricOptions, GeometricReconstructor
+from mapless_server.method.correspond import Correspondences, Matcher
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.views import PosedView, View
 
 EXACT = SceneOptions(noise_px=0.0, point_count=300, reference_count=4)
 

@@ -16,7 +16,7 @@ from images import textured
 from PIL import Image
 
 from mapless.geometry import Array, Camera, Fisheye, RadialTangential
-from mapless_server.coarse.grids import (
+from mapless_server.method.coarse.grids import (
     OFFICIAL_PIXEL_LIMIT,
     Grid,
     GridOptions,
@@ -26,7 +26,7 @@ from mapless_server.coarse.grids import (
     lay_out,
     natural_grid,
 )
-from mapless_server.features import undistort_pixels
+from mapless_server.method.features import undistort_pixels
 
 OPTIONS = GridOptions()
 BARREL = RadialTangential(-0.25, 0.07, 0.001, -0.0015, -0.005)

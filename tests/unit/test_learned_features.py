@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scenes import random_for
 
 from mapless.geometry import Array, Camera, RadialTangential
-from mapless_server.features import FeatureExtractor, make_extractor
-from mapless_server.views import Features
+from mapless_server.method.features import FeatureExtractor, make_extractor
+from mapless_server.method.views import Features
 
 torch = pytest.importorskip("torch", reason="the learned features' extra is not installed")
 pytest.importorskip("kornia", reason="the learned features' extra is not installed")
@@ -23,9 +23,9 @@ from kornia.feature import ALIKED, XFeat  # noqa: E402
 from safetensors.torch import save_file  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
-from mapless_server.features.aliked import AlikedExtractor  # noqa: E402
-from mapless_server.features.network import LearnedOptions, image_tensor  # noqa: E402
-from mapless_server.features.xfeat import SHIFT_PX, XfeatExtractor, peak_offsets, strict_maxima  # noqa: E402
+from mapless_server.method.features.aliked import AlikedExtractor  # noqa: E402
+from mapless_server.method.features.network import LearnedOptions, image_tensor  # noqa: E402
+from mapless_server.method.features.xfeat import SHIFT_PX, XfeatExtractor, peak_offsets, strict_maxima  # noqa: E402
 from mapless_server.weights import CheckpointError  # noqa: E402
 
 CAMERA = Camera(320, 256, 300.0, 300.0, 159.5, 127.5)
@@ -230,7 +230,7 @@ def test_weights_that_do_not_fit_are_refused(weights: dict[str, Path], tmp_path:
 def test_superpoint_keypoints_are_pixels(tmp_path: Path) -> None:
     """A random network, against transformers' own output; relative coordinates are whole pixels again."""
     transformers = pytest.importorskip("transformers", reason="the superpoint extra is not installed")
-    from mapless_server.features.superpoint import SuperPointExtractor
+    from mapless_server.method.features.superpoint import SuperPointExtractor
 
     def config() -> object:
         return transformers.SuperPointConfig(

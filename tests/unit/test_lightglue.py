@@ -11,8 +11,8 @@ import pytest
 from scenes import CAMERA, random_for, unit_rows
 
 from mapless.geometry import RigidTransform
-from mapless_server.correspond import make_matcher
-from mapless_server.views import Features, PosedView, View
+from mapless_server.method.correspond import make_matcher
+from mapless_server.method.views import Features, PosedView, View
 
 torch = pytest.importorskip("torch", reason="the learned features' extra is not installed")
 pytest.importorskip("kornia", reason="the learned features' extra is not installed")
@@ -23,7 +23,7 @@ from safetensors.torch import save_file  # noqa: E402
 from torch import Tensor  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
-from mapless_server.lightglue import (  # noqa: E402
+from mapless_server.method.lightglue import (  # noqa: E402
     LightGlue,
     LightGlueMatching,
     LightGlueOptions,
@@ -262,7 +262,7 @@ def test_senseless_options_are_refused() -> None:
 def test_superpoints_is_transformers_own(tmp_path: Path) -> None:
     """Random weights in transformers' network and, translated, in ours: the same scores for the same keypoints."""
     transformers = pytest.importorskip("transformers", reason="the superpoint extra is not installed")
-    from mapless_server.superpoint_lightglue import load_superpoint_lightglue
+    from mapless_server.method.superpoint_lightglue import load_superpoint_lightglue
 
     detector = transformers.SuperPointConfig(
         encoder_hidden_sizes=[4, 4, 4, 4], decoder_hidden_size=4, descriptor_decoder_dim=256

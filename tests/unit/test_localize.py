@@ -13,14 +13,14 @@ from fake_network import FakeNetwork, FakeNetworkOptions
 from planted import moved_references
 from scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for, unit_rows
 
-import mapless_server.localize as method
+import mapless_server.method.localize as method
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server import pnp
-from mapless_server.coarse import Reconstruction, Reconstructor
-from mapless_server.coarse.device import DeviceReconstruction
-from mapless_server.coarse.geometric import GeometricReconstructor
-from mapless_server.correspond import Correspondences, Matcher, Matches
-from mapless_server.localize import (
+from mapless_server.method import pnp
+from mapless_server.method.coarse import Reconstruction, Reconstructor
+from mapless_server.method.coarse.device import DeviceReconstruction
+from mapless_server.method.coarse.geometric import GeometricReconstructor
+from mapless_server.method.correspond import Correspondences, Matcher, Matches
+from mapless_server.method.localize import (
     MIN_FEATURES,
     Answer,
     Localization,
@@ -29,10 +29,10 @@ from mapless_server.localize import (
     Variant,
     localize,
 )
-from mapless_server.pnp import PoseStage
-from mapless_server.rejection import Rejection, RejectionReason
-from mapless_server.scale import ScaleStage, ScaleStrategy
-from mapless_server.views import Features, PosedView, View
+from mapless_server.method.pnp import PoseStage
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.scale import ScaleStage, ScaleStrategy
+from mapless_server.method.views import Features, PosedView, View
 
 SCENE = make_scene(random_for("localize"), SceneOptions(point_count=400, reference_count=5))
 MATCHER = Matcher()

@@ -13,12 +13,12 @@ from planted import true_correspondences, true_structure
 from scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.correspond import Correspondences
-from mapless_server.match import PAPER_MATCH, MatchOptions, PointMatches, match_points, one_to_one, search, vote
-from mapless_server.observations import ONE_PIXEL
-from mapless_server.structure import Structure
-from mapless_server.tracks import Tracks
-from mapless_server.views import Features, View
+from mapless_server.method.correspond import Correspondences
+from mapless_server.method.match import PAPER_MATCH, MatchOptions, PointMatches, match_points, one_to_one, search, vote
+from mapless_server.method.observations import ONE_PIXEL
+from mapless_server.method.structure import Structure
+from mapless_server.method.tracks import Tracks
+from mapless_server.method.views import Features, View
 
 NOTHING = PointMatches(np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, bool), 0.0)
 

@@ -23,20 +23,20 @@ from safetensors.torch import save_file
 from small_networks import GRIDS, SMALL, photograph, references_of, small_network, small_request, small_runner, view_of
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.coarse import Reconstruction
-from mapless_server.coarse.device import DeviceReconstruction
-from mapless_server.coarse.geometric import GeometricReconstructor
-from mapless_server.coarse.make import make_reconstructor
-from mapless_server.coarse.network import NetworkOptions, NetworkReconstructor, Outcome, condition_poses
-from mapless_server.coarse.token_cache import TokenCacheOptions
+from mapless_server.method.coarse import Reconstruction
+from mapless_server.method.coarse.device import DeviceReconstruction
+from mapless_server.method.coarse.geometric import GeometricReconstructor
+from mapless_server.method.coarse.make import make_reconstructor
+from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor, Outcome, condition_poses
+from mapless_server.method.coarse.token_cache import TokenCacheOptions
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.views import PosedView, View
 from mapless_server.networks import pi3
 from mapless_server.networks import runner as runner_module
 from mapless_server.networks.conditions import normalize_poses
 from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.runner import NetworkRunner
-from mapless_server.rejection import Rejection, RejectionReason
-from mapless_server.views import PosedView, View
 from mapless_server.weights import CheckpointError, WeightsMissing
 
 OPTIONS = NetworkOptions(grids=GRIDS)
@@ -477,7 +477,7 @@ def test_geometric_runs_without_torch() -> None:
     program = (
         "import sys; sys.modules['torch'] = sys.modules['PIL'] = None\n"
         "from pathlib import Path\n"
-        "from mapless_server.coarse.make import make_reconstructor\n"
+        "from mapless_server.method.coarse.make import make_reconstructor\n"
         "print(make_reconstructor('geometric', Path()).name, make_reconstructor('auto', Path()).name)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -11,12 +11,12 @@ from fake_network import FakeNetwork
 from scenes import SceneOptions, random_for
 
 from mapless.geometry import RigidTransform
-from mapless_server.coarse import Reconstruction
-from mapless_server.correspond import Correspondences
-from mapless_server.match import one_to_one as one_to_one_on_host
-from mapless_server.rejection import Rejection, RejectionReason
-from mapless_server.scale import ScaleOptions, ScaleStage, ScaleStrategy
-from mapless_server.structure import StructureOptions, tracks_of
+from mapless_server.method.coarse import Reconstruction
+from mapless_server.method.correspond import Correspondences
+from mapless_server.method.match import one_to_one as one_to_one_on_host
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.scale import ScaleOptions, ScaleStage, ScaleStrategy
+from mapless_server.method.structure import StructureOptions, tracks_of
 
 pytest.importorskip("torch", reason="the networks' extra is not installed")
 
@@ -24,11 +24,11 @@ import torch
 from device import CASES, VARIANTS, Case, Watch, assert_same, case_of, on_device
 from torch import Tensor
 
-from mapless_server.coarse.device import DeviceReconstruction
-from mapless_server.on_device import Refined, prepare, refine_on_device
-from mapless_server.on_device import match as device_match
-from mapless_server.on_device.compute import Inputs, Options, compute
-from mapless_server.on_device.transfer import byte_count, fetch, upload
+from mapless_server.method.coarse.device import DeviceReconstruction
+from mapless_server.method.on_device import Refined, prepare, refine_on_device
+from mapless_server.method.on_device import match as device_match
+from mapless_server.method.on_device.compute import Inputs, Options, compute
+from mapless_server.method.on_device.transfer import byte_count, fetch, upload
 
 # The host's results
 

@@ -15,10 +15,10 @@ from planted import true_structure
 from scenes import CAMERA, SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server import pnp
-from mapless_server.match import PointMatches
-from mapless_server.observations import ONE_PIXEL
-from mapless_server.pnp import (
+from mapless_server.method import pnp
+from mapless_server.method.match import PointMatches
+from mapless_server.method.observations import ONE_PIXEL
+from mapless_server.method.pnp import (
     PnpOptions,
     PoseEstimate,
     PoseStage,
@@ -31,10 +31,10 @@ from mapless_server.pnp import (
     solve_pose,
     world_covariance,
 )
-from mapless_server.rejection import Rejection, RejectionReason
-from mapless_server.structure import Structure
-from mapless_server.tracks import Tracks
-from mapless_server.views import Features, View
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.structure import Structure
+from mapless_server.method.tracks import Tracks
+from mapless_server.method.views import Features, View
 
 POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
 TRUSTING = PnpOptions(max_log10_false_alarms=math.inf, min_found_share=0.0, min_hull_share=0.0)

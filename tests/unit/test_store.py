@@ -22,9 +22,9 @@ from sqlalchemy.exc import IntegrityError
 
 from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
 from mapless_server import errors
+from mapless_server.method.views import Features, View
 from mapless_server.store import NewReference, Store, StoreError, codec, sqlite
 from mapless_server.store.cache import LruCache
-from mapless_server.views import Features, View
 
 EXTRACTOR = "sift"
 

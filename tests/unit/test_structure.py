@@ -14,8 +14,8 @@ from scenes import CAMERA, SceneOptions, SyntheticScene, arc_poses, make_scene, 
 from scipy.optimize import least_squares
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.correspond import Correspondences
-from mapless_server.observations import (
+from mapless_server.method.correspond import Correspondences
+from mapless_server.method.observations import (
     MIN_NOISE_LEVEL_PX,
     ONE_PIXEL,
     KeypointNoise,
@@ -30,7 +30,7 @@ from mapless_server.observations import (
     triangulate,
     trustworthy,
 )
-from mapless_server.structure import (
+from mapless_server.method.structure import (
     PAPER_STRUCTURE,
     Structure,
     StructureOptions,
@@ -38,8 +38,8 @@ from mapless_server.structure import (
     observe,
     predicted_points,
 )
-from mapless_server.tracks import Tracks
-from mapless_server.views import Features, PosedView, View
+from mapless_server.method.tracks import Tracks
+from mapless_server.method.views import Features, PosedView, View
 
 
 def planted(

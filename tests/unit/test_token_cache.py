@@ -13,8 +13,8 @@ pytest.importorskip("PIL", reason="the networks' extra is not installed")
 import torch
 
 from mapless.geometry import Camera
-from mapless_server.coarse.grids import Grid
-from mapless_server.coarse.token_cache import TokenCache, TokenCacheCounters, TokenCacheOptions, TokenKey
+from mapless_server.method.coarse.grids import Grid
+from mapless_server.method.coarse.token_cache import TokenCache, TokenCacheCounters, TokenCacheOptions, TokenKey
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 KEY = TokenKey("pi3", "weights", torch.float32, "image", CAMERA, Grid(5, 4), CAMERA.resized(70, 56))

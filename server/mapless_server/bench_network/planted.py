@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..coarse import ReconstructedView, Reconstruction
-from ..coarse.device import DeviceReconstruction
-from ..coarse.grids import GridOptions, common_grid, lay_out
-from ..coarse.network import NetworkReconstructor
-from ..correspond import Correspondences
 from ..demo.room import Photo
-from ..rejection import Rejection
-from ..views import PosedView, View
+from ..method.coarse import ReconstructedView, Reconstruction
+from ..method.coarse.device import DeviceReconstruction
+from ..method.coarse.grids import GridOptions, common_grid, lay_out
+from ..method.coarse.network import NetworkReconstructor
+from ..method.correspond import Correspondences
+from ..method.rejection import Rejection
+from ..method.views import PosedView, View
 
 UNITS_PER_METRE = 0.3
 """Of the planted reconstruction, so that there is a scale to find."""

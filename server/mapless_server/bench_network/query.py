@@ -18,16 +18,16 @@ import numpy as np
 import torch
 
 from ..assembly import make_tiers
-from ..coarse.network import NetworkOptions, NetworkReconstructor
 from ..decode import ImageLimits, decode_image
 from ..demo.room import Photo, jpeg, render_room
-from ..features import FeatureExtractor
-from ..localize import Answer, Localization, LocalizeOptions, Pipeline, localize
+from ..method.coarse.network import NetworkOptions, NetworkReconstructor
+from ..method.features import FeatureExtractor
+from ..method.localize import Answer, Localization, LocalizeOptions, Pipeline, localize
+from ..method.views import Photograph, PosedView
 from ..networks.network import Network
 from ..networks.runner import Bucket, NetworkRunner, RunnerOptions
 from ..settings import load_settings
 from ..tiers import Tier
-from ..views import Photograph, PosedView
 from ..weights import WeightsError
 from .operations import compiled_graphs
 from .planted import PlantedReconstructor

@@ -12,12 +12,12 @@ import numpy as np
 from ..dataset import Dataset, Frame
 from ..decode import ImageLimits, decode_image, image_size
 from ..errors import InvalidArgument
-from ..features import FeatureExtractor
-from ..localize import Variant
-from ..retrieve import choose_references
-from ..scale import ScaleStrategy
+from ..method.features import FeatureExtractor
+from ..method.localize import Variant
+from ..method.retrieve import choose_references
+from ..method.scale import ScaleStrategy
+from ..method.views import PosedView, View
 from ..settings import available_cores
-from ..views import PosedView, View
 
 T = TypeVar("T")
 Progress = Callable[[str, int, int], None]

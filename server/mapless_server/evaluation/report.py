@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from .. import __version__
-from ..retrieve import RetrieveOptions
+from ..method.retrieve import RetrieveOptions
 from .metrics import QueryResult, Summary, summarize
 from .run import Evaluation
 

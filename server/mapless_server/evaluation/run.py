@@ -14,8 +14,8 @@ from mapless import Client, ConnectOptions, LocalizationResult, NewReference
 
 from ..assembly import make_first_features
 from ..child import child_server
-from ..correspond import OPTIONS
 from ..dataset import Dataset
+from ..method.correspond import OPTIONS
 from ..serve import image_limits
 from ..settings import Settings
 from ..weights import WeightsError

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform
-from mapless_server.views import Features, View
+from mapless_server.method.views import Features, View
 
 VIEW_FORMAT_VERSION = 1
 _PREFIX = struct.Struct("<B3xI")

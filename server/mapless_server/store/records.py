@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.views import View
+from mapless_server.method.views import View
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from typing import Any
 from sqlalchemy import Row
 
 from mapless_server.errors import DataLoss
+from mapless_server.method.views import View
 from mapless_server.store import codec
 from mapless_server.store.records import DescribedReference, NewReference, ReferenceRecord, SceneRecord
-from mapless_server.views import View
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _MICROSECOND = timedelta(microseconds=1)

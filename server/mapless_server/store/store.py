@@ -10,6 +10,7 @@ from types import TracebackType
 from sqlalchemy import delete, insert, select
 
 from mapless_server.errors import AlreadyExists
+from mapless_server.method.views import View
 from mapless_server.store import queries, rows, tables
 from mapless_server.store.cache import LruCache
 from mapless_server.store.records import (
@@ -21,7 +22,6 @@ from mapless_server.store.records import (
     SceneSnapshot,
 )
 from mapless_server.store.sqlite import SqliteDatabase
-from mapless_server.views import View
 
 DEFAULT_CACHE_BYTES = 512 * 2**20
 """About 500 references with 2048 SIFT features each; 0 reads the database every time."""

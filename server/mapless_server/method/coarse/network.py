@@ -22,9 +22,9 @@ from torch import Tensor
 
 from mapless.geometry import Array, RigidTransform
 
+from ...networks.network import NetworkOutput
+from ...networks.runner import NetworkRunner
 from ..correspond import Correspondences
-from ..networks.network import NetworkOutput
-from ..networks.runner import NetworkRunner
 from ..rejection import Rejection, RejectionReason
 from ..views import Photograph, PosedView, View
 from . import Reconstruction

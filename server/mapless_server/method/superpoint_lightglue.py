@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from transformers import LightGlueConfig, LightGlueForKeypointMatching
 
+from ..networks.checkpoint import load_strictly
 from .lightglue import LightGlue
-from .networks.checkpoint import load_strictly
 
 
 def load_superpoint_lightglue(weights: Path, config: LightGlueConfig | None = None) -> LightGlue:

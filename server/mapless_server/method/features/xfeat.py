@@ -12,7 +12,7 @@ from torch.nn.functional import log_softmax, max_pool2d, normalize, pixel_shuffl
 
 from mapless.geometry import Camera
 
-from ..networks.checkpoint import load_strictly
+from ...networks.checkpoint import load_strictly
 from ..views import View
 from .image import reduce_image, view_of
 from .network import LearnedOptions, array_of, image_tensor

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera
 
-from ..networks.checkpoint import load_strictly
+from ...networks.checkpoint import load_strictly
 from ..views import View
 from .image import reduce_image, view_of
 from .network import LearnedOptions, array_of, image_tensor

@@ -19,8 +19,8 @@ from PIL import Image
 
 from mapless.geometry import Array, Camera
 
+from ...networks.encoder import PATCH_PX
 from ..features import undistort_pixels
-from ..networks.encoder import PATCH_PX
 
 PIXEL_LIMIT = 37 * 28 * PATCH_PX**2
 """Of 518x392."""

@@ -30,8 +30,8 @@ from torch.nn.functional import log_softmax, logsigmoid, scaled_dot_product_atte
 
 from mapless.geometry import Camera
 
+from ..networks.checkpoint import load_strictly
 from .correspond import Matches
-from .networks.checkpoint import load_strictly
 from .views import Features, PosedView, View
 
 NOTHING: Matches = np.empty((0, 2), np.int32)
