@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import logging
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -18,7 +19,7 @@ from mapless.geometry import Array, Camera
 
 from .decode import ImageLimits, decode_image
 from .errors import DeadlineExceeded, FailedPrecondition, NotFound, Unavailable
-from .library import ReferenceLibrary
+from .library import NotDescribedYet, ReferenceLibrary
 from .method.features import FeatureExtractor
 from .method.localize import Answer, Localization, LocalizeOptions, Pipeline, localize
 from .method.rejection import Rejection, RejectionReason
@@ -27,6 +28,8 @@ from .method.views import Photograph, PosedView, View
 from .store import Store
 from .tiers import Attempt, EscalationOptions, Tier, better_of, is_doubtful
 from .turns import Turn, Turns
+
+log = logging.getLogger(__name__)
 
 Localize = Callable[[View, Sequence[PosedView], Pipeline, LocalizeOptions, Callable[[], None]], Answer]
 
@@ -100,8 +103,8 @@ class Result:
     Attributes:
         attempt: of the tier whose answer is the better one.
         stage_seconds: of all that was computed, in order, whichever tier is answered. A stage of another tier than the
-            first begins with its extractor's name, "aliked-2048-1024px/coarse". Such a tier has two more: "queue", its
-            waiting for a thread, and, alone, "unfinished", if it took too long and was given up.
+            first begins with its extractor's name and a slash. Such a tier has two more: "queue", its waiting for a
+            thread, and, alone, "unfinished", if it failed, took too long, or has yet to describe the references.
         queue_s: from admission to the start of the computation.
     """
 
@@ -185,6 +188,7 @@ class Engine:
     def close(self) -> None:
         """Ends what is being computed at its next step, and drops what waits."""
         self.turns.close()
+        self._library.close()
         for tier in self.tiers:
             tier.pipeline.matcher.close()
         shared = {id(tier.pipeline.reconstructor): tier.pipeline.reconstructor for tier in self.tiers}
@@ -197,13 +201,19 @@ class Engine:
         return {it.extractor.name: replace(views.view(it.extractor, turn), photograph=None) for it in self.tiers}
 
     async def _attempt_in_time(self, query: Query, tier: Tier, views: _QueryViews, deadline_s: float) -> Attempt | None:
-        """A stronger tier's attempt; None if it takes more than its share of the time left."""
+        """A stronger tier's attempt; None if it fails or takes more than its share of the time left.
+
+        It is made for a better answer than the one at hand, so it must never cost that one.
+        """
         now_s = time.monotonic()
         share_s = self.options.escalation.time_share * (deadline_s - now_s)
         try:
             # A step may be long: it is not waited for, and its thread finds out at the next one.
             return await asyncio.wait_for(self._attempt(query, tier, views, now_s + share_s), share_s)
-        except (asyncio.TimeoutError, DeadlineExceeded):
+        except (asyncio.TimeoutError, DeadlineExceeded, NotDescribedYet):
+            return None
+        except Exception:
+            log.warning("%s failed; the first answer is given", tier.extractor.name, exc_info=True)
             return None
 
     async def _attempt(self, query: Query, tier: Tier, views: _QueryViews, deadline_s: float) -> Attempt:
@@ -231,7 +241,10 @@ class Engine:
         self, reference_ids: Sequence[str], query: Query, tier: Tier, views: _QueryViews, turn: Turn
     ) -> Attempt:
         # References come first: a name that is wrong is found out before the photograph is described.
-        generation, references = self._library.load(query.scene_id, reference_ids, tier.extractor, turn)
+        # Only the first tier's references are waited for: there is an answer before the others'.
+        generation, references = self._library.load(
+            query.scene_id, reference_ids, tier.extractor, turn, waits=tier is self.tiers[0]
+        )
         view = views.view(tier.extractor, turn)
         if not query.reference_ids and references:
             with turn.stage("retrieval"):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -33,22 +34,42 @@ STORED_IMAGES = ImageLimits(max_bytes=2**31, max_pixels=2**30, min_side_px=1, ma
 _POLL_S = 0.05
 
 
+class NotDescribedYet(Exception):
+    """References lack the features asked for, and whoever asked does not wait for them."""
+
+
 class ReferenceLibrary:
     """Loads references from the store; safe to use from several threads."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._claims = _Claims()
+        self._background = ThreadPoolExecutor(1, "describe")
+        self._announced: set[tuple[str, str]] = set()
+        self._announcing = threading.Lock()
+        self._closing = threading.Event()
+
+    def close(self) -> None:
+        """Ends what is done in the background, after the reference that it is at."""
+        self._closing.set()
+        self._background.shutdown(wait=True, cancel_futures=True)
 
     def load(
-        self, scene_id: str, reference_ids: Sequence[str], extractor: FeatureExtractor, turn: Turn
+        self,
+        scene_id: str,
+        reference_ids: Sequence[str],
+        extractor: FeatureExtractor,
+        turn: Turn,
+        waits: bool = True,
     ) -> tuple[int, tuple[PosedView, ...]]:
         """The scene's generation and references of it, in the order asked for.
 
         Those without features of the extractor are described now, one by one until the turn is over; what was done by
-        then stays done. Their photographs are read when somebody asks for the pixels, not before.
+        then stays done. Who does not wait is told so, and they are described in the background. The photographs of
+        references are read when somebody asks for the pixels, not before.
 
         Raises:
+            NotDescribedYet: somebody who does not wait would have to.
             NotFound: there is no such scene (field "scene") or reference (field "references[i]").
             DeadlineExceeded: the turn is over.
             DataLoss: what is stored of one of them is damaged.
@@ -57,14 +78,36 @@ class ReferenceLibrary:
             snapshot = self._store.load_references(scene_id, reference_ids, extractor.name)
             if not snapshot.undescribed:
                 return snapshot.generation, tuple(map(self._posed_view, snapshot.references))
+            if not waits:
+                self._describe_later(snapshot.undescribed, extractor)
+                raise NotDescribedYet
+            log.info(
+                "describing %d references of scene %s with %s", len(snapshot.undescribed), scene_id, extractor.name
+            )
             with turn.stage("describe"):
                 self._describe_all(snapshot.undescribed, extractor, turn.check)
+
+    def _describe_later(self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:
+        with self._announcing:
+            new = [record for record in records if (record.key, extractor.name) not in self._announced]
+            self._announced |= {(record.key, extractor.name) for record in new}
+        if new:
+            _announce(new, extractor)
+        for record in new:
+            self._background.submit(self._describe_unasked, record, extractor)
+
+    def _describe_unasked(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
+        if self._closing.is_set():
+            return
+        try:
+            self._describe_all([record], extractor, lambda: None)
+        except Exception as error:  # one that is damaged or gone must not keep the others from being described
+            log.warning("reference %s of scene %s: %s", record.reference_id, record.scene_id, error)
 
     def _describe_all(
         self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor, check: Callable[[], None]
     ) -> None:
         """Describes references, but those that other threads are at: these it waits for, not for their success."""
-        log.info("describing %d references of scene %s with %s", len(records), records[0].scene_id, extractor.name)
         taken: list[ReferenceRecord] = []
         for record in records:
             check()
@@ -100,6 +143,10 @@ class ReferenceLibrary:
             return decode_image(data, STORED_IMAGES)
         except InvalidArgument as error:
             raise DataLoss(f"the photograph of reference {record.reference_id!r} cannot be read: {error}") from error
+
+
+def _announce(records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:
+    log.info("describing %d references of scene %s with %s", len(records), records[0].scene_id, extractor.name)
 
 
 class _Claims:

@@ -90,6 +90,13 @@ class Settings(BaseSettings):
         default="info", description="Least severity that is logged."
     )
 
+    @field_validator("compiled_views")
+    @classmethod
+    def _check_compiled_views(cls, count: int) -> int:
+        if count in (1, 2):
+            raise ValueError("must be 0, or at least 3: the photograph and two references")
+        return count
+
     @field_validator("device")
     @classmethod
     def _check_device(cls, device: str) -> str:

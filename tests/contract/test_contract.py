@@ -110,6 +110,13 @@ def test_nothing_below_the_service_knows_grpc(module: str) -> None:
         assert not {name for name in names for bad in forbidden if name == bad or name.startswith(bad + ".")}, path
 
 
+def test_the_method_knows_no_service_store_or_queue() -> None:
+    above = {"store", "engine", "turns", "tiers", "library", "assembly", "settings", "decode", *ABOVE}
+    for path in sorted((SERVER / "method").rglob("*.py")):
+        known = {name.split(".")[1] for name in imports_of(path) if name.startswith("mapless_server.")}
+        assert not known & above, path
+
+
 def test_the_public_names() -> None:
     assert sorted(mapless.__all__) == mapless.__all__
     for name in mapless.__all__:

@@ -185,6 +185,39 @@ class TestTiers:
         assert isinstance(result.attempt.answer.outcome, Localization)
         assert list(result.stage_seconds) == ["decode", "features", "coarse", "strong/unfinished"]
 
+    def test_no_answer_is_lost_because_a_better_one_fails(
+        self, setting: Setting, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        def failing(*_: object) -> Answer:
+            raise RuntimeError("out of memory, say")
+
+        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": failing}
+        result = setting.localize()
+        assert result.attempt.tier.extractor.name == "cheap"
+        assert list(result.stage_seconds)[-1] == "strong/unfinished"
+        assert "strong failed" in caplog.text
+        assert "out of memory, say" in caplog.text
+
+    def test_nobody_waits_until_references_are_described_for_a_better_answer(self, setting: Setting) -> None:
+        """It is done after the call, once, and the next doubtful query has the better answer."""
+        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": localized(SURE_INLIERS)}
+        photo = encode(".png", textured(seed=7))
+        of_cheap = View(CAMERA, setting.extractors["cheap"].extract(textured(seed=7), CAMERA).features)
+        new = NewReference("late", photo, CAMERA, pose(9.0), {"cheap": of_cheap})
+        setting.store.add_references("s", [new])
+        names = []
+        for _ in range(200):
+            result = setting.localize(reference_ids=("r0", "late"))
+            names.append(result.attempt.tier.extractor.name)
+            if names[-1] == "strong":
+                break
+            assert list(result.stage_seconds)[-1] == "strong/unfinished"
+            time.sleep(0.02)
+        assert names[0] == "cheap"
+        assert names[-1] == "strong"
+        seen = setting.extractors["strong"].seen
+        assert sum(np.array_equal(image, textured(seed=7)) for image in seen) == 1
+
     def test_a_deadline_that_passes_in_the_first_tier_is_no_answer(self, setting: Setting) -> None:
         def slow(_: View, __: Sequence[PosedView], check: Callable[[], None]) -> Answer:
             time.sleep(0.3)

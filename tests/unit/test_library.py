@@ -7,18 +7,22 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from images import encode, textured
+from numpy.typing import NDArray
 from servers import CAMERA, StandInExtractor, pose
 
+from mapless.geometry import Camera
 from mapless_server import library as library_module
 from mapless_server.decode import ImageLimits
 from mapless_server.errors import DataLoss, DeadlineExceeded, NotFound
-from mapless_server.library import ReferenceLibrary
+from mapless_server.library import NotDescribedYet, ReferenceLibrary
+from mapless_server.method.views import View
 from mapless_server.store import NewReference, Store
 from mapless_server.store.sqlite import DATABASE_FILE, choose_library
 from mapless_server.turns import Turn
@@ -144,6 +148,29 @@ class TestDescribing:
             assert len(new.seen) == store.images_read == described
         assert call.stage_seconds == {}, "nothing is described when everything is"
         assert "describe" not in call.stage_seconds
+
+    def test_who_does_not_wait_is_told_and_one_damaged_photograph_does_not_hold_up_the_others(
+        self, store: CountingStore, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        class Picky(StandInExtractor):
+            def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+                if np.array_equal(image, PIXELS["r1"]):
+                    raise ValueError("not this one")
+                return super().extract(image, camera)
+
+        new, library = Picky("new"), ReferenceLibrary(store)
+        for _ in range(3):
+            with pytest.raises(NotDescribedYet):
+                library.load("s", IDS, new, turn(), waits=False)
+        others = [it for it in IDS if it != "r1"]
+        for _ in range(500):
+            with suppress(NotDescribedYet):
+                library.load("s", others, new, turn(), waits=False)
+                break
+            time.sleep(0.01)
+        library.close()
+        assert len(new.seen) == len(others)
+        assert caplog.text.count("not this one") == 1
 
     def test_threads_share_the_work_and_do_nothing_twice(self, store: CountingStore) -> None:
         new, library = SlowExtractor("new"), ReferenceLibrary(store)

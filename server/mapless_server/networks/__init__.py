@@ -1,12 +1,17 @@
 """The feed-forward 3D networks pi^3 (Wang et al. 2025) and its successor Pi3X, written from a description of them.
 
 A network takes images of one scene and gives, up to one similarity, each view's pose and the point seen at each of its
-pixels. The modules' names are those of the official checkpoints' entries. Nothing here knows the rest of mapless.
+pixels. The modules' names are those of the official checkpoints' entries. Nothing here knows the rest of mapless but
+the header of weights' files.
 
+    blocks.py      attention, normalization, rotary positions
     encoder.py     each image to patch tokens
     decoder.py     blocks within views and over the scene in turn
     heads.py       poses, points and confidence from decoded tokens
+    rotation.py    the nearest rotation
     conditions.py  what Pi3X may be told: rays, depths, poses
     network.py     what both have in common, in order
     pi3.py, pi3x.py
+    checkpoint.py  weights from a file, all of them and nothing else
+    runner.py      a network on a device
 """

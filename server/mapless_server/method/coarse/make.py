@@ -35,7 +35,7 @@ def make_reconstructor(
     """The backend that a setting names.
 
     `auto` is a network if its weights are there and a CUDA device to run it, on which it takes a fraction of a second
-    where a CPU takes a minute; otherwise it is `geometric`, and the log says why.
+    where a CPU takes minutes; otherwise it is `geometric`, and the log says why.
 
     Args:
         backend: one of `BACKENDS`.
@@ -62,7 +62,7 @@ def make_reconstructor(
 
 def _choose(weights_dir: Path, device: str) -> str:
     """What `auto` means here; the log says why."""
-    problem: str | None = "there is no CUDA device, and on a CPU a network takes about a minute for a query"
+    problem: str | None = "there is no CUDA device, and on a CPU a network takes minutes for a query"
     if device != "cpu":
         missing = {name: _missing(name, weights_dir) for name in NETWORKS}
         for name, sentence in missing.items():
@@ -100,7 +100,7 @@ def _load(
     from .network import NetworkReconstructor
 
     if device == "cpu":
-        log.warning("backend %s on the CPU: about a minute for a query", backend)
+        log.warning("backend %s on the CPU: minutes for a query, so calls need longer deadlines", backend)
     with torch.device("meta"):
         network = Pi3() if backend == "pi3" else Pi3X()
     # On the host, where the runner reduces the precision before anything goes to the device.
