@@ -135,6 +135,33 @@ class RunningServer:
 
 
 @contextmanager
+def listening(settings: Settings, store: Store, engine: Engine) -> Iterator[tuple[str, Callable[[], None]]]:
+    """A server in a thread until the block is left; its address, and what makes it drain before that."""
+    address: Future[str] = Future()
+    loop = asyncio.new_event_loop()
+    stopping = asyncio.Event()
+
+    async def run() -> None:
+        async with running_server(settings, engine, store) as bound:
+            address.set_result(bound)
+            await stopping.wait()
+
+    thread = threading.Thread(target=loop.run_until_complete, args=(run(),))
+    thread.start()
+
+    def stop() -> None:
+        loop.call_soon_threadsafe(stopping.set)
+
+    try:
+        yield address.result(30), stop
+    finally:
+        stop()
+        thread.join(30)
+        assert not thread.is_alive()
+        loop.close()
+
+
+@contextmanager
 def serving(data_dir: Path, features: Sequence[str] = ("stand-in",), **options: Any) -> Iterator[RunningServer]:
     """A server with the given settings until the block is left, or `stop` is called, which begins to drain it.
 
@@ -152,29 +179,11 @@ def serving(data_dir: Path, features: Sequence[str] = ("stand-in",), **options: 
     )
     tiers = [Tier(extractor, Pipeline(cast(Any, StandInReconstructor()))) for extractor in extractors]
     engine = Engine(store, tiers, engine_options, localize=method)
-    address: Future[str] = Future()
-    loop = asyncio.new_event_loop()
-    stopping = asyncio.Event()
-
-    async def run() -> None:
-        async with running_server(settings, engine, store) as bound:
-            address.set_result(bound)
-            await stopping.wait()
-
-    thread = threading.Thread(target=loop.run_until_complete, args=(run(),))
-    thread.start()
-
-    def stop() -> None:
-        loop.call_soon_threadsafe(stopping.set)
-
-    try:
-        yield RunningServer(address.result(30), method, extractors, engine, stop)
-    finally:
-        method.gate.set()
-        stop()
-        thread.join(30)
-        assert not thread.is_alive()
-        loop.close()
+    with listening(settings, store, engine) as (address, stop):
+        try:
+            yield RunningServer(address, method, extractors, engine, stop)
+        finally:
+            method.gate.set()
 
 
 @dataclass

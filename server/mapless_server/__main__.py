@@ -2,6 +2,8 @@
 
 import sys
 
+from .extras import install_hint
+
 
 def main() -> None:
     """Run the command line; without what the server needs beyond the client, say how to get it."""
@@ -10,7 +12,7 @@ def main() -> None:
 
         app(prog_name="mapless-server")
     except ModuleNotFoundError as error:
-        sys.exit(f"mapless-server: {error}; is it installed with its extra? pip install 'mapless[server]'")
+        sys.exit(f"mapless-server: {install_hint(error)}")
 
 
 if __name__ == "__main__":

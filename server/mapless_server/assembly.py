@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import logging
 
+from .extras import install_hint
 from .method.coarse.make import make_reconstructor
 from .method.correspond import Matcher, make_matcher
-from .method.features import FeatureExtractor, make_extractor
+from .method.features import FEATURES, FeatureExtractor, make_extractor
 from .method.localize import Pipeline
 from .settings import Settings, available_cores
 from .tiers import Tier
@@ -30,7 +31,13 @@ WITH_WEIGHTS = frozenset(entry.name for entry in CATALOGUE)
 
 
 def feature_names(features: str, device: str) -> tuple[str, ...]:
-    """The features that a setting means on "cpu" or "cuda...", the cheapest first."""
+    """The features that a setting means on "cpu" or "cuda...", the cheapest first.
+
+    Raises:
+        ValueError: unknown features.
+    """
+    if features not in ("auto", *FEATURES):
+        raise ValueError(f"unknown features {features!r}; known: auto, {', '.join(FEATURES)}")
     if features != "auto":
         return (features,)
     return (CHEAP_FEATURES, STRONG_FEATURES) if device == "cpu" else (STRONG_FEATURES,)
@@ -47,7 +54,7 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
         WeightsError: weights are not there, or do not fit.
         ImportError: a package that a network needs is not installed.
     """
-    device = choose_device(settings.device)
+    device = device_for(settings)
     extractors = _make_extractors(settings, device)
     reconstructor = make_reconstructor(
         settings.backend, settings.weights_dir, device, compiled_views=settings.compiled_views
@@ -60,14 +67,22 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
 
 def make_first_features(settings: Settings) -> tuple[str, FeatureExtractor]:
     """The first tier's features, and their extractor; errors as `make_tiers`."""
-    return next(iter(_make_extractors(settings, choose_device(settings.device)).items()))
+    return next(iter(_make_extractors(settings, device_for(settings)).items()))
 
 
 def what_is_missing(error: ImportError | WeightsMissing) -> str:
     """What is not there and what to do about it, for the operator."""
-    if isinstance(error, ImportError) and error.name:
-        return f"the Python package {error.name} is not installed: pip install 'mapless[server,networks]'"
-    return str(error)
+    return install_hint(error) if isinstance(error, ImportError) else str(error)
+
+
+def device_for(settings: Settings) -> str:
+    """What networks run on; errors as `choose_device`.
+
+    Where there are none it does not matter, and finding out would take torch, a third of the server's memory.
+    """
+    if settings.device == "auto" and settings.backend == "geometric" and settings.features == CHEAP_FEATURES:
+        return "cpu"
+    return choose_device(settings.device)
 
 
 def choose_device(device: str) -> str:

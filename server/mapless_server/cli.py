@@ -222,7 +222,7 @@ def weights_add_command(
     file: Annotated[Path, typer.Argument(help="The file: safetensors, or the authors' own.")],
     link: Annotated[bool, typer.Option("--link", help="Link to the file instead of copying it.")] = False,
     unofficial: Annotated[
-        bool, typer.Option("--unofficial", help="Take a file that is not the official one, but fits.")
+        bool, typer.Option("--unofficial", help="Take a file that is not the official one, if the network takes it.")
     ] = False,
     weights_dir: WeightsDir = None,
 ) -> None:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
-import threading
 from collections.abc import Iterator
-from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +15,7 @@ pytest.importorskip("PIL", reason="the networks' extra is not installed")
 
 import torch
 from images import encode, textured
+from servers import listening
 from small_networks import GRIDS, small_network
 
 from mapless import Client, LocalizationResult, NewReference, Rejected
@@ -28,7 +26,6 @@ from mapless_server.method.features import SiftExtractor
 from mapless_server.method.localize import Pipeline
 from mapless_server.networks.network import Network
 from mapless_server.networks.runner import NetworkRunner
-from mapless_server.serve import running_server
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_server.tiers import Tier
@@ -57,32 +54,14 @@ def serving(data_dir: Path, network: Network, name: str) -> Iterator[tuple[Clien
     store = Store.open(data_dir)
     engine = Engine(store, [Tier(SiftExtractor(), Pipeline(backend))], EngineOptions(workers=2))
     settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, workers=2)
-    address: Future[str] = Future()
-    loop = asyncio.new_event_loop()
-    stopping = asyncio.Event()
-
-    async def run() -> None:
-        async with running_server(settings, engine, store) as bound:
-            address.set_result(bound)
-            await stopping.wait()
-
-    thread = threading.Thread(target=loop.run_until_complete, args=(run(),))
-    thread.start()
-    try:
-        with Client(address.result(30)) as client:
-            client.create_scene("wall")
-            photos = [
-                NewReference(f"r{i}", encode(".png", photograph_at(x_m)), CAMERA, pose_at(x_m))
-                for i, x_m in enumerate((0.0, 0.5, 1.0, 1.5))
-            ]
-            client.add_references("wall", photos)
-            yield client, backend
-    finally:
-        loop.call_soon_threadsafe(stopping.set)
-        thread.join(30)
-        assert not thread.is_alive()
-        loop.close()
-        backend.close()
+    with closing(backend), listening(settings, store, engine) as (address, _), Client(address) as client:
+        client.create_scene("wall")
+        photos = [
+            NewReference(f"r{i}", encode(".png", photograph_at(x_m)), CAMERA, pose_at(x_m))
+            for i, x_m in enumerate((0.0, 0.5, 1.0, 1.5))
+        ]
+        client.add_references("wall", photos)
+        yield client, backend
 
 
 @pytest.mark.parametrize("name", ["pi3", "pi3x"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import subprocess
 import sys
 from pathlib import Path
 
@@ -62,6 +63,17 @@ def test_what_is_asked_for_by_name_is_never_replaced(tmp_path: Path) -> None:
         for features, told in (("aliked", "weights fetch aliked"), ("nonesuch", "nonesuch")):
             with pytest.raises(StartupError, match=told):
                 make_engine(settings(tmp_path, features=features), store)
+
+
+def test_a_server_without_networks_does_not_load_torch(tmp_path: Path) -> None:
+    program = (
+        "import sys; from pathlib import Path; from mapless_server.assembly import make_tiers\n"
+        "from mapless_server.settings import Settings\n"
+        "make_tiers(Settings(data_dir=Path(sys.argv[1]), weights_dir=Path(sys.argv[1])))\n"
+        "print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program, tmp_path], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
 
 
 def test_features_without_a_network_need_no_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

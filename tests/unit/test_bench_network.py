@@ -168,16 +168,33 @@ def test_planted_reconstruction_is_the_truth_up_to_scale(keep_on_device: bool) -
 
 def test_table_shows_every_number_beside_its_floor() -> None:
     figures = [
-        Figure("forward", "compiled", 50.0, "ms", 51.0, floor=25.0, predicted=48.0, target=60.0),
+        Figure("forward", "compiled", 50.0, "ms", 51.0, floor_ms=25.0, predicted_ms=48.0, target=60.0),
         Figure("query", "sustained", 11.0, "queries/s", target=12.0, target_is_least=True),
         Figure("memory", "peak", None, "GB", target=8.0, note="there is no CUDA device"),
     ]
     assert [figure.is_met for figure in figures] == [True, False, None]
-    assert table(figures)[1].split("  ") != table(figures)[2].split("  ")
     rows = markdown("a device", figures)[-3:]
     assert rows[0] == "| forward | compiled | 50 ms | 51 | 25 | 2 | 48 | at most 60 | yes |  |"
     assert rows[1] == "| query | sustained | 11 queries/s |  |  |  |  | at least 12 | no |  |"
     assert rows[2] == "| memory | peak | not measured |  |  |  |  | at most 8 |  | there is no CUDA device |"
+
+
+def test_printed_table_fits_a_screen_and_says_what_is_not_measured() -> None:
+    """Long notes are elsewhere; operations have a floor in another unit, and no ratio to it."""
+    note = "very long " * 16
+    figures = [
+        Figure("pi3, 11 views", "references' tokens kept, references mapped", 34.3, "TFLOP", None, 43.5, 91.0),
+        Figure("pi3, 11 views", "eager", 100.0, "ms", 101.0, 43.5, 115.0, 150.0, note=note),
+        Figure("queries", "sustained, 8 threads", None, "queries/s", target=12.0, target_is_least=True, note=note),
+    ]
+    lines = table(figures)
+    assert max(map(len, lines)) <= 120
+    assert [line for line in lines if "pi3, 11 views" in line] == ["pi3, 11 views"]
+    assert "floor, ms" in lines[0]
+    assert lines[2].split()[-4:] == ["34.3", "TFLOP", "43.5", "91"]
+    assert lines[3].split() == ["eager", "100", "ms", "101", "43.5", "2.3", "115", "at", "most", "150", "yes"]
+    assert " ".join(lines).count("very") == 16
+    assert lines[6].startswith("Not measured: queries, sustained, 8 threads: very long")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
@@ -193,4 +210,7 @@ def test_part_that_fails_says_so_and_the_rest_goes_on(
     written = json.loads((tmp_path / "network.json").read_text())
     assert [it["value"] for it in written["figures"]] == [it.value for it in figures]
     assert (tmp_path / "network.md").read_text().count("not measured") == 2
-    assert "There is no CUDA device" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "There is no CUDA device" in printed
+    assert "attention: 0 figures, 1 not measured, " in printed
+    assert printed.count("rounding: 1 figures") == 1

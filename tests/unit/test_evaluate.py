@@ -219,6 +219,19 @@ class TestReport:
         assert content["per_query"][0]["translation_m"] == 0.01
         assert content["ground_truth"] == "survey"
 
+    def test_features_are_those_of_every_answer(self) -> None:
+        """Where stronger features answered some queries, and their stages are one sum for people."""
+        stages = {"decode": 10.0, "pnp": 20.0, "aliked-n16-1024px/coarse": 50.0, "aliked-n16-1024px/pnp": 20.0}
+        stronger = replace(result(0.01), features="aliked-n16-1024px", stage_ms=stages)
+        mixed = evaluation(stronger, *[replace(result(0.01), stage_ms={})] * 2)
+        content = to_json(mixed)
+        assert content["features"] == {"sift": 2, "aliked-n16-1024px": 1}
+        assert [query["features"] for query in content["per_query"]] == ["aliked-n16-1024px", "sift", "sift"]
+        text = printed(mixed)
+        assert "geometric, sift 2, aliked-n16-1024px 1;" in text
+        assert "decode 10 %, pnp 20 %, aliked 70 % " in text
+        assert to_json(evaluation(result(0.01)))["features"] == "sift"
+
     def test_infinite_is_null(self) -> None:
         content = to_json(evaluation(MISSED, MISSED))
         json.dumps(content, allow_nan=False)

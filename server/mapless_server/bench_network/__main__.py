@@ -1,4 +1,4 @@
-"""The command where what the other commands need is not installed."""
+"""The same command with torch and NumPy alone, for a machine with a GPU and none of the server's other packages."""
 
 from __future__ import annotations
 

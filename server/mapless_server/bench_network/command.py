@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from ..machine import cpu_model
 from . import host
 from .ceilings import measure_rates
 from .forward import measure_forward, measure_kernels, reason_of
@@ -37,7 +38,7 @@ REPEATS, QUICK_REPEATS = 20, 3
 
 
 def bench_network(quick: bool = False, only: Sequence[str] | None = None, output: Path = OUTPUT) -> list[Figure]:
-    """Measures, prints a table and writes `network.json` and `network.md`, anew after each part.
+    """Measures, and prints a table; writes `network.json` and `network.md`, anew after each part.
 
     Args:
         quick: few repetitions and nothing compiled: to see that it runs.
@@ -56,7 +57,7 @@ def bench_network(quick: bool = False, only: Sequence[str] | None = None, output
     for part in only or (CUDA_PARTS if device.type == "cuda" else HOST_PARTS):
         bench.run(part)
         bench.write(output)
-    print("\n".join(["", bench.title, "", *table(bench.figures)]))
+    print("\n".join(["", bench.title, "", *table(bench.figures), "", f"With notes: {output / 'network.md'}"]))
     return bench.figures
 
 
@@ -70,7 +71,7 @@ class _Bench:
         self._repeats = QUICK_REPEATS if quick else REPEATS
         self._details: dict[str, Any] = {}
         cuda = device.type == "cuda"
-        name = torch.cuda.get_device_name(device) if cuda else _host_name()
+        name = torch.cuda.get_device_name(device) if cuda else f"{cpu_model()}, one thread"
         quickly = ", quick run: not comparable" if quick else ""
         self.title = f"{name}, torch {torch.__version__}{quickly}"
         self.rates = self._ceilings() if cuda else H200
@@ -85,12 +86,14 @@ class _Bench:
         return rates
 
     def run(self, part: str) -> None:
-        """Adds the figures of a part, and prints them as they come."""
+        """Adds the figures of a part."""
         start_s = time.perf_counter()
-        for figure in self._tried(self._part(part), part):
-            self.figures.append(figure)
-            print("  ".join(table([figure])[1:]), flush=True)
-        print(f"{part} took {time.perf_counter() - start_s:.0f} s", flush=True)
+        print(f"{part}: ", end="", flush=True)
+        figures = [*self._tried(self._part(part), part)]
+        self.figures += figures
+        missing = sum(figure.value is None for figure in figures)
+        failed = f", {missing} not measured" if missing else ""
+        print(f"{len(figures) - missing} figures{failed}, {time.perf_counter() - start_s:.0f} s", flush=True)
         torch._dynamo.reset()
         gc.collect()
         if self.device.type == "cuda":
@@ -169,9 +172,3 @@ class _Bench:
         content = as_json(self.title, self.figures, self._details)
         (output / "network.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
         (output / "network.md").write_text("\n".join(markdown(self.title, self.figures)) + "\n", encoding="utf-8")
-
-
-def _host_name() -> str:
-    from ..bench.command import cpu_model
-
-    return f"{cpu_model()}, one thread"

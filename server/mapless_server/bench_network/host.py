@@ -18,7 +18,7 @@ from .report import Figure
 from .subject import GRID, REFERENCES, Scene, Work, make_network, meta_network, operations_of
 
 VIEWS = REFERENCES + 1
-GRIDS = {"392x518": GRID, "378x504": (27, 36), "294x392": (21, 28)}
+GRIDS = {"518x392": GRID, "504x378": (27, 36), "392x294": (21, 28)}
 WORKS = {
     "everything": Work(VIEWS, VIEWS),
     "references mapped": Work(VIEWS, REFERENCES),
@@ -35,23 +35,22 @@ def count_forward(rates: Rates = H200, quick: bool = False) -> Iterator[Figure]:
         for size, grid in GRIDS.items():
             if quick and grid is not GRID:
                 continue
-            part = f"{name}, {VIEWS} views of {size}"
+            part = f"{name}, {VIEWS} views of {size}; times are those of {rates.device}, compiled"
             for label, work in WORKS.items():
                 operations = operations_of(name, Work(work.encoded, work.mapped, grid=grid))
                 yield _counted(part, label, operations, rates)
 
 
 def _counted(part: str, label: str, operations: Operations, rates: Rates) -> Figure:
+    floor_ms, predicted_ms = 1e3 * operations.floor_s(rates), 1e3 * operations.predicted_s(rates, True)
     note = (
-        f"{rates.device}: floor {1e3 * operations.floor_s(rates):.1f} ms, predicted "
-        f"{1e3 * operations.predicted_s(rates, False):.0f} ms eager, "
-        f"{1e3 * operations.predicted_s(rates, True):.0f} ms compiled; "
+        f"eager {1e3 * operations.predicted_s(rates, False):.0f} ms; "
         f"attention {operations.attention_flop / 1e12:.2f} TFLOP, "
         f"in float32 {(operations.tf32_flop + operations.float32_flop) / 1e12:.2f}; "
         f"{operations.kernels} kernels, {operations.eager_bytes / 1e9:.0f} GB between products, "
         f"{operations.fused_bytes / 1e9:.0f} GB fused"
     )
-    return Figure(part, label, operations.flop / 1e12, "TFLOP", note=note)
+    return Figure(part, label, operations.flop / 1e12, "TFLOP", None, floor_ms, predicted_ms, note=note)
 
 
 def count_memory() -> Iterator[Figure]:
@@ -61,7 +60,7 @@ def count_memory() -> Iterator[Figure]:
         weights = sum(it.nbytes for it in network.parameters())
         tokens = CACHED * (SPECIALS + GRID[0] * GRID[1]) * network.sizes.width * torch.bfloat16.itemsize
         yield Figure(f"{name} memory", "weights, linear layers in bfloat16", weights / 1e9, "GB")
-        yield Figure(f"{name} memory", f"tokens of {CACHED} references of 392x518", tokens / 1e9, "GB")
+        yield Figure(f"{name} memory", f"tokens of {CACHED} references of 518x392", tokens / 1e9, "GB")
 
 
 def count_pixel_heads() -> Iterator[Figure]:
@@ -77,7 +76,7 @@ def count_pixel_heads() -> Iterator[Figure]:
 
 
 def measure_blocks(repeats: int) -> Iterator[Figure]:
-    """One block of each kind at full width, three views of 196x266, on one thread."""
+    """One block of each kind at full width, three views of 266x196, on one thread."""
     views, grid, device = 3, (14, 19), torch.device("cpu")
     sizes = Sizes(encoder_depth=1, decoder_depth=2, head_depth=1)
     for dtype in (torch.float32, torch.bfloat16):
@@ -97,7 +96,7 @@ def measure_blocks(repeats: int) -> Iterator[Figure]:
             with torch.no_grad():
                 first, second = median_s(work, device, repeats, warm_up=1)
             flop = count_operations(work).flop
-            part = f"CPU, one block, {views} views of {14 * grid[0]}x{14 * grid[1]}, {str(dtype)[6:]}"
+            part = f"CPU, one block, {views} views of {14 * grid[1]}x{14 * grid[0]}, {str(dtype)[6:]}"
             note = f"{flop / 1e9:.1f} GFLOP, {flop / first / 1e9:.0f} GFLOP/s"
             yield Figure(part, label, 1e3 * first, "ms", 1e3 * second, note=note)
 
@@ -145,7 +144,7 @@ def compare_rounding() -> Iterator[Figure]:
     single, half = torch.float32, torch.bfloat16
     part = "medium pi3, largest relative difference of outputs"
     pairs = {
-        "float32, tokens rounded to bfloat16, against not": ((single, half), (single, single)),
+        "float32, tokens in bfloat16, against not": ((single, half), (single, single)),
         "bfloat16 with float32 tokens against float32": ((half, single), (single, single)),
         "bfloat16 with bfloat16 tokens against float32": ((half, half), (single, single)),
         "bfloat16, tokens rounded, against not": ((half, half), (half, single)),

@@ -139,7 +139,8 @@ def measure_queries(
 ) -> Iterator[Figure]:
     """Latency, its stages, and throughput, on a planted reconstruction; and what the random network's own leads to."""
     where = "device" if keep_on_device else "host"
-    part = f"{runner.name} query, K = {REFERENCES}, stages after the network on the {where}"
+    features = bench.tier.extractor.name.split("-")[0]
+    part = f"{runner.name} query, {features}, K = {REFERENCES}, stages after the network on the {where}"
     network = NetworkReconstructor(runner, NetworkOptions(keep_on_device=keep_on_device))
     photos = {**bench.room.references, **bench.room.queries}
     planted = Pipeline(PlantedReconstructor(network, photos, runner.device), bench.tier.pipeline.matcher)
@@ -148,6 +149,7 @@ def measure_queries(
     runs, again = (_runs(bench, planted, options.rounds) for _ in range(2))
     outcomes = f"{_outcomes([*runs, *again])}; {note}"
     yield Figure(part, "p50", _p50_ms(runs), "ms", _p50_ms(again), target=LATENCY_MS, note=outcomes)
+    yield Figure(part, "localized", 100 * _localized_share([*runs, *again]), "%")
     yield from _stages(part, [*runs, *again])
     yield _throughput(part, bench, planted, options)
     alone = _runs(bench, Pipeline(network, bench.tier.pipeline.matcher), 1)
@@ -181,6 +183,10 @@ def _outcomes(runs: Runs) -> str:
     outcomes = [answer.outcome for answer, _ in runs]
     names = ["localized" if isinstance(it, Localization) else it.reason.name for it in outcomes]
     return ", ".join(f"{names.count(name)} {name}" for name in sorted(set(names)))
+
+
+def _localized_share(runs: Runs) -> float:
+    return sum(isinstance(answer.outcome, Localization) for answer, _ in runs) / len(runs)
 
 
 def _throughput(part: str, bench: Bench, pipeline: Pipeline, options: QueryOptions) -> Figure:

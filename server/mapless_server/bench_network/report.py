@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -15,10 +16,10 @@ class Figure:
         part: what it belongs to.
         name: what it is.
         value: the number; None if it was not measured.
-        unit: of the number and those below.
+        unit: of the number, `again` and `target`.
         again: the same measured a second time.
-        floor: what no program is better than.
-        predicted: before it was measured.
+        floor_ms: what no program is faster than.
+        predicted_ms: before it was measured.
         target: what is wanted.
         target_is_least: whether more is better.
         note: anything else, the reason if it was not measured.
@@ -29,8 +30,8 @@ class Figure:
     value: float | None
     unit: str
     again: float | None = None
-    floor: float | None = None
-    predicted: float | None = None
+    floor_ms: float | None = None
+    predicted_ms: float | None = None
     target: float | None = None
     target_is_least: bool = False
     note: str = ""
@@ -43,26 +44,40 @@ class Figure:
         return self.value >= self.target if self.target_is_least else self.value <= self.target
 
 
-HEADINGS = ("part", "figure", "measured", "again", "floor", "x floor", "predicted", "target", "met", "note")
+HEADINGS = ("figure", "measured", "again", "floor, ms", "x floor", "predicted, ms", "target", "met")
+COLUMNS = 120
+"""Of the table for people."""
 
 
 def markdown(title: str, figures: Sequence[Figure]) -> list[str]:
     """The lines of a section."""
-    rows = [_cells(figure) for figure in figures]
+    headings = ("part", *HEADINGS, "note")
     return [
         title,
         "",
-        f"| {' | '.join(HEADINGS)} |",
-        "|" + "---|" * len(HEADINGS),
-        *(f"| {' | '.join(row)} |" for row in rows),
+        f"| {' | '.join(headings)} |",
+        "|" + "---|" * len(headings),
+        *(f"| {' | '.join((figure.part, *_cells(figure), figure.note))} |" for figure in figures),
     ]
 
 
 def table(figures: Sequence[Figure]) -> list[str]:
-    """The same in columns of equal width."""
+    """The same in columns of equal width, a heading for each part; of the notes only why something is not measured."""
     rows = [HEADINGS, *(_cells(figure) for figure in figures)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(HEADINGS))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    result = [f"  {lines[0]}"]
+    part = None
+    for figure, line in zip(figures, lines[1:], strict=True):
+        if figure.part != part:
+            part = figure.part
+            result.append(part)
+        result.append(f"  {line}")
+    for figure in figures:
+        if figure.value is None:
+            reason = f"Not measured: {figure.part}, {figure.name}: {figure.note}"
+            result += textwrap.wrap(reason, COLUMNS, subsequent_indent="  ")
+    return result
 
 
 def as_json(title: str, figures: Sequence[Figure], details: dict[str, Any]) -> dict[str, Any]:
@@ -71,13 +86,14 @@ def as_json(title: str, figures: Sequence[Figure], details: dict[str, Any]) -> d
 
 
 def _cells(figure: Figure) -> tuple[str, ...]:
-    ratio = figure.value / figure.floor if figure.value and figure.floor else None
+    """What stands below `HEADINGS`."""
+    ratio = figure.value / figure.floor_ms if figure.value and figure.floor_ms and figure.unit == "ms" else None
     met = {True: "yes", False: "no", None: ""}[figure.is_met]
-    measured = "not measured" if figure.value is None else f"{_short(figure.value)} {figure.unit}"
+    measured = "not measured" if figure.value is None else f"{_short(figure.value)} {figure.unit}".rstrip()
     sign = "at least " if figure.target_is_least else "at most "
     target = "" if figure.target is None else sign + _short(figure.target)
-    numbers = (figure.again, figure.floor, ratio, figure.predicted)
-    return (figure.part, figure.name, measured, *map(_short, numbers), target, met, figure.note)
+    numbers = (figure.again, figure.floor_ms, ratio, figure.predicted_ms)
+    return (figure.name, measured, *map(_short, numbers), target, met)
 
 
 def _short(value: float | None) -> str:

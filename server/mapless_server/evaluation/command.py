@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from rich.progress import Progress as Bars
 
 from ..dataset import read_folder
 from ..settings import ConfigError, load_settings
+from ..signals import terminable
 from .plan import EvaluationOptions, Progress, UsageError
 from .report import print_report, to_json
 from .run import evaluate
@@ -87,17 +87,3 @@ def progress_bars() -> Iterator[Progress]:
                 print(f"{step}: {total}", file=sys.stderr, flush=True)
 
         yield progress if console.is_terminal else announce
-
-
-@contextmanager
-def terminable() -> Iterator[None]:
-    """SIGTERM ends this program as an exception does, so that servers and temporary folders go with it."""
-
-    def leave(*_: Any) -> None:
-        sys.exit(128 + signal.SIGTERM)
-
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

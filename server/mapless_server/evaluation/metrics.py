@@ -70,6 +70,7 @@ class Summary:
         latency_first_ms: of the first, which finds every cache empty.
         stage_share: share of each stage in the time of all.
         rejections: how many by reason.
+        features: how many answers by the features that they are of; several where stronger ones are tried.
     """
 
     query_count: int
@@ -85,6 +86,7 @@ class Summary:
     latency_first_ms: float
     stage_share: Mapping[str, float]
     rejections: Mapping[str, int]
+    features: Mapping[str, int]
 
 
 def pose_error(true: RigidTransform, answered: RigidTransform) -> tuple[float, float]:
@@ -119,6 +121,7 @@ def summarize(results: Sequence[QueryResult]) -> Summary:
         latency_first_ms=latencies[0],
         stage_share=stage_share(results),
         rejections=dict(Counter(r.rejection for r in results if not r.localized).most_common()),
+        features=dict(Counter(r.features for r in results).most_common()),
     )
 
 

@@ -42,7 +42,7 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
         "variant": options.variant,
         "scale": options.scale_strategy,
         "backend": evaluation.results[0].backend,
-        "features": evaluation.results[0].features,
+        "features": next(iter(summary.features)) if len(summary.features) == 1 else dict(summary.features),
         "version": __version__,
         "queries": summary.query_count,
         "localized": summary.localized_count,
@@ -69,17 +69,16 @@ def print_report(evaluation: Evaluation, console: Console) -> None:
     dataset, options = evaluation.dataset, evaluation.options
     summary = summarize(evaluation.results)
     split = "leave one out" if options.reference_count is None else f"{evaluation.reference_count} references"
-    result = evaluation.results[0]
     table = Table("", "", title=f"{dataset.name}: {split}, K = {options.k}", show_header=False, title_justify="left")
     for name, value in {
         "localized": f"{summary.localized_count} of {summary.query_count}",
         **_accuracy_rows(evaluation, summary),
         "latency": f"p50 {summary.latency_p50_ms:.0f} ms, p95 {summary.latency_p95_ms:.0f} ms, "
         f"first call {summary.latency_first_ms:.0f} ms",
-        "time by stage": ", ".join(f"{stage} {100 * share:.0f} %" for stage, share in summary.stage_share.items()),
+        "time by stage": format_stages(summary.stage_share),
         "rejected": ", ".join(f"{count} {reason}" for reason, count in summary.rejections.items()) or "none",
-        "method": f"{options.variant}, scale {options.scale_strategy}; {result.backend}, {result.features}; "
-        f"mapless {__version__}",
+        "method": f"{options.variant}, scale {options.scale_strategy}; {evaluation.results[0].backend}, "
+        f"{_format_features(summary.features)}; mapless {__version__}",
         "ground truth": dataset.source or "not named",
     }.items():
         table.add_row(name, value)
@@ -105,6 +104,23 @@ def format_rotation(degrees: float) -> str:
 def format_share(share: float) -> str:
     """Per cent, three decimals."""
     return "infinite" if math.isinf(share) else f"{100 * share:.3f} %"
+
+
+def format_stages(shares: Mapping[str, float]) -> str:
+    """Shares of the time, per cent; the stages of each stronger tier, "aliked-2048-1024px/coarse", in one sum."""
+    sums: dict[str, float] = {}
+    for stage, share in shares.items():
+        features, slash, _ = stage.partition("/")
+        name = features.split("-")[0] if slash else stage
+        sums[name] = sums.get(name, 0.0) + share
+    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in sums.items())
+
+
+def _format_features(counts: Mapping[str, int]) -> str:
+    """The features, and how many answers are of them unless all are."""
+    if len(counts) == 1:
+        return next(iter(counts))
+    return ", ".join(f"{name} {count}" for name, count in counts.items())
 
 
 def _accuracy_rows(evaluation: Evaluation, summary: Summary) -> dict[str, str]:
@@ -152,6 +168,7 @@ def _query(result: QueryResult, metric: bool) -> dict[str, Any]:
         "inliers": result.inlier_count,
         "matches": result.match_count,
         "rejection": _rejection(result),
+        "features": result.features,
         "latency_ms": result.latency_ms,
         "stage_ms": dict(result.stage_ms),
         "references": list(result.references),

