@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 from .errors import DeadlineExceeded, Overloaded
+from .stopwatch import timed
 
 T = TypeVar("T")
 
@@ -45,13 +46,10 @@ class Turn:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Checks, then times one step; a step that is done twice counts twice."""
+        """Checks, then times one step."""
         self.check()
-        start_s = time.perf_counter()
-        try:
+        with timed(self.stage_seconds, name):
             yield
-        finally:
-            self.stage_seconds[name] = self.stage_seconds.get(name, 0.0) + time.perf_counter() - start_s
 
 
 class Turns:

@@ -41,11 +41,12 @@ LATER_STAGES = ["structure", "match", "pnp"]
 
 
 @dataclass(frozen=True)
-class NetworkOnDevice:
-    """A network that leaves its answer where it computed it."""
+class ChangedNetwork:
+    """A network whose answer is changed on the way."""
 
     network: FakeNetwork
-    name: str = "on device"
+    change: Callable[[Reconstruction], Reconstruction | DeviceReconstruction]
+    name: str = "changed"
     weights_sha256: str = ""
     uses_correspondences: bool = False
 
@@ -54,15 +55,15 @@ class NetworkOnDevice:
 
     def reconstruct(
         self, query: View, references: Sequence[PosedView], correspondences: Correspondences
-    ) -> DeviceReconstruction:
-        return on_device(self.network.reconstruct(query, references, correspondences), self.name)
+    ) -> Reconstruction | DeviceReconstruction:
+        return self.change(self.network.reconstruct(query, references, correspondences))
 
 
 def pipeline_of(backend: str, scene: SyntheticScene = SCENE, options: FakeNetworkOptions | None = None) -> Pipeline:
     reconstructor: Reconstructor = GeometricReconstructor()
     if backend != "geometric":
         network = FakeNetwork(scene, 0, options)
-        reconstructor = network if backend == "network" else NetworkOnDevice(network)
+        reconstructor = network if backend == "network" else ChangedNetwork(network, on_device)
     return Pipeline(reconstructor, MATCHER if scene is SCENE else Matcher())
 
 
@@ -340,30 +341,16 @@ def test_refinement_wins_when_it_explains_more() -> None:
 # Rejections
 
 
-@dataclass(frozen=True)
-class BlindNetwork:
-    """A network whose activations overflowed."""
-
-    network: FakeNetwork
-    name: str = "blind"
-    weights_sha256: str = ""
-    uses_correspondences: bool = False
-
-    def close(self) -> None:
-        self.network.close()
-
-    def reconstruct(
-        self, query: View, references: Sequence[PosedView], correspondences: Correspondences
-    ) -> Reconstruction:
-        reconstruction = self.network.reconstruct(query, references, correspondences)
-        nowhere = RigidTransform(np.full((3, 3), np.nan), np.full(3, np.nan))
-        return Reconstruction(
-            replace(reconstruction.query, local_from_camera=nowhere),
-            tuple(
-                replace(r, local_from_camera=nowhere, point_map=np.full_like(r.point_map, np.nan))
-                for r in reconstruction.references
-            ),
-        )
+def blinded(reconstruction: Reconstruction) -> Reconstruction:
+    """As of a network whose activations overflowed."""
+    nowhere = RigidTransform(np.full((3, 3), np.nan), np.full(3, np.nan))
+    return Reconstruction(
+        replace(reconstruction.query, local_from_camera=nowhere),
+        tuple(
+            replace(r, local_from_camera=nowhere, point_map=np.full_like(r.point_map, np.nan))
+            for r in reconstruction.references
+        ),
+    )
 
 
 @pytest.mark.parametrize("backend", ["geometric", "network"])
@@ -409,7 +396,7 @@ def test_low_overlap() -> None:
 
 
 def test_scale_unreliable() -> None:
-    answer = answer_of(Pipeline(BlindNetwork(FakeNetwork(SCENE)), MATCHER))
+    answer = answer_of(Pipeline(ChangedNetwork(FakeNetwork(SCENE), blinded), MATCHER))
     assert reason_of(answer) is RejectionReason.SCALE_UNRELIABLE
     assert list(answer.stage_seconds) == ["correspond", "coarse", "scale"]
 
@@ -480,28 +467,15 @@ def test_a_network_is_asked_once_for_a_query(backend: str, times: int) -> None:
     assert len(asked) == times
 
 
-@dataclass(frozen=True)
-class NetworkLookingBack:
-    """A network that is right but for the query, which it turns around."""
-
-    network: FakeNetwork
-    name: str = "looking back"
-    weights_sha256: str = ""
-    uses_correspondences: bool = False
-
-    def close(self) -> None:
-        self.network.close()
-
-    def reconstruct(
-        self, query: View, references: Sequence[PosedView], correspondences: Correspondences
-    ) -> Reconstruction:
-        true = self.network.reconstruct(query, references, correspondences)
-        turned = true.query.local_from_camera.compose(RigidTransform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)))
-        return replace(true, query=replace(true.query, local_from_camera=turned))
+def looking_back(reconstruction: Reconstruction) -> Reconstruction:
+    """Right but for the query, which is turned around."""
+    query = reconstruction.query
+    turned = query.local_from_camera.compose(RigidTransform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)))
+    return replace(reconstruction, query=replace(query, local_from_camera=turned))
 
 
 def test_pnp_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pnp, "ransac", lambda *_: None)
-    answer = answer_of(Pipeline(NetworkLookingBack(FakeNetwork(SCENE)), MATCHER))
+    answer = answer_of(Pipeline(ChangedNetwork(FakeNetwork(SCENE), looking_back), MATCHER))
     assert reason_of(answer) is RejectionReason.PNP_FAILED
     assert list(answer.stage_seconds)[-1] == "pnp"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.on_device import Refined, prepare, refine_on_device
 from mapless_server.method.on_device import match as device_match
 from mapless_server.method.on_device.compute import Inputs, Options, compute
-from mapless_server.method.on_device.transfer import byte_count, fetch, upload
+from mapless_server.method.on_device.transfer import fetch, upload
 
 # The host's results
 
@@ -181,6 +182,13 @@ def test_the_watch_would_see_it(wait: Callable[[Tensor], object]) -> None:
     x = torch.ones(3, device="meta")
     with Watch("meta"), pytest.raises((RuntimeError, NotImplementedError, AssertionError)):
         wait(x)
+
+
+def byte_count(record: Any) -> int:
+    """Size of all arrays in a dataclass, at any depth."""
+    values = vars(record).values()
+    inside = sum(byte_count(value) for value in values if is_dataclass(value))
+    return inside + sum(value.nbytes for value in values if isinstance(value, np.ndarray))
 
 
 def test_what_travels() -> None:

@@ -9,7 +9,6 @@ This module knows nothing of grpc, queues or storage.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -20,6 +19,7 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 
+from ..stopwatch import timed
 from .accuracy import accuracy_from_covariance
 from .adjust import AdjustOptions, adjust_pose
 from .coarse import Reconstruction, Reconstructor
@@ -155,11 +155,8 @@ class _Progress:
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         self.check()
-        start_s = time.perf_counter()
-        try:
+        with timed(self.stage_seconds, name):
             yield
-        finally:
-            self.stage_seconds[name] = self.stage_seconds.get(name, 0.0) + time.perf_counter() - start_s
 
     def answer(self, outcome: Localization | Rejection) -> Answer:
         none = (0,) * self.reference_count

@@ -68,11 +68,8 @@ class NetworkRunner:
         weights_sha256: of the checkpoint.
         device: where.
         dtype: what transformer blocks compute in, and the type of tokens.
-        patch_px: side of a patch; sides of images are multiples of it.
         conditioned: whether the network takes intrinsics and poses.
     """
-
-    patch_px = PATCH_PX
 
     def __init__(
         self,

@@ -39,13 +39,6 @@ def fetch(record: Record) -> Record:
     return _changed(record, Tensor, lambda tensor: next(parts).reshape(tensor.shape))
 
 
-def byte_count(record: object) -> int:
-    """Size of all NumPy arrays in a dataclass."""
-    sizes: list[int] = []
-    _changed(record, np.ndarray, lambda array: sizes.append(array.nbytes))
-    return sum(sizes)
-
-
 def _changed(record: Record, kind: type, change: Callable[[Any], object]) -> Record:
     """A dataclass with another value for every one of this kind in it, at any depth; the rest as it is."""
     values: dict[str, Any] = {field.name: getattr(record, field.name) for field in fields(record)}  # type: ignore[arg-type]
