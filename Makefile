@@ -10,7 +10,7 @@ TORCH  ?= torch==2.13.0
 PROTO_TOOLS := grpcio-tools==1.71.2 setuptools==80.9.0
 PROTO_VENV  := $(VENV)/proto-tools
 
-.PHONY: help setup test lint format proto demo bench bench-gpu clean
+.PHONY: help setup test lint format proto demo bench bench-gpu load clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -18,7 +18,7 @@ help:  ## List the targets
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check $(TORCH)
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[server,networks,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[server,networks,otel,dev]'
 	touch $@
 
 setup: $(VENV)/.installed  ## Create .venv with everything
@@ -55,6 +55,9 @@ bench: setup  ## Measure accuracy and latency on the real scenes; DATA=folder wi
 
 bench-gpu: setup  ## Measure the networks and whole queries on a CUDA device; without one, what a CPU can tell
 	$(BIN)/mapless-server bench-network $(ARGS)
+
+load: setup  ## Measure the server under load; DATA=folder for real photographs, ARGS="--minutes 2" for all's options
+	$(BIN)/mapless-server load all $(if $(DATA),--data '$(DATA)') $(ARGS)
 
 clean:  ## Remove the environment and caches
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache build *.egg-info

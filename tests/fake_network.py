@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scenes import SyntheticScene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, resized_pixel, rotation_from_vector
-from mapless_server.method.coarse import ReconstructedView, Reconstruction
-from mapless_server.method.correspond import Correspondences
+from mapless_server.method.coarse import Bucket, Outcome, ReconstructedView, Reconstruction, Request
 from mapless_server.method.views import PosedView, View
 
 
@@ -67,9 +66,15 @@ class FakeNetwork:
     def close(self) -> None:
         """Nothing to give back."""
 
-    def reconstruct(
-        self, query: View, references: Sequence[PosedView], correspondences: Correspondences | None = None
-    ) -> Reconstruction:
+    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
+        """By the number of references alone."""
+        return Bucket(self.name, len(references))
+
+    def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
+        """See Reconstructor.reconstruct_many."""
+        return [self.reconstruct(request.query, request.references) for request in requests]
+
+    def reconstruct(self, query: View, references: Sequence[PosedView]) -> Reconstruction:
         """The truth with the ordered faults; looks at no correspondences."""
         predicted_query = self._predict("query", query, self._scene.query_points, self._scene.world_from_query)
         return Reconstruction(predicted_query, tuple(self._predict_reference(reference) for reference in references))

@@ -9,6 +9,7 @@ from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import grpc
@@ -23,13 +24,15 @@ from mapless.geometry import Camera, RigidTransform, Similarity, rotation_from_v
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
-from mapless_server.decode import ImageLimits
-from mapless_server.engine import Engine, EngineOptions
+from mapless_server.engine import Engine
 from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.scale import MetricScale, ScaleStage
 from mapless_server.method.views import Features, PosedView, View
-from mapless_server.serve import running_server
+from mapless_server.observability.metrics import Metrics
+from mapless_server.query_stages import Method
+from mapless_server.security.rate import RateLimiter
+from mapless_server.serve import MakeEngine, Running, engine_options, running_server
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_server.tiers import Tier
@@ -67,7 +70,10 @@ class StandInReconstructor:
     def close(self) -> None:
         pass
 
-    def reconstruct(self, *_: Any) -> Any:
+    def bucket(self, *_: Any) -> Any:
+        return "stand-in"
+
+    def reconstruct_many(self, *_: Any) -> Any:
         raise NotImplementedError
 
 
@@ -123,11 +129,25 @@ class StandInMethod:
             self.gate.set()
 
 
+def whole(localize: Callable[..., Answer]) -> Method:
+    """A method whose work is all done in the last part, by `localize(query, references, pipeline, options, check)`."""
+
+    def prepare(*arguments: Any) -> Any:
+        *asked, _ = arguments
+        return SimpleNamespace(asked=asked, bucket="stand-in")
+
+    def refine(coarse: Any, check: Callable[[], None]) -> Answer:
+        return localize(*coarse.asked, check)
+
+    return Method(prepare, lambda batch, checks: list(batch), cast(Any, refine), lambda coarse: None)
+
+
 @dataclass
 class RunningServer:
     """A server in a thread of its own."""
 
     address: str
+    metrics_address: str
     method: StandInMethod
     extractors: Sequence[StandInExtractor]
     engine: Engine
@@ -135,25 +155,33 @@ class RunningServer:
 
 
 @contextmanager
-def listening(settings: Settings, store: Store, engine: Engine) -> Iterator[tuple[str, Callable[[], None]]]:
-    """A server in a thread until the block is left; its address, and what makes it drain before that."""
-    address: Future[str] = Future()
+def listening(settings: Settings, store: Store, make: MakeEngine) -> Iterator[tuple[Running, Callable[[], None]]]:
+    """A server in a thread until the block is left, and what makes it drain before that."""
+    started: Future[Running] = Future()
     loop = asyncio.new_event_loop()
     stopping = asyncio.Event()
 
     async def run() -> None:
-        async with running_server(settings, engine, store) as bound:
-            address.set_result(bound)
+        async with running_server(settings, make, store) as running:
+            started.set_result(running)
             await stopping.wait()
 
-    thread = threading.Thread(target=loop.run_until_complete, args=(run(),))
+    def run_loop() -> None:
+        try:
+            loop.run_until_complete(run())
+        except BaseException as error:
+            if started.done():
+                raise
+            started.set_exception(error)
+
+    thread = threading.Thread(target=run_loop)
     thread.start()
 
     def stop() -> None:
         loop.call_soon_threadsafe(stopping.set)
 
     try:
-        yield address.result(30), stop
+        yield started.result(60), stop
     finally:
         stop()
         thread.join(30)
@@ -167,21 +195,19 @@ def serving(data_dir: Path, features: Sequence[str] = ("stand-in",), **options: 
 
     It has a tier for each of the `features`.
     """
-    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, **({"workers": 2, "max_waiting": 2} | options))
+    defaults = {"workers": 2, "metrics": False, "warm_up": False}
+    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, **(defaults | options))
     store = Store.open(data_dir)
     method, extractors = StandInMethod(), [StandInExtractor(name) for name in features]
     method.gate.set()
-    engine_options = EngineOptions(
-        workers=settings.workers,
-        max_waiting=settings.max_waiting,
-        max_candidates=settings.retrieval_max_references,
-        image_limits=ImageLimits(),
-    )
-    tiers = [Tier(extractor, Pipeline(cast(Any, StandInReconstructor()))) for extractor in extractors]
-    engine = Engine(store, tiers, engine_options, localize=method)
-    with listening(settings, store, engine) as (address, stop):
+
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+        tiers = [Tier(extractor, Pipeline(cast(Any, StandInReconstructor()))) for extractor in extractors]
+        return Engine(store, tiers, engine_options(settings), metrics, quota, whole(method))
+
+    with listening(settings, store, make) as (running, stop):
         try:
-            yield RunningServer(address, method, extractors, engine, stop)
+            yield RunningServer(running.address, running.metrics_address, method, extractors, running.engine, stop)
         finally:
             method.gate.set()
 

@@ -14,7 +14,9 @@ from .errors import (
     InvalidArgument,
     MaplessError,
     NotFound,
+    PermissionDenied,
     ResourceExhausted,
+    Unauthenticated,
     Unavailable,
 )
 from .geometry import Camera, Fisheye, Quaternion, RadialTangential, RigidTransform
@@ -38,6 +40,7 @@ __all__ = [
     "MaplessError",
     "NewReference",
     "NotFound",
+    "PermissionDenied",
     "PositionPrior",
     "Quaternion",
     "RadialTangential",
@@ -48,5 +51,6 @@ __all__ = [
     "RigidTransform",
     "ScaleEstimate",
     "Scene",
+    "Unauthenticated",
     "Unavailable",
 ]

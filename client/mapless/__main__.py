@@ -29,6 +29,7 @@ from .results import Rejected
 from .v1 import geometry_pb2
 
 EXIT_FAILED, EXIT_USAGE, EXIT_REJECTED = 1, 2, 3
+TOKEN_VARIABLE = "MAPLESS_TOKEN"
 
 M = TypeVar("M", bound=Message)
 
@@ -45,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; exits."""
     parsed = _parser().parse_args(arguments)
     try:
-        with Client(parsed.address, ConnectOptions(timeout_s=parsed.timeout)) as client:
+        with Client(parsed.address, _connect_options(parsed)) as client:
             sys.exit(parsed.run(client, parsed))
     except MaplessError as error:
         field = f" (field {error.field})" if error.field and error.field not in error.message else ""
@@ -66,6 +67,17 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"mapless {version('mapless')}")
     parser.add_argument("--address", default="localhost:50051", help="of the server (default: %(default)s)")
     parser.add_argument("--timeout", type=float, default=30.0, help="of a call, seconds (default: %(default)s)")
+    connection = parser.add_argument_group("connection")
+    connection.add_argument("--tls", action="store_true", help="encrypt; --ca and --cert imply it")
+    connection.add_argument(
+        "--ca", type=Path, metavar="FILE", help="certificate that signed the server's, PEM (default: the system's)"
+    )
+    connection.add_argument("--cert", type=Path, metavar="FILE", help="our own certificate, PEM, if the server asks")
+    connection.add_argument("--key", type=Path, metavar="FILE", help="its key, PEM")
+    connection.add_argument(
+        "--token-file", type=Path, metavar="FILE", help=f"holds the token to show (default: that in {TOKEN_VARIABLE})"
+    )
+    connection.add_argument("--client-id", default="", help="which of the token's users this is")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
     health = commands.add_parser("health", help="whether the server takes calls")
@@ -110,6 +122,21 @@ def _parser() -> argparse.ArgumentParser:
     localize.add_argument("--scale-strategy", default="", help="two_stage, triangulation or trajectory")
     localize.set_defaults(run=_localize)
     return parser
+
+
+def _connect_options(arguments: argparse.Namespace) -> ConnectOptions:
+    """How to connect; OSError or ValueError if the flags or their files do not fit."""
+    # Not a flag of its own: what stands on a command line, everybody on the machine can read.
+    token = arguments.token_file.read_text() if arguments.token_file else os.environ.get(TOKEN_VARIABLE)
+    return ConnectOptions(
+        timeout_s=arguments.timeout,
+        tls=bool(arguments.tls or arguments.ca or arguments.cert),
+        root_certificates=arguments.ca.read_bytes() if arguments.ca else None,
+        client_certificate=arguments.cert.read_bytes() if arguments.cert else None,
+        client_key=arguments.key.read_bytes() if arguments.key else None,
+        token=token.strip() if token else None,
+        client_id=arguments.client_id,
+    )
 
 
 def _health(client: Client, arguments: argparse.Namespace) -> int:

@@ -72,12 +72,8 @@ class Client:
             options: how to connect.
         """
         self.options = options or ConnectOptions()
-        arguments = self.options.channel_options()
-        if self.options.tls:
-            credentials = grpc.ssl_channel_credentials(self.options.root_certificates)
-            self._channel = grpc.secure_channel(address, credentials, options=arguments)
-        else:
-            self._channel = grpc.insecure_channel(address, options=arguments)
+        self._channel = self.options.channel(address)
+        self._metadata = self.options.metadata()
         self._localization = LocalizationServiceStub(self._channel)
         self._references = ReferenceServiceStub(self._channel)
         self._health = self._channel.unary_unary(_HEALTH_METHOD)
@@ -109,6 +105,7 @@ class Client:
         variant: str = "",
         scale_strategy: str = "",
         reference_count: int = 0,
+        allow_coarse: bool = False,
         capture_time: datetime | None = None,
         session_from_camera: RigidTransform | None = None,
         timeout_s: float | None = None,
@@ -124,6 +121,8 @@ class Client:
             variant: "best" (default), "full", "no_structure" or "coarse".
             scale_strategy: "two_stage" (default), "triangulation" or "trajectory".
             reference_count: how many references the server chooses if none are named; 0 is its default.
+            allow_coarse: whether a pose that could not be refined before the deadline is answered all the same, with
+                `LocalizationResult.pose_stage` "COARSE" and no covariance, instead of raising `DeadlineExceeded`.
             capture_time: when it was taken, with time zone; echoed.
             session_from_camera: where the device believed its camera to be then; echoed, and what makes
                 `LocalizationResult.world_from_session`.
@@ -139,6 +138,7 @@ class Client:
                 variant=_enum_value(localization_pb.Variant, variant),
                 scale_strategy=_enum_value(localization_pb.ScaleStrategy, scale_strategy),
                 reference_count=reference_count,
+                allow_coarse=allow_coarse,
             ),
         )
         if position_prior is not None:
@@ -229,7 +229,7 @@ class Client:
     def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None) -> Any:
         """Every call: always with a deadline, and errors as ours."""
         try:
-            return method(request, timeout=timeout_s or self.options.timeout_s)
+            return method(request, timeout=timeout_s or self.options.timeout_s, metadata=self._metadata)
         except grpc.RpcError as error:
             raise errors.from_rpc_error(error) from error
 

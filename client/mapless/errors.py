@@ -47,6 +47,14 @@ class InvalidArgument(MaplessError):
     """The request is wrong: a bad image, camera, pose, name or field."""
 
 
+class Unauthenticated(MaplessError):
+    """The server asks for a token, and none was shown, or one that is wrong or has expired."""
+
+
+class PermissionDenied(MaplessError):
+    """The token does not allow this."""
+
+
 class NotFound(MaplessError):
     """There is no such scene or reference."""
 
@@ -81,6 +89,8 @@ class Internal(MaplessError):
 
 _BY_CODE: dict[str, type[MaplessError]] = {
     "INVALID_ARGUMENT": InvalidArgument,
+    "UNAUTHENTICATED": Unauthenticated,
+    "PERMISSION_DENIED": PermissionDenied,
     "NOT_FOUND": NotFound,
     "ALREADY_EXISTS": AlreadyExists,
     "FAILED_PRECONDITION": FailedPrecondition,

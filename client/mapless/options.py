@@ -3,7 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, field
+
+import grpc
+
+TOKEN_KEY = "authorization"
+CLIENT_ID_KEY = "x-client-id"
+_TOKEN = re.compile(r"[!-~]{1,4096}", re.ASCII)
+_CLIENT_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it enters the server's log
 
 
 @dataclass(frozen=True)
@@ -22,6 +30,10 @@ class ConnectOptions:
         keepalive_s: a connection in use is probed after so much silence; servers refuse less than 30.
         tls: whether to encrypt, and to check the server's certificate.
         root_certificates: PEM bytes to check it with; None for the system's.
+        client_certificate, client_key: PEM bytes, for servers that ask clients for a certificate; with tls only.
+        token: shown to the server with every call. Without tls it travels in clear.
+        client_id: which of the token's users this is, 1 to 64 of A-Z a-z 0-9 _ . -; the server is fair between them,
+            and its log names them.
     """
 
     timeout_s: float = 30.0
@@ -35,6 +47,10 @@ class ConnectOptions:
     keepalive_s: float = 60.0
     tls: bool = False
     root_certificates: bytes | None = None
+    client_certificate: bytes | None = None
+    client_key: bytes | None = field(default=None, repr=False)
+    token: str | None = field(default=None, repr=False)
+    client_id: str = ""
 
     def __post_init__(self) -> None:
         if not (self.timeout_s > 0 and self.upload_timeout_s > 0 and self.keepalive_s > 0):
@@ -43,6 +59,32 @@ class ConnectOptions:
             raise ValueError("batch_mib must be above 0 and at most max_message_mib, counts at least 1")
         if not (1 <= self.max_attempts <= 5 and 0 < self.initial_backoff_s <= self.max_backoff_s):
             raise ValueError("max_attempts must be 1 to 5 and initial_backoff_s above 0 and at most max_backoff_s")
+
+        if (self.client_certificate is None) != (self.client_key is None):
+            raise ValueError("client_certificate and client_key go together")
+        if self.client_certificate is not None and not self.tls:
+            raise ValueError("client_certificate needs tls")
+        if self.token is not None and not _TOKEN.fullmatch(self.token):
+            raise ValueError("token must be visible ASCII characters, without spaces or line breaks")
+        if self.client_id and not _CLIENT_ID.fullmatch(self.client_id):
+            raise ValueError(f"client_id must be 1 to 64 characters of A-Z a-z 0-9 _ . -, is {self.client_id!a}")
+
+    def channel(self, address: str) -> grpc.Channel:
+        """A channel to "host:port"; it does not connect yet."""
+        options = self.channel_options()
+        channel: grpc.Channel
+        if self.tls:
+            credentials = grpc.ssl_channel_credentials(self.root_certificates, self.client_key, self.client_certificate)
+            channel = grpc.secure_channel(address, credentials, options=options)
+        else:
+            channel = grpc.insecure_channel(address, options=options)
+        return channel
+
+    def metadata(self) -> tuple[tuple[str, str], ...]:
+        """What every call carries. Not call credentials, which grpc sends on encrypted channels only."""
+        token = ((TOKEN_KEY, f"Bearer {self.token}"),) if self.token is not None else ()
+        client_id = ((CLIENT_ID_KEY, self.client_id),) if self.client_id else ()
+        return token + client_id
 
     def channel_options(self) -> list[tuple[str, int | str]]:
         """The options as grpc takes them."""

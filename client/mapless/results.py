@@ -112,7 +112,8 @@ class LocalizationResult:
         world_from_camera: the camera's pose; its translation is the camera centre in the scene's world frame, metres.
         covariance: (6, 6), order x y z rx ry rz, metres and radians about fixed world axes; None if not estimated.
         accuracy: radii of the same; None if it is.
-        pose_stage: "REFINED" or "INITIAL".
+        pose_stage: "REFINED" or "INITIAL"; "COARSE" for a pose that nothing has checked, because there was no time to,
+            which only a call that allows it is given.
         inlier_count, match_count: 2D-3D matches that agree with the pose, and all that were tried.
         reprojection_error_px: median of the inliers, pixels of the processed image.
         capture_time, session_from_camera: as they were sent.

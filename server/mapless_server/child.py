@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,10 +52,10 @@ class ChildServer:
 
 
 @contextmanager
-def child_server(data_dir: Path) -> Iterator[ChildServer]:
+def child_server(data_dir: Path, more_flags: Mapping[str, str] | None = None) -> Iterator[ChildServer]:
     """A server on a free port of the loopback interface until the block is left, by whatever way.
 
-    Settings of the environment hold for it, except where it listens and stores.
+    Settings of the environment hold for it, except where it listens and stores, and those of `more_flags`.
 
     Raises:
         ServerFailed: it ended, or did not listen within `START_TIMEOUT_S`.
@@ -66,10 +66,17 @@ def child_server(data_dir: Path) -> Iterator[ChildServer]:
         "--data-dir": str(data_dir),
         "--log-level": "warning",
         "--drain-grace-s": str(GRACE_S),
-    }
-    arguments = [part for flag in flags.items() for part in flag]
+        "--metrics-port": "0",
+    } | dict(more_flags or {})
+    with child_module("mapless_server", "serve", *(part for flag in flags.items() for part in flag)) as server:
+        yield server
+
+
+@contextmanager
+def child_module(module: str, *arguments: str) -> Iterator[ChildServer]:
+    """A module that runs as a server and announces itself as ours does; otherwise as `child_server`."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "mapless_server", "serve", *arguments],
+        [sys.executable, "-m", module, *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         text=True,

@@ -14,6 +14,8 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from . import __version__
+from .load.command import load_app
+from .security.command import token_app
 from .settings import ConfigError, Settings, load_settings
 
 app = typer.Typer(
@@ -27,6 +29,8 @@ weights_app = typer.Typer(
     help="Weights of networks: list them, fetch them, add files of your own, check them.", no_args_is_help=True
 )
 app.add_typer(weights_app, name="weights")
+app.add_typer(token_app, name="token")
+app.add_typer(load_app, name="load")
 
 
 def _help(setting: str) -> str:
@@ -60,27 +64,45 @@ def serve_command(
     weights_dir: Annotated[Path | None, typer.Option(help=_help("weights_dir"))] = None,
     compiled_views: Annotated[int | None, typer.Option(help=_help("compiled_views"))] = None,
     workers: Annotated[int | None, typer.Option(help=_help("workers"))] = None,
-    max_waiting: Annotated[int | None, typer.Option(help=_help("max_waiting"))] = None,
+    max_batch: Annotated[int | None, typer.Option(help=_help("max_batch"))] = None,
+    max_queued_s: Annotated[float | None, typer.Option(help=_help("max_queued_s"))] = None,
+    max_queued_mib: Annotated[int | None, typer.Option(help=_help("max_queued_mib"))] = None,
+    stall_limit_s: Annotated[float | None, typer.Option(help=_help("stall_limit_s"))] = None,
+    tenant_rate_ms: Annotated[float | None, typer.Option(help=_help("tenant_rate_ms"))] = None,
+    tenant_burst_ms: Annotated[float | None, typer.Option(help=_help("tenant_burst_ms"))] = None,
     default_deadline_s: Annotated[float | None, typer.Option(help=_help("default_deadline_s"))] = None,
+    max_deadline_s: Annotated[float | None, typer.Option(help=_help("max_deadline_s"))] = None,
     max_message_mib: Annotated[int | None, typer.Option(help=_help("max_message_mib"))] = None,
     max_image_mib: Annotated[int | None, typer.Option(help=_help("max_image_mib"))] = None,
     max_image_megapixels: Annotated[float | None, typer.Option(help=_help("max_image_megapixels"))] = None,
     retrieval_max_references: Annotated[int | None, typer.Option(help=_help("retrieval_max_references"))] = None,
     reference_cache_mib: Annotated[int | None, typer.Option(help=_help("reference_cache_mib"))] = None,
+    warm_up: Annotated[bool | None, typer.Option(help=_help("warm_up"))] = None,
+    drain_delay_s: Annotated[float | None, typer.Option(help=_help("drain_delay_s"))] = None,
     drain_grace_s: Annotated[float | None, typer.Option(help=_help("drain_grace_s"))] = None,
+    tls_certificate: Annotated[Path | None, typer.Option(help=_help("tls_certificate"))] = None,
+    tls_key: Annotated[Path | None, typer.Option(help=_help("tls_key"))] = None,
+    tls_client_ca: Annotated[Path | None, typer.Option(help=_help("tls_client_ca"))] = None,
+    tokens_file: Annotated[Path | None, typer.Option(help=_help("tokens_file"))] = None,
+    insecure: Annotated[bool | None, typer.Option(help=_help("insecure"))] = None,
+    metrics: Annotated[bool | None, typer.Option(help=_help("metrics"))] = None,
+    metrics_host: Annotated[str | None, typer.Option(help=_help("metrics_host"))] = None,
+    metrics_port: Annotated[int | None, typer.Option(help=_help("metrics_port"))] = None,
+    otlp_endpoint: Annotated[str | None, typer.Option(help=_help("otlp_endpoint"))] = None,
     reflection: Annotated[bool | None, typer.Option(help=_help("reflection"))] = None,
     log_level: Annotated[str | None, typer.Option(help=_help("log_level"))] = None,
+    log_format: Annotated[str | None, typer.Option(help=_help("log_format"))] = None,
 ) -> None:
     """Serve until SIGTERM. Every flag is also a setting of the file and of the environment, as MAPLESS_<FLAG>."""
+    from .observability.logs import configure_logging
+
     flags: dict[str, Any] = {name: value for name, value in locals().items() if name in Settings.model_fields}
     try:
         loaded = load_settings(flags, config)
     except ConfigError as error:
         _fail(str(error))
     settings = loaded.settings
-    logging.basicConfig(
-        level=settings.log_level.upper(), stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
-    )
+    configure_logging(settings)
     logging.getLogger(__name__).info("mapless-server %s\n%s", __version__, loaded)
     _configure_libraries(settings)
 

@@ -36,6 +36,20 @@ class InvalidArgument(RequestError):
     reason = "INVALID_ARGUMENT"
 
 
+class Unauthenticated(RequestError):
+    """Nobody knows who calls: the token is missing, unknown or expired."""
+
+    code = "UNAUTHENTICATED"
+    reason = "UNAUTHENTICATED"
+
+
+class PermissionDenied(RequestError):
+    """It is known who calls, and that they may not do this."""
+
+    code = "PERMISSION_DENIED"
+    reason = "PERMISSION_DENIED"
+
+
 class NotFound(RequestError):
     """A well-formed name of something that does not exist."""
 

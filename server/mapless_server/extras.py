@@ -5,6 +5,7 @@ from __future__ import annotations
 _EXTRA_OF = {
     "huggingface_hub": "networks",
     "kornia": "networks",
+    "opentelemetry": "otel",
     "PIL": "networks",
     "safetensors": "networks",
     "torch": "networks",

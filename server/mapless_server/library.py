@@ -23,7 +23,8 @@ from .decode import ImageLimits, decode_image
 from .errors import AlreadyExists, DataLoss, InvalidArgument
 from .method.features import FeatureExtractor
 from .method.views import Photograph, PosedView
-from .store import DescribedReference, ReferenceRecord, Store
+from .store import DescribedReference, ReferencePose, ReferenceRecord, Store
+from .tenancy import SceneKey
 from .turns import Turn
 
 log = logging.getLogger(__name__)
@@ -54,9 +55,13 @@ class ReferenceLibrary:
         self._closing.set()
         self._background.shutdown(wait=True, cancel_futures=True)
 
+    def list_poses(self, scene_key: SceneKey) -> Sequence[ReferencePose]:
+        """The poses of all references of a scene; NotFound if there is none such."""
+        return self._store.list_poses(scene_key)[1]
+
     def load(
         self,
-        scene_id: str,
+        scene_key: SceneKey,
         reference_ids: Sequence[str],
         extractor: FeatureExtractor,
         turn: Turn,
@@ -71,18 +76,18 @@ class ReferenceLibrary:
         Raises:
             NotDescribedYet: somebody who does not wait would have to.
             NotFound: there is no such scene (field "scene") or reference (field "references[i]").
-            DeadlineExceeded: the turn is over.
+            Over: the turn is over.
             DataLoss: what is stored of one of them is damaged.
         """
         while True:
-            snapshot = self._store.load_references(scene_id, reference_ids, extractor.name)
+            snapshot = self._store.load_references(scene_key, reference_ids, extractor.name)
             if not snapshot.undescribed:
                 return snapshot.generation, tuple(map(self._posed_view, snapshot.references))
             if not waits:
                 self._describe_later(snapshot.undescribed, extractor)
                 raise NotDescribedYet
             log.info(
-                "describing %d references of scene %s with %s", len(snapshot.undescribed), scene_id, extractor.name
+                "describing %d references of scene %s with %s", len(snapshot.undescribed), scene_key, extractor.name
             )
             with turn.stage("describe"):
                 self._describe_all(snapshot.undescribed, extractor, turn.check)
@@ -102,7 +107,7 @@ class ReferenceLibrary:
         try:
             self._describe_all([record], extractor, lambda: None)
         except Exception as error:  # one that is damaged or gone must not keep the others from being described
-            log.warning("reference %s of scene %s: %s", record.reference_id, record.scene_id, error)
+            log.warning("reference %s of scene %s: %s", record.reference_id, record.scene_key, error)
 
     def _describe_all(
         self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor, check: Callable[[], None]
@@ -146,7 +151,7 @@ class ReferenceLibrary:
 
 
 def _announce(records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:
-    log.info("describing %d references of scene %s with %s", len(records), records[0].scene_id, extractor.name)
+    log.info("describing %d references of scene %s with %s", len(records), records[0].scene_key, extractor.name)
 
 
 class _Claims:

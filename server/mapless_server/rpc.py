@@ -1,4 +1,4 @@
-"""What every call has in common: a request id, a deadline, one line in the log, and errors as google.rpc.Status."""
+"""What every call has in common: an id, a caller, a deadline, one line in the log, and errors as google.rpc.Status."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import logging
 import re
 import time
 import uuid
-from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+from urllib.parse import unquote
 
 import grpc
 from google.protobuf.message import DecodeError, Message
@@ -18,12 +19,25 @@ from grpc_status import rpc_status
 
 from mapless.wire import FieldError
 
-from .errors import AlreadyExists, DeadlineExceeded, InvalidArgument, NotFound, RequestError
+from .errors import AlreadyExists, DeadlineExceeded, InvalidArgument, NotFound, RequestError, Unavailable
+from .observability.logs import as_extra
+from .observability.tracing import CallSpan, Metadata, NoTracer, Tracer
+from .observability.trail import Trail
+from .principal import Principal
+from .query import Caller
+from .scheduling.fair import Flow
 
 log = logging.getLogger(__name__)
 
 REQUEST_ID_KEY = "x-request-id"
-_REQUEST_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it enters the log: no line breaks, no escapes
+CLIENT_ID_KEY = "x-client-id"
+ANSWER_MARGIN_SHARE = 0.02
+"""Of the time given, the answer leaves this early: gRPC rounds the time up when it sends it, by 1 % at most."""
+ANSWER_MARGIN_S = 0.01
+"""And at least so early, because the answer has to be written and sent as well ..."""
+_MAX_MARGIN_SHARE = 0.1
+"""... where there is time for that."""
+_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it enters the log: no line breaks, no escapes
 _DOMAIN = "mapless"
 _MAX_MESSAGE_CHARACTERS = 1000  # trailers hold about 8 KB, and the text stands in them twice
 
@@ -31,27 +45,90 @@ _MAX_MESSAGE_CHARACTERS = 1000  # trailers hold about 8 KB, and the text stands 
 Context = Any
 """grpc.aio.ServicerContext, whose annotations are wrong in places."""
 
+Authenticate = Callable[[Metadata, str, Mapping[str, Iterable[bytes]]], Principal]
+"""Who calls a method ("/package.Service/Method"), from the call's metadata and the connection's auth_context.
+
+Raises Unauthenticated or PermissionDenied; called on the event loop.
+"""
+
+
+class CallObserver(Protocol):
+    """Counts calls; called on the event loop, so it must return at once and never raise."""
+
+    def call_started(self, method: str) -> None:
+        """A call arrived; `method` is "/package.Service/Method"."""
+
+    def call_handled(self, method: str, code: str, seconds: float, trace_id: str) -> None:
+        """It ended with a gRPC status; told once, whatever happened. The id is empty if it is not traced."""
+
 
 @dataclass(frozen=True)
 class Call:
-    """What a servicer may know of the call it answers.
+    """What a servicer may know of the call it answers, and what it tells of it.
 
     Attributes:
         request_id: identifies it in the log; the caller's own if it sent a well-formed one.
         arrived_s: when it arrived, `time.monotonic`.
-        deadline_s: when its answer is of no use any more, `time.monotonic`.
+        deadline_s: when the servicer must have answered, `time.monotonic`.
+        principal: who calls.
+        client: what tells callers apart: the id that they give, else the address of their connection.
+        trail: what was told of it so far.
     """
 
     request_id: str
     arrived_s: float
     deadline_s: float
+    principal: Principal = field(default_factory=Principal)
+    client: str = ""
+    trail: Trail = field(default_factory=Trail, repr=False, compare=False)
+
+    @property
+    def caller(self) -> Caller:
+        """Who asks, as the engine knows it."""
+        return Caller(Flow(self.principal.tenant, self.client), self.deadline_s)
+
+    def note(self, **fields: object) -> None:
+        """Adds fields to the call's line in the log and to its trace; those that every line has cannot be changed."""
+        self.trail.notes.update(fields)
+
+    def waited(self, stage: str, start_s: float, end_s: float) -> None:
+        """It waited for a stage of the queue, `time.monotonic`."""
+        self.trail.waited(stage, start_s, end_s)
+
+    def computed(
+        self, stage: str, start_s: float, end_s: float, part_seconds: Mapping[str, float] | None = None, **about: object
+    ) -> None:
+        """A stage was computed for it, `time.monotonic`; the parts that it consisted of followed each other."""
+        self.trail.computed(stage, start_s, end_s, part_seconds or {}, **about)
 
 
 class CallInterceptor(grpc.aio.ServerInterceptor):
     """Wraps the methods of mapless (health and reflection pass); servicers get a `Call` in place of the context."""
 
-    def __init__(self, default_deadline_s: float) -> None:
+    def __init__(
+        self,
+        default_deadline_s: float = 30.0,
+        max_deadline_s: float = 600.0,
+        *,
+        authenticate: Authenticate | None = None,
+        observer: CallObserver | None = None,
+        tracer: Tracer | None = None,
+    ) -> None:
+        """Without `authenticate`, everybody is admitted.
+
+        Args:
+            default_deadline_s: for calls without one.
+            max_deadline_s: for calls with a later one.
+            authenticate: who calls.
+            observer: counts calls.
+            tracer: traces them; closed by whoever made it.
+        """
         self._default_deadline_s = default_deadline_s
+        self._max_deadline_s = max_deadline_s
+        self._authenticate = authenticate
+        self._observer = observer
+        self._tracer = tracer or NoTracer()
+        self._abandoned: set[asyncio.Task[Message]] = set()  # the loop itself would forget them
 
     async def intercept_service(self, continuation: Callable[[Any], Awaitable[Any]], handler_call_details: Any) -> Any:
         """Implements grpc.aio.ServerInterceptor."""
@@ -60,60 +137,130 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         if handler is None or not method.startswith("/mapless."):
             return handler
 
-        async def answer(data: bytes, context: Context) -> Message:
+        async def answer(data: bytes, context: Context) -> bytes:
             call = self._begin(context)
-            outcome = "CANCELLED"
-            log.debug("request_id=%s method=%s begins", call.request_id, method)
+            span = self._tracer.begin(method, _metadata(context), call.arrived_s)
+            if self._observer is not None:
+                self._observer.call_started(method)
+            log.debug("%s begins", method, extra={"request_id": call.request_id})
+            call.note(bytes_in=len(data))
+            code = "UNKNOWN"
             try:
-                response = await self._answer_in_time(handler, data, call)
+                response = await self._answer(handler, data, method, call, context)
+                call.note(bytes_out=len(response))
                 context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id),))
-                outcome = "OK"
+                code = "OK"
                 return response
             except RequestError as error:
-                outcome = f"{error.code} {error.reason}: {error}"
+                code = error.code
+                call.note(reason=error.reason, error=str(error))
                 await _abort(context, call, error)
                 raise  # not reached: abort raises
-            except Exception:
-                outcome = "INTERNAL"
-                log.exception("request_id=%s method=%s failed", call.request_id, method)
+            except asyncio.CancelledError:
+                # Where the caller's deadline passes, it may be grpc that notices first.
+                code = "CANCELLED" if time.monotonic() < call.deadline_s else "DEADLINE_EXCEEDED"
+                raise
+            except Exception as error:
+                code = "INTERNAL"
+                call.note(reason=type(error).__name__)
+                log.exception("%s failed", method, extra={"request_id": call.request_id, "trace_id": span.trace_id})
                 await _abort(context, call, RequestError(f"internal error, id={call.request_id}"))
                 raise
             finally:
-                duration_ms = 1000 * (time.monotonic() - call.arrived_s)
-                log.info(
-                    "request_id=%s method=%s bytes=%d duration_ms=%.0f outcome=%s",
-                    call.request_id,
-                    method,
-                    len(data),
-                    duration_ms,
-                    outcome.encode("unicode_escape").decode("ascii"),
-                )
+                self._end(method, code, call, span)
 
         # Without a deserializer the bytes arrive as they are, so that a malformed message is answered here too.
-        return grpc.unary_unary_rpc_method_handler(answer, None, handler.response_serializer)
+        return grpc.unary_unary_rpc_method_handler(answer, None, None)
 
     def _begin(self, context: Context) -> Call:
         now_s = time.monotonic()
-        remaining_s = context.time_remaining()
-        if remaining_s is None:
-            remaining_s = self._default_deadline_s
-        given_id = next((str(value) for key, value in context.invocation_metadata() or () if key == REQUEST_ID_KEY), "")
-        request_id = given_id if _REQUEST_ID.fullmatch(given_id) else uuid.uuid4().hex
-        return Call(request_id, now_s, now_s + remaining_s)
+        asked_s = context.time_remaining()
+        given_s = min(self._default_deadline_s if asked_s is None else asked_s, self._max_deadline_s)
+        margin_s = min(max(ANSWER_MARGIN_S, ANSWER_MARGIN_SHARE * given_s), _MAX_MARGIN_SHARE * given_s)
+        metadata = _metadata(context)
+        request_id = _well_formed(metadata, REQUEST_ID_KEY) or uuid.uuid4().hex
+        client = _well_formed(metadata, CLIENT_ID_KEY) or unquote(context.peer())
+        call = Call(request_id, now_s, now_s + given_s - margin_s, client=client)
+        call.note(deadline_ms=round(1000 * given_s))
+        return call
 
-    @staticmethod
-    async def _answer_in_time(handler: Any, data: bytes, call: Call) -> Message:
+    async def _answer(self, handler: Any, data: bytes, method: str, call: Call, context: Context) -> bytes:
         """The servicer's answer; whatever is wrong with the request is a RequestError."""
+        if self._authenticate is not None:
+            principal = self._authenticate(_metadata(context), method, context.auth_context())
+            call = replace(call, principal=principal)
+        call.note(tenant=call.principal.tenant, **({"principal": call.principal.name} if call.principal.name else {}))
         try:
             request = handler.request_deserializer(data)
         except (DecodeError, ValueError):
             raise InvalidArgument("the request is not a well-formed message", reason="MALFORMED_MESSAGE") from None
         try:
-            return await asyncio.wait_for(handler.unary_unary(request, call), call.deadline_s - time.monotonic())
+            response = await self._in_time(lambda: handler.unary_unary(request, call), call.deadline_s)
         except FieldError as error:
             raise InvalidArgument(str(error), field=error.field) from None
-        except asyncio.TimeoutError:
-            raise DeadlineExceeded("the deadline passed before the answer was ready") from None
+        return bytes(handler.response_serializer(response))
+
+    async def _in_time(self, answer: Callable[[], Coroutine[Any, Any, Message]], deadline_s: float) -> Message:
+        """The answer, or DeadlineExceeded as soon as the time is over, however long it takes the servicer to stop.
+
+        Neither asyncio.wait_for nor asyncio.timeout will do: before Python 3.12 the first forgets that the caller has
+        gone where the answer comes in the same moment, Python 3.10 lacks the second, and both wait for the servicer.
+        """
+        remaining_s = deadline_s - time.monotonic()
+        if remaining_s > 0:
+            task = asyncio.ensure_future(answer())
+            try:
+                await asyncio.wait({task}, timeout=remaining_s)
+            except asyncio.CancelledError:
+                self._abandon(task)
+                raise
+            if task.cancelled():  # by what it waited for, since nobody else knows it
+                raise Unavailable("the server gave the call up", reason="GIVEN_UP")
+            if task.done():
+                return task.result()
+            self._abandon(task)
+        raise DeadlineExceeded("the deadline passed before the answer was ready")
+
+    def _abandon(self, task: asyncio.Task[Message]) -> None:
+        self._abandoned.add(task)
+        task.add_done_callback(self._bury)
+        task.cancel()
+
+    def _bury(self, task: asyncio.Task[Message]) -> None:
+        self._abandoned.discard(task)
+        error = None if task.cancelled() else task.exception()
+        if error is not None and not isinstance(error, RequestError | FieldError):
+            log.error("a call failed after it was given up", exc_info=error)
+
+    def _end(self, method: str, code: str, call: Call, span: CallSpan) -> None:
+        seconds = time.monotonic() - call.arrived_s
+        if self._observer is not None:
+            self._observer.call_handled(method, code, seconds, span.trace_id)
+        trail = call.trail
+        fields: dict[str, object] = {**trail.notes, "request_id": call.request_id, "client": call.client}
+        span.end(code, trail.steps, fields)
+        if span.trace_id:
+            fields["trace_id"] = span.trace_id
+        if trail.queue_s is not None:
+            fields["queue_ms"] = _ms(trail.queue_s)
+        if trail.stage_seconds:
+            fields["stages_ms"] = {name: _ms(spent_s) for name, spent_s in trail.stage_seconds.items()}
+        fields |= {"method": method, "code": code, "duration_ms": _ms(seconds)}
+        log.info("%s %s", method.rpartition("/")[2], code, extra=as_extra(fields))
+
+
+def _metadata(context: Context) -> Metadata:
+    return context.invocation_metadata() or ()
+
+
+def _well_formed(metadata: Metadata, wanted: str) -> str:
+    """The metadata's value; empty if there is none or it is not fit for the log."""
+    given = next((str(value) for key, value in metadata if key == wanted), "")
+    return given if _ID.fullmatch(given) else ""
+
+
+def _ms(seconds: float) -> float:
+    return round(1000 * seconds, 1)
 
 
 async def _abort(context: Context, call: Call, error: RequestError) -> None:

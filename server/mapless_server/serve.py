@@ -3,39 +3,54 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
+import os
 import signal
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
+import sys
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from typing import Any
 
-import grpc
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
-from grpc_reflection.v1alpha import reflection, reflection_pb2
-from grpc_reflection.v1alpha._async import ReflectionServicer
-
-from mapless.v1 import (
-    localization_service_pb2,
-    localization_service_pb2_grpc,
-    reference_service_pb2,
-    reference_service_pb2_grpc,
-)
-
+from . import __version__
 from .assembly import make_tiers, what_is_missing
 from .decode import ImageLimits
 from .engine import Engine, EngineOptions
-from .reference_service import ReferenceService
-from .rpc import CallInterceptor
-from .service import LocalizationService
+from .grpc_server import AddressTaken, GrpcServer
+from .observability.event_loop import watch_event_loop
+from .observability.exporter import MetricsServer
+from .observability.metrics import Metrics
+from .observability.tracing import Tracer, make_tracer
+from .scheduling.schedule import ScheduleOptions
+from .scheduling.work_queue import Fatal, WorkQueueOptions
+from .security.access import Authenticator
+from .security.binding import Verdict, advise
+from .security.errors import SecurityError
+from .security.rate import RateLimiter
+from .security.reloading import LOOK_INTERVAL_S, Refreshable, Reloading
+from .security.tls import Tls, TlsFiles
+from .security.tokens import Tokens, read_tokens
 from .settings import Settings
 from .store import Store, StoreError
+from .warm_up import warm_up
 from .weights import WeightsError, WeightsMissing
 
 log = logging.getLogger(__name__)
 
-SERVICE_NAMES = (
-    localization_service_pb2.DESCRIPTOR.services_by_name["LocalizationService"].full_name,
-    reference_service_pb2.DESCRIPTOR.services_by_name["ReferenceService"].full_name,
-)
+FATAL_EXIT_CODE = 70
+"""EX_SOFTWARE: something inside is broken; whoever supervises the process starts it anew."""
+
+_LAST_WORDS_S = 1.0
+"""For callers and health watchers to be told before a broken process ends."""
+
+_TRACES_FLUSH_S = 3.0
+
+_SWITCH_INTERVAL_S = 0.001
+"""How long a computing thread keeps the interpreter from the event loop; Python's own 5 ms add up to late answers."""
+
+_HEARTBEAT_LIMIT_S = 5.0
 
 
 class StartupError(Exception):
@@ -49,6 +64,20 @@ def image_limits(settings: Settings) -> ImageLimits:
     )
 
 
+def engine_options(settings: Settings) -> EngineOptions:
+    """The engine's options that the settings ask for."""
+    return EngineOptions(
+        workers=settings.workers,
+        max_batch=settings.max_batch,
+        max_candidates=settings.retrieval_max_references,
+        image_limits=image_limits(settings),
+        queue=WorkQueueOptions(
+            ScheduleOptions(max_queued_s=settings.max_queued_s, max_bytes=settings.max_queued_mib * 2**20),
+            stall_limit_s=settings.stall_limit_s,
+        ),
+    )
+
+
 def open_store(settings: Settings) -> Store:
     """The store in the settings' data folder; StartupError if it cannot be opened."""
     try:
@@ -57,142 +86,251 @@ def open_store(settings: Settings) -> Store:
         raise StartupError(str(error)) from error
 
 
-def make_engine(settings: Settings, store: Store) -> Engine:
+@dataclass
+class Security:
+    """What protects the server; made from the settings' files, and kept up to date with them."""
+
+    tls: Tls | None
+    tokens: Reloading[Tokens] | None
+    quota: RateLimiter | None
+
+    @staticmethod
+    def of(settings: Settings) -> Security:
+        """StartupError if a file cannot be used, or the server would be open to the world by accident."""
+        advice = advise(
+            settings.host,
+            tls=settings.tls_certificate is not None,
+            client_certificates=settings.tls_client_ca is not None,
+            tokens=settings.tokens_file is not None,
+            insecure=settings.insecure,
+        )
+        if advice.verdict is Verdict.REFUSED:
+            raise StartupError(advice.sentence)
+        if advice.sentence:
+            log.log(logging.WARNING if advice.verdict is Verdict.WARNING else logging.INFO, "%s", advice.sentence)
+        tls = tokens = None
+        try:
+            if settings.tls_certificate is not None and settings.tls_key is not None:
+                tls = Tls(TlsFiles(settings.tls_certificate, settings.tls_key, settings.tls_client_ca))
+            if (path := settings.tokens_file) is not None:
+                tokens = Reloading([path], lambda: read_tokens(path), "tokens")
+        except SecurityError as error:
+            raise StartupError(str(error)) from error
+        return Security(tls, tokens, _make_quota(settings, tokens))
+
+    @property
+    def authenticator(self) -> Authenticator:
+        """Finds out who calls."""
+        tokens = self.tokens
+        return Authenticator(None if tokens is None else lambda: tokens.value)
+
+    @property
+    def refreshable(self) -> list[Refreshable]:
+        """What follows files."""
+        return [it for it in (self.tls, self.tokens) if it is not None]
+
+
+def _make_quota(settings: Settings, tokens: Reloading[Tokens] | None) -> RateLimiter | None:
+    def own_rate(tenant: str) -> float | None:
+        own_ms = None if tokens is None else tokens.value.rate_ms(tenant)
+        return None if own_ms is None else own_ms / 1000
+
+    if not settings.tenant_rate_ms and tokens is None:
+        return None
+    return RateLimiter(settings.tenant_rate_ms / 1000, settings.tenant_burst_ms / 1000, own_rate)
+
+
+MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], Engine]
+
+
+def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
     """The engine that the settings ask for; StartupError if they name what is not known or not there."""
-    options = EngineOptions(
-        workers=settings.workers,
-        max_waiting=settings.max_waiting,
-        max_candidates=settings.retrieval_max_references,
-        image_limits=image_limits(settings),
-    )
     try:
-        return Engine(store, make_tiers(settings), options)
+        return Engine(store, make_tiers(settings), engine_options(settings), metrics, quota)
     except (ImportError, WeightsMissing) as error:
         raise StartupError(what_is_missing(error)) from error
     except (ValueError, WeightsError) as error:
         raise StartupError(str(error)) from error
 
 
-class Server:
-    """The gRPC server around an engine and a store, which it closes when it stops."""
+@dataclass(frozen=True)
+class Running:
+    """A server that serves.
 
-    def __init__(self, settings: Settings, engine: Engine, store: Store) -> None:
-        self._settings = settings
-        self._engine = engine
-        self._store = store
-        self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]
-        self._references = ReferenceService(engine, store)
-        self._server = grpc.aio.server(
-            interceptors=[CallInterceptor(settings.default_deadline_s)], options=_server_options(settings)
-        )
+    Attributes:
+        address: "host:port".
+        metrics_address: the same of the metrics; empty if there are none.
+        engine: what computes.
+        failed: done when something inside is broken and nothing will be computed any more.
+        begin_draining: says that the server stops, takes no new calls, and returns when the running ones have ended.
+    """
 
-    async def start(self) -> str:
-        """Listens; returns "host:port".
-
-        Raises:
-            StartupError: the address cannot be listened on.
-        """
-        server, settings = self._server, self._settings
-        localization_service_pb2_grpc.add_LocalizationServiceServicer_to_server(
-            LocalizationService(self._engine), server
-        )
-        reference_service_pb2_grpc.add_ReferenceServiceServicer_to_server(self._references, server)
-        health_pb2_grpc.add_HealthServicer_to_server(self._health, server)
-        if settings.reflection:
-            names = (*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME)
-            _enable_reflection(server, names)
-        host = f"[{settings.host}]" if ":" in settings.host else settings.host
-        try:
-            port = server.add_insecure_port(f"{host}:{settings.port}")
-        except RuntimeError as error:
-            raise StartupError(f"cannot listen on {host}:{settings.port}: in use, or not an address of ours") from error
-        await server.start()
-        await self._set_health(health_pb2.HealthCheckResponse.SERVING)
-        return f"{host}:{port}"
-
-    async def stop(self, grace_s: float) -> None:
-        """Takes no new calls, gives the running ones `grace_s` to finish, and closes everything."""
-        await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
-        await self._server.stop(grace_s)
-        # Threads may still compute for calls that were cut off.
-        await asyncio.to_thread(self._close)
-
-    def _close(self) -> None:
-        self._engine.close()
-        self._references.close()
-        self._store.close()
-
-    async def _set_health(self, status: int) -> None:
-        for service in ("", *SERVICE_NAMES):
-            await self._health.set(service, status)
+    address: str
+    metrics_address: str
+    engine: Engine
+    failed: asyncio.Future[Fatal]
 
 
 @asynccontextmanager
 async def running_server(
-    settings: Settings, engine: Engine | None = None, store: Store | None = None
-) -> AsyncIterator[str]:
-    """A running server, for use within a program; gives its "host:port".
+    settings: Settings, make: MakeEngine = make_engine, store: Store | None = None
+) -> AsyncIterator[Running]:
+    """A running server, for use within a program; it is drained when the block is left.
+
+    It listens from the first moment on, and is opened when its engine is warm.
 
     Args:
         settings: port 0 takes any free one.
-        engine: what computes; made from the settings if None. Closed at the end either way, as is the store.
-        store: what the engine reads; opened from the settings if None.
+        make: makes the engine, in a thread of its own: networks take long to load. Closed at the end.
+        store: what the engine reads; opened from the settings if None. Closed at the end either way.
 
     Raises:
-        StartupError: no such backend or features, the data folder cannot be used, the port is taken.
+        StartupError: no such backend or features, the data folder or a file cannot be used, a port is taken, or the
+            first localization fails.
     """
-    store = store or open_store(settings)
-    try:
-        engine = engine or make_engine(settings, store)
-    except BaseException:
-        store.close()
-        raise
-    server = Server(settings, engine, store)
-    try:
-        yield await server.start()
-    finally:
-        await server.stop(settings.drain_grace_s)
+    metrics = Metrics()
+    async with AsyncExitStack() as stack:
+        store = store or open_store(settings)
+        stack.push_async_callback(asyncio.to_thread, store.close)
+        security = Security.of(settings)
+        tracer = _make_tracer(settings)
+        stack.push_async_callback(asyncio.to_thread, tracer.close, _TRACES_FLUSH_S)
+        metrics_address = _serve_metrics(settings, metrics, store, security, stack)
+        server = _make_server(settings, store, metrics, security, tracer)
+        stack.push_async_callback(server.close)
+        await server.start()
+        engine = await asyncio.to_thread(make, settings, store, metrics, security.quota)
+        stack.push_async_callback(engine.close)
+        failed: asyncio.Future[Fatal] = asyncio.get_running_loop().create_future()
+        engine.queue.on_fatal = lambda fatal: _announce_failure(fatal, failed, metrics)
+        _keep(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
+        _keep(stack, _refresh(security.refreshable))
+        await _warm_up(settings, engine, metrics)
+        await server.open(engine)
+        stack.push_async_callback(server.drain, settings.drain_delay_s, settings.drain_grace_s)
+        failed.add_done_callback(lambda _: asyncio.ensure_future(server.set_serving(False)))
+        yield Running(server.address, metrics_address, engine, failed)
 
 
-async def serve(settings: Settings) -> None:
-    """Serves until SIGTERM or SIGINT, then lets running calls finish; StartupError if it cannot begin."""
+async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
+    """Serves until SIGTERM or SIGINT, then lets running calls finish; StartupError if it cannot begin.
+
+    If something inside breaks that cannot be mended, the process ends with FATAL_EXIT_CODE.
+    """
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop.set)
-    async with running_server(settings) as address:
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    stopped = asyncio.ensure_future(stop.wait())
+    async with AsyncExitStack() as stack:
+        starting = asyncio.ensure_future(stack.enter_async_context(running_server(settings, make)))
+        waited: set[asyncio.Future[Any]] = {starting, stopped}
+        await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
+        if not starting.done():
+            log.info("stopping before the start was over")
+            starting.cancel()
+            await asyncio.wait({starting})
+            return
+        running = starting.result()
+        # What is there by now stays; going through it again and again would only stop the event loop.
+        gc.collect()
+        gc.freeze()
         # Read by programs that start a server on port 0: keep its form.
-        print(f"mapless-server listening on {address}", flush=True)
-        await stop.wait()
+        print(f"mapless-server listening on {running.address}", flush=True)
+        ended: set[asyncio.Future[Any]] = {stopped, running.failed}
+        await asyncio.wait(ended, return_when=asyncio.FIRST_COMPLETED)
+        if running.failed.done():
+            await asyncio.sleep(_LAST_WORDS_S)
+            logging.shutdown()
+            os._exit(FATAL_EXIT_CODE)  # threads may hang, so none is waited for
         log.info("stopping: running calls get %g s", settings.drain_grace_s)
 
 
-def _enable_reflection(server: grpc.aio.Server, service_names: Sequence[str]) -> None:
-    """Both versions of the protocol: the package has v1alpha only, and v1 is the same bytes under another name."""
-    reflection.enable_server_reflection(service_names, server)
-    method = grpc.stream_stream_rpc_method_handler(
-        ReflectionServicer(service_names).ServerReflectionInfo,
-        request_deserializer=reflection_pb2.ServerReflectionRequest.FromString,
-        response_serializer=reflection_pb2.ServerReflectionResponse.SerializeToString,
-    )
-    v1 = grpc.method_handlers_generic_handler("grpc.reflection.v1.ServerReflection", {"ServerReflectionInfo": method})
-    server.add_generic_rpc_handlers((v1,))
+def _make_tracer(settings: Settings) -> Tracer:
+    try:
+        return make_tracer(settings.otlp_endpoint)
+    except ImportError as error:
+        raise StartupError(what_is_missing(error)) from error
 
 
-def _server_options(settings: Settings) -> list[tuple[str, int]]:
-    max_message_bytes = settings.max_message_mib * 2**20
-    return [
-        ("grpc.max_receive_message_length", max_message_bytes),
-        ("grpc.max_send_message_length", max_message_bytes),
-        # With reuseport, the default, a second server silently shares the port and takes half of the calls.
-        ("grpc.so_reuseport", 0),
-        # Above the engine's own bound, so that callers are told of overload instead of waiting unseen in their channel.
-        ("grpc.max_concurrent_streams", settings.workers + settings.max_waiting + 100),
-        ("grpc.max_metadata_size", 16 * 1024),
-        # Clients may ping every 30 s, but only while they have a call.
-        ("grpc.http2.min_recv_ping_interval_without_data_ms", 30_000),
-        ("grpc.http2.max_ping_strikes", 2),
-        ("grpc.keepalive_permit_without_calls", 0),
-        # Forgets clients that went away without a word.
-        ("grpc.max_connection_idle_ms", 15 * 60_000),
-    ]
+def _serve_metrics(
+    settings: Settings, metrics: Metrics, store: Store, security: Security, stack: AsyncExitStack
+) -> str:
+    """Where the metrics are served, "host:port"; empty if they are not."""
+    metrics.watch_reference_cache(lambda: store.reference_cache)
+    if security.tls is not None:
+        tls = security.tls
+        metrics.watch_certificate(lambda: tls.expiry_s)
+    if not settings.metrics:
+        return ""
+    try:
+        exporter = MetricsServer(metrics.registry, settings.metrics_host, settings.metrics_port)
+    except OSError as error:
+        address = f"{settings.metrics_host}:{settings.metrics_port}"
+        raise StartupError(f"cannot serve metrics on {address}: {error.strerror or error}") from error
+    stack.push_async_callback(asyncio.to_thread, exporter.close)
+    address = f"{settings.metrics_host}:{exporter.port}"
+    log.info("metrics on http://%s/metrics", address)
+    return address
+
+
+def _make_server(settings: Settings, store: Store, metrics: Metrics, security: Security, tracer: Tracer) -> GrpcServer:
+    try:
+        return GrpcServer(
+            settings,
+            store,
+            metrics,
+            authenticate=security.authenticator.authenticate,
+            tracer=tracer,
+            credentials=None if security.tls is None else security.tls.server_credentials(),
+        )
+    except AddressTaken as error:
+        raise StartupError(str(error)) from error
+
+
+async def _warm_up(settings: Settings, engine: Engine, metrics: Metrics) -> None:
+    first = engine.tiers[0]
+    reconstructor = first.pipeline.reconstructor
+    metrics.built(__version__, reconstructor.name, first.extractor.name, reconstructor.weights_sha256)
+    engine.queue.start()
+    if not settings.warm_up:
+        return
+    start_s = time.monotonic()
+    try:
+        await warm_up(engine)
+    except Exception as error:
+        log.critical("the first localization failed", exc_info=error)
+        raise StartupError(f"the first localization failed, so none would succeed: {error}") from error
+    metrics.warmed_up(time.monotonic() - start_s)
+    log.info("warm after %.1f s", time.monotonic() - start_s)
+
+
+def _announce_failure(fatal: Fatal, failed: asyncio.Future[Fatal], metrics: Metrics) -> None:
+    if not failed.done():
+        metrics.failed_fatally()
+        log.critical("the server cannot go on and ends: %s", fatal)
+        failed.set_result(fatal)
+
+
+async def _refresh(refreshable: list[Refreshable]) -> None:
+    """Follows the files until it is cancelled."""
+    while True:
+        await asyncio.sleep(LOOK_INTERVAL_S)
+        for it in refreshable:
+            await asyncio.to_thread(it.refresh)
+
+
+def _keep(stack: AsyncExitStack, work: Coroutine[Any, Any, None]) -> None:
+    """Runs it until the stack is left; should it fail, the log says so at once."""
+    task = asyncio.ensure_future(work)
+
+    def complain(_: asyncio.Task[None]) -> None:
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log.critical("a task of the server ended", exc_info=error)
+
+    async def end() -> None:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    task.add_done_callback(complain)
+    stack.push_async_callback(end)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from enum import Enum
 from typing import Any, TypeVar
 
@@ -14,13 +15,16 @@ from mapless.wire import FieldError
 
 from . import __version__
 from .decode import ImageLimits
-from .engine import Engine, PositionPrior, Query, Result
+from .engine import Engine
 from .method.accuracy import accuracy_from_covariance
 from .method.localize import Localization, LocalizeOptions
 from .method.rejection import Rejection
 from .method.scale import MetricScale
+from .observability.metrics import LOCALIZED, Metrics
 from .photos import photo_from_message
+from .query import PositionPrior, Query, Result
 from .rpc import Call
+from .tenancy import key_of
 
 MAX_REFERENCES = 64
 DEFAULT_REFERENCE_COUNT = 10
@@ -31,13 +35,21 @@ E = TypeVar("E", bound=Enum)
 class LocalizationService(rpcs.LocalizationServiceServicer):
     """Says where a photograph was taken."""
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Callable[[], Engine], metrics: Metrics) -> None:
+        """`engine` gives it, or raises Unavailable as long as there is none."""
         self._engine = engine
+        self._metrics = metrics
 
     async def Localize(self, request: pb.LocalizeRequest, call: Call) -> pb.LocalizeResponse:
         """Implements LocalizationService.Localize."""
-        query = _query_from_message(request, self._engine.options.image_limits)
-        result = await self._engine.localize(query, call.deadline_s)
+        engine = self._engine()
+        query = _query_from_message(request, call.principal.tenant, engine.options.image_limits)
+        call.note(scene=query.scene_key, references=len(query.reference_ids))
+        result, visits = await engine.localize(query, call.caller)
+        for visit in visits:
+            call.waited(visit.stage, visit.queued_s, visit.start_s)
+            call.computed(visit.stage, visit.start_s, visit.end_s, jobs=visit.jobs)
+        self._count(result, call)
         response = pb.LocalizeResponse()
         outcome = result.attempt.answer.outcome
         if isinstance(outcome, Localization):
@@ -49,6 +61,29 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
                 getattr(response, echoed).CopyFrom(getattr(request, echoed))
         response.diagnostics.CopyFrom(self._diagnostics(result, query.options, call))
         return response
+
+    def _count(self, result: Result, call: Call) -> None:
+        """Tells the log and the metrics how good the answer is."""
+        answer = result.attempt.answer
+        outcome = answer.outcome
+        self._metrics.stages(result.stage_seconds)
+        parts_ms = {stage: round(1000 * seconds, 1) for stage, seconds in result.stage_seconds.items()}
+        call.note(parts_ms=parts_ms, used_references=len(result.attempt.references))
+        if not isinstance(outcome, Localization):
+            self._metrics.answered(outcome.reason.value)
+            call.note(outcome=outcome.reason.value)
+            return
+        call.note(outcome="localized", pose_stage=outcome.pose_stage.value, inliers=outcome.inlier_count)
+        covariance = outcome.covariance
+        measured = covariance is not None
+        self._metrics.answered(
+            LOCALIZED,
+            inlier_count=outcome.inlier_count if measured else None,
+            match_count=outcome.match_count if measured else None,
+            reprojection_error_px=outcome.reprojection_error_px if measured else None,
+            scale_deviation=answer.scale.deviation if answer.scale else None,
+            accuracy_radius_m=None if covariance is None else accuracy_from_covariance(covariance).position_68_m,
+        )
 
     @staticmethod
     def _diagnostics(result: Result, options: LocalizeOptions, call: Call) -> pb.Diagnostics:
@@ -73,12 +108,12 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             message.references.add(name=reference.name, match_count=matches, inlier_count=inliers)
         for stage, seconds in result.stage_seconds.items():
             message.stages.add(stage=stage).duration.FromNanoseconds(round(1e9 * seconds))
-        message.queue_duration.FromNanoseconds(round(1e9 * result.queue_s))
+        message.queue_duration.FromNanoseconds(round(1e9 * (call.trail.queue_s or 0.0)))
         message.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))
         return message
 
 
-def _query_from_message(request: pb.LocalizeRequest, limits: ImageLimits) -> Query:
+def _query_from_message(request: pb.LocalizeRequest, tenant: str, limits: ImageLimits) -> Query:
     """Checks everything that can be checked without the store; FieldError or InvalidArgument names the field."""
     scene_id = wire.scene_id_from_name(request.scene, "scene")
     if request.HasField("session_from_camera"):
@@ -87,12 +122,13 @@ def _query_from_message(request: pb.LocalizeRequest, limits: ImageLimits) -> Que
     if not 0 <= reference_count <= MAX_REFERENCES:
         raise FieldError("options.reference_count", f"must be 0 to {MAX_REFERENCES}, is {reference_count}")
     return Query(
-        scene_id=scene_id,
+        scene_key=key_of(tenant, scene_id),
         reference_ids=_reference_ids(request, scene_id),
         photo=photo_from_message(request, "", limits),
         prior=_prior_from_message(request.position_prior) if request.HasField("position_prior") else None,
         reference_count=reference_count or DEFAULT_REFERENCE_COUNT,
         options=_options_from_message(request.options),
+        allow_coarse=request.options.allow_coarse,
     )
 
 

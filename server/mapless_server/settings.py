@@ -20,6 +20,8 @@ from pydantic_settings import (
 
 PREFIX = "MAPLESS_"
 CONFIG_VARIABLE = "MAPLESS_CONFIG"
+CLIENT_TOKEN_VARIABLE = "MAPLESS_TOKEN"
+"""The client's, which may run in the same environment."""
 
 # Kubernetes sets these in every pod that has a service called "mapless" beside it; MAPLESS_PORT is then "tcp://...".
 _SERVICE_LINKS = re.compile(r"MAPLESS_SERVICE_(HOST|PORT.*)|MAPLESS_PORT_\d+_.*")
@@ -69,10 +71,24 @@ class Settings(BaseSettings):
         description="Photographs of a query, itself among them, that a network is compiled for at the start; 0: none.",
     )
     workers: int = Field(default_factory=available_cores, ge=1, description="Threads that compute; default: all cores.")
-    max_waiting: int = Field(default=32, ge=0, description="Calls that may wait for a thread; more are refused.")
+    max_batch: int = Field(default=4, ge=1, le=64, description="Queries a network reconstructs at a time.")
+    max_queued_s: float = Field(
+        default=4.0, gt=0, description="Predicted computing time that may wait, seconds a worker; more is refused."
+    )
+    max_queued_mib: int = Field(default=256, ge=1, description="Memory for photographs of calls in progress, MiB.")
+    stall_limit_s: float = Field(
+        default=120.0, gt=0, description="A step that computes longer has hung; the server then ends, seconds."
+    )
+    tenant_rate_ms: float = Field(
+        default=0.0, ge=0, description="Computing time a tenant may use, milliseconds a second; 0: no limit."
+    )
+    tenant_burst_ms: float = Field(
+        default=20_000.0, gt=0, description="Computing time that a tenant may save up, milliseconds."
+    )
     default_deadline_s: float = Field(
         default=30.0, gt=0, description="Time for calls that come without a deadline, seconds."
     )
+    max_deadline_s: float = Field(default=600.0, gt=0, description="Calls with a later deadline get this one, seconds.")
     max_message_mib: int = Field(default=32, ge=1, le=1024, description="Largest message, either way, MiB.")
     max_image_mib: int = Field(default=16, ge=1, description="Largest image file, MiB.")
     max_image_megapixels: float = Field(default=50.0, gt=0, le=268, description="Largest image, width times height.")
@@ -80,8 +96,31 @@ class Settings(BaseSettings):
         default=200, ge=1, description="References compared with a photograph when the request names none."
     )
     reference_cache_mib: int = Field(default=512, ge=0, description="Memory for references' features, MiB.")
+    warm_up: bool = Field(default=True, description="Whether a localization is tried before the first call is taken.")
+    drain_delay_s: float = Field(
+        default=0.0,
+        ge=0,
+        description="Time to say that it stops before it takes no more calls, for load balancers, seconds.",
+    )
     drain_grace_s: float = Field(
         default=10.0, ge=0, description="Time that running calls get when the server stops, seconds."
+    )
+    tls_certificate: Path | None = Field(default=None, description="The server's certificate chain, PEM; read anew.")
+    tls_key: Path | None = Field(default=None, description="Its private key, PEM.")
+    tls_client_ca: Path | None = Field(
+        default=None, description="Certificates that clients' own must be signed by, PEM; without, clients need none."
+    )
+    tokens_file: Path | None = Field(
+        default=None, description="Hashes of the bearer tokens that callers must show; see mapless-server token."
+    )
+    insecure: bool = Field(
+        default=False, description="Whether to listen beyond this machine with neither TLS nor tokens."
+    )
+    metrics: bool = Field(default=True, description="Whether to serve metrics to Prometheus.")
+    metrics_host: str = Field(default="127.0.0.1", min_length=1, description="Address of the metrics; 0.0.0.0 for all.")
+    metrics_port: int = Field(default=9464, ge=0, le=65535, description="Port of the metrics; 0 for any free one.")
+    otlp_endpoint: str = Field(
+        default="", description="Where traces go by OTLP over gRPC, http://host:4317; empty: nowhere."
     )
     reflection: bool = Field(
         default=True, description="Whether the server describes its interface to grpcurl and the like."
@@ -89,6 +128,7 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="Least severity that is logged."
     )
+    log_format: Literal["json", "text"] = Field(default="json", description="One JSON object a line, or plain text.")
 
     @field_validator("compiled_views")
     @classmethod
@@ -108,6 +148,10 @@ class Settings(BaseSettings):
     def _check_together(self) -> Settings:
         if self.max_image_mib > self.max_message_mib:
             raise ValueError("max_image_mib must not exceed max_message_mib")
+        if (self.tls_certificate is None) != (self.tls_key is None):
+            raise ValueError("tls_certificate and tls_key go together")
+        if self.tls_client_ca is not None and self.tls_certificate is None:
+            raise ValueError("tls_client_ca needs tls_certificate")
         return self
 
     @classmethod
@@ -175,7 +219,7 @@ def _read_file(path: Path) -> dict[str, Any]:
 
 
 def _read_environment() -> dict[str, Any]:
-    known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields} | {CONFIG_VARIABLE}
+    known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields} | {CONFIG_VARIABLE, CLIENT_TOKEN_VARIABLE}
     unknown = {name for name in os.environ if name.startswith(PREFIX) and not _SERVICE_LINKS.fullmatch(name)} - known
     if unknown:
         raise ConfigError("\n".join(f"environment: {name} is not a setting" for name in sorted(unknown)))

@@ -8,7 +8,7 @@ pose that is claimed with little support.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,8 +77,6 @@ class Attempt:
         references: those it used, in order.
         generation: of the scene when they were read.
         processed: the camera of the reduced image that features were found in.
-        stage_seconds: what each stage took, in order.
-        queue_s: how long it waited for a thread.
     """
 
     tier: Tier
@@ -86,8 +84,6 @@ class Attempt:
     references: tuple[PosedView, ...]
     generation: int
     processed: Camera
-    stage_seconds: dict[str, float] = field(default_factory=dict)
-    queue_s: float = 0.0
 
 
 def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:

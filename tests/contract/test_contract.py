@@ -38,8 +38,12 @@ RPCS = [
     for method in module.DESCRIPTOR.services_by_name[name].methods
 ]
 SERVER = ROOT / "server" / "mapless_server"
-# What answers calls, and what starts it; all else is below, and knows neither grpc nor messages.
-ABOVE = {"__init__", "__main__", "cli", "serve", "service", "reference_service", "rpc", "demo", "evaluation", "bench"}
+# What answers, guards and counts calls, what starts that, and what calls it; all else is below, and knows neither grpc
+# nor messages.
+ABOVE = {
+    *("__init__", "__main__", "cli", "serve", "service", "reference_service", "rpc", "grpc_server"),
+    *("security", "observability", "demo", "evaluation", "bench", "load"),
+}
 BELOW = sorted(
     {path.stem for path in SERVER.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()} - ABOVE
 )
@@ -110,11 +114,24 @@ def test_nothing_below_the_service_knows_grpc(module: str) -> None:
         assert not {name for name in names for bad in forbidden if name == bad or name.startswith(bad + ".")}, path
 
 
-def test_the_method_knows_no_service_store_or_queue() -> None:
-    above = {"store", "engine", "turns", "tiers", "library", "assembly", "settings", "decode", *ABOVE}
-    for path in sorted((SERVER / "method").rglob("*.py")):
+@pytest.mark.parametrize(
+    ("package", "beside_itself"),
+    [
+        ("method", {"networks", "weights", "stopwatch"}),
+        ("networks", {"weights"}),
+        ("scheduling", set()),
+    ],
+)
+def test_the_method_knows_no_queue_and_the_queue_no_method(package: str, beside_itself: set[str]) -> None:
+    for path in sorted((SERVER / package).rglob("*.py")):
         known = {name.split(".")[1] for name in imports_of(path) if name.startswith("mapless_server.")}
-        assert not known & above, path
+        assert known <= beside_itself | {package}, path
+
+
+def test_the_queue_knows_nothing_of_vision_or_calls() -> None:
+    for path in sorted((SERVER / "scheduling").rglob("*.py")):
+        imported = {name.partition(".")[0] for name in imports_of(path)} - {"mapless_server"}
+        assert imported <= sys.stdlib_module_names, path
 
 
 def test_the_public_names() -> None:

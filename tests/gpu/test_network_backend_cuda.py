@@ -14,8 +14,9 @@ pytest.importorskip("PIL", reason="the networks' extra is not installed")
 import torch
 from small_networks import GRIDS, small_network, small_request
 
+from mapless_server.method.coarse import Outcome, Request, reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
-from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor, Outcome
+from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.coarse.token_cache import TokenCacheOptions
 from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.runner import NetworkRunner
@@ -50,7 +51,7 @@ def assert_same_bits(actual: Outcome | Exception, expected: Outcome | Exception)
 
 
 def outcomes_of(backend: NetworkReconstructor, requests: Sequence[Any], times: int) -> list[Outcome]:
-    return [backend.reconstruct(*request) for _ in range(times) for request in requests]
+    return [reconstruct_one(backend, *request) for _ in range(times) for request in requests]
 
 
 @pytest.mark.parametrize("name", ["pi3", "pi3x"])
@@ -73,7 +74,7 @@ def test_kept_tokens_give_the_same_bits(name: str, views_on_device: int) -> None
 def test_a_batch_that_does_not_fit_is_halved() -> None:
     runner, requests = runner_of("pi3", TightRunner), [small_request(3, i) for i in range(4)]
     backend = NetworkReconstructor(runner, OPTIONS)
-    together = backend.reconstruct_many(requests)
+    together = backend.reconstruct_many([Request(*request) for request in requests])
     assert backend.cache.counters.device_bytes == 0
     for actual, expected in zip(together, outcomes_of(backend, requests, 1), strict=True):
         assert_same_bits(actual, expected)

@@ -103,9 +103,10 @@ class Command:
 @contextmanager
 def command(data_dir: Path, *arguments: str, **environment: str) -> Iterator[Command]:
     log = data_dir.with_suffix(".log")
+    flags = ["--port", "0", "--metrics-port", "0", "--data-dir", str(data_dir), *arguments]
     with log.open("w") as stderr:
         process = subprocess.Popen(
-            [sys.executable, "-m", "mapless_server", "serve", "--port", "0", "--data-dir", str(data_dir), *arguments],
+            [sys.executable, "-m", "mapless_server", "serve", *flags],
             stdout=subprocess.PIPE,
             stderr=stderr,
             text=True,
@@ -152,10 +153,10 @@ def test_sigterm_finishes_a_running_call_and_exits_with_0(tmp_path: Path) -> Non
 
 
 def test_settings_are_shown_at_the_start(tmp_path: Path) -> None:
-    with command(tmp_path / "data", "--max-waiting", "7", MAPLESS_WORKERS="1") as server:
+    with command(tmp_path / "data", "--max-batch", "7", "--log-format", "text", MAPLESS_WORKERS="1") as server:
         assert server.stop(signal.SIGTERM) == 0
         log = server.log.read_text()
-    assert "max_waiting               7  (flag)" in log
+    assert "max_batch                 7  (flag)" in log
     assert "workers                   1  (environment)" in log
     assert "reflection                True  (default)" in log
 

@@ -30,6 +30,7 @@ from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.decode import ImageLimits, decode_image
 from mapless_server.store import Store
+from mapless_server.tenancy import SceneKey
 
 Request = pb.LocalizeRequest
 DEEP = np.random.default_rng(3).integers(0, 65536, (64, 96, 3)).astype(np.uint16)
@@ -93,10 +94,10 @@ def test_references_that_go_while_the_server_chooses(
     listed = Store.list_poses
     left = iter(range(deletions))
 
-    def list_then_delete(store: Store, scene_id: str) -> Any:
-        poses = listed(store, scene_id)
+    def list_then_delete(store: Store, scene_key: SceneKey) -> Any:
+        poses = listed(store, scene_key)
         for i in itertools.islice(left, 1):
-            store.delete_reference(scene_id, f"r{i}")
+            store.delete_reference(scene_key, f"r{i}")
         return poses
 
     monkeypatch.setattr(Store, "list_poses", list_then_delete)

@@ -20,12 +20,15 @@ from small_networks import GRIDS, small_network
 
 from mapless import Client, LocalizationResult, NewReference, Rejected
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.engine import Engine, EngineOptions
+from mapless_server.engine import Engine
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.features import SiftExtractor
 from mapless_server.method.localize import Pipeline
 from mapless_server.networks.network import Network
 from mapless_server.networks.runner import NetworkRunner
+from mapless_server.observability.metrics import Metrics
+from mapless_server.security.rate import RateLimiter
+from mapless_server.serve import engine_options
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_server.tiers import Tier
@@ -52,9 +55,16 @@ def serving(data_dir: Path, network: Network, name: str) -> Iterator[tuple[Clien
     runner = NetworkRunner(network, name, f"sha-of-{name}", "cpu")
     backend = NetworkReconstructor(runner, NetworkOptions(grids=GRIDS))
     store = Store.open(data_dir)
-    engine = Engine(store, [Tier(SiftExtractor(), Pipeline(backend))], EngineOptions(workers=2))
-    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, workers=2)
-    with closing(backend), listening(settings, store, engine) as (address, _), Client(address) as client:
+    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, workers=2, metrics=False, warm_up=False)
+
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+        return Engine(store, [Tier(SiftExtractor(), Pipeline(backend))], engine_options(settings), metrics, quota)
+
+    with (
+        closing(backend),
+        listening(settings, store, make) as (running, _),
+        Client(running.address) as client,
+    ):
         client.create_scene("wall")
         photos = [
             NewReference(f"r{i}", encode(".png", photograph_at(x_m)), CAMERA, pose_at(x_m))

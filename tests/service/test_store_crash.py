@@ -18,10 +18,11 @@ from mapless.geometry import Camera, RigidTransform
 from mapless_server.method.views import Features, View
 from mapless_server.store import NewReference, Store
 from mapless_server.store.sqlite import DATABASE_FILE, choose_library
+from mapless_server.tenancy import SceneKey
 
 ROUNDS = 15
 LIMIT_S = 30.0
-SCENE = "office"
+SCENE = SceneKey("office")
 EXTRACTOR = "sift"
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 

@@ -16,7 +16,7 @@ STAGES = ["decode", "features", "coarse", "pnp"]
     ("inliers", "answered", "stages"),
     [
         (90, "cheap", STAGES),
-        (3, "strong", [*STAGES, *(f"strong/{it}" for it in ("queue", "features", "coarse", "pnp"))]),
+        (3, "strong", [*STAGES, *(f"strong/{it}" for it in ("features", "coarse", "pnp"))]),
     ],
     ids=["sure", "doubtful"],
 )

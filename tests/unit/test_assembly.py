@@ -12,6 +12,7 @@ import pytest
 from mapless_server import assembly
 from mapless_server.assembly import choose_device, feature_names, make_first_features, make_tiers
 from mapless_server.method.features import make_extractor
+from mapless_server.observability.metrics import Metrics
 from mapless_server.serve import StartupError, make_engine
 from mapless_server.settings import Settings
 from mapless_server.store import Store
@@ -62,7 +63,7 @@ def test_what_is_asked_for_by_name_is_never_replaced(tmp_path: Path) -> None:
     with Store.open(tmp_path / "data") as store:
         for features, told in (("aliked", "weights fetch aliked"), ("nonesuch", "nonesuch")):
             with pytest.raises(StartupError, match=told):
-                make_engine(settings(tmp_path, features=features), store)
+                make_engine(settings(tmp_path, features=features), store, Metrics(), None)
 
 
 def test_a_server_without_networks_does_not_load_torch(tmp_path: Path) -> None:
@@ -90,7 +91,7 @@ def test_a_device_that_is_not_there_is_said(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     absent = f"cuda:{torch.cuda.device_count()}"
     with Store.open(tmp_path / "data") as store, pytest.raises(StartupError, match=f"no device {absent}"):
-        make_engine(settings(tmp_path, device=absent), store)
+        make_engine(settings(tmp_path, device=absent), store, Metrics(), None)
     assert choose_device("cpu") == "cpu"
 
 

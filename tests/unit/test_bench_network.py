@@ -24,7 +24,7 @@ from mapless_server.bench_network.report import Figure, markdown, table
 from mapless_server.bench_network.subject import Work, make_network, operations_of
 from mapless_server.bench_network.variants import with_low_precision_stream
 from mapless_server.demo.room import Photo
-from mapless_server.method.coarse import Reconstruction
+from mapless_server.method.coarse import Reconstruction, reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.views import Features, View
@@ -151,7 +151,7 @@ def test_planted_reconstruction_is_the_truth_up_to_scale(keep_on_device: bool) -
     nothing = Features(np.empty((0, 2), np.float32), np.empty((0, 4), np.float32), np.empty(0, np.float32))
     query = View(photos[0].camera, nothing, pictures[0])
     network = NetworkReconstructor(small_runner("pi3"), NetworkOptions(keep_on_device=keep_on_device))
-    outcome = PlantedReconstructor(network, truth, torch.device("cpu")).reconstruct(query, references)
+    outcome = reconstruct_one(PlantedReconstructor(network, truth, torch.device("cpu")), query, references)
     network.close()
     if isinstance(outcome, DeviceReconstruction):
         outcome = outcome.fetch()

@@ -14,21 +14,25 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from images import encode, textured
-from servers import CAMERA, PHOTO, StandInExtractor, StandInReconstructor, pose
+from servers import CAMERA, PHOTO, StandInExtractor, StandInReconstructor, pose, whole
 
 from mapless.geometry import RigidTransform
 from mapless_server.decode import ImageLimits, decode_image
-from mapless_server.engine import Engine, EngineOptions, Photo, PositionPrior, Query, Result
+from mapless_server.engine import Engine, EngineOptions
 from mapless_server.errors import DeadlineExceeded, InvalidArgument
 from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import PosedView, View
+from mapless_server.query import Caller, Photo, PositionPrior, Query, Result
+from mapless_server.scheduling.fair import Flow
 from mapless_server.store import NewReference, Store
+from mapless_server.tenancy import SceneKey
 from mapless_server.tiers import EscalationOptions, Tier
 
 SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
 ESCALATION = EscalationOptions(doubtful_inliers=50, doubtful_radius_m=0.2)
+SCENE = SceneKey("s")
 PIXELS = decode_image(PHOTO, ImageLimits())
 
 
@@ -43,6 +47,10 @@ def rejected(reason: RejectionReason = RejectionReason.TOO_FEW_MATCHES) -> Answe
 
 
 Reply = Answer | Callable[[View, Sequence[PosedView], Callable[[], None]], Answer]
+
+
+def caller(deadline_s: float = 60.0) -> Caller:
+    return Caller(Flow("tenant", "client"), time.monotonic() + deadline_s)
 
 
 @dataclass
@@ -68,23 +76,32 @@ class Setting:
             return reply(query, references, check) if callable(reply) else reply
 
         tiers = [Tier(extractor, pipelines[name]) for name, extractor in self.extractors.items()]
-        self.engine = Engine(self.store, tiers, EngineOptions(escalation=ESCALATION), method)
+        self.engine = Engine(self.store, tiers, EngineOptions(escalation=ESCALATION), method=whole(method))
+        self.loop = asyncio.new_event_loop()
+
+    def describe(self, photos: Sequence[Photo]) -> list[dict[str, View]]:
+        return self.loop.run_until_complete(self.engine.describe(photos, caller()))
+
+    def close(self) -> None:
+        self.loop.run_until_complete(self.engine.close())
+        self.loop.close()
 
     def localize(self, deadline_s: float = 60.0, **changes: Any) -> Result:
         values: dict[str, Any] = {"reference_ids": ("r0", "r1"), "prior": None, "reference_count": 2} | changes
-        query = Query("s", photo=Photo(PHOTO, CAMERA, "image"), options=LocalizeOptions(), **values)
-        return asyncio.run(self.engine.localize(query, time.monotonic() + deadline_s))
+        query = Query(SCENE, photo=Photo(PHOTO, CAMERA, "image"), options=LocalizeOptions(), **values)
+        result, _ = self.loop.run_until_complete(self.engine.localize(query, caller(deadline_s)))
+        return result
 
 
 @pytest.fixture
 def setting(tmp_path: Path) -> Iterator[Setting]:
     with Store.open(tmp_path) as store:
         setting = Setting(store)
-        store.create_scene("s")
+        store.create_scene(SCENE)
         photos = [Photo(encode(".png", textured(seed=i)), CAMERA, "image") for i in range(3)]
-        views = asyncio.run(setting.engine.describe(photos, time.monotonic() + 60))
+        views = setting.describe(photos)
         store.add_references(
-            "s",
+            SCENE,
             [
                 NewReference(f"r{i}", photo.image, CAMERA, pose(float(i)), its_views)
                 for i, (photo, its_views) in enumerate(zip(photos, views, strict=True))
@@ -93,7 +110,7 @@ def setting(tmp_path: Path) -> Iterator[Setting]:
         for extractor in setting.extractors.values():
             extractor.seen.clear()
         yield setting
-        setting.engine.close()
+        setting.close()
 
 
 class TestTiers:
@@ -132,7 +149,7 @@ class TestTiers:
         seconds = setting.localize().stage_seconds
         assert list(seconds) == [
             *("decode", "features", "correspond"),
-            *("strong/queue", "strong/features", "strong/coarse"),
+            *("strong/features", "strong/coarse"),
         ]
         assert (seconds["correspond"], seconds["strong/coarse"]) == (0.125, 0.25)
 
@@ -204,7 +221,7 @@ class TestTiers:
         photo = encode(".png", textured(seed=7))
         of_cheap = View(CAMERA, setting.extractors["cheap"].extract(textured(seed=7), CAMERA).features)
         new = NewReference("late", photo, CAMERA, pose(9.0), {"cheap": of_cheap})
-        setting.store.add_references("s", [new])
+        setting.store.add_references(SCENE, [new])
         names = []
         for _ in range(200):
             result = setting.localize(reference_ids=("r0", "late"))
@@ -255,7 +272,7 @@ class TestPhotograph:
 
         def look(_: View, references: Sequence[PosedView], __: Any) -> Answer:
             if len(setting.asked) == 1:
-                setting.store.delete_reference("s", references[0].name.rpartition("/")[2])
+                setting.store.delete_reference(SCENE, references[0].name.rpartition("/")[2])
             for reference in references:
                 assert reference.view.photograph is not None
                 reference.view.photograph.read()
@@ -271,7 +288,7 @@ class TestPhotograph:
 class TestDescribe:
     def test_every_tier_once_and_without_pixels(self, setting: Setting) -> None:
         photos = [Photo(encode(".png", textured(seed=i)), CAMERA, "image") for i in range(5)]
-        described = asyncio.run(setting.engine.describe(photos, time.monotonic() + 60))
+        described = setting.describe(photos)
         assert [list(views) for views in described] == [["cheap", "strong"]] * 5
         assert all(view.photograph is None for views in described for view in views.values())
         assert [len(it.seen) for it in setting.extractors.values()] == [5, 5]
@@ -279,5 +296,5 @@ class TestDescribe:
     def test_a_bad_image_names_its_field(self, setting: Setting) -> None:
         photos = [Photo(PHOTO, CAMERA, "requests[0].image"), Photo(PHOTO[:-50], CAMERA, "requests[1].image")]
         with pytest.raises(InvalidArgument) as caught:
-            asyncio.run(setting.engine.describe(photos, time.monotonic() + 60))
+            setting.describe(photos)
         assert caught.value.field == "requests[1].image"

@@ -16,7 +16,7 @@ else:
     import tomli as tomllib
 
 PROJECT = Path(__file__).parents[2] / "pyproject.toml"
-DISTRIBUTION_OF = {"PIL": "pillow"}
+DISTRIBUTION_OF = {"PIL": "pillow", "opentelemetry": "opentelemetry-sdk"}
 
 
 def test_every_extra_brings_its_packages() -> None:

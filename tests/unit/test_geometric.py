@@ -11,7 +11,7 @@ from planted import moved_references, true_correspondences
 from scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
-from mapless_server.method.coarse import ReconstructedView, Reconstruction
+from mapless_server.method.coarse import ReconstructedView, Reconstruction, Request, reconstruct_one
 from mapless_server.method.coarse.geometric import GeometricOptions, GeometricReconstructor
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.rejection import Rejection, RejectionReason
@@ -21,15 +21,15 @@ EXACT = SceneOptions(noise_px=0.0, point_count=300, reference_count=4)
 
 
 def reconstruct(scene: SyntheticScene, references: tuple[PosedView, ...] | None = None) -> Reconstruction:
-    outcome = GeometricReconstructor().reconstruct(
-        scene.query, references or scene.references, true_correspondences(scene)
+    outcome = reconstruct_one(
+        GeometricReconstructor(), scene.query, references or scene.references, true_correspondences(scene)
     )
     assert isinstance(outcome, Reconstruction), outcome
     return outcome
 
 
 def rejection_of(query: View, references: tuple[PosedView, ...], correspondences: Correspondences) -> Rejection:
-    outcome = GeometricReconstructor().reconstruct(query, references, correspondences)
+    outcome = reconstruct_one(GeometricReconstructor(), query, references, correspondences)
     assert isinstance(outcome, Rejection)
     return outcome
 
@@ -103,12 +103,28 @@ def test_the_world_does_not_show() -> None:
 
 def test_wrong_matches_are_survived() -> None:
     scene = make_scene(random_for("outliers"), SceneOptions(outlier_share=0.4))
-    reconstruction = GeometricReconstructor().reconstruct(
-        scene.query, scene.references, Matcher().correspond(scene.query, scene.references)
+    reconstruction = reconstruct_one(
+        GeometricReconstructor(), scene.query, scene.references, Matcher().correspond(scene.query, scene.references)
     )
     assert isinstance(reconstruction, Reconstruction)
     pose = world_from_local(scene, reconstruction).transform_pose(reconstruction.query.local_from_camera)
     assert_pose_close(pose, scene.world_from_query, metres=0.02, degrees=0.2)
+
+
+def test_queries_together_are_as_alone_and_one_s_fault_is_its_own() -> None:
+    scenes = [make_scene(random_for("together", seed), EXACT) for seed in range(2)]
+    requests = [Request(it.query, it.references, true_correspondences(it)) for it in scenes]
+    without = replace(requests[0], correspondences=None)
+    first, failed, second = GeometricReconstructor().reconstruct_many([requests[0], without, requests[1]])
+    assert isinstance(failed, ValueError)
+    for outcome, scene in ((first, scenes[0]), (second, scenes[1])):
+        assert isinstance(outcome, Reconstruction)
+        np.testing.assert_array_equal(outcome.query.point_map, reconstruct(scene).query.point_map)
+
+
+def test_any_number_of_references_is_a_bucket_of_its_own() -> None:
+    scene = make_scene(random_for("bucket"), EXACT)
+    assert str(GeometricReconstructor().bucket(scene.query, scene.references[:3])) == "geometric-3"
 
 
 # Rejections

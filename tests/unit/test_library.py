@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -20,13 +20,15 @@ from servers import CAMERA, StandInExtractor, pose
 from mapless.geometry import Camera
 from mapless_server import library as library_module
 from mapless_server.decode import ImageLimits
-from mapless_server.errors import DataLoss, DeadlineExceeded, NotFound
+from mapless_server.errors import DataLoss, NotFound
 from mapless_server.library import NotDescribedYet, ReferenceLibrary
 from mapless_server.method.views import View
 from mapless_server.store import NewReference, Store
 from mapless_server.store.sqlite import DATABASE_FILE, choose_library
+from mapless_server.tenancy import SceneKey
 from mapless_server.turns import Turn
 
+SCENE = SceneKey("s")
 IDS = [f"r{i}" for i in range(4)]
 PIXELS = {it: textured(seed=i) for i, it in enumerate(IDS)}
 OLD = StandInExtractor("old")
@@ -57,17 +59,27 @@ def store(tmp_path: Path) -> Iterator[CountingStore]:
     store = CountingStore(opened._database, opened._described)
     store.images_read = 0
     with store:
-        store.create_scene("s")
+        store.create_scene(SCENE)
         news = [
             NewReference(it, encode(".png", PIXELS[it]), CAMERA, pose(i), {"old": OLD.extract(PIXELS[it], CAMERA)})
             for i, it in enumerate(IDS)
         ]
-        store.add_references("s", news)
+        store.add_references(SCENE, news)
         yield store
 
 
-def turn(seconds: float = 60.0) -> Turn:
-    return Turn(time.monotonic() + seconds)
+class Abandoned(Exception):
+    """Nobody wants the result any more."""
+
+
+def turn(seconds: float = 60.0, is_abandoned: Callable[[], bool] = lambda: False) -> Turn:
+    deadline_s = time.monotonic() + seconds
+
+    def check() -> None:
+        if is_abandoned() or time.monotonic() > deadline_s:
+            raise Abandoned
+
+    return Turn(check)
 
 
 def execute(data_dir: Path, statement: str) -> None:
@@ -79,39 +91,39 @@ def execute(data_dir: Path, statement: str) -> None:
 
 class TestPhotographs:
     def test_are_read_when_somebody_looks_and_not_before(self, store: CountingStore) -> None:
-        generation, references = ReferenceLibrary(store).load("s", IDS[::-1], OLD, turn())
-        assert generation == store.get_scene("s").generation
+        generation, references = ReferenceLibrary(store).load(SCENE, IDS[::-1], OLD, turn())
+        assert generation == store.get_scene(SCENE).generation
         assert [it.name for it in references] == [f"scenes/s/references/{it}" for it in IDS[::-1]]
         assert store.images_read == 0
         for count, (reference_id, reference) in enumerate(zip(IDS[::-1], references, strict=True), start=1):
             photograph = reference.view.photograph
             assert photograph is not None
             assert photograph.camera == CAMERA
-            assert photograph.sha256 == store.get_reference("s", reference_id).image_sha256
+            assert photograph.sha256 == store.get_reference(SCENE, reference_id).image_sha256
             np.testing.assert_array_equal(photograph.read(), PIXELS[reference_id])
             assert store.images_read == count
 
     def test_nothing_holds_pixels_after_they_were_looked_at(self, store: CountingStore) -> None:
         library = ReferenceLibrary(store)
         for count in (1, 2):
-            (reference,) = library.load("s", ["r0"], OLD, turn())[1]
+            (reference,) = library.load(SCENE, ["r0"], OLD, turn())[1]
             assert reference.view.photograph is not None
             reference.view.photograph.read()
             assert store.images_read == count
 
     def test_stay_those_of_the_reference_while_the_scene_changes(self, store: CountingStore) -> None:
-        _, (kept, gone) = ReferenceLibrary(store).load("s", ["r0", "r1"], OLD, turn())
+        _, (kept, gone) = ReferenceLibrary(store).load(SCENE, ["r0", "r1"], OLD, turn())
         assert kept.view.photograph is not None
         assert gone.view.photograph is not None
-        store.delete_reference("s", "r1")
+        store.delete_reference(SCENE, "r1")
         other = encode(".png", textured(seed=9))
-        store.add_references("s", [NewReference("r1", other, CAMERA, pose(1.0), {"old": gone.view})])
+        store.add_references(SCENE, [NewReference("r1", other, CAMERA, pose(1.0), {"old": gone.view})])
         np.testing.assert_array_equal(kept.view.photograph.read(), PIXELS["r0"])
         with pytest.raises(NotFound, match="deleted"):
             gone.view.photograph.read()
 
     def test_damaged_ones_are_data_loss(self, store: CountingStore, tmp_path: Path) -> None:
-        _, (reference,) = ReferenceLibrary(store).load("s", ["r0"], OLD, turn())
+        _, (reference,) = ReferenceLibrary(store).load(SCENE, ["r0"], OLD, turn())
         execute(tmp_path, "UPDATE image SET data = zeroblob(5000)")
         assert reference.view.photograph is not None
         with pytest.raises(DataLoss, match="'r0'"):
@@ -119,8 +131,8 @@ class TestPhotographs:
 
     def test_what_no_decoder_reads_is_data_loss_and_no_fault_of_the_caller(self, store: CountingStore) -> None:
         view = OLD.extract(PIXELS["r0"], CAMERA)
-        store.add_references("s", [NewReference("odd", b"no image", CAMERA, pose(0.0), {"old": view})])
-        _, (reference,) = ReferenceLibrary(store).load("s", ["odd"], OLD, turn())
+        store.add_references(SCENE, [NewReference("odd", b"no image", CAMERA, pose(0.0), {"old": view})])
+        _, (reference,) = ReferenceLibrary(store).load(SCENE, ["odd"], OLD, turn())
         assert reference.view.photograph is not None
         with pytest.raises(DataLoss, match="'odd'"):
             reference.view.photograph.read()
@@ -134,14 +146,14 @@ class TestPhotographs:
 class TestDescribing:
     def test_a_store_filled_under_other_features_describes_each_reference_once(self, store: CountingStore) -> None:
         """Whatever calls ask for, in whatever order, and however often."""
-        new, generation = StandInExtractor("new"), store.get_scene("s").generation
+        new, generation = StandInExtractor("new"), store.get_scene(SCENE).generation
         expected = {it: new.extract(PIXELS[it], CAMERA).features.keypoints for it in IDS}
         new.seen.clear()
         for ids, described in ((["r2"], 1), (["r2", "r1"], 2), (IDS, 4), (IDS[::-1], 4)):
             library = ReferenceLibrary(store)  # what is known is in the store
             call = turn()
-            found, references = library.load("s", ids, new, call)
-            assert found == generation == store.get_scene("s").generation, "features are no change of the scene"
+            found, references = library.load(SCENE, ids, new, call)
+            assert found == generation == store.get_scene(SCENE).generation, "features are no change of the scene"
             assert [it.name.rpartition("/")[2] for it in references] == ids
             for reference_id, reference in zip(ids, references, strict=True):
                 np.testing.assert_array_equal(reference.view.features.keypoints, expected[reference_id])
@@ -161,11 +173,11 @@ class TestDescribing:
         new, library = Picky("new"), ReferenceLibrary(store)
         for _ in range(3):
             with pytest.raises(NotDescribedYet):
-                library.load("s", IDS, new, turn(), waits=False)
+                library.load(SCENE, IDS, new, turn(), waits=False)
         others = [it for it in IDS if it != "r1"]
         for _ in range(500):
             with suppress(NotDescribedYet):
-                library.load("s", others, new, turn(), waits=False)
+                library.load(SCENE, others, new, turn(), waits=False)
                 break
             time.sleep(0.01)
         library.close()
@@ -178,7 +190,7 @@ class TestDescribing:
 
         def load(order: int) -> list[str]:
             together.wait()
-            _, references = library.load("s", IDS[::order], new, turn())
+            _, references = library.load(SCENE, IDS[::order], new, turn())
             return sorted(it.name for it in references)
 
         with ThreadPoolExecutor(6) as pool:
@@ -196,12 +208,12 @@ class TestDescribing:
                 raise MemoryError("planted")
 
         with ThreadPoolExecutor(2) as pool:
-            failing = pool.submit(library.load, "s", ["r0"], Failing("new"), turn())
+            failing = pool.submit(library.load, SCENE, ["r0"], Failing("new"), turn())
             assert entered.wait(20)
             good = StandInExtractor("new")
-            waiting = pool.submit(library.load, "s", ["r0"], good, turn())
-            with pytest.raises(DeadlineExceeded):
-                library.load("s", ["r0"], good, turn(0.05))
+            waiting = pool.submit(library.load, SCENE, ["r0"], good, turn())
+            with pytest.raises(Abandoned):
+                library.load(SCENE, ["r0"], good, turn(0.05))
             assert not good.seen
             fail.set()
             with pytest.raises(MemoryError):
@@ -210,24 +222,24 @@ class TestDescribing:
 
     def test_a_deadline_between_two_keeps_what_is_done(self, store: CountingStore) -> None:
         new, library = StandInExtractor("new"), ReferenceLibrary(store)
-        call = turn()
+        begun = threading.Event()
 
         class Abandoning(StandInExtractor):
             def extract(self, *arguments: Any) -> Any:
-                call.abandon()
+                begun.set()
                 return super().extract(*arguments)
 
-        with pytest.raises(DeadlineExceeded):
-            library.load("s", IDS, Abandoning("new"), call)
-        assert len(store.load_references("s", IDS, "new").references) == 1
-        library.load("s", IDS, new, turn())
+        with pytest.raises(Abandoned):
+            library.load(SCENE, IDS, Abandoning("new"), turn(is_abandoned=begun.is_set))
+        assert len(store.load_references(SCENE, IDS, "new").references) == 1
+        library.load(SCENE, IDS, new, turn())
         assert len(new.seen) == len(IDS) - 1
 
     def test_a_reference_that_goes_meanwhile_is_not_found(self, store: CountingStore) -> None:
         class Deleting(StandInExtractor):
             def extract(self, *arguments: Any) -> Any:
-                store.delete_reference("s", "r0")
+                store.delete_reference(SCENE, "r0")
                 return super().extract(*arguments)
 
         with pytest.raises(NotFound):
-            ReferenceLibrary(store).load("s", IDS, Deleting("new"), turn())
+            ReferenceLibrary(store).load(SCENE, IDS, Deleting("new"), turn())

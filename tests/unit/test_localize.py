@@ -16,18 +16,24 @@ from scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for,
 import mapless_server.method.localize as method
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method import pnp
-from mapless_server.method.coarse import Reconstruction, Reconstructor
+from mapless_server.method.coarse import Bucket, Outcome, Reconstruction, Reconstructor, Request
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.correspond import Correspondences, Matcher, Matches
 from mapless_server.method.localize import (
     MIN_FEATURES,
     Answer,
+    Coarse,
     Localization,
     LocalizeOptions,
     Pipeline,
+    Prepared,
     Variant,
+    coarse_answer,
     localize,
+    prepare,
+    reconstruct,
+    refine,
 )
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
@@ -53,10 +59,11 @@ class ChangedNetwork:
     def close(self) -> None:
         self.network.close()
 
-    def reconstruct(
-        self, query: View, references: Sequence[PosedView], correspondences: Correspondences
-    ) -> Reconstruction | DeviceReconstruction:
-        return self.change(self.network.reconstruct(query, references, correspondences))
+    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
+        return self.network.bucket(query, references)
+
+    def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
+        return [self.change(self.network.reconstruct(request.query, request.references)) for request in requests]
 
 
 def pipeline_of(backend: str, scene: SyntheticScene = SCENE, options: FakeNetworkOptions | None = None) -> Pipeline:
@@ -440,7 +447,8 @@ def test_the_wide_answer_is_given_for_more_inliers_at_a_similar_claim(
         return Answer(Localization(SCENE.world_from_query, covariance, PoseStage.REFINED, claim[0], 90, 1.0))
 
     answers = {False: made(strict), True: made(wide)}
-    monkeypatch.setattr(method, "_attempt", lambda *_, wide: answers[wide])
+    poses = iter((answers[False], answers[True]))
+    monkeypatch.setattr(method, "_pose", lambda *_: next(poses))
     found = answer_of(pipeline_of("geometric"))
     expected = answers[wide_wins].outcome
     assert isinstance(expected, Localization)
@@ -455,15 +463,16 @@ def test_a_network_is_asked_once_for_a_query(backend: str, times: int) -> None:
     class Counting:
         name, weights_sha256 = "counting", ""
         uses_correspondences = pipeline.reconstructor.uses_correspondences
+        bucket = pipeline.reconstructor.bucket
 
         def close(self) -> None:
             pass
 
-        def reconstruct(self, query: View, references: Sequence[PosedView], correspondences: Correspondences) -> object:
-            asked.append(len(references))
-            return pipeline.reconstructor.reconstruct(query, references, correspondences)
+        def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
+            asked.append(len(requests))
+            return pipeline.reconstructor.reconstruct_many(requests)
 
-    answer_of(replace(pipeline, reconstructor=Counting()), LocalizeOptions(weak_inliers=10**6))  # type: ignore[arg-type]
+    answer_of(replace(pipeline, reconstructor=Counting()), LocalizeOptions(weak_inliers=10**6))
     assert len(asked) == times
 
 
@@ -479,3 +488,141 @@ def test_pnp_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     answer = answer_of(Pipeline(ChangedNetwork(FakeNetwork(SCENE), looking_back), MATCHER))
     assert reason_of(answer) is RejectionReason.PNP_FAILED
     assert list(answer.stage_seconds)[-1] == "pnp"
+
+
+# Many queries, in three parts
+
+
+def prepared_of(pipeline: Pipeline, options: LocalizeOptions | None = None, query: View | None = None) -> Prepared:
+    prepared = prepare(query or SCENE.query, SCENE.references, pipeline, options or LocalizeOptions())
+    assert isinstance(prepared, Prepared), prepared
+    return prepared
+
+
+def fewer_features(seed: int) -> View:
+    """The query, but that every tenth of its features is not found."""
+    f = SCENE.query.features
+    kept = random_for("fewer features", seed).random(len(f)) < 0.9
+    return replace(SCENE.query, features=Features(f.keypoints[kept], f.descriptors[kept], f.sizes_px[kept]))
+
+
+def coarse_of(result: Coarse | Answer | Exception) -> Coarse:
+    assert isinstance(result, Coarse), result
+    return result
+
+
+def same_bits(first: Answer, second: Answer) -> bool:
+    one, other = pose_of(first), pose_of(second)
+    return (
+        one.world_from_camera.matrix().tobytes() == other.world_from_camera.matrix().tobytes()
+        and (one.inlier_count, one.match_count) == (other.inlier_count, other.match_count)
+        and list(first.stage_seconds) == list(second.stage_seconds)
+    )
+
+
+@pytest.mark.parametrize("weak_inliers", [0, 10**6])
+@pytest.mark.parametrize("backend", ["geometric", "network", "device"])
+def test_queries_of_one_batch_are_answered_as_alone(backend: str, weak_inliers: int) -> None:
+    """To the bit, where the backend itself gives the same bits; with their own options."""
+    pipeline = pipeline_of(backend, options=None if backend == "geometric" else ROUGH)
+    queries = [fewer_features(seed) for seed in range(3)] if backend == "geometric" else [SCENE.query] * 3
+    choices = [LocalizeOptions(variant, weak_inliers=weak_inliers) for variant in (Variant.BEST, Variant.FULL)]
+    options = [choices[i % 2] for i in range(3)]
+    batch = [prepared_of(pipeline, o, q) for o, q in zip(options, queries, strict=True)]
+    assert len({prepared.bucket for prepared in batch}) == 1
+    parts = [coarse_of(result) for result in reconstruct(batch)]
+    assert len({part.stage_seconds["coarse"] for part in parts}) == 1
+    for part, option, query in zip(parts, options, queries, strict=True):
+        assert same_bits(refine(part), answer_of(pipeline, option, query))
+
+
+def test_a_coarse_answer_is_the_pose_of_the_coarse_form_and_says_why() -> None:
+    for backend in ("geometric", "network", "device"):
+        offset = np.full(3, 1e5)
+        far = [replace(r, world_from_camera=r.world_from_camera.shifted(offset)) for r in SCENE.references]
+        pipeline = pipeline_of(backend, options=ROUGH)
+        prepared = prepare(SCENE.query, far, pipeline, LocalizeOptions())
+        assert isinstance(prepared, Prepared)
+        answer = coarse_answer(coarse_of(reconstruct([prepared])[0]))
+        assert answer is not None
+        expected = localize(SCENE.query, far, pipeline, LocalizeOptions(Variant.COARSE))
+        found, asked_for = pose_of(answer), pose_of(expected)
+        assert (found.pose_stage, asked_for.pose_stage) == (PoseStage.COARSE, PoseStage.INITIAL)
+        assert found.covariance is None
+        assert found.world_from_camera.matrix().tobytes() == asked_for.world_from_camera.matrix().tobytes()
+        assert answer.scale is not None
+        assert expected.scale is not None
+        assert answer.scale.metres_per_unit == expected.scale.metres_per_unit
+        assert answer.reference_match_counts == expected.reference_match_counts
+        assert list(answer.stage_seconds)[:2] == ["correspond", "coarse"]
+
+
+def test_where_the_reconstruction_gives_no_pose_only_refining_may() -> None:
+    pipeline = Pipeline(ChangedNetwork(FakeNetwork(SCENE), blinded), MATCHER)
+    hopeful, settled = reconstruct(
+        [prepared_of(pipeline, LocalizeOptions(variant)) for variant in (Variant.BEST, Variant.FULL)]
+    )
+    assert coarse_answer(coarse_of(hopeful)) is None
+    assert reason_of(refine(coarse_of(hopeful))) is RejectionReason.SCALE_UNRELIABLE
+    assert isinstance(settled, Answer)
+    assert reason_of(settled) is RejectionReason.SCALE_UNRELIABLE
+
+
+def test_the_coarse_form_is_answered_without_refining() -> None:
+    (answer,) = reconstruct([prepared_of(pipeline_of("network"), LocalizeOptions(Variant.COARSE))])
+    assert isinstance(answer, Answer)
+    assert pose_of(answer).pose_stage is PoseStage.INITIAL
+
+
+def test_one_query_s_exception_is_its_own() -> None:
+    """Of its check before and after the backend, and of the backend; and the backend is not asked in vain."""
+    network = FakeNetwork(SCENE)
+    fault, asked = MemoryError("of this query"), []
+
+    class Faulty(ChangedNetwork):
+        def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
+            asked.append(len(requests))
+            outcomes = super().reconstruct_many(requests)
+            return [fault, *outcomes[1:]]
+
+    pipeline = Pipeline(Faulty(network, lambda it: it), MATCHER)
+    gone = NobodyWaits()
+    later_calls: list[int] = []
+
+    def already() -> None:
+        raise gone
+
+    def later() -> None:
+        later_calls.append(len(later_calls))
+        if len(later_calls) > 1:
+            raise gone
+
+    batch = [prepared_of(pipeline) for _ in range(4)]
+    first, second, third, fourth = reconstruct(batch, [already, lambda: None, later, lambda: None])
+    assert first is gone
+    assert second is fault
+    assert third is gone
+    assert pose_of(refine(coarse_of(fourth))).pose_stage is PoseStage.REFINED
+    assert asked == [3]
+
+
+def test_an_exception_of_the_whole_batch_is_raised_unchanged() -> None:
+    fault = RuntimeError("CUDA error: an illegal memory access was encountered")
+
+    class Broken(ChangedNetwork):
+        def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
+            raise fault
+
+    pipeline = Pipeline(Broken(FakeNetwork(SCENE), lambda it: it), MATCHER)
+    with pytest.raises(RuntimeError) as raised:
+        reconstruct([prepared_of(pipeline), prepared_of(pipeline)])
+    assert raised.value is fault
+    with pytest.raises(RuntimeError) as raised:
+        answer_of(pipeline)
+    assert raised.value is fault
+
+
+def test_a_batch_has_one_reconstructor() -> None:
+    with pytest.raises(ValueError, match="one reconstructor"):
+        reconstruct([prepared_of(pipeline_of(backend)) for backend in ("geometric", "network")])
+    assert reconstruct([]) == []

@@ -23,11 +23,11 @@ from safetensors.torch import save_file
 from small_networks import GRIDS, SMALL, photograph, references_of, small_network, small_request, small_runner, view_of
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.method.coarse import Reconstruction
+from mapless_server.method.coarse import Bucket, Outcome, Reconstruction, Request, reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.coarse.make import make_reconstructor
-from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor, Outcome, condition_poses
+from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor, condition_poses
 from mapless_server.method.coarse.token_cache import TokenCacheOptions
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import PosedView, View
@@ -128,7 +128,7 @@ def assert_same_bits(actual: Outcome | Exception, expected: Outcome | Exception)
 
 def test_every_view_has_its_own_place_in_the_answer() -> None:
     runner = GreyRunner()
-    outcome = grey_backend(runner).reconstruct(*grey_request(7, 50, 100, 150))
+    outcome = reconstruct_one(grey_backend(runner), *grey_request(7, 50, 100, 150))
     assert greys_of(outcome) == [7, 50, 100, 150]
     assert isinstance(outcome, Reconstruction)
     assert outcome.query.camera.width_px == 70
@@ -140,7 +140,7 @@ def test_every_view_has_its_own_place_in_the_answer() -> None:
 @pytest.mark.parametrize("name", NETWORKS)
 def test_maps_belong_to_the_pictures(name: str) -> None:
     """Point maps are of the grid's size, confidence is 0 to 1, and both differ from reference to reference."""
-    outcome = NetworkReconstructor(small_runner(name), OPTIONS).reconstruct(*small_request(3))
+    outcome = reconstruct_one(NetworkReconstructor(small_runner(name), OPTIONS), *small_request(3))
     assert isinstance(outcome, Reconstruction)
     for view in outcome.references:
         assert view.point_map.shape == (56, 70, 3)
@@ -156,7 +156,7 @@ def test_maps_belong_to_the_pictures(name: str) -> None:
 def test_there_is_no_confidence_where_a_picture_is_filled() -> None:
     query, references = small_request(2)
     portrait = references_of([photograph(textured(72, 96, seed=i)) for i in range(3)])[2]
-    outcome = NetworkReconstructor(small_runner("pi3"), OPTIONS).reconstruct(query, [*references, portrait])
+    outcome = reconstruct_one(NetworkReconstructor(small_runner("pi3"), OPTIONS), query, [*references, portrait])
     assert isinstance(outcome, Reconstruction)
     filled = outcome.references[2]
     assert (outcome.references[0].confidence > 0).all()
@@ -168,7 +168,7 @@ def test_there_is_no_confidence_where_a_picture_is_filled() -> None:
 
 def test_without_references_there_is_no_answer() -> None:
     query, _ = small_request(0)
-    outcome = grey_backend(GreyRunner()).reconstruct(query, [])
+    outcome = reconstruct_one(grey_backend(GreyRunner()), query, [])
     assert isinstance(outcome, Rejection)
     assert outcome.reason is RejectionReason.NO_USABLE_REFERENCES
 
@@ -177,7 +177,7 @@ def test_a_view_without_a_photograph_is_misuse() -> None:
     query, references = small_request(2)
     bare = replace(references[1], view=replace(references[1].view, photograph=None))
     with pytest.raises(ValueError, match="r1 has no photograph"):
-        grey_backend(GreyRunner()).reconstruct(query, [references[0], bare])
+        reconstruct_one(grey_backend(GreyRunner()), query, [references[0], bare])
 
 
 # Kept tokens
@@ -189,14 +189,14 @@ def test_kept_tokens_give_the_same_bits(name: str) -> None:
     query, references = small_request(4, reads=reads)
     runner = small_runner(name)
     backend = NetworkReconstructor(runner, OPTIONS)
-    backend.reconstruct(query, references[:3])
-    backend.reconstruct(query, references[2:])
+    reconstruct_one(backend, query, references[:3])
+    reconstruct_one(backend, query, references[2:])
     reads.clear()
-    kept = backend.reconstruct(query, references)
+    kept = reconstruct_one(backend, query, references)
     assert query.photograph is not None
     assert reads == [query.photograph.sha256]
     assert backend.cache.counters.device_hits == 5
-    assert_same_bits(kept, NetworkReconstructor(runner, UNCACHED).reconstruct(query, references))
+    assert_same_bits(kept, reconstruct_one(NetworkReconstructor(runner, UNCACHED), query, references))
     assert len(reads) == 6
 
 
@@ -205,32 +205,32 @@ def test_tokens_from_the_host_give_the_same_bits(name: str) -> None:
     request = small_request(4)
     runner = small_runner(name)
     backend = NetworkReconstructor(runner, OPTIONS)
-    backend.reconstruct(*request)
+    reconstruct_one(backend, *request)
     one_view_bytes = backend.cache.counters.device_bytes // 4
     # On a device of its own memory; here both levels are the host's.
     backend.cache = type(backend.cache)(runner.device, TokenCacheOptions(one_view_bytes, 4 * one_view_bytes))
-    first, second = backend.reconstruct(*request), backend.reconstruct(*request)
+    first, second = reconstruct_one(backend, *request), reconstruct_one(backend, *request)
     assert backend.cache.counters.host_hits == 3 + 1
     assert_same_bits(first, second)
-    assert_same_bits(second, NetworkReconstructor(runner, UNCACHED).reconstruct(*request))
+    assert_same_bits(second, reconstruct_one(NetworkReconstructor(runner, UNCACHED), *request))
 
 
 def test_another_photograph_under_the_same_name_is_another_view() -> None:
     query, references = grey_request(7, 50, 100)
     backend = grey_backend(GreyRunner())
-    backend.reconstruct(query, references)
+    reconstruct_one(backend, query, references)
     changed = replace(references[1], view=grey_request(200)[0])
-    assert greys_of(backend.reconstruct(query, [references[0], changed])) == [7, 50, 200]
+    assert greys_of(reconstruct_one(backend, query, [references[0], changed])) == [7, 50, 200]
 
 
 def test_another_grid_is_a_miss_and_no_more() -> None:
     query, references = grey_request(7, 50, 100)
     portraits = grey_request(7, 60, 70, 80, size=(72, 96))[1]
     backend = grey_backend(GreyRunner())
-    backend.reconstruct(query, references)
-    assert greys_of(backend.reconstruct(query, [references[0], *portraits])) == [7, 50, 60, 70, 80]
+    reconstruct_one(backend, query, references)
+    assert greys_of(reconstruct_one(backend, query, [references[0], *portraits])) == [7, 50, 60, 70, 80]
     assert backend.cache.counters.device_hits == 0
-    assert greys_of(backend.reconstruct(query, references)) == [7, 50, 100]
+    assert greys_of(reconstruct_one(backend, query, references)) == [7, 50, 100]
     assert backend.cache.counters.device_hits == 2
 
 
@@ -247,18 +247,51 @@ def test_queries_together_are_as_alone(name: str) -> None:
         small_request(3, 5),
     ]
     runner = small_runner(name)
-    together = NetworkReconstructor(runner, OPTIONS).reconstruct_many(requests)
+    together = NetworkReconstructor(runner, OPTIONS).reconstruct_many([Request(*request) for request in requests])
     for request, outcome in zip(requests, together, strict=True):
-        alone = NetworkReconstructor(runner, OPTIONS).reconstruct(*request)
+        alone = reconstruct_one(NetworkReconstructor(runner, OPTIONS), *request)
         for one, other in zip(arrays_of(outcome), arrays_of(alone), strict=True):
             np.testing.assert_allclose(one, other, atol=2e-4 * float(np.abs(other).max()))
+
+
+@pytest.mark.parametrize("cache", [OPTIONS.cache, TokenCacheOptions(0, 0)], ids=["kept", "not kept"])
+def test_each_view_of_a_batch_is_encoded_once(cache: TokenCacheOptions) -> None:
+    runner = GreyRunner()
+    _, references = grey_request(0, 50, 100, 150)
+    requests = [Request(grey_request(i)[0], references) for i in (1, 2, 3, 4)]
+    outcomes = grey_backend(runner, replace(OPTIONS, cache=cache)).reconstruct_many(requests)
+    assert [greys_of(outcome) for outcome in outcomes] == [[i, 50, 100, 150] for i in (1, 2, 3, 4)]
+    assert sum(runner.encoded) == 3 + 4
+    assert runner.batches == [4]
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_queries_that_share_their_references_are_as_alone(name: str) -> None:
+    _, references = small_request(3)
+    queries = [small_request(1, seed)[0] for seed in (1, 2, 3, 4)]
+    runner = small_runner(name)
+    together = NetworkReconstructor(runner, UNCACHED).reconstruct_many([Request(q, references) for q in queries])
+    for query, outcome in zip(queries, together, strict=True):
+        alone = reconstruct_one(NetworkReconstructor(runner, UNCACHED), query, references)
+        for one, other in zip(arrays_of(outcome), arrays_of(alone), strict=True):
+            np.testing.assert_allclose(one, other, atol=2e-4 * float(np.abs(other).max()))
+
+
+def test_a_bucket_is_what_the_network_computes_in_one_go() -> None:
+    backend = grey_backend(GreyRunner())
+    assert backend.bucket(*grey_request(1, 50, 60)) == Bucket("grey", 2, (4, 5))
+    assert str(backend.bucket(*grey_request(1, 50, 60))) == "grey-4x5-2"
+    assert str(backend.bucket(*grey_request(1, 50, size=(72, 96)))) == "grey-5x4-1"
+    query, _ = grey_request(1, 50)
+    with pytest.raises(ValueError, match="the query has no photograph"):
+        backend.bucket(replace(query, photograph=None), grey_request(1, 50)[1])
 
 
 def test_one_requests_fault_is_its_own() -> None:
     requests = [grey_request(1, 50), grey_request(2, 60), grey_request(3, 70)]
     query, (reference,) = requests[1]
     requests[1] = (query, (replace(reference, view=replace(reference.view, photograph=None)),))
-    outcomes = grey_backend(GreyRunner()).reconstruct_many(requests)
+    outcomes = grey_backend(GreyRunner()).reconstruct_many([Request(*request) for request in requests])
     assert isinstance(outcomes[1], ValueError)
     assert [greys_of(outcomes[i]) for i in (0, 2)] == [[1, 50], [3, 70]]
 
@@ -269,7 +302,7 @@ def test_one_requests_fault_is_its_own() -> None:
 def test_a_batch_that_does_not_fit_is_halved() -> None:
     runner = GreyRunner(most_scenes=2)
     backend = grey_backend(runner)
-    outcomes = backend.reconstruct_many([grey_request(i, 50, 100) for i in range(4)])
+    outcomes = backend.reconstruct_many([Request(*grey_request(i, 50, 100)) for i in range(4)])
     assert [greys_of(outcome) for outcome in outcomes] == [[i, 50, 100] for i in range(4)]
     assert runner.batches == [4, 2, 2]
     assert backend.cache.counters.device_bytes == 0
@@ -277,7 +310,7 @@ def test_a_batch_that_does_not_fit_is_halved() -> None:
 
 def test_only_the_query_that_never_fits_is_lost(caplog: pytest.LogCaptureFixture) -> None:
     runner = GreyRunner(poison=33)
-    outcomes = grey_backend(runner).reconstruct_many([grey_request(i, 50) for i in (31, 32, 33, 34)])
+    outcomes = grey_backend(runner).reconstruct_many([Request(*grey_request(i, 50)) for i in (31, 32, 33, 34)])
     assert [type(outcome) for outcome in outcomes] == [
         Reconstruction,
         Reconstruction,
@@ -292,20 +325,43 @@ def test_only_the_query_that_never_fits_is_lost(caplog: pytest.LogCaptureFixture
 def test_a_query_alone_is_tried_again_once() -> None:
     runner = GreyRunner(most_scenes=0)
     with pytest.raises(torch.OutOfMemoryError):
-        grey_backend(runner).reconstruct(*grey_request(1, 50))
+        reconstruct_one(grey_backend(runner), *grey_request(1, 50))
     assert runner.batches == [1, 1]
 
 
 @pytest.mark.parametrize("failing", [1, 2])
 def test_encoding_is_tried_again_once(failing: int) -> None:
     outcomes = grey_backend(GreyRunner(failing_encodings=failing)).reconstruct_many(
-        [grey_request(1, 50), grey_request(2, 50)]
+        [Request(*grey_request(1, 50)), Request(*grey_request(2, 50))]
     )
     assert greys_of(outcomes[1]) == [2, 50]
     if failing == 1:
         assert greys_of(outcomes[0]) == [1, 50]
     else:
         assert isinstance(outcomes[0], torch.OutOfMemoryError)
+
+
+class LostDevice(RuntimeError):
+    """As torch raises it when the context is poisoned."""
+
+
+def test_a_lost_device_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether it is lost while one view is encoded or in the middle of the batch, the error comes out unchanged."""
+    lost = LostDevice("CUDA error: an illegal memory access was encountered")
+
+    def fail(*_: Any) -> None:
+        raise lost
+
+    runner = GreyRunner()
+    backend = grey_backend(runner)
+    requests = [Request(*grey_request(i, 50)) for i in (1, 2)]
+    with monkeypatch.context() as patch:
+        patch.setattr(runner, "reconstruct", fail)
+        with pytest.raises(LostDevice) as raised:
+            backend.reconstruct_many(requests)
+        assert raised.value is lost
+    monkeypatch.setattr(runner, "encode", fail)
+    assert all(outcome is lost for outcome in grey_backend(runner).reconstruct_many(requests))
 
 
 # Not a number
@@ -315,22 +371,22 @@ def test_a_broken_network_gives_a_rejection(caplog: pytest.LogCaptureFixture) ->
     network = small_network("pi3")
     cast(Pi3, network).camera_head.fc_t.bias.data[:] = float("nan")
     runner = NetworkRunner(network, "pi3", "sha", "cpu")
-    outcome = NetworkReconstructor(runner, OPTIONS).reconstruct(*small_request(2))
+    outcome = reconstruct_one(NetworkReconstructor(runner, OPTIONS), *small_request(2))
     assert isinstance(outcome, Rejection)
     assert outcome.reason is RejectionReason.SCALE_UNRELIABLE
     assert "pi3" in outcome.message
     assert [record.message for record in caplog.records] == ["pi3: the network's output is not finite"]
-    kept = NetworkReconstructor(runner, replace(OPTIONS, keep_on_device=True)).reconstruct(*small_request(2))
+    kept = reconstruct_one(NetworkReconstructor(runner, replace(OPTIONS, keep_on_device=True)), *small_request(2))
     assert isinstance(kept, DeviceReconstruction)
     assert kept.local_from_camera.isnan().any()
 
 
 def test_what_stays_on_the_device_is_the_same() -> None:
     runner, request = small_runner("pi3"), small_request(3)
-    kept = NetworkReconstructor(runner, replace(OPTIONS, keep_on_device=True)).reconstruct(*request)
+    kept = reconstruct_one(NetworkReconstructor(runner, replace(OPTIONS, keep_on_device=True)), *request)
     assert isinstance(kept, DeviceReconstruction)
     assert kept.backend == "pi3"
-    assert_same_bits(kept.fetch(), NetworkReconstructor(runner, OPTIONS).reconstruct(*request))
+    assert_same_bits(kept.fetch(), reconstruct_one(NetworkReconstructor(runner, OPTIONS), *request))
 
 
 # Known poses (Pi3X)
@@ -377,7 +433,7 @@ def test_pi3x_answers_as_if_the_query_were_left_out_of_the_mean(monkeypatch: pyt
     """The plain way: the query stands far away, and the mean is taken without it. With it the answer is another."""
     query, references = small_request(3)
     runner = small_runner("pi3x")
-    outcome = NetworkReconstructor(runner, OPTIONS).reconstruct(query, references)
+    outcome = reconstruct_one(NetworkReconstructor(runner, OPTIONS), query, references)
     assert isinstance(outcome, Reconstruction)
     ours = np.stack([view.point_map for view in outcome.references])
 
@@ -420,14 +476,14 @@ def test_a_single_posed_view_conditions_nothing() -> None:
     query, (reference,) = small_request(1)
     backend = NetworkReconstructor(small_runner("pi3x"), OPTIONS)
     moved = replace(reference, world_from_camera=random_poses(1)[0])
-    assert_same_bits(backend.reconstruct(query, [reference]), backend.reconstruct(query, [moved]))
+    assert_same_bits(reconstruct_one(backend, query, [reference]), reconstruct_one(backend, query, [moved]))
 
 
 def test_pi3_is_told_no_poses() -> None:
     query, references = small_request(3)
     backend = NetworkReconstructor(small_runner("pi3"), OPTIONS)
     moved = [replace(it, world_from_camera=pose) for it, pose in zip(references, random_poses(3), strict=True)]
-    assert_same_bits(backend.reconstruct(query, references), backend.reconstruct(query, moved))
+    assert_same_bits(reconstruct_one(backend, query, references), reconstruct_one(backend, query, moved))
 
 
 # From a name to a backend
@@ -451,9 +507,9 @@ def test_a_network_from_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert made.name == "pi3"
     assert made.weights_sha256 == hashlib.sha256((tmp_path / "pi3.safetensors").read_bytes()).hexdigest()
     request = small_request(2)
-    expected = NetworkReconstructor(NetworkRunner(network, "pi3", "sha", "cpu"), OPTIONS).reconstruct(*request)
+    expected = reconstruct_one(NetworkReconstructor(NetworkRunner(network, "pi3", "sha", "cpu"), OPTIONS), *request)
     assert isinstance(made, NetworkReconstructor)
-    assert_same_bits(made.reconstruct(*request), expected)
+    assert_same_bits(reconstruct_one(made, *request), expected)
     with (tmp_path / "pi3.safetensors").open("r+b") as stream:
         stream.truncate(1000)
     with pytest.raises(CheckpointError):

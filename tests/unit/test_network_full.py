@@ -16,12 +16,12 @@ from parity_rule import ruled_network
 from small_networks import photograph, references_of, view_of
 from images import textured
 from mapless_server.method.coarse.network import NetworkReconstructor
-from mapless_server.method.coarse import Reconstruction
+from mapless_server.method.coarse import Reconstruction, reconstruct_one
 from mapless_server.networks.runner import NetworkRunner
 
 backend = NetworkReconstructor(NetworkRunner(ruled_network("pi3", small=False), "pi3", "rule"))
 photos = [photograph(textured(640, 480, seed=seed)) for seed in range(2)]
-made = backend.reconstruct(view_of(photos[0]), references_of(photos[1:]))
+made = reconstruct_one(backend, view_of(photos[0]), references_of(photos[1:]))
 assert isinstance(made, Reconstruction), made
 print(made.references[0].point_map.shape)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)

@@ -21,7 +21,7 @@ def clean_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
     path = tmp_path / "mapless.toml"
-    path.write_text('host = "10.0.0.1"\nport = 1000\nmax_waiting = 5\nreflection = false\n')
+    path.write_text('host = "10.0.0.1"\nport = 1000\nmax_queued_mib = 5\nreflection = false\n')
     return path
 
 
@@ -29,9 +29,9 @@ def test_precedence_and_origins(config: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setenv("MAPLESS_PORT", "2000")
     monkeypatch.setenv("MAPLESS_HOST", "10.0.0.2")
     loaded = load_settings({"host": "10.0.0.3", "workers": None}, config)
-    assert (loaded.settings.host, loaded.settings.port, loaded.settings.max_waiting) == ("10.0.0.3", 2000, 5)
+    assert (loaded.settings.host, loaded.settings.port, loaded.settings.max_queued_mib) == ("10.0.0.3", 2000, 5)
     assert not loaded.settings.reflection
-    expected = {"host": "flag", "port": "environment", "max_waiting": "file", "workers": "default"}
+    expected = {"host": "flag", "port": "environment", "max_queued_mib": "file", "workers": "default"}
     assert {name: loaded.origins[name] for name in expected} == expected
 
 

@@ -23,10 +23,13 @@ from sqlalchemy.exc import IntegrityError
 from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
 from mapless_server import errors
 from mapless_server.method.views import Features, View
+from mapless_server.principal import DEFAULT_TENANT
 from mapless_server.store import NewReference, Store, StoreError, codec, sqlite
 from mapless_server.store.cache import LruCache
+from mapless_server.tenancy import SceneKey
 
 EXTRACTOR = "sift"
+OFFICE, HALL, SCENE, NOWHERE = map(SceneKey, ("office", "hall", "scene", "nowhere"))
 
 
 def make_reference(
@@ -95,32 +98,32 @@ def store(data_dir: Path) -> Iterator[Store]:
 
 class TestScenes:
     def test_created_scene_is_found(self, store: Store) -> None:
-        created = store.create_scene("office")
+        created = store.create_scene(OFFICE)
         assert created.scene_id == "office"
         assert created.generation == 1
         assert created.reference_count == 0
         assert created.create_time.utcoffset() is not None
-        assert store.get_scene("office") == created
-        assert store.list_scenes(10) == [created]
+        assert store.get_scene(OFFICE) == created
+        assert store.list_scenes(DEFAULT_TENANT, 10) == [created]
 
     def test_taken_id_is_refused_and_changes_nothing(self, store: Store) -> None:
-        created = store.create_scene("office")
+        created = store.create_scene(OFFICE)
         with pytest.raises(errors.AlreadyExists):
-            store.create_scene("office")
-        assert store.get_scene("office") == created
+            store.create_scene(OFFICE)
+        assert store.get_scene(OFFICE) == created
 
     def test_everything_of_an_unknown_scene_is_not_found(self, store: Store) -> None:
         calls = (
-            lambda: store.get_scene("nowhere"),
-            lambda: store.delete_scene("nowhere"),
-            lambda: store.add_references("nowhere", [make_reference("a")]),
-            lambda: store.get_reference("nowhere", "a"),
-            lambda: store.read_image("nowhere", "a"),
-            lambda: store.list_references("nowhere", 10),
-            lambda: store.delete_reference("nowhere", "a"),
-            lambda: store.list_poses("nowhere"),
-            lambda: store.load_references("nowhere", None, EXTRACTOR),
-            lambda: store.load_references("nowhere", ["a"], EXTRACTOR),
+            lambda: store.get_scene(NOWHERE),
+            lambda: store.delete_scene(NOWHERE),
+            lambda: store.add_references(NOWHERE, [make_reference("a")]),
+            lambda: store.get_reference(NOWHERE, "a"),
+            lambda: store.read_image(NOWHERE, "a"),
+            lambda: store.list_references(NOWHERE, 10),
+            lambda: store.delete_reference(NOWHERE, "a"),
+            lambda: store.list_poses(NOWHERE),
+            lambda: store.load_references(NOWHERE, None, EXTRACTOR),
+            lambda: store.load_references(NOWHERE, ["a"], EXTRACTOR),
         )
         for call in calls:
             with pytest.raises(errors.NotFound, match="nowhere") as caught:
@@ -128,12 +131,12 @@ class TestScenes:
             assert caught.value.field == "scene"
 
     def test_deleted_scene_takes_its_references_along(self, store: Store, data_dir: Path) -> None:
-        store.create_scene("office")
-        store.create_scene("hall")
-        store.add_references("office", [make_reference("a")])
-        store.add_references("hall", [make_reference("a")])
-        store.delete_scene("office")
-        assert [scene.scene_id for scene in store.list_scenes(10)] == ["hall"]
+        store.create_scene(OFFICE)
+        store.create_scene(HALL)
+        store.add_references(OFFICE, [make_reference("a")])
+        store.add_references(HALL, [make_reference("a")])
+        store.delete_scene(OFFICE)
+        assert [scene.scene_id for scene in store.list_scenes(DEFAULT_TENANT, 10)] == ["hall"]
         connection = connect(data_dir)
         for table in ("reference", "image", "features"):
             assert connection.execute(f"SELECT count(*) FROM {table}").fetchone() == (1,), table
@@ -142,60 +145,60 @@ class TestScenes:
 
 class TestGenerations:
     def test_every_change_raises_and_nothing_else_does(self, store: Store) -> None:
-        store.create_scene("office")
+        store.create_scene(OFFICE)
         changes = (
-            lambda: store.add_references("office", [make_reference("a"), make_reference("b")]),
-            lambda: store.add_references("office", [make_reference("c")]),
-            lambda: store.delete_reference("office", "b"),
+            lambda: store.add_references(OFFICE, [make_reference("a"), make_reference("b")]),
+            lambda: store.add_references(OFFICE, [make_reference("c")]),
+            lambda: store.delete_reference(OFFICE, "b"),
         )
         view = view_of(make_reference("a"))
 
         def add_features(extractor: str) -> None:
-            store.add_features(store.get_reference("office", "a").key, extractor, view)
+            store.add_features(store.get_reference(OFFICE, "a").key, extractor, view)
 
         others = (
             lambda: add_features("other"),
-            lambda: store.get_reference("office", "a"),
-            lambda: store.load_references("office", None, EXTRACTOR),
-            lambda: store.create_scene("hall"),
+            lambda: store.get_reference(OFFICE, "a"),
+            lambda: store.load_references(OFFICE, None, EXTRACTOR),
+            lambda: store.create_scene(HALL),
         )
         refused = (
-            lambda: store.create_scene("office"),
-            lambda: store.add_references("office", [make_reference("a")]),
+            lambda: store.create_scene(OFFICE),
+            lambda: store.add_references(OFFICE, [make_reference("a")]),
             lambda: add_features(EXTRACTOR),
             lambda: store.add_features("no such key", EXTRACTOR, view),
-            lambda: store.delete_reference("office", "z"),
+            lambda: store.delete_reference(OFFICE, "z"),
         )
         generation = 1
         for change in changes:
             change()
-            assert store.get_scene("office").generation > generation
-            generation = store.get_scene("office").generation
+            assert store.get_scene(OFFICE).generation > generation
+            generation = store.get_scene(OFFICE).generation
         for read in others:
             read()
         for call in refused:
             with pytest.raises(errors.RequestError):
                 call()
-        assert store.get_scene("office").generation == generation
+        assert store.get_scene(OFFICE).generation == generation
 
     def test_a_new_life_repeats_no_generation(self, data_dir: Path) -> None:
         seen: list[int] = []
         for _ in range(3):
             with Store.open(data_dir) as store:
-                seen.append(store.create_scene("office").generation)
-                store.add_references("office", [make_reference("a")])
-                seen.append(store.get_scene("office").generation)
-                store.delete_scene("office")
+                seen.append(store.create_scene(OFFICE).generation)
+                store.add_references(OFFICE, [make_reference("a")])
+                seen.append(store.get_scene(OFFICE).generation)
+                store.delete_scene(OFFICE)
         assert seen == sorted(set(seen))
 
     def test_a_new_life_repeats_no_key(self, store: Store) -> None:
-        store.create_scene("office")
+        store.create_scene(OFFICE)
         keys = set()
         for seed in range(3):
-            keys.add(store.add_references("office", [make_reference("a", seed)])[0].key)
-            snapshot = store.load_references("office", ["a"], EXTRACTOR)
+            keys.add(store.add_references(OFFICE, [make_reference("a", seed)])[0].key)
+            snapshot = store.load_references(OFFICE, ["a"], EXTRACTOR)
             assert_same_view(snapshot.references[0].view, view_of(make_reference("a", seed)))
-            store.delete_reference("office", "a")
+            store.delete_reference(OFFICE, "a")
         assert len(keys) == 3
 
 
@@ -211,14 +214,14 @@ class TestReferences:
     def test_comes_back_bit_for_bit_after_reopening(self, data_dir: Path, distortion: Distortion | None) -> None:
         new = make_reference("a", seed=3, distortion=distortion)
         with Store.open(data_dir) as store:
-            store.create_scene("office")
-            (created,) = store.add_references("office", [new])
+            store.create_scene(OFFICE)
+            (created,) = store.add_references(OFFICE, [new])
         with Store.open(data_dir) as store:
-            read = store.get_reference("office", "a")
-            image = store.read_image("office", "a")
+            read = store.get_reference(OFFICE, "a")
+            image = store.read_image(OFFICE, "a")
             assert store.read_image_of(created.key) == image
-            (loaded,) = store.load_references("office", ["a"], EXTRACTOR).references
-            _, (pose,) = store.list_poses("office")
+            (loaded,) = store.load_references(OFFICE, ["a"], EXTRACTOR).references
+            _, (pose,) = store.list_poses(OFFICE)
         assert image == new.image
         assert read.camera == new.camera
         assert repr(read.camera) == repr(new.camera)  # tells -0.0 from 0.0
@@ -234,7 +237,7 @@ class TestReferences:
         assert_same_view(loaded.view, view_of(new))
 
     def test_no_features_and_odd_floats_survive(self, store: Store) -> None:
-        store.create_scene("office")
+        store.create_scene(OFFICE)
         bits = np.array([0x7FC00001, 0x80000000, 0x00000001, 0x7F800000], np.uint32).view(np.float32)
         odd = Features(bits.reshape(2, 2), bits.reshape(2, 2), bits[:2])
         none = Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32))
@@ -242,12 +245,12 @@ class TestReferences:
         for reference_id, features in (("odd", odd), ("none", none)):
             views = {EXTRACTOR: View(camera, features)}
             new = NewReference(reference_id, b"", camera, RigidTransform.identity(), views)
-            store.add_references("office", [new])
-            (read,) = store.load_references("office", [reference_id], EXTRACTOR).references
+            store.add_references(OFFICE, [new])
+            (read,) = store.load_references(OFFICE, [reference_id], EXTRACTOR).references
             assert_same_view(read.view, view_of(new))
 
     def test_what_cannot_be_kept_exactly_is_refused(self, store: Store) -> None:
-        store.create_scene("office")
+        store.create_scene(OFFICE)
         good = make_reference("a")
         double = replace(view_of(good).features, keypoints=view_of(good).features.keypoints.astype(float))
         lost = RigidTransform(np.eye(3), np.array([0.0, np.nan, 0.0]))
@@ -256,61 +259,61 @@ class TestReferences:
             NewReference("a", b"", good.camera, lost, good.views),
         ):
             with pytest.raises(ValueError, match="float"):
-                store.add_references("office", [make_reference("b"), bad])
-        assert store.list_references("office", 10) == []
+                store.add_references(OFFICE, [make_reference("b"), bad])
+        assert store.list_references(OFFICE, 10) == []
 
     @pytest.mark.parametrize("ids", [["new", "taken"], ["new", "other", "new"]])
     def test_a_batch_with_one_bad_id_stores_nothing(self, store: Store, ids: list[str]) -> None:
-        store.create_scene("office")
-        store.add_references("office", [make_reference("taken")])
-        before = store.get_scene("office")
+        store.create_scene(OFFICE)
+        store.add_references(OFFICE, [make_reference("taken")])
+        before = store.get_scene(OFFICE)
         with pytest.raises(errors.AlreadyExists, match=ids[-1]) as caught:
-            store.add_references("office", [make_reference(it) for it in ids])
+            store.add_references(OFFICE, [make_reference(it) for it in ids])
         assert caught.value.field == f"requests[{len(ids) - 1}].reference_id"
-        assert store.get_scene("office") == before
-        assert [it.reference_id for it in store.list_references("office", 10)] == ["taken"]
+        assert store.get_scene(OFFICE) == before
+        assert [it.reference_id for it in store.list_references(OFFICE, 10)] == ["taken"]
 
     def test_references_load_in_the_order_asked(self, store: Store) -> None:
-        store.create_scene("office")
-        store.add_references("office", [make_reference(it, seed) for seed, it in enumerate("cab")])
+        store.create_scene(OFFICE)
+        store.add_references(OFFICE, [make_reference(it, seed) for seed, it in enumerate("cab")])
         for ids, expected in ((["b", "c", "a"], "bca"), (["c"], "c"), ([], ""), (None, "abc"), (["b", "a"], "ba")):
-            snapshot = store.load_references("office", ids, EXTRACTOR)
+            snapshot = store.load_references(OFFICE, ids, EXTRACTOR)
             assert [it.record.reference_id for it in snapshot.references] == list(expected)
-            assert snapshot.generation == store.get_scene("office").generation
+            assert snapshot.generation == store.get_scene(OFFICE).generation
         with pytest.raises(errors.NotFound, match="'z'") as caught:
-            store.load_references("office", ["a", "z"], EXTRACTOR)
+            store.load_references(OFFICE, ["a", "z"], EXTRACTOR)
         assert caught.value.field == "references[1]"
 
     def test_features_are_kept_per_extractor(self, store: Store) -> None:
-        store.create_scene("office")
+        store.create_scene(OFFICE)
         new = make_reference("a")
         other = View(view_of(new).camera.resized(320, 240), make_features(np.random.default_rng(9), 7))
-        store.add_references("office", [new])
-        snapshot = store.load_references("office", None, "aliked")
+        store.add_references(OFFICE, [new])
+        snapshot = store.load_references(OFFICE, None, "aliked")
         (lacking,) = snapshot.undescribed
         assert (snapshot.references, lacking.reference_id, lacking.camera) == ((), "a", new.camera)
         assert not store.has_features(lacking.key, "aliked")
         store.add_features(lacking.key, "aliked", other)
         assert store.has_features(lacking.key, "aliked")
         for extractor, expected in (("aliked", other), (EXTRACTOR, view_of(new))):
-            snapshot = store.load_references("office", None, extractor)
+            snapshot = store.load_references(OFFICE, None, extractor)
             assert_same_view(snapshot.references[0].view, expected)
             assert not snapshot.undescribed
 
     def test_those_without_features_are_told_apart_in_the_order_asked(self, store: Store) -> None:
-        store.create_scene("office")
+        store.create_scene(OFFICE)
         both = {"cheap": view_of(make_reference("x")), "strong": view_of(make_reference("x", 1))}
         news = [replace(make_reference(it, count=1), views=both) for it in "ac"]
-        store.add_references("office", [*news, replace(make_reference("b"), views={"cheap": both["cheap"]})])
+        store.add_references(OFFICE, [*news, replace(make_reference("b"), views={"cheap": both["cheap"]})])
         for _ in range(2):  # from the database, then from memory
-            snapshot = store.load_references("office", ["c", "b", "a"], "strong")
+            snapshot = store.load_references(OFFICE, ["c", "b", "a"], "strong")
             assert [it.record.reference_id for it in snapshot.references] == ["c", "a"]
             assert [it.reference_id for it in snapshot.undescribed] == ["b"]
 
     def test_features_of_all_extractors_are_stored_with_the_reference_or_not_at_all(
         self, store: Store, data_dir: Path
     ) -> None:
-        store.create_scene("office")
+        store.create_scene(OFFICE)
         good, other = make_reference("a", 1), make_reference("a", 2, count=7)
         double = replace(view_of(other).features, sizes_px=np.ones(7))  # type: ignore[arg-type]
         both = replace(good, views={"cheap": view_of(good), "strong": view_of(other)})
@@ -318,7 +321,7 @@ class TestReferences:
         none = replace(good, views={})
         for bad in (half, none):
             with pytest.raises(ValueError, match=r"float32|no features"):
-                store.add_references("office", [bad])
+                store.add_references(OFFICE, [bad])
         # Even a failure in the middle of the transaction leaves nothing.
         execute(
             data_dir,
@@ -326,20 +329,20 @@ class TestReferences:
             "BEGIN SELECT RAISE(ABORT, 'denied'); END",
         )
         with pytest.raises(IntegrityError, match="denied"):
-            store.add_references("office", [both])
+            store.add_references(OFFICE, [both])
         execute(data_dir, "DROP TRIGGER deny")
-        assert (store.get_scene("office").generation, store.list_references("office", 10)) == (1, [])
-        (record,) = store.add_references("office", [both])
-        assert (record.feature_count, store.get_scene("office").generation) == (20, 2)
+        assert (store.get_scene(OFFICE).generation, store.list_references(OFFICE, 10)) == (1, [])
+        (record,) = store.add_references(OFFICE, [both])
+        assert (record.feature_count, store.get_scene(OFFICE).generation) == (20, 2)
         for name, view in both.views.items():
-            (loaded,) = store.load_references("office", None, name).references
+            (loaded,) = store.load_references(OFFICE, None, name).references
             assert_same_view(loaded.view, view)
 
     def test_a_key_is_for_one_image_for_ever(self, store: Store) -> None:
-        store.create_scene("office")
-        (old,) = store.add_references("office", [make_reference("a", 1)])
-        store.delete_reference("office", "a")
-        store.add_references("office", [make_reference("a", 2)])
+        store.create_scene(OFFICE)
+        (old,) = store.add_references(OFFICE, [make_reference("a", 1)])
+        store.delete_reference(OFFICE, "a")
+        store.add_references(OFFICE, [make_reference("a", 2)])
         for call in (
             lambda: store.read_image_of(old.key),
             lambda: store.add_features(old.key, "other", view_of(make_reference("a", 1))),
@@ -347,26 +350,26 @@ class TestReferences:
             with pytest.raises(errors.NotFound, match="deleted"):
                 call()
         assert not store.has_features(old.key, EXTRACTOR)
-        assert len(store.load_references("office", None, "other").undescribed) == 1
+        assert len(store.load_references(OFFICE, None, "other").undescribed) == 1
 
     def test_more_references_than_one_statement_takes(self, store: Store) -> None:
-        store.create_scene("office")
+        store.create_scene(OFFICE)
         ids = [f"{index:04}" for index in range(1100)]
-        store.add_references("office", [make_reference(it, count=1) for it in ids])
-        assert len(store.load_references("office", None, EXTRACTOR).references) == 1100
-        assert len(store.load_references("office", ids[::-1], EXTRACTOR).references) == 1100
-        assert len(store.list_poses("office")[1]) == 1100
+        store.add_references(OFFICE, [make_reference(it, count=1) for it in ids])
+        assert len(store.load_references(OFFICE, None, EXTRACTOR).references) == 1100
+        assert len(store.load_references(OFFICE, ids[::-1], EXTRACTOR).references) == 1100
+        assert len(store.list_poses(OFFICE)[1]) == 1100
         with pytest.raises(errors.AlreadyExists):
-            store.add_references("office", [make_reference(it, count=1) for it in ["new", *ids]])
+            store.add_references(OFFICE, [make_reference(it, count=1) for it in ["new", *ids]])
 
     def test_ids_are_data_not_sql(self, store: Store) -> None:
         nasty = ["'; DROP TABLE scene; --", "../../etc/passwd", '"', "%", "_", "\x00", "a b"]
-        for scene_id in nasty:
-            store.create_scene(scene_id)
-            store.add_references(scene_id, [make_reference(it, count=1) for it in nasty])
-        for scene_id in nasty:
-            assert {it.reference_id for it in store.list_references(scene_id, 100)} == set(nasty)
-            assert store.read_image(scene_id, "%") == make_reference("%", count=1).image
+        for scene_key in map(SceneKey, nasty):
+            store.create_scene(scene_key)
+            store.add_references(scene_key, [make_reference(it, count=1) for it in nasty])
+        for scene_key in map(SceneKey, nasty):
+            assert {it.reference_id for it in store.list_references(scene_key, 100)} == set(nasty)
+            assert store.read_image(scene_key, "%") == make_reference("%", count=1).image
 
 
 ids = st.text("ab_-.AZ09", min_size=1, max_size=3)
@@ -379,43 +382,43 @@ class TestPages:
         self, tmp_path_factory: pytest.TempPathFactory, names: set[str], limit: int
     ) -> None:
         with Store.open(tmp_path_factory.mktemp("pages")) as store:
-            store.create_scene("scene")
+            store.create_scene(SCENE)
             for name in names:
-                store.create_scene("s" + name)
+                store.create_scene(SceneKey("s" + name))
             if names:
-                store.add_references("scene", [make_reference(name, count=1) for name in names])
+                store.add_references(SCENE, [make_reference(name, count=1) for name in names])
             scene_ids, after = [], ""
-            while page := store.list_scenes(limit, after):
+            while page := store.list_scenes(DEFAULT_TENANT, limit, after):
                 assert len(page) <= limit
                 scene_ids += [it.scene_id for it in page]
                 after = page[-1].scene_id
             reference_ids, after = [], ""
-            while references := store.list_references("scene", limit, after):
+            while references := store.list_references(SCENE, limit, after):
                 assert len(references) <= limit
                 reference_ids += [it.reference_id for it in references]
                 after = references[-1].reference_id
-            poses = [it.reference_id for it in store.list_poses("scene")[1]]
-            assert store.get_scene("scene").reference_count == len(names)
+            poses = [it.reference_id for it in store.list_poses(SCENE)[1]]
+            assert store.get_scene(SCENE).reference_count == len(names)
         assert scene_ids == sorted({"scene", *("s" + name for name in names)})
         assert reference_ids == poses == sorted(names)
 
 
 class TestMemory:
     def test_repeated_load_reads_no_blob(self, store: Store, data_dir: Path) -> None:
-        store.create_scene("office")
-        store.add_references("office", [make_reference("a"), make_reference("b")])
-        first = store.load_references("office", ["a", "b"], EXTRACTOR)
+        store.create_scene(OFFICE)
+        store.add_references(OFFICE, [make_reference("a"), make_reference("b")])
+        first = store.load_references(OFFICE, ["a", "b"], EXTRACTOR)
         execute(data_dir, "UPDATE features SET data = x'00'")
-        store.add_references("office", [make_reference("c")])
-        again = store.load_references("office", ["b", "a", "c"], EXTRACTOR)
+        store.add_references(OFFICE, [make_reference("c")])
+        again = store.load_references(OFFICE, ["b", "a", "c"], EXTRACTOR)
         assert again.references[0] is first.references[1]
         assert again.references[1] is first.references[0]
         assert again.generation > first.generation
 
     def test_shared_arrays_cannot_be_written(self, store: Store) -> None:
-        store.create_scene("office")
-        store.add_references("office", [make_reference("a")])
-        (loaded,) = store.load_references("office", None, EXTRACTOR).references
+        store.create_scene(OFFICE)
+        store.add_references(OFFICE, [make_reference("a")])
+        (loaded,) = store.load_references(OFFICE, None, EXTRACTOR).references
         for array in (
             loaded.view.features.keypoints,
             loaded.view.features.descriptors,
@@ -425,14 +428,14 @@ class TestMemory:
                 array[:] = 0
 
     def test_poses_follow_changes(self, store: Store) -> None:
-        store.create_scene("office")
-        assert store.list_poses("office") == (1, ())
-        store.add_references("office", [make_reference("a")])
-        generation, poses = store.list_poses("office")
+        store.create_scene(OFFICE)
+        assert store.list_poses(OFFICE) == (1, ())
+        store.add_references(OFFICE, [make_reference("a")])
+        generation, poses = store.list_poses(OFFICE)
         assert [it.reference_id for it in poses] == ["a"]
-        assert store.list_poses("office")[1] is poses
-        store.delete_reference("office", "a")
-        assert store.list_poses("office") == (generation + 1, ())
+        assert store.list_poses(OFFICE)[1] is poses
+        store.delete_reference(OFFICE, "a")
+        assert store.list_poses(OFFICE) == (generation + 1, ())
 
     @given(
         capacity=st.integers(0, 20),
@@ -467,22 +470,22 @@ class TestMemory:
 class TestThreads:
     def test_writers_and_readers_at_once(self, store: Store) -> None:
         """Four writers, four readers: nothing is lost and no snapshot is torn."""
-        store.create_scene("office")
+        store.create_scene(OFFICE)
         done = threading.Event()
 
         def write(writer: int) -> None:
             for index in range(10):
                 pair = [make_reference(f"{writer}-{index}-{side}", index, count=2) for side in "ab"]
-                store.add_references("office", pair)
+                store.add_references(OFFICE, pair)
                 if index % 3 == 2:
-                    store.delete_reference("office", f"{writer}-{index}-b")
-                    store.delete_reference("office", f"{writer}-{index}-a")
+                    store.delete_reference(OFFICE, f"{writer}-{index}-b")
+                    store.delete_reference(OFFICE, f"{writer}-{index}-a")
 
         def read() -> int:
             sizes: dict[int, int] = {}
             while not done.is_set():
-                snapshot = store.load_references("office", None, EXTRACTOR)
-                generation, poses = store.list_poses("office")
+                snapshot = store.load_references(OFFICE, None, EXTRACTOR)
+                generation, poses = store.list_poses(OFFICE)
                 for seen, size in ((snapshot.generation, len(snapshot.references)), (generation, len(poses))):
                     assert sizes.setdefault(seen, size) == size
             return len(sizes)
@@ -495,23 +498,23 @@ class TestThreads:
             finally:
                 done.set()
             assert all(reader.result(timeout=60) >= 1 for reader in readers)
-        scene = store.get_scene("office")
+        scene = store.get_scene(OFFICE)
         assert scene.reference_count == 4 * (10 - 3) * 2
         assert scene.generation == 1 + 4 * (10 + 2 * 3)
 
     def test_one_of_many_gets_an_id(self, store: Store) -> None:
-        store.create_scene("office")
+        store.create_scene(OFFICE)
 
         def add(seed: int) -> bool:
             try:
-                store.add_references("office", [make_reference("a", seed)])
+                store.add_references(OFFICE, [make_reference("a", seed)])
             except errors.AlreadyExists:
                 return False
             return True
 
         with ThreadPoolExecutor(8) as pool:
             assert sum(pool.map(add, range(8))) == 1
-        assert store.get_scene("office").generation == 2
+        assert store.get_scene(OFFICE).generation == 2
 
 
 class TestDamage:
@@ -531,27 +534,27 @@ class TestDamage:
     def test_one_damaged_reference_is_named_and_the_other_served(
         self, store: Store, data_dir: Path, damage: str
     ) -> None:
-        store.create_scene("office")
-        bad, _ = store.add_references("office", [make_reference("bad", 1), make_reference("good", 2)])
+        store.create_scene(OFFICE)
+        bad, _ = store.add_references(OFFICE, [make_reference("bad", 1), make_reference("good", 2)])
         execute(data_dir, damage, bad.key)
         for ids in (["bad"], ["good", "bad"], None):
             with pytest.raises(errors.DataLoss, match="'bad'"):
-                store.load_references("office", ids, EXTRACTOR)
-        (good,) = store.load_references("office", ["good"], EXTRACTOR).references
+                store.load_references(OFFICE, ids, EXTRACTOR)
+        (good,) = store.load_references(OFFICE, ["good"], EXTRACTOR).references
         assert_same_view(good.view, view_of(make_reference("good", 2)))
-        assert store.read_image("office", "bad") == make_reference("bad", 1).image
-        store.delete_reference("office", "bad")
-        assert len(store.load_references("office", None, EXTRACTOR).references) == 1
+        assert store.read_image(OFFICE, "bad") == make_reference("bad", 1).image
+        store.delete_reference(OFFICE, "bad")
+        assert len(store.load_references(OFFICE, None, EXTRACTOR).references) == 1
 
     def test_damaged_image_is_not_handed_out(self, store: Store, data_dir: Path) -> None:
-        store.create_scene("office")
-        bad, _ = store.add_references("office", [make_reference("bad"), make_reference("good")])
+        store.create_scene(OFFICE)
+        bad, _ = store.add_references(OFFICE, [make_reference("bad"), make_reference("good")])
         execute(data_dir, "UPDATE image SET data = zeroblob(5000) WHERE reference_key = ?", bad.key)
         with pytest.raises(errors.DataLoss, match="'bad'"):
-            store.read_image("office", "bad")
+            store.read_image(OFFICE, "bad")
         with pytest.raises(errors.DataLoss, match="'bad'"):
             store.read_image_of(bad.key)
-        assert store.read_image("office", "good") == make_reference("good").image
+        assert store.read_image(OFFICE, "good") == make_reference("good").image
 
     def test_every_single_bit_flip_is_noticed(self) -> None:
         blob = codec.encode_view(view_of(make_reference("a", count=1)))
@@ -572,21 +575,21 @@ class TestDamage:
 
 class TestFaults:
     def test_a_full_disk_is_said_and_harms_nothing(self, store: Store) -> None:
-        store.create_scene("office")
-        store.add_references("office", [make_reference("a")])
-        before = store.get_scene("office")
+        store.create_scene(OFFICE)
+        store.add_references(OFFICE, [make_reference("a")])
+        before = store.get_scene(OFFICE)
         with store._database.read() as connection:
             pages = connection.exec_driver_sql("PRAGMA page_count").scalar()
             unlimited = connection.exec_driver_sql("PRAGMA max_page_count").scalar()
             connection.exec_driver_sql(f"PRAGMA max_page_count={pages}")
         with pytest.raises(errors.Overloaded) as caught:
-            store.add_references("office", [make_reference(it, count=200) for it in "bcd"])
+            store.add_references(OFFICE, [make_reference(it, count=200) for it in "bcd"])
         assert caught.value.reason == "STORE_FULL"
-        assert store.get_scene("office") == before
+        assert store.get_scene(OFFICE) == before
         with store._database.read() as connection:
             connection.exec_driver_sql(f"PRAGMA max_page_count={unlimited}")
-        store.add_references("office", [make_reference(it, count=200) for it in "bcd"])
-        assert store.get_scene("office").reference_count == 4
+        store.add_references(OFFICE, [make_reference(it, count=200) for it in "bcd"])
+        assert store.get_scene(OFFICE).reference_count == 4
 
     def test_a_lock_held_by_another_tool_asks_for_a_retry(
         self, data_dir: Path, monkeypatch: pytest.MonkeyPatch
@@ -596,12 +599,12 @@ class TestFaults:
             other = connect(data_dir)
             other.execute("BEGIN IMMEDIATE")
             with pytest.raises(errors.Unavailable) as caught:
-                store.create_scene("office")
+                store.create_scene(OFFICE)
             assert caught.value.retry_after_s is not None
-            assert store.list_scenes(10) == []
+            assert store.list_scenes(DEFAULT_TENANT, 10) == []
             other.rollback()
             other.close()
-            assert store.create_scene("office").generation == 1
+            assert store.create_scene(OFFICE).generation == 1
 
 
 class TestOpening:
@@ -658,7 +661,7 @@ class TestOpening:
         self, data_dir: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:
         with Store.open(data_dir) as store:
-            store.create_scene("office")
+            store.create_scene(OFFICE)
             assert self.settings_in_use(store)["journal_mode"] == "wal"
         with monkeypatch.context() as patch, caplog.at_level(logging.WARNING):
             for library in (sqlite3.dbapi2, pytest.importorskip("pysqlite3.dbapi2")):
@@ -667,29 +670,29 @@ class TestOpening:
                 in_use = self.settings_in_use(store)
                 assert (in_use["journal_mode"], in_use["synchronous"]) == ("delete", 3)
                 with ThreadPoolExecutor(4) as pool:
-                    list(pool.map(lambda it: store.add_references("office", [make_reference(it)]), "abcd"))
-                    list(pool.map(lambda it: store.delete_reference("office", it), "bcd"))
+                    list(pool.map(lambda it: store.add_references(OFFICE, [make_reference(it)]), "abcd"))
+                    list(pool.map(lambda it: store.delete_reference(OFFICE, it), "bcd"))
         assert "WAL-reset" in caplog.text
         with Store.open(data_dir) as store:
             assert self.settings_in_use(store)["journal_mode"] == "wal"
-            assert store.get_scene("office").reference_count == 1
+            assert store.get_scene(OFFICE).reference_count == 1
 
     def test_works_without_the_packaged_library(self, data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "pysqlite3", None)
         monkeypatch.setitem(sys.modules, "pysqlite3.dbapi2", None)
         with Store.open(data_dir) as store:
-            store.create_scene("office")
-            store.add_references("office", [make_reference("a")])
-            assert store.load_references("office", None, EXTRACTOR).generation == 2
+            store.create_scene(OFFICE)
+            store.add_references(OFFICE, [make_reference("a")])
+            assert store.load_references(OFFICE, None, EXTRACTOR).generation == 2
 
     def test_second_server_is_refused_until_the_first_has_gone(self, data_dir: Path) -> None:
         with Store.open(data_dir) as store:
-            store.create_scene("office")
+            store.create_scene(OFFICE)
             with pytest.raises(StoreError, match=f"in use by another server .process {os.getpid()}."):
                 Store.open(data_dir)
-            assert store.get_scene("office").generation == 1
+            assert store.get_scene(OFFICE).generation == 1
         with Store.open(data_dir) as store:
-            assert store.get_scene("office").generation == 1
+            assert store.get_scene(OFFICE).generation == 1
 
     def test_refused_opening_leaves_no_lock(self, data_dir: Path) -> None:
         data_dir.mkdir()
@@ -715,11 +718,11 @@ class TestOpening:
 
     def test_truncated_database_is_refused_or_reported(self, data_dir: Path) -> None:
         with Store.open(data_dir) as store:
-            store.create_scene("office")
-            store.add_references("office", [make_reference(str(index)) for index in range(20)])
+            store.create_scene(OFFICE)
+            store.add_references(OFFICE, [make_reference(str(index)) for index in range(20)])
         os.truncate(data_dir / sqlite.DATABASE_FILE, 8192)
         with pytest.raises((StoreError, errors.DataLoss)), Store.open(data_dir) as store:
-            store.load_references("office", None, EXTRACTOR)
+            store.load_references(OFFICE, None, EXTRACTOR)
 
     def test_unusable_folders_are_one_sentence(self, tmp_path: Path) -> None:
         file = tmp_path / "file"

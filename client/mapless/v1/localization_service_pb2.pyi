@@ -29,6 +29,7 @@ class PoseStage(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     POSE_STAGE_UNSPECIFIED: _ClassVar[PoseStage]
     POSE_STAGE_REFINED: _ClassVar[PoseStage]
     POSE_STAGE_INITIAL: _ClassVar[PoseStage]
+    POSE_STAGE_COARSE: _ClassVar[PoseStage]
 
 class RejectionReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -59,6 +60,7 @@ SCALE_STRATEGY_TWO_STAGE: ScaleStrategy
 POSE_STAGE_UNSPECIFIED: PoseStage
 POSE_STAGE_REFINED: PoseStage
 POSE_STAGE_INITIAL: PoseStage
+POSE_STAGE_COARSE: PoseStage
 REJECTION_REASON_UNSPECIFIED: RejectionReason
 REJECTION_REASON_NO_USABLE_REFERENCES: RejectionReason
 REJECTION_REASON_DEGENERATE_REFERENCES: RejectionReason
@@ -101,14 +103,16 @@ class PositionPrior(_message.Message):
     def __init__(self, position_m: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., radius_m: _Optional[float] = ...) -> None: ...
 
 class LocalizeOptions(_message.Message):
-    __slots__ = ("variant", "scale_strategy", "reference_count")
+    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse")
     VARIANT_FIELD_NUMBER: _ClassVar[int]
     SCALE_STRATEGY_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
+    ALLOW_COARSE_FIELD_NUMBER: _ClassVar[int]
     variant: Variant
     scale_strategy: ScaleStrategy
     reference_count: int
-    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ...) -> None: ...
+    allow_coarse: bool
+    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
     __slots__ = ("localization", "rejection", "diagnostics", "capture_time", "session_from_camera")

@@ -28,8 +28,18 @@ if _version_not_supported:
 class LocalizationServiceStub(object):
     """Tells where a photograph was taken, from a few posed reference photographs and nothing else.
 
+    Request metadata, all optional unless the server asks for tokens:
+
+    * `authorization`: "Bearer " and the caller's token. It says which tenant's scenes the caller sees and what it may do
+    (read, localize, write). A server without tokens has one tenant and allows everything.
+    * `x-request-id`: 1 to 64 characters of A-Z a-z 0-9 . _ -, by which this call is found in the server's log; the server
+    makes one up otherwise, and where it is anything else. Diagnostics and errors carry it.
+    * `x-client-id`: names the caller, 1 to 64 of the same characters. A tenant's callers share the server fairly, however
+    many calls each of them makes; without it, each connection is one caller.
+
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless") and, for INVALID_ARGUMENT, a BadRequest that
-    names the field. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED.
+    names the field. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
+    RetryInfo: sending it again does not help.
     """
 
     def __init__(self, channel):
@@ -48,18 +58,34 @@ class LocalizationServiceStub(object):
 class LocalizationServiceServicer(object):
     """Tells where a photograph was taken, from a few posed reference photographs and nothing else.
 
+    Request metadata, all optional unless the server asks for tokens:
+
+    * `authorization`: "Bearer " and the caller's token. It says which tenant's scenes the caller sees and what it may do
+    (read, localize, write). A server without tokens has one tenant and allows everything.
+    * `x-request-id`: 1 to 64 characters of A-Z a-z 0-9 . _ -, by which this call is found in the server's log; the server
+    makes one up otherwise, and where it is anything else. Diagnostics and errors carry it.
+    * `x-client-id`: names the caller, 1 to 64 of the same characters. A tenant's callers share the server fairly, however
+    many calls each of them makes; without it, each connection is one caller.
+
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless") and, for INVALID_ARGUMENT, a BadRequest that
-    names the field. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED.
+    names the field. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
+    RetryInfo: sending it again does not help.
     """
 
     def Localize(self, request, context):
         """Localizes one photograph. Has no side effects and stores nothing; safe to retry.
 
         "I could not localize this" is an answer (Rejection), not an error. Errors:
-        INVALID_ARGUMENT for a bad image, camera or field; NOT_FOUND for an unknown scene or reference; RESOURCE_EXHAUSTED
-        with RetryInfo when too many calls wait; DEADLINE_EXCEEDED when the call's deadline passed while it waited;
-        UNAVAILABLE while the server starts or drains; DATA_LOSS when a stored reference is damaged; INTERNAL for a fault of
-        the server, without detail (the log has it, under the error's request id).
+
+        * INVALID_ARGUMENT: a bad image, camera or field.
+        * UNAUTHENTICATED: the token is missing, unknown or expired. PERMISSION_DENIED: its role does not include localizing.
+        * NOT_FOUND: no such scene or reference. Another tenant's is not found either.
+        * RESOURCE_EXHAUSTED with RetryInfo: too many calls wait, so that there is no room for this one or it would not be
+        answered before its deadline; or the tenant has used up the computing time it is granted. Nothing was computed.
+        * DEADLINE_EXCEEDED: the deadline passed, or leaves too little time for the work itself, however idle the server.
+        * UNAVAILABLE: the server starts or drains. Try again, at another server if there is one.
+        * DATA_LOSS: a stored reference is damaged.
+        * INTERNAL: a fault of the server, without detail; the log has it, under the error's request id.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -84,8 +110,18 @@ def add_LocalizationServiceServicer_to_server(servicer, server):
 class LocalizationService(object):
     """Tells where a photograph was taken, from a few posed reference photographs and nothing else.
 
+    Request metadata, all optional unless the server asks for tokens:
+
+    * `authorization`: "Bearer " and the caller's token. It says which tenant's scenes the caller sees and what it may do
+    (read, localize, write). A server without tokens has one tenant and allows everything.
+    * `x-request-id`: 1 to 64 characters of A-Z a-z 0-9 . _ -, by which this call is found in the server's log; the server
+    makes one up otherwise, and where it is anything else. Diagnostics and errors carry it.
+    * `x-client-id`: names the caller, 1 to 64 of the same characters. A tenant's callers share the server fairly, however
+    many calls each of them makes; without it, each connection is one caller.
+
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless") and, for INVALID_ARGUMENT, a BadRequest that
-    names the field. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED.
+    names the field. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
+    RetryInfo: sending it again does not help.
     """
 
     @staticmethod

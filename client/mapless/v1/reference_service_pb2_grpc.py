@@ -31,8 +31,21 @@ class ReferenceServiceStub(object):
     Ids of scenes and references are 1 to 128 characters of A-Z a-z 0-9 . _ -, begin and end with a letter, digit or
     underscore, and do not contain "..". Names are "scenes/{scene}" and "scenes/{scene}/references/{reference}".
     Anything else is INVALID_ARGUMENT; a well-formed name of something that does not exist is NOT_FOUND.
+
+    A scene belongs to the tenant whose token created it; to every other tenant it does not exist, in any call or list, and
+    its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`.
+
     Errors are google.rpc.Status with one ErrorInfo (domain "mapless"); INVALID_ARGUMENT carries a BadRequest that names
-    the field.
+    the field. Beside what stands with each call, any of them may fail with
+
+    * UNAUTHENTICATED: the token is missing, unknown or expired. PERMISSION_DENIED: its role does not include the call;
+    looking takes the role read, changing the role write.
+    * RESOURCE_EXHAUSTED with RetryInfo, where photographs are uploaded: too many calls wait, so that there is no room for
+    this one or it would not be done before its deadline; or the tenant has used up the computing time it is granted.
+    Nothing was stored. A message over the server's limit is RESOURCE_EXHAUSTED without RetryInfo.
+    * DEADLINE_EXCEEDED: the deadline passed, or leaves too little time for the work itself, however idle the server.
+    * UNAVAILABLE: the server starts or drains. Try again, at another server if there is one.
+    * INTERNAL: a fault of the server, without detail; the log has it, under the error's request id.
     """
 
     def __init__(self, channel):
@@ -94,8 +107,21 @@ class ReferenceServiceServicer(object):
     Ids of scenes and references are 1 to 128 characters of A-Z a-z 0-9 . _ -, begin and end with a letter, digit or
     underscore, and do not contain "..". Names are "scenes/{scene}" and "scenes/{scene}/references/{reference}".
     Anything else is INVALID_ARGUMENT; a well-formed name of something that does not exist is NOT_FOUND.
+
+    A scene belongs to the tenant whose token created it; to every other tenant it does not exist, in any call or list, and
+    its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`.
+
     Errors are google.rpc.Status with one ErrorInfo (domain "mapless"); INVALID_ARGUMENT carries a BadRequest that names
-    the field.
+    the field. Beside what stands with each call, any of them may fail with
+
+    * UNAUTHENTICATED: the token is missing, unknown or expired. PERMISSION_DENIED: its role does not include the call;
+    looking takes the role read, changing the role write.
+    * RESOURCE_EXHAUSTED with RetryInfo, where photographs are uploaded: too many calls wait, so that there is no room for
+    this one or it would not be done before its deadline; or the tenant has used up the computing time it is granted.
+    Nothing was stored. A message over the server's limit is RESOURCE_EXHAUSTED without RetryInfo.
+    * DEADLINE_EXCEEDED: the deadline passed, or leaves too little time for the work itself, however idle the server.
+    * UNAVAILABLE: the server starts or drains. Try again, at another server if there is one.
+    * INTERNAL: a fault of the server, without detail; the log has it, under the error's request id.
     """
 
     def CreateScene(self, request, context):
@@ -224,8 +250,21 @@ class ReferenceService(object):
     Ids of scenes and references are 1 to 128 characters of A-Z a-z 0-9 . _ -, begin and end with a letter, digit or
     underscore, and do not contain "..". Names are "scenes/{scene}" and "scenes/{scene}/references/{reference}".
     Anything else is INVALID_ARGUMENT; a well-formed name of something that does not exist is NOT_FOUND.
+
+    A scene belongs to the tenant whose token created it; to every other tenant it does not exist, in any call or list, and
+    its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`.
+
     Errors are google.rpc.Status with one ErrorInfo (domain "mapless"); INVALID_ARGUMENT carries a BadRequest that names
-    the field.
+    the field. Beside what stands with each call, any of them may fail with
+
+    * UNAUTHENTICATED: the token is missing, unknown or expired. PERMISSION_DENIED: its role does not include the call;
+    looking takes the role read, changing the role write.
+    * RESOURCE_EXHAUSTED with RetryInfo, where photographs are uploaded: too many calls wait, so that there is no room for
+    this one or it would not be done before its deadline; or the tenant has used up the computing time it is granted.
+    Nothing was stored. A message over the server's limit is RESOURCE_EXHAUSTED without RetryInfo.
+    * DEADLINE_EXCEEDED: the deadline passed, or leaves too little time for the work itself, however idle the server.
+    * UNAVAILABLE: the server starts or drains. Try again, at another server if there is one.
+    * INTERNAL: a fault of the server, without detail; the log has it, under the error's request id.
     """
 
     @staticmethod

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..demo.room import Photo
-from ..method.coarse import ReconstructedView, Reconstruction
+from ..method.coarse import Bucket, Outcome, ReconstructedView, Reconstruction, Request
 from ..method.coarse.device import DeviceReconstruction
 from ..method.coarse.grids import GridOptions, common_grid, lay_out
 from ..method.coarse.network import NetworkReconstructor
-from ..method.correspond import Correspondences
 from ..method.rejection import Rejection
 from ..method.views import PosedView, View
 
@@ -57,13 +56,19 @@ class PlantedReconstructor:
         """Ends the network's thread."""
         self.network.close()
 
-    def reconstruct(
-        self, query: View, references: Sequence[PosedView], correspondences: Correspondences | None = None
-    ) -> Reconstruction | DeviceReconstruction | Rejection:
-        """See Reconstructor.reconstruct."""
-        outcome = self.network.reconstruct(query, references, correspondences)
-        if isinstance(outcome, Rejection):
+    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
+        """Of the network."""
+        return self.network.bucket(query, references)
+
+    def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
+        """See Reconstructor.reconstruct_many."""
+        outcomes = self.network.reconstruct_many(requests)
+        return [self._planted(request, outcome) for request, outcome in zip(requests, outcomes, strict=True)]
+
+    def _planted(self, request: Request, outcome: Outcome | Exception) -> Outcome | Exception:
+        if isinstance(outcome, Rejection | Exception):
             return outcome
+        query, references = request.query, request.references
         keys = [_sha256(view) for view in (*(reference.view for reference in references), query)]
         poses = np.stack([self._local_pose(key, keys[0]) for key in keys])
         if isinstance(outcome, DeviceReconstruction):

@@ -3,128 +3,61 @@
 Five stages, each knowing the result of the one before: coarse > scale > structure > match > pnp; and a sixth of our
 own, adjust. Beneath them all lie the correspondences between the photographs' features.
 
+    prepare > reconstruct > refine
+    (each    (many queries  (each
+     query)   in one go)     query)
+
+`localize` is the three in order, for one query; whoever has many calls them itself, and may do without the last.
+
 This module knows nothing of grpc, queues or storage.
 """
 
 from __future__ import annotations
 
-import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from enum import Enum
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 
-from mapless.geometry import Array, RigidTransform
+from mapless.geometry import Array
 
 from ..stopwatch import timed
-from .accuracy import accuracy_from_covariance
-from .adjust import AdjustOptions, adjust_pose
-from .coarse import Reconstruction, Reconstructor
+from .adjust import adjust_pose
+from .answer import Answer, Localization, LocalizeOptions, Variant, is_better, shifted
+from .coarse import Bucket, Outcome, Reconstruction, Reconstructor, Request, reconstruct_one
 from .coarse.geometric import GeometricReconstructor
 from .correspond import Correspondences, Matcher
-from .match import PAPER_MATCH, MatchOptions, PointMatches, match_points
-from .pnp import PnpOptions, PoseEstimate, PoseStage, solve_pose
+from .match import MatchOptions, PointMatches, match_points
+from .pnp import PoseEstimate, PoseStage, solve_pose
 from .rejection import Rejection, RejectionReason
-from .scale import MetricScale, ScaleOptions, ScaleStrategy, estimate_scale
-from .structure import PAPER_STRUCTURE, Structure, StructureOptions, build_structure
+from .scale import MetricScale, ScaleOptions, estimate_scale
+from .structure import Structure, build_structure
 from .views import PosedView, View
 
-if TYPE_CHECKING:  # it needs torch
-    from .coarse.device import DeviceReconstruction
+__all__ = [
+    "MIN_FEATURES",
+    "Answer",
+    "Coarse",
+    "Localization",
+    "LocalizeOptions",
+    "Pipeline",
+    "Prepared",
+    "Variant",
+    "coarse_answer",
+    "localize",
+    "prepare",
+    "reconstruct",
+    "refine",
+]
+
+T = TypeVar("T")
 
 MIN_FEATURES = 12
 """A photograph with fewer local features is blank, black or blurred."""
-
-
-class Variant(str, Enum):
-    """Forms of the method; all but `BEST` are the paper's."""
-
-    COARSE = "coarse"
-    """The reconstruction's own pose at metric scale."""
-    NO_STRUCTURE = "no_structure"
-    """PnP on predicted points."""
-    FULL = "full"
-    """The paper's method."""
-    BEST = "best"
-    """Tracks over all references, keypoints weighted by their noise, a final adjustment of everything."""
-
-
-@dataclass(frozen=True)
-class LocalizeOptions:
-    """Options of the method; the defaults are the best we know.
-
-    Attributes:
-        variant: decides the options of structure and matching.
-        scale_strategy: how the metric scale is found.
-        weak_inliers: an answer of `Variant.BEST` with fewer inliers is computed again from wide correspondences (see
-            `correspond`), and replaced if that finds more. Above a hundred they do not help any more.
-        max_radius_ratio: but not if the wide answer claims a radius this many times as large. On photographs where it
-            was the better one it claimed at most 1.7 times as much; where repeated floor tiles had given it inliers,
-            and centimetres of error, 40 to 80 times.
-        pnp: of the pose solver.
-        adjust: of the final adjustment.
-    """
-
-    variant: Variant = Variant.BEST
-    scale_strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
-    weak_inliers: int = 100
-    max_radius_ratio: float = 3.0
-    pnp: PnpOptions = field(default_factory=PnpOptions)
-    adjust: AdjustOptions = field(default_factory=AdjustOptions)
-
-    @property
-    def structure(self) -> StructureOptions:
-        """Options of the structure stage."""
-        if self.variant is Variant.BEST:
-            return StructureOptions()
-        return replace(PAPER_STRUCTURE, optimize=self.variant is Variant.FULL)
-
-    def match(self, guided_similarity: float) -> MatchOptions:
-        """Options of the matching stage; what similarity is enough depends on the features."""
-        return MatchOptions(min_similarity=guided_similarity) if self.variant is Variant.BEST else PAPER_MATCH
-
-
-@dataclass(frozen=True, eq=False)
-class Localization:
-    """Where the query was taken.
-
-    Attributes:
-        world_from_camera: metric.
-        covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians; None for `Variant.COARSE`.
-        pose_stage: whether the refined or the initial pose is answered.
-        inlier_count: 2D-3D matches that agree with it.
-        match_count: 2D-3D matches tried.
-        reprojection_error_px: median of the inliers, pixels of the processed image.
-    """
-
-    world_from_camera: RigidTransform
-    covariance: Array | None
-    pose_stage: PoseStage
-    inlier_count: int
-    match_count: int
-    reprojection_error_px: float
-
-
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """What the method says of one query.
-
-    Attributes:
-        outcome: the pose, or why there is none.
-        scale: None if that stage was not reached.
-        stage_seconds: time of each stage that ran, in order.
-        reference_match_counts: per reference, feature matches with the query.
-        reference_inlier_counts: per reference, inliers on points that it observes.
-    """
-
-    outcome: Localization | Rejection
-    scale: MetricScale | None = None
-    stage_seconds: dict[str, float] = field(default_factory=dict)
-    reference_match_counts: tuple[int, ...] = ()
-    reference_inlier_counts: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,28 +73,71 @@ class Pipeline:
     matcher: Matcher = field(default_factory=Matcher)
 
 
-@dataclass(eq=False)
-class _Progress:
-    """What is known of an answer while its stages run."""
+Check = Callable[[], None]
+"""Called between steps; raises when nobody wants the answer any more."""
 
-    reference_count: int
-    check: Callable[[], None]
+
+def _somebody_waits() -> None:
+    """A `Check` that never raises."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A query whose features are matched: all that can be known of it before the coarse stage.
+
+    Attributes:
+        query: the photograph.
+        references: the most similar first, in a world in which the first one stands at the origin. World coordinates
+            may be millions of metres (UTM, ECEF), too long for the digits of differences of squares.
+        origin: (3,) where that is in the caller's world, metres.
+        pipeline: what to run on.
+        options: of the method.
+        correspondences: between all photographs.
+        bucket: prepared queries of the same bucket may be reconstructed together.
+        stage_seconds: time of each stage so far.
+    """
+
+    query: View
+    references: tuple[PosedView, ...]
+    origin: Array
+    pipeline: Pipeline
+    options: LocalizeOptions
+    correspondences: Correspondences
+    bucket: Bucket
+    stage_seconds: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Coarse:
+    """A query reconstructed together with its references.
+
+    Attributes:
+        prepared: the query.
+        reconstruction: up to scale, or why there is none.
+        scale: and with it the initial pose, in the world of `prepared`. Or why there is none: then `refine` has wider
+            correspondences yet to try.
+        structure, matches: where they came with the scale, as they do from a device.
+        stage_seconds: time of each stage so far.
+    """
+
+    prepared: Prepared
+    reconstruction: Outcome
+    scale: MetricScale | Rejection
+    structure: Structure | None = None
+    matches: PointMatches | None = None
     stage_seconds: dict[str, float] = field(default_factory=dict)
-    correspondences: Correspondences | None = None
-    reconstruction: Reconstruction | DeviceReconstruction | Rejection | None = None
-    scale: MetricScale | None = None
-    inlier_counts: tuple[int, ...] = ()
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        self.check()
-        with timed(self.stage_seconds, name):
-            yield
-
-    def answer(self, outcome: Localization | Rejection) -> Answer:
-        none = (0,) * self.reference_count
-        matches = tuple(len(m) for m in self.correspondences.query_matches) if self.correspondences else none
-        return Answer(outcome, self.scale, self.stage_seconds, matches, self.inlier_counts or none)
+    def answer(
+        self,
+        outcome: Localization | Rejection,
+        stage_seconds: dict[str, float],
+        inlier_counts: tuple[int, ...] | None = None,
+    ) -> Answer:
+        """What `outcome`, in the world of `prepared`, is to the caller."""
+        prepared, scale = self.prepared, None if isinstance(self.scale, Rejection) else self.scale
+        matches = tuple(len(m) for m in prepared.correspondences.query_matches)
+        inliers = inlier_counts or (0,) * len(prepared.references)
+        return shifted(Answer(outcome, scale, stage_seconds, matches, inliers), prepared.origin)
 
 
 def localize(
@@ -169,7 +145,7 @@ def localize(
     references: Sequence[PosedView],
     pipeline: Pipeline,
     options: LocalizeOptions,
-    check: Callable[[], None] = lambda: None,
+    check: Check = _somebody_waits,
 ) -> Answer:
     """Localizes a query among posed references.
 
@@ -178,10 +154,31 @@ def localize(
         references: the most similar first.
         pipeline: what to run on.
         options: see there.
-        check: called between the steps; raises when nobody wants the answer any more.
+        check: called between the steps.
 
     Returns:
         The answer; "no pose" is one, with the first stage that could not do its work.
+    """
+    prepared = prepare(query, references, pipeline, options, check)
+    if isinstance(prepared, Answer):
+        return prepared
+    (coarse,) = reconstruct([prepared], [check])
+    if isinstance(coarse, Exception):
+        raise coarse
+    return coarse if isinstance(coarse, Answer) else refine(coarse, check)
+
+
+def prepare(
+    query: View,
+    references: Sequence[PosedView],
+    pipeline: Pipeline,
+    options: LocalizeOptions,
+    check: Check = _somebody_waits,
+) -> Prepared | Answer:
+    """The first of the three parts, with the arguments of `localize`; an answer if there is nothing to go on with.
+
+    Raises:
+        ValueError: a view lacks what the coarse backend looks at.
     """
     if not references:
         return Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, "no references"))
@@ -189,106 +186,147 @@ def localize(
         message = f"the photograph has {len(query.features)} local features, {MIN_FEATURES} are needed"
         return Answer(Rejection(RejectionReason.LOW_TEXTURE, message))
 
-    # World coordinates may be millions of metres (UTM, ECEF), too long for the digits of differences of squares.
     origin = references[0].world_from_camera.translation
-    nearby = [replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references]
-    first = _Progress(len(references), check)
-    answer = _attempt(query, nearby, pipeline, options, first, wide=False)
-    if options.variant is Variant.BEST and _is_weak(answer, options) and len(references) > 1:
-        kept = None if pipeline.reconstructor.uses_correspondences else first.reconstruction
-        second = _Progress(
-            len(references), check, dict(answer.stage_seconds), first.correspondences, reconstruction=kept
-        )
-        wide = _attempt(query, nearby, pipeline, options, second, wide=True)
-        better = wide if _is_better(wide, answer, options) else answer
-        answer = replace(better, stage_seconds=wide.stage_seconds)
-    return _shifted(answer, origin)
+    nearby = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references)
+    bucket = pipeline.reconstructor.bucket(query, nearby)
+    stage_seconds: dict[str, float] = {}
+    with _stage("correspond", stage_seconds, check):
+        correspondences = pipeline.matcher.correspond(query, nearby, False, check, None)
+    return Prepared(query, nearby, origin, pipeline, options, correspondences, bucket, stage_seconds)
 
 
-def _shifted(answer: Answer, offset: Array) -> Answer:
-    """The answer in a world in which everything lies `offset` (3,) further."""
-    outcome, scale = answer.outcome, answer.scale
-    if isinstance(outcome, Localization):
-        outcome = replace(outcome, world_from_camera=outcome.world_from_camera.shifted(offset))
-    if scale:
-        world_from_local = replace(scale.world_from_local, translation=scale.world_from_local.translation + offset)
-        scale = replace(
-            scale, world_from_local=world_from_local, world_from_query=scale.world_from_query.shifted(offset)
-        )
-    return replace(answer, outcome=outcome, scale=scale)
+def reconstruct(batch: Sequence[Prepared], checks: Sequence[Check] = ()) -> list[Coarse | Answer | Exception]:
+    """The second part: the coarse stage of many queries in one go, then the metric scale of each.
+
+    A reconstruction that stays on a device is worked on there as far as it can be, and the device has nothing more to
+    do for these queries when this returns.
+
+    Args:
+        batch: queries of one reconstructor. Those of one bucket are reconstructed together.
+        checks: one for each query, or none at all.
+
+    Returns:
+        For each query, in their order, what is known of it; or its answer, if no more was asked for or nothing more
+        can be done; or the exception that is its own, unchanged: what its check raised, or what was raised while it
+        alone was computed, such as a torch.OutOfMemoryError when halving the batch did not help any more.
+
+    Raises:
+        ValueError: several reconstructors.
+        Exception: of the batch as a whole; its halves tell whose fault it was.
+    """
+    if len({id(prepared.pipeline.reconstructor) for prepared in batch}) > 1:
+        raise ValueError("one batch has one reconstructor")
+    checks = checks or [_somebody_waits] * len(batch)
+    seconds: dict[str, float] = {}
+    outcomes: list[Any] = _each(lambda check: check(), checks)
+    wanted = [i for i, outcome in enumerate(outcomes) if outcome is None]
+    with timed(seconds, "coarse"):
+        requests = [Request(p.query, p.references, p.correspondences) for p in (batch[i] for i in wanted)]
+        made = batch[0].pipeline.reconstructor.reconstruct_many(requests) if requests else []
+    for i, outcome in zip(wanted, made, strict=True):
+        outcomes[i] = outcome
+    # All are launched before the first is waited for, so that a device does not wait for the host in between.
+    launched = _each(_launch_scale, batch, outcomes, [p.stage_seconds | seconds for p in batch], checks)
+    return _each(lambda finish: _settled(finish()), launched)
 
 
-def _is_weak(answer: Answer, options: LocalizeOptions) -> bool:
-    """Whether wide correspondences could make the answer better."""
-    if isinstance(answer.outcome, Rejection):
-        return answer.outcome.reason is not RejectionReason.DEGENERATE_REFERENCES
-    return answer.outcome.inlier_count < options.weak_inliers
+def refine(coarse: Coarse, check: Check = _somebody_waits) -> Answer:
+    """The third part: structure, matches and pose; and where that gives little, all again more widely."""
+    prepared, options = coarse.prepared, coarse.prepared.options
+    answer = _pose(coarse, check)
+    if not _may_be_better(answer, prepared):
+        return answer
+    wide = _pose(_look_wider(coarse, answer.stage_seconds, check), check)
+    better = wide if is_better(wide, answer, options) else answer
+    return replace(better, stage_seconds=wide.stage_seconds)
 
 
-def _is_better(wide: Answer, strict: Answer, options: LocalizeOptions) -> bool:
-    """Whether the answer from wide correspondences is to be given."""
-    if isinstance(wide.outcome, Rejection) or isinstance(strict.outcome, Rejection):
-        return isinstance(wide.outcome, Localization)
-    if wide.outcome.inlier_count <= strict.outcome.inlier_count:
-        return False
-    return _claimed_radius_m(wide) <= options.max_radius_ratio * _claimed_radius_m(strict)
+def coarse_answer(coarse: Coarse) -> Answer | None:
+    """What can be answered when there is no time to refine: the pose of `Variant.COARSE`; None if there is none yet."""
+    if isinstance(coarse.scale, Rejection):
+        return None
+    outcome = Localization(coarse.scale.world_from_query, None, PoseStage.COARSE, 0, 0, 0.0)
+    return coarse.answer(outcome, dict(coarse.stage_seconds))
 
 
-def _claimed_radius_m(answer: Answer) -> float:
-    """Within which the position lies in 68 % of cases, by its covariance; infinite where there is none."""
-    if isinstance(answer.outcome, Rejection) or answer.outcome.covariance is None:
-        return math.inf
-    return accuracy_from_covariance(answer.outcome.covariance).position_68_m
+def _each(work: Callable[..., T], *columns: Sequence[Any]) -> list[T | Exception]:
+    """The work's result in each row; an exception that stands in the row, or is raised there, is the row's alone."""
+    results: list[T | Exception] = []
+    for row in zip(*columns, strict=True):
+        failures = [value for value in row if isinstance(value, Exception)]
+        try:
+            results.append(failures[0] if failures else work(*row))
+        except Exception as error:
+            results.append(error)
+    return results
 
 
-def _attempt(
-    query: View,
-    references: Sequence[PosedView],
-    pipeline: Pipeline,
-    options: LocalizeOptions,
-    progress: _Progress,
-    wide: bool,
-) -> Answer:
-    return progress.answer(_stages(query, references, pipeline, options, progress, wide))
+@contextmanager
+def _stage(name: str, stage_seconds: dict[str, float], check: Check) -> Iterator[None]:
+    check()
+    with timed(stage_seconds, name):
+        yield
 
 
-def _stages(
-    query: View,
-    references: Sequence[PosedView],
-    pipeline: Pipeline,
-    options: LocalizeOptions,
-    progress: _Progress,
-    wide: bool,
-) -> Localization | Rejection:
-    with progress.stage("correspond"):
-        # The second attempt looks more widely among the references alone.
-        query_matches = progress.correspondences.query_matches if progress.correspondences else None
-        correspondences = pipeline.matcher.correspond(query, references, wide, progress.check, query_matches)
-        progress.correspondences = correspondences
-    with progress.stage("coarse"):
-        reconstruction = progress.reconstruction or pipeline.reconstructor.reconstruct(
-            query, references, correspondences
-        )
-        progress.reconstruction = reconstruction
+def _launch_scale(
+    prepared: Prepared, reconstruction: Outcome, stage_seconds: dict[str, float], check: Check
+) -> Callable[[], Coarse]:
+    """The metric scale, computed where the reconstruction lies; only what is returned waits for a device."""
+    query, references, correspondences = prepared.query, prepared.references, prepared.correspondences
+    options, scale_options = prepared.options, ScaleOptions(prepared.options.scale_strategy)
+    known = partial(Coarse, prepared, reconstruction, stage_seconds=stage_seconds)
     if isinstance(reconstruction, Rejection):
-        return reconstruction
-    match_options = options.match(pipeline.matcher.options.guided_similarity)
-    refined = _refine(reconstruction, query, references, correspondences, options, match_options, progress)
-    if isinstance(refined, Rejection):
-        return refined
-    scale, structure, matches = refined
-    progress.scale, initial = scale, scale.world_from_query
-    if structure is None or matches is None:
-        return Localization(initial, None, PoseStage.INITIAL, 0, 0, 0.0)
-    with progress.stage("pnp"):
-        estimate = solve_pose(query, structure, matches, initial, options.pnp)
+        return partial(known, reconstruction)
+    if isinstance(reconstruction, Reconstruction):
+        with _stage("scale", stage_seconds, check):
+            return partial(known, estimate_scale(reconstruction, references, correspondences, scale_options))
+    from .on_device import launch_on_device
+    from .on_device.compute import Options
+
+    further = (None, None) if options.variant is Variant.COARSE else (options.structure, _match_options(prepared))
+    check()
+    start_s = time.perf_counter()
+    refined = launch_on_device(reconstruction, query, references, correspondences, Options(scale_options, *further))
+
+    def wait() -> Coarse:
+        found = refined()
+        # Waiting for the whole batch is each query's.
+        stage_seconds["refine"] = stage_seconds.get("refine", 0.0) + time.perf_counter() - start_s
+        return known(found) if isinstance(found, Rejection) else known(found.scale, found.structure, found.matches)
+
+    return wait
+
+
+def _match_options(prepared: Prepared) -> MatchOptions:
+    return prepared.options.match(prepared.pipeline.matcher.options.guided_similarity)
+
+
+def _settled(coarse: Coarse) -> Coarse | Answer:
+    """The answer, if refining would not change it."""
+    scale, seconds = coarse.scale, coarse.stage_seconds
+    if isinstance(scale, Rejection):
+        answer = coarse.answer(scale, seconds)
+        return coarse if _may_be_better(answer, coarse.prepared) else answer
+    if coarse.prepared.options.variant is Variant.COARSE:
+        return coarse.answer(Localization(scale.world_from_query, None, PoseStage.INITIAL, 0, 0, 0.0), seconds)
+    return coarse
+
+
+def _pose(coarse: Coarse, check: Check) -> Answer:
+    """From the metric scale to the pose."""
+    prepared, scale, seconds = coarse.prepared, coarse.scale, dict(coarse.stage_seconds)
+    if isinstance(scale, Rejection):
+        return coarse.answer(scale, seconds)
+    query, references, options = prepared.query, prepared.references, prepared.options
+    structure, matches = _structure_and_matches(coarse, scale, seconds, check)
+    with _stage("pnp", seconds, check):
+        estimate = solve_pose(query, structure, matches, scale.world_from_query, options.pnp)
     if isinstance(estimate, Rejection):
-        return estimate
+        return coarse.answer(estimate, seconds)
     if options.variant is Variant.BEST:
-        with progress.stage("adjust"):
+        with _stage("adjust", seconds, check):
             estimate = adjust_pose(query, references, structure, matches, estimate, options.adjust)
-    progress.inlier_counts = _inliers_by_reference(structure, matches, estimate, len(references))
-    return Localization(
+    outcome = Localization(
         estimate.world_from_camera,
         estimate.covariance,
         estimate.stage,
@@ -296,37 +334,48 @@ def _stages(
         len(matches),
         float(np.median(estimate.errors_px[estimate.inliers])),
     )
+    return coarse.answer(outcome, seconds, _inliers_by_reference(structure, matches, estimate, len(references)))
 
 
-def _refine(
-    reconstruction: Reconstruction | DeviceReconstruction,
-    query: View,
-    references: Sequence[PosedView],
-    correspondences: Correspondences,
-    options: LocalizeOptions,
-    match_options: MatchOptions,
-    progress: _Progress,
-) -> tuple[MetricScale, Structure | None, PointMatches | None] | Rejection:
-    """Scale, structure and matches, computed where the reconstruction lies; of `Variant.COARSE` the scale alone."""
-    scale_options = ScaleOptions(options.scale_strategy)
-    only_scale = options.variant is Variant.COARSE
-    if not isinstance(reconstruction, Reconstruction):
-        from .on_device import refine_on_device
+def _structure_and_matches(
+    coarse: Coarse, scale: MetricScale, stage_seconds: dict[str, float], check: Check
+) -> tuple[Structure, PointMatches]:
+    """They came with the scale from a device, or are computed here."""
+    if coarse.structure is not None and coarse.matches is not None:
+        return coarse.structure, coarse.matches
+    prepared, reconstruction = coarse.prepared, coarse.reconstruction
+    assert isinstance(reconstruction, Reconstruction)
+    references, correspondences = prepared.references, prepared.correspondences
+    with _stage("structure", stage_seconds, check):
+        structure = build_structure(reconstruction, scale, references, correspondences, prepared.options.structure)
+    with _stage("match", stage_seconds, check):
+        options, initial = _match_options(prepared), scale.world_from_query
+        matches = match_points(prepared.query, references, structure, correspondences, initial, options)
+    return structure, matches
 
-        with progress.stage("refine"):
-            further = (None, None) if only_scale else (options.structure, match_options)
-            refined = refine_on_device(reconstruction, query, references, correspondences, scale_options, *further)
-        return refined if isinstance(refined, Rejection) else (refined.scale, refined.structure, refined.matches)
-    with progress.stage("scale"):
-        scale = estimate_scale(reconstruction, references, correspondences, scale_options)
-    if isinstance(scale, Rejection) or only_scale:
-        return scale if isinstance(scale, Rejection) else (scale, None, None)
-    with progress.stage("structure"):
-        structure = build_structure(reconstruction, scale, references, correspondences, options.structure)
-    with progress.stage("match"):
-        initial = scale.world_from_query
-        matches = match_points(query, references, structure, correspondences, initial, match_options)
-    return scale, structure, matches
+
+def _look_wider(coarse: Coarse, stage_seconds: dict[str, float], check: Check) -> Coarse:
+    """The same query with wide correspondences among the references, and a reconstruction from them if they matter."""
+    prepared, seconds = coarse.prepared, dict(stage_seconds)
+    query, references, pipeline = prepared.query, prepared.references, prepared.pipeline
+    with _stage("correspond", seconds, check):
+        known = prepared.correspondences.query_matches
+        correspondences = pipeline.matcher.correspond(query, references, True, check, known)
+    with _stage("coarse", seconds, check):
+        reconstruction = coarse.reconstruction
+        if pipeline.reconstructor.uses_correspondences:
+            reconstruction = reconstruct_one(pipeline.reconstructor, query, references, correspondences)
+    return _launch_scale(replace(prepared, correspondences=correspondences), reconstruction, seconds, check)()
+
+
+def _may_be_better(answer: Answer, prepared: Prepared) -> bool:
+    """Whether wide correspondences could make the answer better."""
+    options, outcome = prepared.options, answer.outcome
+    if options.variant is not Variant.BEST or len(prepared.references) < 2:
+        return False
+    if isinstance(outcome, Rejection):
+        return outcome.reason is not RejectionReason.DEGENERATE_REFERENCES
+    return outcome.inlier_count < options.weak_inliers
 
 
 def _inliers_by_reference(

@@ -30,6 +30,8 @@ class PoseStage(str, Enum):
 
     INITIAL = "initial"
     REFINED = "refined"
+    COARSE = "coarse"
+    """The initial one, because there was no time to refine it."""
 
 
 @dataclass(frozen=True)

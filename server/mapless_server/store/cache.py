@@ -11,13 +11,19 @@ Value = TypeVar("Value")
 
 
 class LruCache(Generic[Value]):
-    """Holds values of at most ``capacity_bytes`` together; 0 holds nothing."""
+    """Holds values of at most ``capacity_bytes`` together; 0 holds nothing.
+
+    Attributes:
+        hits, misses: of `get`.
+        evictions: values forgotten for want of room.
+    """
 
     def __init__(self, capacity_bytes: int) -> None:
         """Raises ValueError if the capacity is negative."""
         if capacity_bytes < 0:
             raise ValueError(f"cache capacity must not be negative, is {capacity_bytes} bytes")
         self._capacity_bytes = capacity_bytes
+        self.hits = self.misses = self.evictions = 0
         self._used_bytes = 0
         self._entries: OrderedDict[Hashable, tuple[Value, int]] = OrderedDict()
         self._lock = threading.Lock()
@@ -32,7 +38,9 @@ class LruCache(Generic[Value]):
         with self._lock:
             entry = self._entries.get(key)
             if entry is None:
+                self.misses += 1
                 return None
+            self.hits += 1
             self._entries.move_to_end(key)
             return entry[0]
 
@@ -47,3 +55,4 @@ class LruCache(Generic[Value]):
             while self._used_bytes > self._capacity_bytes:
                 _, (_, forgotten_bytes) = self._entries.popitem(last=False)
                 self._used_bytes -= forgotten_bytes
+                self.evictions += 1

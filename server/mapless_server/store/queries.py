@@ -8,7 +8,9 @@ from typing import Any
 from sqlalchemy import Connection, Row, Select, func, select, update
 
 from mapless_server.errors import AlreadyExists, NotFound
+from mapless_server.principal import DEFAULT_TENANT
 from mapless_server.store.tables import features, image, reference, scene, scene_generation
+from mapless_server.tenancy import KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
 
 _IDS_PER_STATEMENT = 500
 """Databases bound the number of parameters of a statement."""
@@ -24,46 +26,54 @@ def select_scenes() -> Select[Any]:
     )
 
 
-def find_scene(connection: Connection, scene_id: str) -> Row[Any]:
+def select_scenes_of(tenant: str, after: str) -> Select[Any]:
+    """The same for the scenes of one tenant whose id is greater than ``after``, by id."""
+    key = scene.c.scene_id
+    # Not LIKE: to SQLite, "acme/%" is "ACME/%".
+    is_theirs = ~key.contains(KEY_SEPARATOR) if tenant == DEFAULT_TENANT else key < end_of_keys(tenant)
+    return select_scenes().where(key > key_of(tenant, after), is_theirs).order_by(key)
+
+
+def find_scene(connection: Connection, scene_key: SceneKey) -> Row[Any]:
     """The row of ``select_scenes`` for one scene. Raises NotFound."""
-    row = connection.execute(select_scenes().where(scene.c.scene_id == scene_id)).one_or_none()
+    row = connection.execute(select_scenes().where(scene.c.scene_id == scene_key)).one_or_none()
     if row is None:
-        raise _scene_not_found(scene_id)
+        raise _scene_not_found(scene_key)
     return row
 
 
-def read_generation(connection: Connection, scene_id: str) -> int:
+def read_generation(connection: Connection, scene_key: SceneKey) -> int:
     """Generation of a scene. Raises NotFound."""
     generation: int | None = connection.scalar(
         select(scene_generation.c.generation)
         .join(scene, scene.c.scene_id == scene_generation.c.scene_id)
-        .where(scene.c.scene_id == scene_id)
+        .where(scene.c.scene_id == scene_key)
     )
     if generation is None:
-        raise _scene_not_found(scene_id)
+        raise _scene_not_found(scene_key)
     return generation
 
 
-def raise_generation(connection: Connection, scene_id: str) -> bool:
+def raise_generation(connection: Connection, scene_key: SceneKey) -> bool:
     """Count a change; False if no scene of this id ever existed."""
     generation = scene_generation.c.generation
-    change = update(scene_generation).where(scene_generation.c.scene_id == scene_id).values(generation=generation + 1)
+    change = update(scene_generation).where(scene_generation.c.scene_id == scene_key).values(generation=generation + 1)
     return connection.execute(change).rowcount == 1
 
 
-def begin_change(connection: Connection, scene_id: str) -> None:
+def begin_change(connection: Connection, scene_key: SceneKey) -> None:
     """Count a change of a scene that must exist. Raises NotFound.
 
     The counter is raised before anything is looked at: its row is the lock that orders the changes of a scene where the
     database lets several writers in.
     """
-    raise_generation(connection, scene_id)
-    read_generation(connection, scene_id)
+    raise_generation(connection, scene_key)
+    read_generation(connection, scene_key)
 
 
-def find_keys(connection: Connection, scene_id: str, reference_ids: Sequence[str]) -> dict[str, str]:
+def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
     """Keys by id, of those of these references that exist."""
-    statement = select(reference.c.reference_id, reference.c.key).where(reference.c.scene_id == scene_id)
+    statement = select(reference.c.reference_id, reference.c.key).where(reference.c.scene_id == scene_key)
     keys: dict[str, str] = {}
     for ids in _portions(reference_ids):
         rows = connection.execute(statement.where(reference.c.reference_id.in_(ids)))
@@ -71,29 +81,29 @@ def find_keys(connection: Connection, scene_id: str, reference_ids: Sequence[str
     return keys
 
 
-def list_keys(connection: Connection, scene_id: str) -> dict[str, str]:
+def list_keys(connection: Connection, scene_key: SceneKey) -> dict[str, str]:
     """Keys by id of all references of a scene, ordered by id."""
-    statement = select(reference.c.reference_id, reference.c.key).where(reference.c.scene_id == scene_id)
+    statement = select(reference.c.reference_id, reference.c.key).where(reference.c.scene_id == scene_key)
     rows = connection.execute(statement.order_by(reference.c.reference_id))
     return {row.reference_id: row.key for row in rows}
 
 
-def find_key(connection: Connection, scene_id: str, reference_id: str) -> str:
+def find_key(connection: Connection, scene_key: SceneKey, reference_id: str) -> str:
     """Key of one reference. Raises NotFound for the scene or the reference."""
-    read_generation(connection, scene_id)
-    keys = find_keys(connection, scene_id, [reference_id])
+    read_generation(connection, scene_key)
+    keys = find_keys(connection, scene_key, [reference_id])
     if reference_id not in keys:
-        raise reference_not_found(scene_id, reference_id, field="name")
+        raise reference_not_found(scene_key, reference_id, field="name")
     return keys[reference_id]
 
 
-def refuse_taken_ids(connection: Connection, scene_id: str, reference_ids: Sequence[str]) -> None:
+def refuse_taken_ids(connection: Connection, scene_key: SceneKey, reference_ids: Sequence[str]) -> None:
     """Raises AlreadyExists for the first id that is stored already or stands twice."""
-    taken = set(find_keys(connection, scene_id, reference_ids))
+    taken = set(find_keys(connection, scene_key, reference_ids))
     for index, reference_id in enumerate(reference_ids):
         if reference_id in taken:
             raise AlreadyExists(
-                f"reference {reference_id!r} exists already in scene {scene_id!r}",
+                f"reference {reference_id!r} exists already in scene {scene_id_of(scene_key)!r}",
                 field=f"requests[{index}].reference_id",
             )
         taken.add(reference_id)
@@ -151,17 +161,17 @@ def has_features(connection: Connection, key: str, extractor: str) -> bool:
     return connection.scalar(statement) is not None
 
 
-def reference_not_found(scene_id: str, reference_id: str, field: str) -> NotFound:
+def reference_not_found(scene_key: SceneKey, reference_id: str, field: str) -> NotFound:
     """The answer for a reference that does not exist."""
-    return NotFound(f"there is no reference {reference_id!r} in scene {scene_id!r}", field=field)
+    return NotFound(f"there is no reference {reference_id!r} in scene {scene_id_of(scene_key)!r}", field=field)
 
 
 def _reference_deleted() -> NotFound:
     return NotFound("a reference was deleted while it was used")
 
 
-def _scene_not_found(scene_id: str) -> NotFound:
-    return NotFound(f"there is no scene {scene_id!r}", field="scene")
+def _scene_not_found(scene_key: SceneKey) -> NotFound:
+    return NotFound(f"there is no scene {scene_id_of(scene_key)!r}", field="scene")
 
 
 def _portions(ids: Sequence[str]) -> Iterator[Sequence[str]]:

@@ -8,6 +8,7 @@ from datetime import datetime
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.method.views import View
+from mapless_server.tenancy import SceneKey, scene_id_of
 
 
 @dataclass(frozen=True)
@@ -15,18 +16,23 @@ class SceneRecord:
     """A stored scene.
 
     Attributes:
-        scene_id: unique among the scenes that exist.
+        scene_key: unique among the scenes that exist.
         generation: raised by every change of the scene or its references. A scene that is deleted and created again
-            counts on, so (scene_id, generation) never means two different contents. Features of one more extractor
+            counts on, so (scene_key, generation) never means two different contents. Features of one more extractor
             are no change: they follow from the image and the extractor's name, and answers are named after both.
         reference_count: number of references.
         create_time: UTC.
     """
 
-    scene_id: str
+    scene_key: SceneKey
     generation: int
     reference_count: int
     create_time: datetime
+
+    @property
+    def scene_id(self) -> str:
+        """What its tenant calls it."""
+        return scene_id_of(self.scene_key)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +60,8 @@ class ReferenceRecord:
     """A stored reference without its image and features.
 
     Attributes:
-        scene_id, reference_id: its name.
+        scene_key: of its scene.
+        reference_id: unique within the scene.
         key: identifies this very reference for good; one that is deleted and added again has another key.
         camera: in pixels of the stored image.
         world_from_camera: its pose, metric.
@@ -63,7 +70,7 @@ class ReferenceRecord:
         create_time: UTC.
     """
 
-    scene_id: str
+    scene_key: SceneKey
     reference_id: str
     key: str
     camera: Camera
@@ -71,6 +78,11 @@ class ReferenceRecord:
     image_sha256: str
     feature_count: int
     create_time: datetime
+
+    @property
+    def scene_id(self) -> str:
+        """What its tenant calls the scene."""
+        return scene_id_of(self.scene_key)
 
 
 @dataclass(frozen=True, eq=False)

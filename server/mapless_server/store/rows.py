@@ -13,6 +13,7 @@ from mapless_server.errors import DataLoss
 from mapless_server.method.views import View
 from mapless_server.store import codec
 from mapless_server.store.records import DescribedReference, NewReference, ReferenceRecord, SceneRecord
+from mapless_server.tenancy import SceneKey
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _MICROSECOND = timedelta(microseconds=1)
@@ -25,15 +26,16 @@ def time_us(time: datetime) -> int:
 
 def scene_record(row: Row[Any]) -> SceneRecord:
     """From a row of ``queries.select_scenes``."""
-    return SceneRecord(row.scene_id, row.generation, row.reference_count, _EPOCH + row.create_time_us * _MICROSECOND)
+    create_time = _EPOCH + row.create_time_us * _MICROSECOND
+    return SceneRecord(SceneKey(row.scene_id), row.generation, row.reference_count, create_time)
 
 
-def new_record(scene_id: str, new: NewReference, create_time: datetime) -> ReferenceRecord:
+def new_record(scene_key: SceneKey, new: NewReference, create_time: datetime) -> ReferenceRecord:
     """The record of a reference about to be stored, with a key nobody had before; ValueError if it has no features."""
     if not new.views:
         raise ValueError(f"reference {new.reference_id!r} has no features of any extractor")
     return ReferenceRecord(
-        scene_id=scene_id,
+        scene_key=scene_key,
         reference_id=new.reference_id,
         key=uuid.uuid4().hex,
         camera=new.camera,
@@ -49,7 +51,7 @@ def reference_row(record: ReferenceRecord) -> dict[str, Any]:
     geometry = codec.encode_geometry(record.camera, record.world_from_camera)
     return {
         "key": record.key,
-        "scene_id": record.scene_id,
+        "scene_id": record.scene_key,
         "reference_id": record.reference_id,
         "geometry": geometry,
         "geometry_sha256": codec.sha256_for(record.key, geometry),
@@ -66,7 +68,7 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
     except codec.Damaged as error:
         raise data_loss(row.reference_id, str(error)) from error
     return ReferenceRecord(
-        scene_id=row.scene_id,
+        scene_key=SceneKey(row.scene_id),
         reference_id=row.reference_id,
         key=row.key,
         camera=camera,

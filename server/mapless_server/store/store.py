@@ -22,6 +22,7 @@ from mapless_server.store.records import (
     SceneSnapshot,
 )
 from mapless_server.store.sqlite import SqliteDatabase
+from mapless_server.tenancy import SceneKey, scene_id_of
 
 DEFAULT_CACHE_BYTES = 512 * 2**20
 """About 500 references with 2048 SIFT features each; 0 reads the database every time."""
@@ -34,6 +35,8 @@ POSE_BYTES = 700
 class Store:
     """Scenes and their references, in one database of a data folder.
 
+    A scene's key says whose it is. Answers and messages name it by its id, which is all that its tenant knows.
+
     DataLoss is raised wherever stored bytes turn out not to be what was stored; other references are still served, and
     the damaged one can be deleted.
     """
@@ -42,7 +45,7 @@ class Store:
         self._database = database
         # By (key, extractor): references never change and keys are never reused, so no entry is ever stale.
         self._described = described
-        # By (scene_id, generation), which are never reused either.
+        # By (scene_key, generation), which are never reused either.
         self._poses: LruCache[tuple[ReferencePose, ...]] = LruCache(POSE_CACHE_BYTES)
 
     @staticmethod
@@ -60,6 +63,11 @@ class Store:
         described: LruCache[DescribedReference] = LruCache(cache_bytes)
         return Store(SqliteDatabase.open(data_dir), described)
 
+    @property
+    def reference_cache(self) -> LruCache[DescribedReference]:
+        """The features held in memory."""
+        return self._described
+
     def close(self) -> None:
         """Release the data folder; no call may be in progress or follow."""
         self._database.close()
@@ -72,7 +80,7 @@ class Store:
     ) -> None:
         self.close()
 
-    def create_scene(self, scene_id: str) -> SceneRecord:
+    def create_scene(self, scene_key: SceneKey) -> SceneRecord:
         """Create an empty scene.
 
         Raises:
@@ -80,40 +88,39 @@ class Store:
         """
         scene, generation = tables.scene, tables.scene_generation
         with self._database.write() as connection:
-            if not queries.raise_generation(connection, scene_id):
-                connection.execute(insert(generation).values(scene_id=scene_id, generation=1))
-            if connection.scalar(select(scene.c.scene_id).where(scene.c.scene_id == scene_id)) is not None:
-                raise AlreadyExists(f"scene {scene_id!r} exists already", field="scene_id")
-            connection.execute(insert(scene).values(scene_id=scene_id, create_time_us=rows.time_us(_now())))
-            return rows.scene_record(queries.find_scene(connection, scene_id))
+            if not queries.raise_generation(connection, scene_key):
+                connection.execute(insert(generation).values(scene_id=scene_key, generation=1))
+            if connection.scalar(select(scene.c.scene_id).where(scene.c.scene_id == scene_key)) is not None:
+                raise AlreadyExists(f"scene {scene_id_of(scene_key)!r} exists already", field="scene_id")
+            connection.execute(insert(scene).values(scene_id=scene_key, create_time_us=rows.time_us(_now())))
+            return rows.scene_record(queries.find_scene(connection, scene_key))
 
-    def get_scene(self, scene_id: str) -> SceneRecord:
+    def get_scene(self, scene_key: SceneKey) -> SceneRecord:
         """A scene.
 
         Raises:
             NotFound: there is no such scene.
         """
         with self._database.read() as connection:
-            return rows.scene_record(queries.find_scene(connection, scene_id))
+            return rows.scene_record(queries.find_scene(connection, scene_key))
 
-    def list_scenes(self, limit: int, after: str = "") -> list[SceneRecord]:
-        """At most ``limit`` scenes, by id, of those whose id is greater than ``after``."""
-        scene_id = tables.scene.c.scene_id
-        page = queries.select_scenes().where(scene_id > after).order_by(scene_id).limit(limit)
+    def list_scenes(self, tenant: str, limit: int, after: str = "") -> list[SceneRecord]:
+        """At most ``limit`` scenes of a tenant, by id, of those whose id is greater than ``after``."""
+        page = queries.select_scenes_of(tenant, after).limit(limit)
         with self._database.read() as connection:
             return [rows.scene_record(row) for row in connection.execute(page)]
 
-    def delete_scene(self, scene_id: str) -> None:
+    def delete_scene(self, scene_key: SceneKey) -> None:
         """Delete a scene and all its references.
 
         Raises:
             NotFound: there is no such scene.
         """
         with self._database.write() as connection:
-            queries.begin_change(connection, scene_id)
-            connection.execute(delete(tables.scene).where(tables.scene.c.scene_id == scene_id))
+            queries.begin_change(connection, scene_key)
+            connection.execute(delete(tables.scene).where(tables.scene.c.scene_id == scene_key))
 
-    def add_references(self, scene_id: str, references: Sequence[NewReference]) -> list[ReferenceRecord]:
+    def add_references(self, scene_key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
         """Add references, all or none, each with the features of all its extractors; one change of the scene.
 
         Returns:
@@ -129,15 +136,15 @@ class Store:
             raise ValueError("no reference to add")
         now = _now()
         # Encoding takes milliseconds a reference, so it is done before the others who want to write have to wait.
-        records = [rows.new_record(scene_id, new, now) for new in references]
+        records = [rows.new_record(scene_key, new, now) for new in references]
         reference_rows = [rows.reference_row(record) for record in records]
         image_rows, features_rows = [], []
         for record, new in zip(records, references, strict=True):
             image_rows.append({"reference_key": record.key, "data": new.image})
             features_rows += [rows.features_row(record.key, *described) for described in new.views.items()]
         with self._database.write() as connection:
-            queries.begin_change(connection, scene_id)
-            queries.refuse_taken_ids(connection, scene_id, [new.reference_id for new in references])
+            queries.begin_change(connection, scene_key)
+            queries.refuse_taken_ids(connection, scene_key, [new.reference_id for new in references])
             connection.execute(insert(tables.reference), reference_rows)
             connection.execute(insert(tables.image), image_rows)
             connection.execute(insert(tables.features), features_rows)
@@ -168,7 +175,7 @@ class Store:
         with self._database.read() as connection:
             return queries.has_features(connection, key, extractor)
 
-    def get_reference(self, scene_id: str, reference_id: str) -> ReferenceRecord:
+    def get_reference(self, scene_key: SceneKey, reference_id: str) -> ReferenceRecord:
         """A reference without its image.
 
         Raises:
@@ -176,11 +183,11 @@ class Store:
             DataLoss: its camera and pose are damaged.
         """
         with self._database.read() as connection:
-            key = queries.find_key(connection, scene_id, reference_id)
+            key = queries.find_key(connection, scene_key, reference_id)
             row = connection.execute(select(tables.reference).where(tables.reference.c.key == key)).one()
         return rows.reference_record(row)
 
-    def read_image(self, scene_id: str, reference_id: str) -> bytes:
+    def read_image(self, scene_key: SceneKey, reference_id: str) -> bytes:
         """The image's bytes as they came.
 
         Raises:
@@ -188,7 +195,7 @@ class Store:
             DataLoss: the bytes are damaged.
         """
         with self._database.read() as connection:
-            row = queries.find_image(connection, queries.find_key(connection, scene_id, reference_id))
+            row = queries.find_image(connection, queries.find_key(connection, scene_key, reference_id))
         return rows.image(row)
 
     def read_image_of(self, key: str) -> bytes:
@@ -202,7 +209,7 @@ class Store:
             row = queries.find_image(connection, key)
         return rows.image(row)
 
-    def list_references(self, scene_id: str, limit: int, after: str = "") -> list[ReferenceRecord]:
+    def list_references(self, scene_key: SceneKey, limit: int, after: str = "") -> list[ReferenceRecord]:
         """At most ``limit`` references of a scene, by id, of those whose id is greater than ``after``.
 
         Raises:
@@ -210,24 +217,24 @@ class Store:
             DataLoss: camera and pose of one of them are damaged.
         """
         column = tables.reference.c
-        page = select(tables.reference).where(column.scene_id == scene_id, column.reference_id > after)
+        page = select(tables.reference).where(column.scene_id == scene_key, column.reference_id > after)
         with self._database.read() as connection:
-            queries.read_generation(connection, scene_id)
+            queries.read_generation(connection, scene_key)
             found = connection.execute(page.order_by(column.reference_id).limit(limit)).all()
         return [rows.reference_record(row) for row in found]
 
-    def delete_reference(self, scene_id: str, reference_id: str) -> None:
+    def delete_reference(self, scene_key: SceneKey, reference_id: str) -> None:
         """Delete a reference with its image and features; works on a damaged one, too.
 
         Raises:
             NotFound: there is no such scene or reference.
         """
         with self._database.write() as connection:
-            queries.begin_change(connection, scene_id)
-            key = queries.find_key(connection, scene_id, reference_id)
+            queries.begin_change(connection, scene_key)
+            key = queries.find_key(connection, scene_key, reference_id)
             connection.execute(delete(tables.reference).where(tables.reference.c.key == key))
 
-    def list_poses(self, scene_id: str) -> tuple[int, tuple[ReferencePose, ...]]:
+    def list_poses(self, scene_key: SceneKey) -> tuple[int, tuple[ReferencePose, ...]]:
         """The scene's generation and the poses of all its references, by id; from memory when nothing has changed.
 
         Raises:
@@ -236,24 +243,26 @@ class Store:
         """
         column = tables.reference.c
         with self._database.read() as connection:
-            generation = queries.read_generation(connection, scene_id)
-            poses = self._poses.get((scene_id, generation))
+            generation = queries.read_generation(connection, scene_key)
+            poses = self._poses.get((scene_key, generation))
             if poses is not None:
                 return generation, poses
-            statement = select(tables.reference).where(column.scene_id == scene_id).order_by(column.reference_id)
+            statement = select(tables.reference).where(column.scene_id == scene_key).order_by(column.reference_id)
             found = connection.execute(statement).all()
         records = [rows.reference_record(row) for row in found]
         poses = tuple(ReferencePose(it.reference_id, it.key, it.world_from_camera) for it in records)
-        self._poses.put((scene_id, generation), poses, POSE_BYTES * len(poses))
+        self._poses.put((scene_key, generation), poses, POSE_BYTES * len(poses))
         return generation, poses
 
-    def load_references(self, scene_id: str, reference_ids: Sequence[str] | None, extractor: str) -> SceneSnapshot:
+    def load_references(
+        self, scene_key: SceneKey, reference_ids: Sequence[str] | None, extractor: str
+    ) -> SceneSnapshot:
         """References with their features, which of them have none, and the generation, all read at one moment.
 
         References that were loaded before come from memory.
 
         Args:
-            scene_id: the scene.
+            scene_key: the scene.
             reference_ids: which references, in the order wanted; None for all, by id.
             extractor: whose features.
 
@@ -262,15 +271,15 @@ class Store:
             DataLoss: features, camera or pose of one of them are damaged.
         """
         with self._database.read() as connection:
-            generation = queries.read_generation(connection, scene_id)
+            generation = queries.read_generation(connection, scene_key)
             if reference_ids is None:
-                keys = queries.list_keys(connection, scene_id)
+                keys = queries.list_keys(connection, scene_key)
                 reference_ids = list(keys)
             else:
-                keys = queries.find_keys(connection, scene_id, reference_ids)
+                keys = queries.find_keys(connection, scene_key, reference_ids)
             for index, reference_id in enumerate(reference_ids):
                 if reference_id not in keys:
-                    raise queries.reference_not_found(scene_id, reference_id, field=f"references[{index}]")
+                    raise queries.reference_not_found(scene_key, reference_id, field=f"references[{index}]")
             wanted = [keys[reference_id] for reference_id in reference_ids]
             remembered = {key: self._described.get((key, extractor)) for key in wanted}
             described = {key: it for key, it in remembered.items() if it is not None}

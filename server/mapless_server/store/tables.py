@@ -24,6 +24,8 @@ metadata = MetaData()
 
 # Pages are cut by comparing ids, so both databases must compare them by code point.
 _Id = String(128).with_variant(String(128, collation="C"), "postgresql")
+# A column called scene_id holds the scene's key, of which the tenant and a slash are part, see tenancy.py.
+_SceneKey = String(257).with_variant(String(257, collation="C"), "postgresql")
 _Key = String(32)
 _Sha256 = String(64)
 
@@ -36,7 +38,7 @@ store_version = Table(
 scene = Table(
     "scene",
     metadata,
-    Column("scene_id", _Id, primary_key=True),
+    Column("scene_id", _SceneKey, primary_key=True),
     Column("create_time_us", BigInteger, nullable=False),
 )
 
@@ -44,7 +46,7 @@ scene = Table(
 scene_generation = Table(
     "scene_generation",
     metadata,
-    Column("scene_id", _Id, primary_key=True),
+    Column("scene_id", _SceneKey, primary_key=True),
     Column("generation", BigInteger, nullable=False),
 )
 
@@ -52,7 +54,7 @@ reference = Table(
     "reference",
     metadata,
     Column("key", _Key, primary_key=True),
-    Column("scene_id", _Id, ForeignKey("scene.scene_id", ondelete="CASCADE"), nullable=False),
+    Column("scene_id", _SceneKey, ForeignKey("scene.scene_id", ondelete="CASCADE"), nullable=False),
     Column("reference_id", _Id, nullable=False),
     Column("geometry", LargeBinary, nullable=False),  # camera and pose, see codec.py
     Column("geometry_sha256", _Sha256, nullable=False),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +77,44 @@ class Reconstruction:
     references: tuple[ReconstructedView, ...]
 
 
+Outcome: TypeAlias = "Reconstruction | DeviceReconstruction | Rejection"
+"""What a backend says of one query: its reconstruction, or why there is none."""
+
+
+@dataclass(frozen=True)
+class Bucket:
+    """Queries of one bucket may be reconstructed together; as text, a short name of it.
+
+    Attributes:
+        backend: its name.
+        reference_count: of each query.
+        grid: rows and columns of the pictures' patches; None for a backend that has none.
+    """
+
+    backend: str
+    reference_count: int
+    grid: tuple[int, int] | None = None
+
+    def __str__(self) -> str:
+        grid = [] if self.grid is None else ["x".join(map(str, self.grid))]
+        return "-".join([self.backend, *grid, str(self.reference_count)])
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """What is to be reconstructed together.
+
+    Attributes:
+        query: the photograph to localize.
+        references: with known poses.
+        correspondences: between them all; a network looks at the images alone and needs none.
+    """
+
+    query: View
+    references: Sequence[PosedView]
+    correspondences: Correspondences | None = None
+
+
 class Reconstructor(Protocol):
     """A coarse backend.
 
@@ -106,11 +144,36 @@ class Reconstructor(Protocol):
         """Gives back threads and devices; nothing follows."""
         ...
 
-    def reconstruct(
-        self, query: View, references: Sequence[PosedView], correspondences: Correspondences
-    ) -> Reconstruction | DeviceReconstruction | Rejection:
-        """Reconstructs the query and its references together, or says why it cannot.
+    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
+        """With which other queries this one, of one reference at least, may be reconstructed in one go.
 
-        A network looks at the images and ignores the correspondences; the geometric backend lives on them.
+        Raises:
+            ValueError: a view lacks what the backend looks at.
         """
         ...
+
+    def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
+        """Reconstructs each query and its references, as far as it can in one go.
+
+        Returns:
+            For each request, in their order, the reconstruction, why there is none, or the exception that is its own,
+            among them one of too little memory for it alone. What company a request has changes its outcome by no
+            more than rounding.
+
+        Raises:
+            Exception: of the batch as a whole. Halves of it tell whose fault it was.
+        """
+        ...
+
+
+def reconstruct_one(
+    reconstructor: Reconstructor,
+    query: View,
+    references: Sequence[PosedView],
+    correspondences: Correspondences | None = None,
+) -> Outcome:
+    """The outcome of a single request; raises the exception that it had."""
+    (outcome,) = reconstructor.reconstruct_many([Request(query, references, correspondences)])
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome

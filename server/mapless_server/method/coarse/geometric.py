@@ -22,7 +22,7 @@ from ..rejection import Rejection, RejectionReason
 from ..structure import Structure, StructureOptions, observe
 from ..tracks import build_tracks
 from ..views import PosedView, View
-from . import ReconstructedView, Reconstruction
+from . import Bucket, Outcome, ReconstructedView, Reconstruction, Request
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,24 @@ class GeometricReconstructor:
     def close(self) -> None:
         """Nothing to give back."""
 
-    def reconstruct(
-        self, query: View, references: Sequence[PosedView], correspondences: Correspondences
-    ) -> Reconstruction | Rejection:
-        """See Reconstructor.reconstruct."""
+    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
+        """See Reconstructor.bucket."""
+        return Bucket(self.name, len(references))
+
+    def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
+        """See Reconstructor.reconstruct_many; one after the other, since they have nothing in common."""
+        return [self._attempt(request) for request in requests]
+
+    def _attempt(self, request: Request) -> Outcome | Exception:
+        try:
+            return self._reconstruct(request)
+        except Exception as error:  # one request's fault is not the others'
+            return error
+
+    def _reconstruct(self, request: Request) -> Reconstruction | Rejection:
+        query, references, correspondences = request.query, request.references, request.correspondences
+        if correspondences is None:
+            raise ValueError(f"{self.name} reconstructs from correspondences, and there are none")
         rejection = self._check(references)
         if rejection:
             return rejection

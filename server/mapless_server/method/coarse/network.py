@@ -24,10 +24,9 @@ from mapless.geometry import Array, RigidTransform
 
 from ...networks.network import NetworkOutput
 from ...networks.runner import NetworkRunner
-from ..correspond import Correspondences
 from ..rejection import Rejection, RejectionReason
 from ..views import Photograph, PosedView, View
-from . import Reconstruction
+from . import Bucket, Outcome, Request
 from .device import DeviceReconstruction
 from .grids import Grid, GridOptions, Layout, common_grid, lay_out
 from .token_cache import TokenCache, TokenCacheOptions, TokenKey
@@ -35,9 +34,6 @@ from .token_cache import TokenCache, TokenCacheOptions, TokenKey
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-Outcome = Reconstruction | DeviceReconstruction | Rejection
-Request = tuple[View, Sequence[PosedView]]
-"""A query and its references."""
 
 
 @dataclass(frozen=True)
@@ -87,42 +83,37 @@ class NetworkReconstructor:
         """Ends the network's thread."""
         self._runner.close()
 
-    def reconstruct(
-        self, query: View, references: Sequence[PosedView], correspondences: Correspondences | None = None
-    ) -> Outcome:
-        """See Reconstructor.reconstruct.
-
-        Raises:
-            ValueError: a view has no photograph.
-            torch.OutOfMemoryError: there is not even room for one query.
-            RequestError: a reference's photograph cannot be read any more.
-        """
-        (outcome,) = self.reconstruct_many([(query, references)])
-        if isinstance(outcome, Exception):
-            raise outcome
-        return outcome
+    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
+        """See Reconstructor.bucket."""
+        grid = _Scene.of(query, references, self._options.grids).grid
+        return Bucket(self.name, len(references), (grid.rows, grid.columns))
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
-        """Reconstructs queries, in one go those that have the same grid and number of references.
+        """See Reconstructor.reconstruct_many: in one go those that have the same grid and number of references.
 
-        When the device's memory does not suffice, tokens that are kept there leave it and the batch is halved.
+        Each view is encoded once, however many requests show it. When the device's memory does not suffice, tokens
+        that are kept there leave it and the batch is halved.
 
         Returns:
-            For each request what `reconstruct` returns, or the exception that it raises.
+            The outcomes, among them the exceptions:
+            ValueError: a view has no photograph.
+            torch.OutOfMemoryError: there is not even room for this query alone.
+            RequestError: a reference's photograph cannot be read any more.
         """
         outcomes: list[Outcome | Exception | None] = [None] * len(requests)
         batches: dict[tuple[Grid, int], list[tuple[int, _EncodedScene]]] = defaultdict(list)
-        for i, (query, references) in enumerate(requests):
-            if not references:
+        encoded: dict[TokenKey, Tensor] = {}
+        for i, request in enumerate(requests):
+            if not request.references:
                 outcomes[i] = Rejection(RejectionReason.NO_USABLE_REFERENCES, "no references")
                 continue
             try:
-                scene = _Scene.of(query, references, self._options.grids)
-                encoded = _EncodedScene(scene, self._with_room(partial(self._encode, scene)))
+                scene = _Scene.of(request.query, request.references, self._options.grids)
+                tokens = self._with_room(partial(self._encode, scene, encoded))
             except Exception as error:  # one request's fault is not the others'
                 outcomes[i] = error
             else:
-                batches[scene.grid, len(references)].append((i, encoded))
+                batches[scene.grid, len(request.references)].append((i, _EncodedScene(scene, tokens)))
         for batch in batches.values():
             indices, scenes = zip(*batch, strict=True)
             for i, outcome in zip(indices, self._solve(scenes), strict=True):
@@ -165,21 +156,31 @@ class NetworkReconstructor:
             known = np.stack([condition_poses([r.world_from_camera for r in it.scene.references]) for it in scenes])
             poses = torch.from_numpy(known.astype(np.float32))
             posed = (torch.arange(len(references) + 1) < len(references)).repeat(len(scenes), 1)
-        tokens = torch.stack([it.tokens for it in scenes])
+        tokens = torch.stack([of_view for it in scenes for of_view in it.tokens]).unflatten(0, (len(scenes), -1))
         output = self._runner.reconstruct(tokens, (grid.rows, grid.columns), len(references), poses, posed)
         return [self._outcome(it.scene, output, index) for index, it in enumerate(scenes)]
 
-    def _encode(self, scene: _Scene) -> Tensor:
-        """Tokens (N, T, C) of a scene's views; of references those that are kept, and photographs only of the rest."""
-        keys = [self._key(view) for view in scene.views[:-1]]
-        tokens = []
-        for key, view in zip(keys, scene.views, strict=False):
-            kept = self.cache.get(key)
-            if kept is None:
-                kept = self._encode_view(view)
-                self.cache.put(key, kept)
-            tokens.append(kept)
-        return torch.stack([*tokens, self._encode_view(scene.views[-1])])
+    def _encode(self, scene: _Scene, encoded: dict[TokenKey, Tensor]) -> tuple[Tensor, ...]:
+        """Tokens (T, C) of each of a scene's views.
+
+        Views that are not in `encoded` join it; of references the cache is asked first, so that photographs are read
+        only of the rest.
+        """
+        keys = [self._key(view) for view in scene.views]
+        for key, view in zip(keys[:-1], scene.views, strict=False):
+            if key not in encoded:
+                encoded[key] = self._encode_reference(key, view)
+        if keys[-1] not in encoded:
+            encoded[keys[-1]] = self._encode_view(scene.views[-1])
+        return tuple(encoded[key] for key in keys)
+
+    def _encode_reference(self, key: TokenKey, view: _LaidOut) -> Tensor:
+        """Tokens (T, C), kept for later queries."""
+        tokens = self.cache.get(key)
+        if tokens is None:
+            tokens = self._encode_view(view)
+            self.cache.put(key, tokens)
+        return tokens
 
     def _encode_view(self, view: _LaidOut) -> Tensor:
         """Tokens (T, C)."""
@@ -248,10 +249,10 @@ class _Scene:
 
 @dataclass(frozen=True, eq=False)
 class _EncodedScene:
-    """A scene and the tokens (N, T, C) of its views."""
+    """A scene and the tokens (T, C) of each of its views, which other scenes of a batch may share."""
 
     scene: _Scene
-    tokens: Tensor
+    tokens: tuple[Tensor, ...]
 
 
 def _photograph(view: View, name: str) -> Photograph:

@@ -8,7 +8,7 @@ equations are those of the host (see `arrays`), in float64; the results are what
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,30 +77,50 @@ def refine_on_device(
     Raises:
         ValueError: the reconstruction has another number of references, or only one of the last two options is given.
     """
-    if len(reconstruction.reference_cameras) != len(references):
-        raise ValueError(f"{len(reconstruction.reference_cameras)} reconstructed references of {len(references)}")
     if (structure_options is None) != (match_options is None):
         raise ValueError("structure and matches go together")
     options = Options(scale_options or ScaleOptions(), structure_options, match_options)
+    return launch_on_device(reconstruction, query, references, correspondences, options)()
+
+
+def launch_on_device(
+    reconstruction: DeviceReconstruction,
+    query: View,
+    references: Sequence[PosedView],
+    correspondences: Correspondences,
+    options: Options,
+) -> Callable[[], Refined | Rejection]:
+    """As refine_on_device, but waits for nothing: what it returns waits, and then gives the result.
+
+    So every query of a batch is prepared, and its work queued up, while the network still computes.
+    """
+    if len(reconstruction.reference_cameras) != len(references):
+        raise ValueError(f"{len(reconstruction.reference_cameras)} reconstructed references of {len(references)}")
     rejection = check_references(references, options.scale)
     if rejection is not None:
-        return rejection
+        return lambda: rejection
     job = prepare(reconstruction.reference_cameras, query, references, correspondences, options)
     uploaded = upload(job.inputs, reconstruction.point_maps.device)
-    outputs = fetch(compute(reconstruction, uploaded, query.camera, options))
+    launched = compute(reconstruction, uploaded, query.camera, options)
+    return lambda: _judged(fetch(launched), job, reconstruction, query, options)
 
-    broken = _not_finite(outputs, len(references))
+
+def _judged(
+    outputs: Outputs, job: Job, reconstruction: DeviceReconstruction, query: View, options: Options
+) -> Refined | Rejection:
+    reference_count = len(reconstruction.reference_cameras)
+    broken = _not_finite(outputs, reference_count)
     if broken:
         message = f"{reconstruction.backend}: {broken}"
         log.warning("%s", message)
         return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
-    scale = judge(outputs.weighed, len(references), options.scale)
+    scale = judge(outputs.weighed, reference_count, options.scale)
     if isinstance(scale, Rejection):
         return scale
-    if outputs.points is None or structure_options is None or match_options is None:
+    if outputs.points is None or options.structure is None or options.match is None:
         return Refined(scale, None, None)
-    structure = _structure(outputs.points, job, structure_options)
-    return Refined(scale, structure, _matches(outputs.points, len(query.features), match_options.radius_px))
+    structure = _structure(outputs.points, job, options.structure)
+    return Refined(scale, structure, _matches(outputs.points, len(query.features), options.match.radius_px))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,118 @@
+"""When calls are made, by whom, and what kind of call each is: decided before the first one is sent.
+
+Several clients call independently of one another and of the answers (open loop), as many robots do; so each one's calls
+are a Poisson process. A closed loop, where a client calls again once it has its answer, asks less of a slow server and
+so makes it look better than it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from mapless.geometry import Array
+
+
+class Kind(str, Enum):
+    """What kind of call is made."""
+
+    QUERY = "query"
+    CANCELLED = "cancelled"
+    """A good query whose caller hangs up at a random moment."""
+    BAD_IMAGE = "bad_image"
+
+
+@dataclass(frozen=True, eq=False)
+class Requests:
+    """Serialized requests to choose from, each as likely as the others; images of `bad` ones are to be refused."""
+
+    good: Sequence[bytes]
+    bad: Sequence[bytes] = ()
+
+
+@dataclass(frozen=True)
+class Mix:
+    """What share of the calls is not a plain query.
+
+    Attributes:
+        cancelled_share: of calls that are cancelled.
+        bad_share: of calls with a bad image.
+        cancel_within_s: a cancelled call is cancelled at any moment up to so long after it was sent; at twice what
+            an answer takes, about half of them come too late, so that both sides of the race are run.
+    """
+
+    cancelled_share: float = 0.0
+    bad_share: float = 0.0
+    cancel_within_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        if min(self.cancelled_share, self.bad_share) < 0 or self.cancelled_share + self.bad_share > 1:
+            raise ValueError("shares must be at least 0 and together at most 1")
+        if not self.cancel_within_s > 0:
+            raise ValueError("cancel_within_s must be above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedCall:
+    """A call to make.
+
+    Attributes:
+        at_s: when, seconds from the start. Latency counts from here, however late the call is sent.
+        client: who makes it, 0, 1, ...
+        kind: what kind of call it is.
+        request: what is sent.
+        cancel_after_s: when the caller hangs up, seconds after sending; None if it waits.
+    """
+
+    at_s: float
+    client: int
+    kind: Kind
+    request: bytes
+    cancel_after_s: float | None = None
+
+
+def poisson_times(rate_per_s: float, duration_s: float, random: np.random.Generator) -> Array:
+    """Times of a Poisson process in [0, duration), seconds, ascending."""
+    if not (rate_per_s > 0 and duration_s > 0):
+        raise ValueError(f"rate and duration must be above 0, are {rate_per_s:g} and {duration_s:g}")
+    # Given their number, which is Poisson's, the times of such a process are independent and uniform.
+    count = random.poisson(rate_per_s * duration_s)
+    return np.sort(random.uniform(0.0, duration_s, count))
+
+
+def plan_calls(
+    rate_per_s: float, duration_s: float, clients: int, requests: Requests, mix: Mix, seed: int
+) -> list[PlannedCall]:
+    """The calls of several clients who together make `rate_per_s`, in order of time; the same for the same seed.
+
+    Raises:
+        ValueError: no client, a rate or duration that is not above 0, or bad images are asked for and there are none.
+    """
+    if clients < 1:
+        raise ValueError(f"clients must be at least 1, are {clients}")
+    if mix.bad_share > 0 and not requests.bad:
+        raise ValueError("no bad requests to choose from")
+    random = np.random.default_rng(seed)
+    calls = [
+        _planned(float(at_s), client, requests, mix, random)
+        for client in range(clients)
+        for at_s in poisson_times(rate_per_s / clients, duration_s, random)
+    ]
+    return sorted(calls, key=lambda call: call.at_s)
+
+
+def _planned(at_s: float, client: int, requests: Requests, mix: Mix, random: np.random.Generator) -> PlannedCall:
+    draw = random.random()
+    if draw < mix.bad_share:
+        return PlannedCall(at_s, client, Kind.BAD_IMAGE, _any_of(requests.bad, random))
+    request = _any_of(requests.good, random)
+    if draw < mix.bad_share + mix.cancelled_share:
+        return PlannedCall(at_s, client, Kind.CANCELLED, request, random.uniform(0.0, mix.cancel_within_s))
+    return PlannedCall(at_s, client, Kind.QUERY, request)
+
+
+def _any_of(requests: Sequence[bytes], random: np.random.Generator) -> bytes:
+    return requests[int(random.integers(len(requests)))]

@@ -1,0 +1,147 @@
+"""`mapless-server load ...`: arguments in; tables, a picture and JSON out."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from ..evaluation.plan import Progress
+    from .report import Check
+
+load_app = typer.Typer(
+    help="Measure what the server does under load; writes load-output/load.json and load-output/load.png.",
+    no_args_is_help=True,
+)
+
+Data = Annotated[
+    Path | None, typer.Option(help="Folder with images/ and cameras.json; default: a room rendered on the spot.")
+]
+Output = Annotated[Path, typer.Option(help="Folder for the picture and the figures.")]
+Quick = Annotated[bool, typer.Option(help="Seconds instead of minutes: to see that it runs. Not for figures.")]
+Deadline = Annotated[float, typer.Option(help="Deadline of every call, seconds.")]
+Clients = Annotated[int, typer.Option(help="Clients that call independently of one another.")]
+Seed = Annotated[int, typer.Option(help="Of the arrivals.")]
+Minutes = Annotated[float, typer.Option(help="How long the soak takes.")]
+
+OUTPUT = Path("load-output")
+
+
+@load_app.command("overhead")
+def overhead_command(quick: Quick = False, output: Output = OUTPUT) -> None:
+    """What serving costs without computing, beside a bare grpc.aio server."""
+    _finish(_overhead(quick, output))
+
+
+@load_app.command("pipeline")
+def pipeline_command(
+    data: Data = None,
+    quick: Quick = False,
+    deadline_s: Deadline = 5.0,
+    step_s: Annotated[float, typer.Option(help="Seconds at each load.")] = 60.0,
+    clients: Clients = 8,
+    seed: Seed = 0,
+    output: Output = OUTPUT,
+) -> None:
+    """Latency, goodput and refusals of the real server from 30 to 300 % of what it can do; draws them."""
+    _finish(_pipeline(data, quick, output, deadline_s=deadline_s, step_s=step_s, clients=clients, seed=seed))
+
+
+@load_app.command("soak")
+def soak_command(
+    data: Data = None,
+    minutes: Minutes = 10.0,
+    quick: Quick = False,
+    deadline_s: Deadline = 5.0,
+    clients: Clients = 8,
+    seed: Seed = 0,
+    output: Output = OUTPUT,
+) -> None:
+    """Nine tenths of the load for long, with calls cancelled and bad images: what grows, what is unaccounted for."""
+    _finish(_soak(data, quick, output, minutes=minutes, deadline_s=deadline_s, clients=clients, seed=seed))
+
+
+@load_app.command("all")
+def all_command(data: Data = None, minutes: Minutes = 10.0, quick: Quick = False, output: Output = OUTPUT) -> None:
+    """All three, one after the other."""
+    checks = [*_overhead(quick, output), *_pipeline(data, quick, output)]
+    _finish(checks + _soak(data, quick, output, minutes=minutes))
+
+
+def _overhead(quick: bool, output: Path) -> list[Check]:
+    from .overhead import OverheadOptions, measure_overhead, overhead_checks, overhead_json, overhead_lines
+
+    options = OverheadOptions(rounds=2, unloaded_s=0.3, saturated_s=0.5) if quick else OverheadOptions()
+    with _measuring() as progress:
+        subjects = measure_overhead(options, progress)
+    checks = overhead_checks(subjects)
+    _report(output, "overhead", overhead_lines(subjects, options), checks, overhead_json(subjects, options))
+    return checks
+
+
+def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
+    from .chart import draw_load
+    from .pipeline import PipelineOptions, measure_pipeline, pipeline_checks, pipeline_json
+    from .report import step_lines
+    from .requests import place_of
+
+    brief = {"unloaded_s": 4.0, "ramp_s": 4.0, "step_s": 6.0, "settle_s": 1.0} if quick else {}
+    options = PipelineOptions(**(given | brief))
+    with _measuring() as progress:
+        result = measure_pipeline(place_of(data), options, progress)
+    checks = pipeline_checks(result)
+    output.mkdir(parents=True, exist_ok=True)
+    (output / "load.png").write_bytes(draw_load(result))
+    _report(output, "pipeline", [f"{result.scene}:", "", *step_lines(result.all_steps)], checks, pipeline_json(result))
+    return checks
+
+
+def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
+    from .report import step_lines
+    from .requests import place_of
+    from .soak import SoakOptions, measure_soak, soak_checks, soak_json
+
+    brief = {"minutes": 0.25, "ramp_s": 4.0, "sample_every_s": 0.5} if quick else {}
+    options = SoakOptions(**(given | brief))
+    with _measuring() as progress:
+        result = measure_soak(place_of(data), options, progress)
+    checks = soak_checks(result)
+    lines = [f"{result.scene}:", "", *step_lines([result.unloaded, *result.ramp, result.soak])]
+    _report(output, "soak", lines, checks, soak_json(result))
+    return checks
+
+
+def _report(output: Path, part: str, lines: list[str], checks: list[Check], figures: dict[str, Any]) -> None:
+    """Prints a part, and puts it into the JSON file beside the others."""
+    from .report import check_lines, machine, update_json
+
+    print("\n".join([f"## {part}", "", machine(), "", *lines, *check_lines(checks)]), flush=True)
+    output.mkdir(parents=True, exist_ok=True)
+    update_json(output / "load.json", part, figures, checks)
+
+
+@contextmanager
+def _measuring() -> Iterator[Progress]:
+    """Progress bars; what goes wrong ends the command with one line."""
+    from mapless import MaplessError
+
+    from ..child import ServerFailed
+    from ..evaluation.command import progress_bars
+    from ..signals import terminable
+
+    try:
+        with terminable(), progress_bars() as progress:
+            yield progress
+    except (ValueError, ServerFailed, MaplessError) as error:
+        print(f"mapless-server: {error}", file=sys.stderr)
+        raise typer.Exit(2 if isinstance(error, ValueError) else 1) from None
+
+
+def _finish(checks: list[Check]) -> None:
+    """Exit code 1 if a bar was missed."""
+    raise typer.Exit(1 if any(check.met is False for check in checks) else 0)

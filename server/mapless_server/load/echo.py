@@ -1,0 +1,41 @@
+"""The least that a server in Python can do, as a program: grpc.aio, bytes in, bytes out."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+
+import grpc
+
+from .sender import MAX_MESSAGE_BYTES
+
+ECHO_METHOD = "/mapless.load.Bare/Echo"
+SHORT_METHOD = "/mapless.load.Bare/Short"
+SHORT_BYTES = 300
+"""What `Short` sends back of what it got: about as long as an answer of the server that computes nothing."""
+
+
+async def main() -> None:
+    """Listens on a free port and serves until SIGTERM."""
+
+    async def echo(data: bytes, _: object) -> bytes:
+        return data
+
+    async def short(data: bytes, _: object) -> bytes:
+        return data[:SHORT_BYTES]
+
+    stop = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
+    server = grpc.aio.server(options=[("grpc.max_receive_message_length", MAX_MESSAGE_BYTES)])
+    service, _, _ = ECHO_METHOD[1:].partition("/")
+    methods = {"Echo": grpc.unary_unary_rpc_method_handler(echo), "Short": grpc.unary_unary_rpc_method_handler(short)}
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(service, methods),))
+    port = server.add_insecure_port("127.0.0.1:0")
+    await server.start()
+    print(f"mapless-server listening on 127.0.0.1:{port}", flush=True)
+    await stop.wait()
+    await server.stop(1.0)
+
+
+if __name__ == "__main__":
+    asyncio.run(main())

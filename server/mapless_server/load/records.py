@@ -1,0 +1,173 @@
+"""What became of calls: each one in exactly one way, and what they amount to."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from .arrivals import Kind
+
+
+class Fate(str, Enum):
+    """How a call ended, for its caller."""
+
+    ANSWERED = "answered"
+    """With a pose, or with the reason why there is none, before its deadline."""
+    REFUSED = "refused"
+    """Told that the server will not do it: it has too much to do, or stops."""
+    BAD_REQUEST = "bad request"
+    """Told that its image is bad, which it was."""
+    HUNG_UP = "hung up"
+    """The caller cancelled it before there was an answer."""
+    OVERDUE = "overdue"
+    """Neither refused nor answered by its deadline: computing was spent on it, or promised, for nothing."""
+    FAILED = "failed"
+    """Any other error, a lost connection among them; there should be none."""
+
+
+REFUSING_CODES = frozenset({"RESOURCE_EXHAUSTED", "UNAVAILABLE"})
+INFEASIBLE = "DEADLINE_INFEASIBLE"
+"""Why a call is refused whose deadline leaves too little time, however idle the server."""
+
+
+@dataclass(frozen=True)
+class CallRecord:
+    """A call that has ended; times are seconds from the start of its step.
+
+    Attributes:
+        kind: what kind of call it was.
+        client: who made it.
+        at_s: when it was to be sent.
+        sent_s: when it was sent; a generator that is slow itself shows here.
+        ended_s: when its caller knew.
+        deadline_s: what it was given, seconds from sending.
+        code: name of the gRPC status.
+        detail: of an answer what it says, of an error its reason; empty where only our own side knows of it.
+    """
+
+    kind: Kind
+    client: int
+    at_s: float
+    sent_s: float
+    ended_s: float
+    deadline_s: float
+    code: str
+    detail: str
+
+    @property
+    def latency_s(self) -> float:
+        """From when it was to be sent: waiting that the server caused counts, wherever it was spent."""
+        return self.ended_s - self.at_s
+
+    @property
+    def outcome(self) -> str:
+        """Status and detail in one."""
+        return f"{self.code} {self.detail}".strip()
+
+    @property
+    def fate(self) -> Fate:
+        """How it ended."""
+        if self.code == "OK":
+            return Fate.ANSWERED if self.ended_s - self.sent_s <= self.deadline_s else Fate.OVERDUE
+        if self.code in REFUSING_CODES and self.detail:
+            return Fate.REFUSED
+        if self.code == "DEADLINE_EXCEEDED":
+            return Fate.REFUSED if self.detail == INFEASIBLE else Fate.OVERDUE
+        if self.code == "CANCELLED" and self.kind is Kind.CANCELLED:
+            return Fate.HUNG_UP
+        if self.code == "INVALID_ARGUMENT" and self.kind is Kind.BAD_IMAGE:
+            return Fate.BAD_REQUEST
+        return Fate.FAILED
+
+
+@dataclass(frozen=True)
+class Latencies:
+    """Of a group of calls, milliseconds; None where there is none."""
+
+    count: int
+    p50_ms: float | None
+    p95_ms: float | None
+    p99_ms: float | None
+    max_ms: float | None
+
+
+@dataclass(frozen=True)
+class Account:
+    """What calls amount to.
+
+    Attributes:
+        window_s: what rates are divided by: the step without its beginning.
+        sent: all calls, those of the beginning too; so are `fates` and `outcomes`, which add up to it.
+        offered_per_s: all calls; this and the next three by when they were to be sent.
+        goodput_per_s: queries answered before their deadline, which counts from then, too.
+        refused_per_s, overdue_per_s: calls that ended so.
+        completed_per_s: answers by when they came: what was done in the window, whenever it was asked for.
+        answers: of queries that were answered.
+        refusals: of calls that were refused.
+        send_lag: how late calls were sent, the generator's own fault. This and all before leave out the beginning.
+    """
+
+    window_s: float
+    sent: int
+    offered_per_s: float
+    goodput_per_s: float
+    refused_per_s: float
+    overdue_per_s: float
+    completed_per_s: float
+    answers: Latencies
+    refusals: Latencies
+    send_lag: Latencies
+    fates: Mapping[str, int]
+    outcomes: Mapping[str, int]
+
+    def count(self, fate: Fate) -> int:
+        """How many calls ended so."""
+        return self.fates.get(fate.value, 0)
+
+
+def percentile(values: Sequence[float], share: float) -> float:
+    """The smallest of the values that at least this share of them does not exceed; no interpolation flatters it."""
+    if not values or not 0 < share <= 1:
+        raise ValueError("there must be values, and the share above 0 and at most 1")
+    ordered = np.sort(np.asarray(values, float))
+    return float(ordered[math.ceil(share * len(ordered) - 1e-9) - 1])
+
+
+def latencies(seconds: Sequence[float]) -> Latencies:
+    """Percentiles of durations."""
+    if not seconds:
+        return Latencies(0, None, None, None, None)
+    p50, p95, p99, most = (1000 * percentile(seconds, share) for share in (0.5, 0.95, 0.99, 1.0))
+    return Latencies(len(seconds), p50, p95, p99, most)
+
+
+def account_of(records: Sequence[CallRecord], duration_s: float, settle_s: float = 0.0) -> Account:
+    """What the calls of a step amount to; the first `settle_s`, when queues are still filling, counts in no rate."""
+    window_s = duration_s - settle_s
+    if not (settle_s >= 0 and window_s > 0):
+        raise ValueError(f"of {duration_s:g} s nothing is left after {settle_s:g} s")
+    counted = [record for record in records if record.at_s >= settle_s]
+    answered = [r for r in counted if r.fate is Fate.ANSWERED and r.kind is not Kind.BAD_IMAGE]
+    refused = [r for r in counted if r.fate is Fate.REFUSED]
+    overdue = [r for r in counted if r.fate is Fate.OVERDUE]
+    completed = [r for r in records if r.fate is Fate.ANSWERED and settle_s <= r.ended_s < duration_s]
+    in_time = [r for r in answered if r.latency_s <= r.deadline_s]
+    return Account(
+        window_s=window_s,
+        sent=len(records),
+        offered_per_s=len(counted) / window_s,
+        goodput_per_s=len(in_time) / window_s,
+        refused_per_s=len(refused) / window_s,
+        overdue_per_s=len(overdue) / window_s,
+        completed_per_s=len(completed) / window_s,
+        answers=latencies([r.latency_s for r in answered]),
+        refusals=latencies([r.latency_s for r in refused]),
+        send_lag=latencies([r.sent_s - r.at_s for r in counted]),
+        fates=dict(Counter(record.fate.value for record in records)),
+        outcomes=dict(Counter(record.outcome for record in records).most_common()),
+    )

@@ -1,0 +1,161 @@
+"""One step of a measurement: calls are made for a while, and client, server and process each give their account."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from .records import Account, CallRecord, Fate, account_of
+from .scrape import Scrape, read_metrics
+from .watch import SAMPLE_EVERY_S, ProcessSample, Trend, trend, watched
+
+Send = Callable[[], Awaitable[list[CallRecord]]]
+
+
+@dataclass(frozen=True)
+class ServerUnderLoad:
+    """What is measured.
+
+    Attributes:
+        process_id: of the server.
+        metrics_address: where it tells of itself; None if it does not.
+    """
+
+    process_id: int
+    metrics_address: str | None = None
+
+    def scrape(self) -> Scrape | None:
+        """Its own account so far."""
+        return None if self.metrics_address is None else read_metrics(self.metrics_address)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What a step came to.
+
+    Attributes:
+        name: of the step.
+        asked_per_s: rate of the Poisson process; None for a closed loop.
+        duration_s: while calls were made.
+        account: the client's.
+        codes: statuses of all calls, for comparing with the server's account.
+        samples: of the server's process, from before the first call until all had ended.
+        settle_s: the beginning that rates leave out; trends do, too.
+        told: what the server counted meanwhile; None if it serves no metrics.
+        own_cpu_s: used by the generator itself.
+        wall_s: from the first sample to the last.
+    """
+
+    name: str
+    asked_per_s: float | None
+    duration_s: float
+    account: Account
+    codes: Sequence[str]
+    samples: Sequence[ProcessSample]
+    settle_s: float
+    told: Scrape | None
+    own_cpu_s: float
+    wall_s: float
+
+    @property
+    def answers(self) -> int:
+        """All answers, those of the beginning too."""
+        return self.account.count(Fate.ANSWERED)
+
+    @property
+    def cpu_s(self) -> float:
+        """Used by the server."""
+        return self.samples[-1].cpu_s - self.samples[0].cpu_s
+
+    @property
+    def cpu_s_per_answer(self) -> float:
+        """The server's, whatever it was spent on; infinite if there was no answer."""
+        return self.cpu_s / self.answers if self.answers else math.inf
+
+    @property
+    def own_share(self) -> float:
+        """Of one core, used by the generator itself."""
+        return self.own_cpu_s / self.wall_s
+
+    def trend_of(self, field: str) -> Trend | None:
+        """How "resident_mib", "threads" or "descriptors" develop once settled; None if the step was too short."""
+        begin_s = self.samples[0].at_s + self.settle_s
+        # The last sample is taken when all is over, which is another state.
+        settled = [sample for sample in self.samples[:-1] if sample.at_s >= begin_s]
+        if len(settled) < 3:
+            return None
+        return trend([sample.at_s for sample in settled], [getattr(sample, field) for sample in settled])
+
+    def as_json(self) -> dict[str, Any]:
+        """All figures, for programs."""
+        longest_lag_s = None if self.told is None else self.told.longest_lag_s
+        trends = {name: self.trend_of(name) for name in ("resident_mib", "threads", "descriptors")}
+        return {
+            "name": self.name,
+            "asked_per_s": self.asked_per_s,
+            "duration_s": self.duration_s,
+            "settle_s": self.settle_s,
+            **{name: _plain(value) for name, value in vars(self.account).items()},
+            "server_cpu_s": self.cpu_s,
+            "server_cpu_s_per_answer": self.cpu_s_per_answer if self.answers else None,
+            "server_start": vars(self.samples[0]),
+            "server_end": vars(self.samples[-1]),
+            "server_trends_per_minute": {name: None if line is None else vars(line) for name, line in trends.items()},
+            "event_loop_lag_below_s": _finite(longest_lag_s),
+            "server_handled": None if self.told is None else dict(self.told.handled),
+            "server_terminated": None if self.told is None else dict(self.told.terminated),
+            "generator_cpu_share_of_a_core": self.own_share,
+        }
+
+
+async def run_step(
+    name: str,
+    server: ServerUnderLoad,
+    send: Send,
+    duration_s: float,
+    *,
+    asked_per_s: float | None = None,
+    settle_s: float = 0.0,
+    sample_every_s: float = SAMPLE_EVERY_S,
+) -> Step:
+    """Makes calls and takes everybody's account.
+
+    Args:
+        name: of the step.
+        server: what is watched.
+        send: makes the calls.
+        duration_s: for which it makes them.
+        asked_per_s: the rate it was told.
+        settle_s: what rates and trends leave out.
+        sample_every_s: between samples of the process.
+    """
+    before = server.scrape()
+    own_s, start_s = time.process_time(), time.monotonic()
+    async with watched(server.process_id, sample_every_s) as samples:
+        records = await send()
+    own_s, wall_s = time.process_time() - own_s, time.monotonic() - start_s
+    after = server.scrape()
+    return Step(
+        name=name,
+        asked_per_s=asked_per_s,
+        duration_s=duration_s,
+        account=account_of(records, duration_s, settle_s),
+        codes=[record.code for record in records],
+        samples=samples,
+        settle_s=settle_s,
+        told=None if before is None or after is None else after.since(before),
+        own_cpu_s=own_s,
+        wall_s=wall_s,
+    )
+
+
+def _plain(value: Any) -> Any:
+    return vars(value) if hasattr(value, "__dict__") else value
+
+
+def _finite(value: float | None) -> float | str | None:
+    """JSON has no infinity."""
+    return value if value is None or math.isfinite(value) else "beyond the widest bucket"

@@ -1,0 +1,38 @@
+"""Whether the event loop is free: how late a timer runs that should run all the time."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.01
+"""A block of the loop is seen with its length less this, at least; waking up so often costs 1 to 2 % of a core."""
+WARN_S = 0.1
+
+
+class LoopObserver(Protocol):
+    """Hears how the loop does."""
+
+    def loop_lagged(self, seconds: float) -> None:
+        """A timer ran so late."""
+
+    def beat(self) -> None:
+        """The scheduler is alive."""
+
+
+async def watch_event_loop(observer: LoopObserver, is_alive: Callable[[], bool] = lambda: True) -> None:
+    """Measures until it is cancelled, and beats as long as the scheduler is alive."""
+    while True:
+        due_s = time.monotonic() + TICK_S
+        await asyncio.sleep(TICK_S)
+        lag_s = max(0.0, time.monotonic() - due_s)
+        observer.loop_lagged(lag_s)
+        if lag_s > WARN_S:
+            log.warning("the event loop was blocked", extra={"lag_ms": round(1000 * lag_s)})
+        if is_alive():
+            observer.beat()

@@ -1,0 +1,351 @@
+"""Every metric of the server: names, labels, buckets, and the events that move them.
+
+All of them live in a registry of their own, so that several servers can live in one process. No label has values that
+callers choose: scenes, tenants and requests are in the log. Series whose labels are known beforehand exist from the
+start, because a series that appears with its first event hides that event from `rate`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from typing import Generic, TypeVar
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, GCCollector, Histogram, PlatformCollector
+from prometheus_client import ProcessCollector as ProcessMetrics
+from prometheus_client.metrics import MetricWrapperBase
+from prometheus_client.metrics_core import Metric
+
+from mapless.v1 import localization_service_pb2, reference_service_pb2
+
+from ..method.rejection import RejectionReason
+from ..scheduling.observer import Ending, Refusal
+from .scraped import CacheCounts, Scraped, TokenCacheCounts
+
+STAGES = ("prepare", "coarse", "refine", "describe")
+"""Stages of the queue."""
+
+LOCALIZED = "localized"
+"""The outcome of an answer that is a pose."""
+
+CALL_BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1, 1.5, 2, 3, 5, 10, 30)
+"""Seconds; an edge at each time that somebody may be promised, and at the default deadline."""
+WAIT_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5)
+STAGE_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10)
+LAG_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5)
+"""Seconds; the event loop is never to be blocked for longer than 0.02."""
+BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64)
+INLIER_BUCKETS = (10, 20, 30, 50, 75, 100, 150, 200, 300, 500, 1000, 2000)
+"""50: below, stronger features are tried."""
+RATIO_BUCKETS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1)
+PIXEL_BUCKETS = (0.1, 0.2, 0.3, 0.5, 0.75, 1, 1.5, 2, 3, 4)
+DEVIATION_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
+"""0.05: the scale's gate."""
+RADIUS_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5)
+"""Metres; 0.2: above, a pose is doubtful."""
+
+_CODES = (
+    "OK",
+    "CANCELLED",
+    "INVALID_ARGUMENT",
+    "DEADLINE_EXCEEDED",
+    "NOT_FOUND",
+    "ALREADY_EXISTS",
+    "PERMISSION_DENIED",
+    "RESOURCE_EXHAUSTED",
+    "FAILED_PRECONDITION",
+    "INTERNAL",
+    "UNAVAILABLE",
+    "DATA_LOSS",
+    "UNAUTHENTICATED",
+)
+_OTHER = "other"
+_MAX_CHILDREN = 64  # stages, buckets and operations have names of ours, far fewer than this
+
+M = TypeVar("M", bound=MetricWrapperBase)
+
+
+class Registry(CollectorRegistry):
+    """A registry that leaves out when each series began, which doubles their number and which nobody reads."""
+
+    def collect(self) -> Iterable[Metric]:
+        """Implements Collector."""
+        for family in super().collect():
+            family.samples = [sample for sample in family.samples if not sample.name.endswith("_created")]
+            yield family
+
+
+class _Children(Generic[M]):
+    """A metric by its labels' values: a look into a dict, because it is on the way of every call; bounded in number."""
+
+    def __init__(self, metric: M, known: Iterable[tuple[str, ...]] = ()) -> None:
+        self._metric = metric
+        self._children = {values: metric.labels(*values) for values in known}
+        self._limit = len(self._children) + _MAX_CHILDREN
+
+    def __call__(self, *values: str) -> M:
+        child = self._children.get(values)
+        if child is None:
+            if len(self._children) >= self._limit:
+                values = (_OTHER,) * len(values)
+            child = self._children[values] = self._metric.labels(*values)
+        return child
+
+
+class Metrics:
+    """The metrics of one server. Implements `scheduling.observer.Observer` and `rpc.CallObserver`; never raises."""
+
+    def __init__(self) -> None:
+        self.registry = Registry()
+        ProcessMetrics(registry=self.registry)
+        PlatformCollector(registry=self.registry)
+        GCCollector(registry=self.registry)
+        self._scraped = Scraped()
+        self.registry.register(self._scraped)
+        self._make_call_metrics()
+        self._make_queue_metrics()
+        self._make_answer_metrics()
+        self._make_server_metrics()
+
+    # Calls
+
+    def call_started(self, method: str) -> None:
+        """A call arrived; `method` is "/package.Service/Method"."""
+        self._started(*self._methods.get(method, (_OTHER, _OTHER))).inc()
+
+    def call_handled(self, method: str, code: str, seconds: float, trace_id: str = "") -> None:
+        """A call ended with a gRPC status; the trace's id becomes the exemplar."""
+        service_and_name = self._methods.get(method, (_OTHER, _OTHER))
+        self._handled(*service_and_name, code).inc()
+        exemplar = {"trace_id": trace_id} if trace_id else None
+        self._handling(*service_and_name).observe(seconds, exemplar)
+
+    # The queue
+
+    def admitted(self, cost_s: float) -> None:
+        """Implements Observer."""
+        self._admitted.inc()
+        self._admitted_cost.inc(max(0.0, cost_s))
+
+    def refused(self, reason: Refusal) -> None:
+        """Implements Observer."""
+        self._refused(reason.value).inc()
+
+    def queued(self, stage: str, jobs: int, cost_s: float) -> None:
+        """Implements Observer."""
+        self._depth(stage).set(jobs)
+        self._cost(stage).set(cost_s)
+
+    def running(self, stage: str, jobs: int) -> None:
+        """Implements Observer."""
+        self._inflight(stage).set(jobs)
+
+    def waited(self, stage: str, seconds: float) -> None:
+        """Implements Observer."""
+        self._waited(stage).observe(seconds)
+
+    def computed(self, stage: str, bucket: str, jobs: int, seconds: float) -> None:
+        """Implements Observer."""
+        self._batch_size(stage).observe(jobs)
+        self._batch_seconds(stage).observe(seconds)
+        self._batches(stage, bucket).inc()
+        self._busy(stage).inc(max(0.0, seconds))
+
+    def ended(self, stage: str, ending: Ending) -> None:
+        """Implements Observer."""
+        self._ended(stage, ending.value).inc()
+
+    def beat(self) -> None:
+        """The scheduler is alive."""
+        self._heartbeat.set(time.time())
+
+    # Answers
+
+    def stages(self, stage_seconds: Mapping[str, float]) -> None:
+        """What the stages of an answer took; those of stronger features are named "extractor/stage"."""
+        for name, seconds in stage_seconds.items():
+            extractor, _, stage = name.rpartition("/")
+            self._stage_seconds(stage, "1" if extractor else "0").observe(seconds)
+
+    def answered(
+        self,
+        outcome: str,
+        *,
+        inlier_count: int | None = None,
+        match_count: int | None = None,
+        reprojection_error_px: float | None = None,
+        scale_deviation: float | None = None,
+        accuracy_radius_m: float | None = None,
+    ) -> None:
+        """An answer was given: LOCALIZED or the value of a RejectionReason, and what is known of its quality.
+
+        Args:
+            outcome: which.
+            inlier_count: 2D-3D matches that agree with the pose; None where none were counted.
+            match_count: 2D-3D matches that were tried.
+            reprojection_error_px: median of the inliers.
+            scale_deviation: relative, of the scaled trajectory.
+            accuracy_radius_m: the claimed 68 % radius.
+        """
+        self._answers(outcome if outcome in self._outcomes else _OTHER).inc()
+        _observe(self._inliers, inlier_count)
+        if match_count and inlier_count is not None:
+            _observe(self._inlier_ratio, inlier_count / match_count)
+        _observe(self._reprojection_error, reprojection_error_px)
+        _observe(self._scale_deviation, scale_deviation)
+        _observe(self._accuracy_radius, accuracy_radius_m)
+
+    # The server
+
+    def loop_lagged(self, seconds: float) -> None:
+        """The event loop ran a timer so late."""
+        self._lag.observe(seconds)
+
+    def stored(self, operation: str, seconds: float) -> None:
+        """An operation of the store ended."""
+        self._store_seconds(operation).observe(seconds)
+
+    def store_failed(self) -> None:
+        """The store could not do what was asked of it, by a fault that is not the caller's."""
+        self._store_errors.inc()
+
+    def ran_out_of_memory(self) -> None:
+        """The device had no memory left for a batch."""
+        self._oom.inc()
+
+    def failed_fatally(self) -> None:
+        """Something is broken that ends the process."""
+        self._fatal.inc()
+
+    def set_serving(self, is_serving: bool) -> None:
+        """What health says of the server as a whole."""
+        self._serving.set(is_serving)
+
+    def warmed_up(self, seconds: float) -> None:
+        """The warm-up is over and took so long."""
+        self._warm_up.set(seconds)
+
+    def built(self, version: str, backend: str, features: str, weights_sha256: str) -> None:
+        """What runs; to be said once."""
+        self._build.labels(version, backend, features, weights_sha256).set(1)
+
+    def watch_reference_cache(self, read: Callable[[], CacheCounts]) -> None:
+        """Asks, at every scrape, how the cache of references' features does."""
+        self._scraped.reference_cache = read
+
+    def watch_token_cache(self, read: Callable[[], TokenCacheCounts]) -> None:
+        """Asks, at every scrape, how the cache of references' tokens does."""
+        self._scraped.token_cache = read
+
+    def watch_gpu_memory(self, read: Callable[[], Mapping[str, float]]) -> None:
+        """Asks, at every scrape, for bytes by kind: allocated, reserved, peak."""
+        self._scraped.gpu_memory = read
+
+    def watch_certificate(self, read: Callable[[], float | None]) -> None:
+        """Asks, at every scrape, when the server's certificate expires, Unix seconds; None if there is none."""
+        self._scraped.certificate_expiry = read
+
+    def _make_call_metrics(self) -> None:
+        labels = ["grpc_service", "grpc_method"]
+        services = [
+            service
+            for file in (localization_service_pb2, reference_service_pb2)
+            for service in file.DESCRIPTOR.services_by_name.values()
+        ]
+        self._methods: dict[str, tuple[str, str]] = {
+            f"/{service.full_name}/{method.name}": (service.full_name, method.name)
+            for service in services
+            for method in service.methods
+        }
+        known = list(self._methods.values())
+        self._started = _Children(self._counter("grpc_server_started", "Calls that arrived.", labels), known)
+        self._handled = _Children(
+            self._counter("grpc_server_handled", "Calls that ended, by status.", [*labels, "grpc_code"]),
+            [(*method, code) for method in known for code in _CODES],
+        )
+        self._handling = _Children(
+            self._histogram("grpc_server_handling_seconds", "Time from arrival to answer.", CALL_BUCKETS, labels), known
+        )
+
+    def _make_queue_metrics(self) -> None:
+        stage = ["stage"]
+        stages = [(name,) for name in STAGES]
+        counter, gauge, histogram = self._counter, self._gauge, self._histogram
+        self._admitted = counter("mapless_admitted", "Jobs admitted to the queue.")
+        self._admitted_cost = counter("mapless_admitted_cost_seconds", "Computing time predicted for admitted jobs.")
+        self._refused = _Children(
+            counter("mapless_admission_rejected", "Jobs not admitted, by reason.", ["reason"]),
+            [(reason.value,) for reason in Refusal],
+        )
+        self._waited = _Children(
+            histogram("mapless_queue_wait_seconds", "Time that jobs waited for a stage.", WAIT_BUCKETS, stage), stages
+        )
+        self._depth = _Children(gauge("mapless_queue_depth", "Jobs that wait.", stage), stages)
+        self._cost = _Children(
+            gauge("mapless_queue_cost_seconds", "Computing time predicted for jobs that wait.", stage), stages
+        )
+        self._inflight = _Children(gauge("mapless_inflight", "Jobs that are computed.", stage), stages)
+        self._ended = _Children(
+            counter("mapless_jobs_terminated", "Admitted jobs that ended.", ["stage", "outcome"]),
+            [(name, ending.value) for name in STAGES for ending in Ending],
+        )
+        self._batch_size = _Children(histogram("mapless_batch_size", "Jobs in a batch.", BATCH_BUCKETS, stage), stages)
+        self._batch_seconds = _Children(
+            histogram("mapless_batch_seconds", "Computing time of a batch.", STAGE_BUCKETS, stage), stages
+        )
+        self._batches = _Children(counter("mapless_batches", "Batches, by shape.", ["stage", "bucket"]))
+        self._busy = _Children(
+            counter("mapless_busy_seconds", "Time in which the device or a worker computed.", stage), stages
+        )
+        self._heartbeat = gauge("mapless_scheduler_heartbeat_timestamp_seconds", "When the scheduler was last alive.")
+
+    def _make_answer_metrics(self) -> None:
+        histogram = self._histogram
+        self._outcomes = {LOCALIZED, *(reason.value for reason in RejectionReason)}
+        self._answers = _Children(
+            self._counter("mapless_answers", "Answers, by outcome.", ["outcome"]),
+            [(outcome,) for outcome in sorted(self._outcomes)],
+        )
+        self._stage_seconds = _Children(
+            histogram("mapless_stage_seconds", "Time of a stage of the method.", STAGE_BUCKETS, ["stage", "tier"])
+        )
+        self._inliers = histogram("mapless_inliers", "2D-3D matches that agree with a pose.", INLIER_BUCKETS)
+        self._inlier_ratio = histogram("mapless_inlier_ratio", "Inliers of all 2D-3D matches.", RATIO_BUCKETS)
+        self._reprojection_error = histogram(
+            "mapless_reprojection_error_px", "Median reprojection error of the inliers.", PIXEL_BUCKETS
+        )
+        self._scale_deviation = histogram(
+            "mapless_scale_deviation", "Relative deviation of the scaled trajectory.", DEVIATION_BUCKETS
+        )
+        self._accuracy_radius = histogram(
+            "mapless_accuracy_radius_m", "Claimed radius that holds 68 % of positions, metres.", RADIUS_BUCKETS
+        )
+
+    def _make_server_metrics(self) -> None:
+        counter, gauge, histogram = self._counter, self._gauge, self._histogram
+        self._lag = histogram("mapless_event_loop_lag_seconds", "How late timers of the loop ran.", LAG_BUCKETS)
+        self._store_seconds = _Children(
+            histogram("mapless_store_op_seconds", "Time of the store's operations.", STAGE_BUCKETS, ["op"])
+        )
+        self._store_errors = counter("mapless_store_errors", "Operations of the store that failed by a fault of ours.")
+        self._oom = counter("mapless_gpu_oom", "Batches that the device had no memory for.")
+        self._fatal = counter("mapless_fatal", "Faults that end the process.")
+        self._serving = gauge("mapless_health_serving", "1 if health says SERVING, else 0.")
+        self._warm_up = gauge("mapless_warmup_seconds", "Time of the warm-up; 0 if there was none.")
+        self._build = gauge("mapless_build_info", "1; what runs.", ["version", "backend", "features", "weights_sha256"])
+
+    def _counter(self, name: str, text: str, labels: Iterable[str] = ()) -> Counter:
+        return Counter(name, text, labels, registry=self.registry)  # the library adds _total
+
+    def _gauge(self, name: str, text: str, labels: Iterable[str] = ()) -> Gauge:
+        return Gauge(name, text, labels, registry=self.registry)
+
+    def _histogram(self, name: str, text: str, buckets: Iterable[float], labels: Iterable[str] = ()) -> Histogram:
+        return Histogram(name, text, labels, registry=self.registry, buckets=tuple(buckets))
+
+
+def _observe(histogram: Histogram, value: float | None) -> None:
+    # One NaN would make the histogram's sum NaN for good.
+    if value is not None and math.isfinite(value):
+        histogram.observe(value)

@@ -1,0 +1,133 @@
+"""Traces by OpenTelemetry: names and attributes as its conventions for RPC say, sent by OTLP in the background."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from urllib.parse import urlsplit
+
+from opentelemetry.context import Context
+from opentelemetry.exporter.otlp.proto.grpc.trace_exporter import OTLPSpanExporter
+from opentelemetry.sdk.resources import OTELResourceDetector, Resource
+from opentelemetry.sdk.trace import TracerProvider
+from opentelemetry.sdk.trace.export import BatchSpanProcessor, SpanExporter
+from opentelemetry.trace import Span, SpanKind, Status, StatusCode, set_span_in_context
+from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+from .. import __version__
+from .logs import plain
+from .tracing import Metadata
+from .trail import Step
+
+EXPORT_LIMIT_S = 5.0
+"""What a collector may take for a batch; retries included."""
+_SERVER_FAULTS = frozenset({"UNKNOWN", "DEADLINE_EXCEEDED", "UNIMPLEMENTED", "INTERNAL", "UNAVAILABLE", "DATA_LOSS"})
+"""Statuses that a server's span counts as errors; the others are the caller's."""
+_HANG_UP_S = 1.0
+
+Attribute = str | bool | int | float
+
+
+def make_otlp_tracer(endpoint: str) -> OtlpTracer:
+    """A tracer that sends to the endpoint; ValueError if it is no address."""
+    address = urlsplit(endpoint)
+    if address.scheme not in ("http", "https") or not address.hostname:
+        raise ValueError(f"otlp_endpoint must be http://host:port or https://host:port, is {endpoint!r}")
+    is_insecure = address.scheme == "http"
+    return OtlpTracer(OTLPSpanExporter(endpoint=endpoint, insecure=is_insecure, timeout=EXPORT_LIMIT_S))
+
+
+class OtlpTracer:
+    """Implements Tracer. Holds 2048 spans at most; what comes while it is full is dropped."""
+
+    def __init__(self, exporter: SpanExporter) -> None:
+        resource = Resource({"service.name": "mapless", "service.version": __version__})
+        # What the operator set by OTEL_SERVICE_NAME and OTEL_RESOURCE_ATTRIBUTES wins.
+        self._provider = TracerProvider(
+            resource=resource.merge(OTELResourceDetector().detect()), shutdown_on_exit=False
+        )
+        self._exporter = exporter
+        self._provider.add_span_processor(BatchSpanProcessor(exporter))
+        self._tracer = self._provider.get_tracer("mapless", __version__)
+        self._propagator = TraceContextTextMapPropagator()
+
+    def begin(self, method: str, metadata: Metadata, start_s: float) -> _OtlpSpan:
+        """Implements Tracer."""
+        keys = ("traceparent", "tracestate")
+        carrier = {key: value for key, value in metadata if key in keys and isinstance(value, str)}
+        span = self._tracer.start_span(
+            method.removeprefix("/"),
+            self._propagator.extract(carrier, context=Context()),
+            SpanKind.SERVER,
+            attributes={"rpc.system.name": "grpc", "rpc.method": method.removeprefix("/")},
+            start_time=_epoch_ns(start_s),
+        )
+        return _OtlpSpan(self, span)
+
+    def close(self, limit_s: float) -> None:
+        """Implements Tracer."""
+        flushing = threading.Thread(target=self._provider.shutdown, name="traces", daemon=True)
+        flushing.start()
+        flushing.join(limit_s)
+        if flushing.is_alive():  # the collector is away: its exporter is cut off in what it is waiting for
+            self._exporter.shutdown()
+            flushing.join(_HANG_UP_S)
+
+    def record(self, parent: Span, steps: Sequence[Step]) -> None:
+        """Adds a child for each step, and below it one for each of its parts."""
+        for step in steps:
+            span = self._child(parent, step.name, step.start_s, step.attributes)
+            part_start_s = step.start_s
+            for name, seconds in step.part_seconds.items():
+                part = self._child(span, name, part_start_s, {})
+                part_start_s += seconds
+                part.end(_epoch_ns(part_start_s))
+            span.end(_epoch_ns(step.end_s))
+
+    def _child(self, parent: Span, name: str, start_s: float, attributes: Mapping[str, object]) -> Span:
+        return self._tracer.start_span(
+            name,
+            set_span_in_context(parent, Context()),
+            attributes=_attributes(attributes),
+            start_time=_epoch_ns(start_s),
+        )
+
+
+class _OtlpSpan:
+    def __init__(self, tracer: OtlpTracer, span: Span) -> None:
+        self._tracer = tracer
+        self._span = span
+        context = span.get_span_context()
+        self.trace_id = f"{context.trace_id:032x}" if context.trace_flags.sampled else ""
+
+    def end(self, code: str, steps: Sequence[Step], attributes: Mapping[str, object]) -> None:
+        """Implements CallSpan."""
+        if not self._span.is_recording():
+            return
+        self._span.set_attributes({"rpc.response.status_code": code, **_attributes(attributes)})
+        if code in _SERVER_FAULTS:
+            self._span.set_attribute("error.type", code)
+            self._span.set_status(Status(StatusCode.ERROR))
+        self._tracer.record(self._span, steps)
+        self._span.end()
+
+
+def _attributes(fields: Mapping[str, object]) -> dict[str, Attribute]:
+    """Fields of the log as attributes, below our own name; what is nested, as JSON."""
+    attributes: dict[str, Attribute] = {}
+    for name, field in fields.items():
+        value = plain(field)
+        if isinstance(value, str):
+            attributes[f"mapless.{name}"] = value.encode(errors="replace").decode()  # half a character spoils the batch
+        elif isinstance(value, bool | int | float):
+            attributes[f"mapless.{name}"] = value
+        elif value is not None:
+            attributes[f"mapless.{name}"] = json.dumps(value)
+    return attributes
+
+
+def _epoch_ns(monotonic_s: float) -> int:
+    """A moment of `time.monotonic` by the clock that traces use."""
+    return time.time_ns() - round(1e9 * (time.monotonic() - monotonic_s))

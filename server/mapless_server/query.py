@@ -1,0 +1,86 @@
+"""What is asked of the engine, and what it answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapless.geometry import Array, Camera
+
+from .method.localize import LocalizeOptions
+from .scheduling.fair import Flow
+from .tenancy import SceneKey
+from .tiers import Attempt
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who asks.
+
+    Attributes:
+        flow: with whom the queue shares its time fairly.
+        deadline_s: when the answer is of no use any more, `time.monotonic`.
+    """
+
+    flow: Flow
+    deadline_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """An encoded image and its camera; `field` is its path in the request, for what is wrong with it."""
+
+    image: bytes
+    camera: Camera
+    field: str
+
+
+@dataclass(frozen=True, eq=False)
+class PositionPrior:
+    """The camera is within `radius_m` of `position` (3,), world, metres."""
+
+    position: Array
+    radius_m: float
+
+    def distance_m(self, position: Array) -> float:
+        """How far from the sphere's surface a position lies; negative inside."""
+        return float(np.linalg.norm(position - self.position)) - self.radius_m
+
+
+@dataclass(frozen=True, eq=False)
+class Query:
+    """A photograph to localize.
+
+    Attributes:
+        scene_key: where.
+        reference_ids: what to compare it with; none means that `reference_count` are to be chosen.
+        photo: the photograph.
+        prior: what is known of its position.
+        reference_count: see there.
+        options: of the method.
+        allow_coarse: whether the coarse pose is an answer where there is no time to refine it.
+    """
+
+    scene_key: SceneKey
+    reference_ids: tuple[str, ...]
+    photo: Photo
+    prior: PositionPrior | None
+    reference_count: int
+    options: LocalizeOptions
+    allow_coarse: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """The attempt that is answered, and where the time went.
+
+    Attributes:
+        attempt: of the tier whose answer is the better one.
+        stage_seconds: of all that was computed, in order, whichever tier is answered. A stage of another tier than the
+            first begins with its extractor's name and a slash. Such a tier has, alone, "unfinished", if it failed, was
+            given up for lack of time, or has yet to describe the references.
+    """
+
+    attempt: Attempt
+    stage_seconds: dict[str, float]

@@ -1,0 +1,319 @@
+"""A query's way through the work queue: prepare, coarse, refine; and again with stronger features where it is doubtful.
+
+What is computed is the method's. Here is what surrounds it: the references, the photograph's features, the prior, the
+choice between the answers of two tiers, and what is given when time runs out.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+
+from .errors import FailedPrecondition, NotFound, Unavailable
+from .failures import failure_of
+from .library import NotDescribedYet
+from .method import localize as method
+from .method.features import FeatureExtractor
+from .method.localize import Answer, Coarse, Localization, Prepared
+from .method.rejection import Rejection, RejectionReason
+from .method.retrieve import choose_references
+from .method.views import PosedView, View
+from .query import PositionPrior, Query, Result
+from .query_views import QueryViews
+from .scheduling.jobs import Done, Fallback, Job, Next, Over, Step, Verdict
+from .scheduling.observer import Ending
+from .scheduling.work_queue import Failure
+from .store import ReferencePose
+from .tenancy import SceneKey
+from .tiers import Attempt, EscalationOptions, Tier, better_of, is_doubtful
+from .turns import Turn
+
+log = logging.getLogger(__name__)
+
+P = TypeVar("P", Prepared, Coarse)
+
+PREPARE, COARSE, REFINE = "prepare", "coarse", "refine"
+
+PRIOR_MARGIN_M = 10.0
+"""References further from a prior's sphere than this are not considered: they see other things."""
+
+MAX_LISTINGS = 3
+"""When a reference goes while it is used, the scene is listed again; more often than this it is being emptied."""
+
+ANSWER_MARGIN_S = 0.05
+"""Before the deadline, for an answer at hand to reach its caller."""
+
+_COUNTS = (2, 5, 10, 20, 64)
+"""Queries with about as many references cost about as much."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """The three parts of the method, and what is known after the second; see `method.localize`."""
+
+    prepare: Callable[..., Prepared | Answer] = method.prepare
+    reconstruct: Callable[..., list[Coarse | Answer | Exception]] = method.reconstruct
+    refine: Callable[..., Answer] = method.refine
+    coarse_answer: Callable[[Coarse], Answer | None] = method.coarse_answer
+
+
+class ReferenceSource(Protocol):
+    """Where references come from; see `ReferenceLibrary`."""
+
+    def load(
+        self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: FeatureExtractor, turn: Turn, waits: bool
+    ) -> tuple[int, tuple[PosedView, ...]]:
+        """The scene's generation and references of it, in the order asked for."""
+        ...
+
+    def list_poses(self, scene_key: SceneKey) -> Sequence[ReferencePose]:
+        """The poses of all references of a scene."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """A query in one tier.
+
+    Attributes:
+        query: what is asked.
+        source: of the references.
+        views: the photograph.
+        deadline_s: when the answer is of no use any more, `time.monotonic`.
+        tier: which of the engine's tiers tries to answer.
+        best: the answer of the tiers before; None in the first.
+        seconds_before: where the time went in them.
+        start_s: when this tier began, `time.monotonic`.
+        give_up_s: when `best` is answered, if this tier has no answer by then.
+        listings: how often the scene was listed in this tier.
+    """
+
+    query: Query
+    source: ReferenceSource
+    views: QueryViews
+    deadline_s: float
+    tier: int = 0
+    best: Attempt | None = None
+    seconds_before: dict[str, float] = field(default_factory=dict)
+    start_s: float = field(default_factory=time.monotonic)
+    give_up_s: float = math.inf
+    listings: int = 1
+
+    @property
+    def kind(self) -> str:
+        """Queries of one kind take about as long."""
+        ids = self.query.reference_ids
+        count = next((count for count in _COUNTS if len(ids) <= count), _COUNTS[-1])
+        return f"tier {self.tier}, {f'up to {count}' if ids else 'chosen'}"
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What is known before the method begins.
+
+    Attributes:
+        references: that it is to use, in order.
+        generation: of the scene when they were read.
+        view: the photograph.
+        seconds: where the time went.
+    """
+
+    references: tuple[PosedView, ...]
+    generation: int
+    view: View
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Underway(Generic[P]):
+    """A query between two stages: what is known of it, and what the stage before made of that."""
+
+    work: Work
+    found: Found
+    part: P
+
+
+class QueryStages:
+    """Computes the three stages; its methods run in the queue's threads."""
+
+    def __init__(
+        self, tiers: Sequence[Tier], max_candidates: int, escalation: EscalationOptions, method: Method | None = None
+    ) -> None:
+        """The tiers, the cheapest first; see `EngineOptions`."""
+        self._tiers = tiers
+        self._max_candidates = max_candidates
+        self._escalation = escalation
+        self._method = method or Method()
+
+    @staticmethod
+    def first_step(work: Work) -> Step:
+        """What a query needs first in its tier."""
+        return Step(PREPARE, work.kind, work.kind, work)
+
+    def prepare(self, jobs: Sequence[Job]) -> list[Verdict]:
+        """References, features and correspondences."""
+        return [self._verdict(job.step.payload, self._prepare, job.step.payload, job) for job in jobs]
+
+    def coarse(self, jobs: Sequence[Job]) -> list[Verdict]:
+        """The reconstruction and its metric scale, of many queries in one go."""
+        batch: list[Underway[Prepared]] = [job.step.payload for job in jobs]
+        parts = self._method.reconstruct([it.part for it in batch], [job.check for job in jobs])
+        return [self._verdict(it.work, self._after_coarse, it, part) for it, part in zip(batch, parts, strict=True)]
+
+    def refine(self, jobs: Sequence[Job]) -> list[Verdict]:
+        """Structure, matches, pose."""
+        return [self._verdict(job.step.payload.work, self._refine, job.step.payload, job) for job in jobs]
+
+    def _verdict(self, work: Work, compute: Callable[..., Verdict], *arguments: Any) -> Verdict:
+        """What is computed, or what its failure means for a query that may have an answer already."""
+        try:
+            return compute(*arguments)
+        except Exception as error:
+            if isinstance(error, Over) or failure_of(error) is Failure.OF_DEVICE:
+                return error
+            if isinstance(error, NotFound) and error.field != "scene" and not work.query.reference_ids:
+                return self._list_again(work)
+            if work.best is None:
+                return error
+            # What fails was to be better than the answer at hand, so it must not cost that one.
+            if not isinstance(error, NotDescribedYet):
+                name = self._tiers[work.tier].extractor.name
+                log.warning("%s failed; the first answer is given", name, exc_info=error)
+            return self._unfinished(work)
+
+    def _list_again(self, work: Work) -> Verdict:
+        """One that was deleted since it was listed was not the caller's choice: the next list is without it."""
+        if work.listings < MAX_LISTINGS:
+            return self._next(work, self.first_step(replace(work, listings=work.listings + 1)))
+        return Unavailable("the scene's references are being deleted", reason="SCENE_CHANGED", retry_after_s=1.0)
+
+    def _prepare(self, work: Work, job: Job) -> Verdict:
+        tier = self._tiers[work.tier]
+        turn = Turn(job.check)
+        found = self._find(work, tier, turn)
+        if not found.references:
+            where = "the scene has no references" if work.query.prior is None else "no reference is near the prior"
+            return self._conclude(work, found, Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, where)))
+        part = self._method.prepare(found.view, found.references, tier.pipeline, work.query.options, job.check)
+        if isinstance(part, Answer):
+            return self._conclude(work, found, part)
+        return self._next(work, Step(COARSE, work.kind, str(part.bucket), Underway(work, found, part)))
+
+    def _find(self, work: Work, tier: Tier, turn: Turn) -> Found:
+        """The references that are named, or those that the photograph resembles most."""
+        query = work.query
+        reference_ids = query.reference_ids or self._list_near(work)
+        # References come first: a name that is wrong is found out before the photograph is described.
+        # Only the first tier's references are waited for: there is an answer before the others'.
+        generation, references = work.source.load(
+            query.scene_key, reference_ids, tier.extractor, turn, waits=work.best is None
+        )
+        view = work.views.view(tier.extractor, turn)
+        if not query.reference_ids and references:
+            with turn.stage("retrieval"):
+                ratio = tier.pipeline.matcher.options.query_ratio
+                chosen = choose_references(view, references, query.reference_count, ratio=ratio)
+            references = tuple(references[i] for i in chosen)
+        return Found(references, generation, view, turn.stage_seconds)
+
+    def _list_near(self, work: Work) -> list[str]:
+        """Ids of the references that come into question."""
+        prior = work.query.prior
+        near = [
+            pose.reference_id
+            for pose in work.source.list_poses(work.query.scene_key)
+            if prior is None or prior.distance_m(pose.world_from_camera.translation) <= PRIOR_MARGIN_M
+        ]
+        if len(near) > self._max_candidates:
+            raise FailedPrecondition(
+                f"{len(near)} references come into question, at most {self._max_candidates} are compared: name "
+                "the references to use, or give a position prior",
+                reason="TOO_MANY_CANDIDATES",
+            )
+        return near
+
+    def _after_coarse(self, underway: Underway[Prepared], part: Coarse | Answer | Exception) -> Verdict:
+        if isinstance(part, Exception):
+            raise part
+        work, found = underway.work, underway.found
+        if isinstance(part, Answer):
+            return self._conclude(work, found, part)
+        step = Step(REFINE, work.kind, work.kind, Underway(work, found, part))
+        coarse = self._method.coarse_answer(part) if work.query.allow_coarse and work.best is None else None
+        if coarse is None:
+            return self._next(work, step)
+        done = Done(self._result(work, self._attempt(work, found, coarse), found, coarse), Ending.DEGRADED)
+        return Next(step, Fallback(lambda: done, work.deadline_s - ANSWER_MARGIN_S))
+
+    def _refine(self, underway: Underway[Coarse], job: Job) -> Verdict:
+        return self._conclude(underway.work, underway.found, self._method.refine(underway.part, job.check))
+
+    def _conclude(self, work: Work, found: Found, answer: Answer) -> Verdict:
+        """A tier has its answer: the better one is given, or tried to be bettered once more."""
+        attempt = self._attempt(work, found, answer)
+        best = attempt if work.best is None else better_of(work.best, attempt, self._escalation)
+        result = self._result(work, best, found, answer)
+        if work.tier + 1 < len(self._tiers) and is_doubtful(best.answer, self._escalation):
+            now_s = time.monotonic()
+            stronger = replace(
+                work,
+                tier=work.tier + 1,
+                best=best,
+                seconds_before=result.stage_seconds,
+                start_s=now_s,
+                listings=1,
+                give_up_s=now_s + self._escalation.time_share * (work.deadline_s - now_s),
+            )
+            return self._next(stronger, self.first_step(stronger))
+        return Done(result, _ending(best))
+
+    def _next(self, work: Work, step: Step) -> Next:
+        """Where there is an answer, it is given in time if the step does not lead to a better one."""
+        if work.best is None:
+            return Next(step)
+        return Next(step, Fallback(lambda: self._unfinished(work), work.give_up_s))
+
+    def _unfinished(self, work: Work) -> Done:
+        assert work.best is not None
+        unfinished = {f"{self._tiers[work.tier].extractor.name}/unfinished": time.monotonic() - work.start_s}
+        return Done(Result(work.best, work.seconds_before | unfinished), _ending(work.best))
+
+    def _attempt(self, work: Work, found: Found, answer: Answer) -> Attempt:
+        if isinstance(answer.outcome, Localization):
+            _check_finite(answer.outcome)
+        answer = _gated(answer, work.query.prior)
+        return Attempt(self._tiers[work.tier], answer, found.references, found.generation, found.view.camera)
+
+    def _result(self, work: Work, best: Attempt, found: Found, answer: Answer) -> Result:
+        prefix = "" if work.best is None else f"{self._tiers[work.tier].extractor.name}/"
+        seconds = {f"{prefix}{stage}": value for stage, value in (found.seconds | answer.stage_seconds).items()}
+        return Result(best, work.seconds_before | seconds)
+
+
+def _ending(attempt: Attempt) -> Ending:
+    return Ending.OK if isinstance(attempt.answer.outcome, Localization) else Ending.LOW_CONFIDENCE
+
+
+def _check_finite(localization: Localization) -> None:
+    """A pose of NaN must never leave the server: ArithmeticError."""
+    covariance = () if localization.covariance is None else localization.covariance
+    for numbers in (localization.world_from_camera.matrix(), covariance, localization.reprojection_error_px):
+        if not np.isfinite(numbers).all():
+            raise ArithmeticError(f"the method gave a pose that is not finite: {localization}")
+
+
+def _gated(answer: Answer, prior: PositionPrior | None) -> Answer:
+    """The answer, rejected if its pose contradicts the prior."""
+    if prior is None or not isinstance(answer.outcome, Localization):
+        return answer
+    outside_m = prior.distance_m(answer.outcome.world_from_camera.translation)
+    if outside_m <= 0:
+        return answer
+    message = f"the pose lies {outside_m:.2f} m outside the prior's radius of {prior.radius_m:g} m"
+    return replace(answer, outcome=Rejection(RejectionReason.GATE, message))

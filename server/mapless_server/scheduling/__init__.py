@@ -1,0 +1,1 @@
+"""The worker queue: who computes what when. It knows nothing of photographs, grpc or metrics."""

@@ -1,0 +1,328 @@
+"""The worker queue's mind: who is admitted, what is computed next, who has waited in vain.
+
+A state machine without threads, waiting or clock: times are passed in, so that it is tested on a virtual clock.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from .costs import Costs
+from .fair import FairQueue, Flow
+from .jobs import Batch, Done, Expired, Fallback, Job, Next, Refused, Stage, Step, Verdict, Visit
+from .ledger import Ledger
+from .observer import Ending, Observer, Refusal
+
+MIN_RETRY_S = 0.1
+RETRY_ELSEWHERE_S = 1.0
+"""When to come again where nothing tells when there will be room."""
+
+_UNASKED = frozenset({Ending.CANCELLED, Ending.EXPIRED})
+"""Endings that come from outside, while a stage may be at the job."""
+
+
+@dataclass(frozen=True)
+class ScheduleOptions:
+    """Options of the schedule.
+
+    Attributes:
+        max_queued_s: predicted computing time that may be admitted and not done, seconds a thread. Whoever is let in
+            later would get an old answer; and a full queue never drains sooner for being longer.
+        max_bytes: memory that admitted jobs may hold.
+        flow_share: of what others have left of either bound, what one caller may fill. So there is always room for one
+            who comes later.
+        caution: a job is let in if so many times the time predicted for it is left. Predictions are means, and what is
+            computed and comes too late is lost for everybody.
+        floor: every so many batches of a lane one is of the stage that was passed over for later ones.
+        quantum_s: of the fair queues; about what one job of a stage takes.
+    """
+
+    max_queued_s: float = 4.0
+    max_bytes: int = 256 * 2**20
+    flow_share: float = 0.75
+    caution: float = 1.2
+    floor: int = 4
+    quantum_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        bounds = (self.max_queued_s, self.max_bytes, self.flow_share, self.quantum_s)
+        if not (all(bound > 0 for bound in bounds) and self.flow_share <= 1 <= self.caution and self.floor >= 2):
+            raise ValueError(f"senseless options: {self}")
+
+
+class Quota(Protocol):
+    """Limits tenants to a rate of computing."""
+
+    def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
+        """Books predicted computing time; if there is no room, books nothing and says how long to wait, seconds."""
+        ...
+
+    def settle(self, tenant: str, predicted_s: float, actual_s: float, now_s: float) -> None:
+        """Replaces what was booked by what was used."""
+        ...
+
+
+@dataclass
+class _Lane:
+    """Threads, and the stages that they compute, the first one first.
+
+    Attributes:
+        threads: how many.
+        stages: in the order in which jobs go through them.
+        free: threads that have nothing to do.
+        passed_over: batches since an earlier stage than the one served had its turn.
+    """
+
+    threads: int
+    stages: list[Stage]
+    free: int
+    passed_over: int = 0
+
+
+class Schedule:
+    """Jobs between admission and their end. Not safe to use from several threads."""
+
+    def __init__(
+        self,
+        stages: Sequence[Stage],
+        lanes: Mapping[str, int],
+        options: ScheduleOptions,
+        observer: Observer,
+        ending_of: Callable[[Exception], Ending] = lambda _: Ending.FAILED,
+        quota: Quota | None = None,
+    ) -> None:
+        """The schedule of an idle server.
+
+        Args:
+            stages: in the order in which jobs go through them.
+            lanes: number of threads of each.
+            options: see there.
+            observer: is told what happens.
+            ending_of: how a job ends for which its stage gives this exception.
+            quota: of tenants, if they have one.
+        """
+        self.costs = Costs()
+        self._options = options
+        self._observer = observer
+        self._ending_of = ending_of
+        self._quota = quota
+        self._stages = {stage.name: stage for stage in stages}
+        self._queues: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
+        self._running: Counter[str] = Counter()
+        self._lanes = {
+            name: _Lane(count, [stage for stage in stages if stage.lane == name], count)
+            for name, count in lanes.items()
+        }
+        self._max_batch: dict[tuple[str, str], int] = {}
+        self._ledger = Ledger()
+        self._due: list[tuple[float, int, Job]] = []
+        self._tick = itertools.count()
+        self._draining = False
+
+    @property
+    def jobs(self) -> frozenset[Job]:
+        """Those that are admitted and have not ended."""
+        return frozenset(self._ledger.jobs)
+
+    @property
+    def next_due_s(self) -> float | None:
+        """When `expire` is to be called next; None if there is no job."""
+        while self._due and (self._due[0][2].is_over or self._due[0][0] != self._due[0][2].due_s):
+            heapq.heappop(self._due)  # it ended, or is due at another time by now
+        return self._due[0][0] if self._due else None
+
+    def admit(self, job: Job, now_s: float) -> None:
+        """Lets a job in, which from then on ends exactly once; Refused, with nothing changed, if there is no room."""
+        cost_s = self._predict(job.step)
+        try:
+            self._check_room(job, cost_s, now_s)
+            if self._quota is not None:
+                job.charged_s = cost_s.total()
+                wait_s = self._quota.charge(job.flow.tenant, job.charged_s, now_s)
+                if wait_s > 0:
+                    raise Refused(Refusal.TENANT_QUOTA, "the tenant's computing time is used up", wait_s)
+        except Refused as refused:
+            self._observer.refused(refused.reason)
+            raise
+        self._observer.admitted(cost_s.total())
+        self._ledger.open(job, cost_s)
+        self._enqueue(job, now_s)
+
+    def take(self, lane_name: str, now_s: float) -> Batch | None:
+        """What a free thread of a lane computes now; None if all are busy or nothing waits."""
+        self.expire(now_s)
+        lane = self._lanes[lane_name]
+        waiting = [stage for stage in lane.stages if self._queues[stage.name]]
+        if not (lane.free and waiting):
+            return None
+        # What is begun is finished first: it holds memory, and time has been spent on it.
+        stage = waiting[0] if lane.passed_over >= self._options.floor - 1 else waiting[-1]
+        lane.passed_over = 0 if stage is waiting[0] else lane.passed_over + 1
+        lane.free -= 1
+        jobs = self._pop_batch(stage)
+        for job in jobs:
+            self._observer.waited(stage.name, now_s - job.waits_since_s)
+        self._running[stage.name] += len(jobs)
+        self._tell(stage)
+        return Batch(stage, jobs, now_s)
+
+    def finish(self, batch: Batch, verdicts: Sequence[Verdict], now_s: float) -> None:
+        """A batch was computed: each of its jobs ends or goes on, unless it has ended meanwhile."""
+        stage, seconds = batch.stage, now_s - batch.start_s
+        self._lanes[stage.lane].free += 1
+        self._running[stage.name] -= len(batch.jobs)
+        self._observer.computed(stage.name, batch.jobs[0].step.bucket, len(batch.jobs), seconds)
+        share_s = seconds / len(batch.jobs)
+        for job, verdict in zip(batch.jobs, verdicts, strict=True):
+            if not isinstance(verdict, Exception):  # what fails, fails early
+                self.costs.observe(stage.name, job.step.kind, share_s)
+            job.used_s += share_s
+            job.visits.append(Visit(stage.name, job.waits_since_s, batch.start_s, now_s, len(batch.jobs)))
+            if job.is_over:
+                continue
+            if isinstance(verdict, Next):
+                self._go_on(job, verdict, now_s)
+            elif isinstance(verdict, Done):
+                self._end(job, verdict.ending, verdict.value, now_s)
+            else:
+                self._end(job, self._ending_of(verdict), verdict, now_s)
+        self._tell(stage)
+
+    def cancel(self, job: Job, now_s: float) -> None:
+        """Nobody waits for a job any more."""
+        if not job.is_over:
+            self._end(job, Ending.CANCELLED, None, now_s)
+
+    def expire(self, now_s: float) -> None:
+        """Ends the jobs whose time is over, wherever they are."""
+        while (due_s := self.next_due_s) is not None and due_s <= now_s:
+            _, _, job = heapq.heappop(self._due)
+            if job.fallback is None:
+                self._end(
+                    job, Ending.EXPIRED, Expired("the deadline passed while the call waited or was computed"), now_s
+                )
+            else:
+                self._give_fallback(job, job.fallback, now_s)
+
+    def limit_batch(self, stage: str, bucket: str, size: int) -> None:
+        """From now on no more jobs of a bucket are computed together: more did not fit the device."""
+        self._max_batch[stage, bucket] = max(1, size)
+
+    def drain(self) -> None:
+        """Admits nothing from now on."""
+        self._draining = True
+
+    def fail_all(self, error: Exception, now_s: float) -> None:
+        """Ends every job, because nothing will be computed any more."""
+        self._draining = True
+        for job in self.jobs:
+            self._end(job, Ending.FAILED, error, now_s)
+
+    def _predict(self, step: Step) -> Counter[str]:
+        """Computing time of a step and of those that usually follow, by lane."""
+        cost_s: Counter[str] = Counter()
+        stage: Stage | None = self._stages[step.stage]
+        while stage is not None:
+            cost_s[stage.lane] += self.costs.predict(stage.name, step.kind)  # type: ignore[assignment]  # not int
+            stage = self._stages[stage.then] if stage.then else None
+        return cost_s
+
+    def _check_room(self, job: Job, cost_s: Counter[str], now_s: float) -> None:
+        """Raises Refused if the job cannot be admitted."""
+        options, ledger = self._options, self._ledger
+        if self._draining:
+            raise Refused(Refusal.DRAINING, "the server is stopping", RETRY_ELSEWHERE_S)
+        if job.size_bytes > options.max_bytes:
+            raise Refused(Refusal.TOO_LARGE, f"the call holds {job.size_bytes} bytes, {options.max_bytes} are allowed")
+        if now_s >= job.deadline_s:
+            raise Refused(Refusal.DEADLINE_INFEASIBLE, "the deadline has passed")
+        if not ledger.jobs:
+            return  # an idle server tries anything: what is predicted may be wrong, and only trying mends that
+        held_bytes = ledger.size_bytes(job.flow)
+        if held_bytes + job.size_bytes > self._share(options.max_bytes, ledger.size_bytes(), held_bytes):
+            raise Refused(Refusal.TOO_MUCH_MEMORY, "the calls in progress hold too much memory", RETRY_ELSEWHERE_S)
+        for lane, own_s in cost_s.items():
+            excess_s = self._excess_s(job.flow, lane, own_s)
+            if excess_s > 0:
+                in_progress = f"{len(ledger.jobs)} calls are in progress or wait"
+                raise Refused(Refusal.QUEUE_FULL, in_progress, max(MIN_RETRY_S, excess_s / self._lanes[lane].threads))
+        own_s = cost_s.total()
+        waits_s = (ledger.ahead_s(job.flow, lane, it) / self._lanes[lane].threads for lane, it in cost_s.items())
+        late_s = now_s + options.caution * (max(waits_s) + own_s) - job.deadline_s
+        if late_s > 0:
+            retry_s = None if now_s + own_s > job.deadline_s else max(MIN_RETRY_S, late_s)
+            raise Refused(Refusal.DEADLINE_INFEASIBLE, "the answer would come after the deadline", retry_s)
+
+    def _share(self, bound: float, held: float, held_by_flow: float) -> float:
+        """What one caller may hold of a bound, given what all hold and it does."""
+        return self._options.flow_share * (bound - (held - held_by_flow))
+
+    def _excess_s(self, flow: Flow, lane: str, added_s: float) -> float:
+        """Computing time by which a caller would be over what it may hold, if it got so much more."""
+        bound_s = self._options.max_queued_s * self._lanes[lane].threads
+        held_s = self._ledger.booked_s(lane, flow)
+        return held_s + added_s - self._share(bound_s, self._ledger.booked_s(lane), held_s)
+
+    def _go_on(self, job: Job, verdict: Next, now_s: float) -> None:
+        """Lets a job wait for its next step, or gives what is at hand if that would come too late or cost too much."""
+        job.step, job.fallback = verdict.step, verdict.fallback
+        cost_s = self._predict(job.step)
+        if job.fallback is None:
+            cost_s &= job.booked_s  # it was admitted for no more
+        elif not self._is_worthwhile(job, cost_s, now_s):
+            self._give_fallback(job, job.fallback, now_s)
+            return
+        self._ledger.rebook(job, cost_s)
+        self._enqueue(job, now_s)
+
+    def _is_worthwhile(self, job: Job, cost_s: Counter[str], now_s: float) -> bool:
+        """Whether a job's next step fits the bounds, and its result will be there before the job is due."""
+        lane_name = self._stages[job.step.stage].lane
+        lane = self._lanes[lane_name]
+        coming_first = lane.stages[lane.stages.index(self._stages[job.step.stage]) :]
+        wait_s = sum(self._queues[stage.name].cost_s for stage in coming_first) / lane.threads
+        added_s = {name: own_s - job.booked_s[name] for name, own_s in cost_s.items()}
+        fits = all(it <= 0 or self._excess_s(job.flow, name, it) <= 0 for name, it in added_s.items())
+        return fits and now_s + wait_s + cost_s.total() <= job.due_s
+
+    def _enqueue(self, job: Job, now_s: float) -> None:
+        stage = self._stages[job.step.stage]
+        job.waits_since_s = now_s
+        self._queues[stage.name].push(job, job.flow, self.costs.predict(stage.name, job.step.kind))
+        heapq.heappush(self._due, (job.due_s, next(self._tick), job))
+        self._tell(stage)
+
+    def _pop_batch(self, stage: Stage) -> tuple[Job, ...]:
+        queue = self._queues[stage.name]
+        first = queue.pop()
+        bucket = first.step.bucket
+        at_most = min(stage.max_batch, self._max_batch.get((stage.name, bucket), stage.max_batch))
+        return (first, *queue.pop_alike(lambda job: job.step.bucket == bucket, at_most - 1))
+
+    def _end(self, job: Job, ending: Ending, value: Any, now_s: float) -> None:
+        stage = self._stages[job.step.stage]
+        waits = job in self._queues[stage.name]
+        if waits:
+            self._queues[stage.name].remove(job)
+            self._tell(stage)
+        self._ledger.close(job)
+        if self._quota is not None:
+            # What is computed just now was not counted yet.
+            used_s = job.used_s if waits or ending not in _UNASKED else max(job.used_s, job.charged_s)
+            self._quota.settle(job.flow.tenant, job.charged_s, used_s, now_s)
+        self._observer.ended(stage.name, ending)
+        job.end(ending, value)
+
+    def _give_fallback(self, job: Job, fallback: Fallback, now_s: float) -> None:
+        done = fallback.give()
+        self._end(job, done.ending, done.value, now_s)
+
+    def _tell(self, stage: Stage) -> None:
+        queue = self._queues[stage.name]
+        self._observer.queued(stage.name, len(queue), queue.cost_s)
+        self._observer.running(stage.name, self._running[stage.name])

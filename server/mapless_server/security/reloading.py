@@ -1,0 +1,99 @@
+"""Files that are read anew when they change, while the server runs; what cannot be read leaves the old in use."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Generic, Protocol, TypeVar
+
+from .errors import SecurityError
+
+log = logging.getLogger(__name__)
+
+LOOK_INTERVAL_S = 1.0
+"""How old what is in use may be: a revoked token is of use this long, and a look costs but a stat a file."""
+
+T = TypeVar("T")
+Stamp = tuple[tuple[int, int, int, int], ...]
+
+
+class Refreshable(Protocol):
+    """Something to be refreshed now and then."""
+
+    def refresh(self) -> bool:
+        """Looks for news; whether there were any. It blocks."""
+
+
+class Reloading(Generic[T]):
+    """What some files hold together; `value` may be read from any thread and never waits."""
+
+    def __init__(self, paths: Sequence[Path], read: Callable[[], T], what: str) -> None:
+        """Reads the files.
+
+        Args:
+            paths: all files that `read` reads.
+            read: makes the value of them; raises SecurityError if it cannot.
+            what: they are, "tokens", for the log.
+
+        Raises:
+            SecurityError: a file is missing, or wrong.
+        """
+        self._paths = tuple(paths)
+        self._read = read
+        self._what = what
+        self._complaint = ""
+        self._stamp, self._value = self._load()
+
+    @property
+    def value(self) -> T:
+        """The value of the newest files that could be read."""
+        return self._value
+
+    def refresh(self) -> bool:
+        """Reads the files if they changed; whether the value is a new one.
+
+        Files that cannot be read are logged once, and tried again by every call: when several files are replaced one
+        after the other, they do not fit together until the last one is. One thread at a time.
+        """
+        try:
+            if self._stamp_files() == self._stamp:
+                return False
+            self._stamp, self._value = self._load()
+        except SecurityError as error:
+            if str(error) != self._complaint:
+                log.error("%s; the %s read before stay in use", error, self._what)
+            self._complaint = str(error)
+            return False
+        self._complaint = ""
+        log.info("the %s have changed and are in use", self._what)
+        return True
+
+    def _load(self) -> tuple[Stamp, T]:
+        # Stamped first: a file that changes while it is read is read again.
+        return self._stamp_files(), self._read()
+
+    def _stamp_files(self) -> Stamp:
+        try:
+            found = [os.stat(path) for path in self._paths]
+        except OSError as error:
+            raise SecurityError(f"{error.filename}: {error.strerror}") from error
+        return tuple((it.st_ino, it.st_size, it.st_mtime_ns, it.st_ctime_ns) for it in found)
+
+
+async def keep_fresh(sources: Sequence[Refreshable], interval_s: float = LOOK_INTERVAL_S) -> None:
+    """Refreshes until it is cancelled, in a thread, so that the event loop never waits for a disk."""
+    while True:
+        await asyncio.sleep(interval_s)
+        for source in sources:
+            await asyncio.to_thread(source.refresh)
+
+
+def read_file(path: Path) -> bytes:
+    """A file's bytes; SecurityError if it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SecurityError(f"{path}: {error.strerror}") from error

@@ -1,0 +1,153 @@
+"""The server's certificate and key, and whose certificates clients must show: read from files, anew when they change.
+
+Connections that are there stay as they are; those that come after a change see the new certificate.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+import grpc
+from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
+
+from .errors import SecurityError
+from .reloading import Reloading, read_file
+
+
+@dataclass(frozen=True)
+class TlsFiles:
+    """Paths of PEM files: the server's certificate chain, its own first; its key; whom clients' must be signed by.
+
+    Without `client_ca` clients need no certificate.
+    """
+
+    certificate: Path
+    key: Path
+    client_ca: Path | None = None
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Those there are."""
+        return (self.certificate, self.key) + ((self.client_ca,) if self.client_ca else ())
+
+
+@dataclass(frozen=True)
+class TlsMaterial:
+    """What the files hold, PEM, and when the server's certificate expires."""
+
+    certificate: bytes
+    key: bytes
+    client_ca: bytes | None
+    expires: datetime
+
+    def __repr__(self) -> str:
+        """Without the key."""
+        return f"TlsMaterial(expires={self.expires})"
+
+
+def read_material(files: TlsFiles) -> TlsMaterial:
+    """What the files hold.
+
+    Raises:
+        SecurityError: a file is missing or not PEM, the key is not the certificate's, or its time is not now.
+    """
+    certificate, key = read_file(files.certificate), read_file(files.key)
+    client_ca = read_file(files.client_ca) if files.client_ca else None
+    own = _certificates(certificate, files.certificate)[0]
+    if _public_key_of(key, files.key) != _certified_key(own, files.certificate):
+        raise SecurityError(f"the key {files.key} is not that of the first certificate in {files.certificate}")
+    _check_time(own, files.certificate)
+    if client_ca is not None and files.client_ca is not None:
+        _certificates(client_ca, files.client_ca)
+    return TlsMaterial(certificate, key, client_ca, own.not_valid_after_utc)
+
+
+class Tls:
+    """The server's side of encryption, kept up to date by `refresh`."""
+
+    def __init__(self, files: TlsFiles) -> None:
+        """Raises SecurityError if the files cannot be used."""
+        self._asks_clients = files.client_ca is not None
+        self._material = Reloading(files.paths, lambda: read_material(files), "certificates")
+
+    @property
+    def expiry_s(self) -> float:
+        """When the certificate in use expires, seconds since 1970."""
+        return self._material.value.expires.timestamp()
+
+    def refresh(self) -> bool:
+        """Reads the files if they changed; files that cannot be used are logged, and the old ones stay in use."""
+        return self._material.refresh()
+
+    def server_credentials(self) -> grpc.ServerCredentials:
+        """For `add_secure_port`; they follow the files."""
+        feed = _Feed(self._material)
+        credentials: grpc.ServerCredentials
+        credentials = grpc.dynamic_ssl_server_credentials(feed.initial, feed.fetch, self._asks_clients)
+        return credentials
+
+
+class _Feed:
+    """Tells grpc of new certificates: it asks with every connection, in threads of its own."""
+
+    def __init__(self, source: Reloading[TlsMaterial]) -> None:
+        self._source = source
+        self._given = source.value
+        self._lock = threading.Lock()
+        self.initial = _configuration(self._given)
+
+    def fetch(self) -> grpc.ServerCertificateConfiguration | None:
+        """What is to be used from now on; None for what is in use."""
+        with self._lock:
+            material = self._source.value
+            if material is self._given:
+                return None
+            self._given = material
+        return _configuration(material)
+
+
+def _configuration(material: TlsMaterial) -> grpc.ServerCertificateConfiguration:
+    pair = (material.key, material.certificate)
+    made: grpc.ServerCertificateConfiguration = grpc.ssl_server_certificate_configuration([pair], material.client_ca)
+    return made
+
+
+def _certificates(data: bytes, path: Path) -> Sequence[x509.Certificate]:
+    try:
+        return x509.load_pem_x509_certificates(data)
+    except ValueError as error:
+        raise SecurityError(f"{path} holds no certificate in PEM form") from error
+
+
+def _check_time(certificate: x509.Certificate, path: Path) -> None:
+    """Raises SecurityError if no client would accept it today."""
+    begins, ends, now = certificate.not_valid_before_utc, certificate.not_valid_after_utc, datetime.now(timezone.utc)
+    if ends <= now:
+        raise SecurityError(f"the certificate {path} expired at {ends.isoformat()}")
+    if begins > now:
+        raise SecurityError(f"the certificate {path} is not valid before {begins.isoformat()}")
+
+
+def _certified_key(certificate: x509.Certificate, path: Path) -> bytes:
+    """The public key that a certificate is for, DER."""
+    try:
+        return certificate.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+    except (ValueError, UnsupportedAlgorithm) as error:
+        raise SecurityError(f"the certificate {path} is for a key of an unknown kind") from error
+
+
+def _public_key_of(data: bytes, path: Path) -> bytes:
+    """The public half of a private key, DER."""
+    try:
+        key = load_pem_private_key(data, password=None)
+    except TypeError as error:
+        raise SecurityError(f"the key {path} is encrypted, and nobody is there to ask for its password") from error
+    except (ValueError, UnsupportedAlgorithm) as error:
+        raise SecurityError(f"{path} holds no private key in PEM form") from error
+    return key.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)

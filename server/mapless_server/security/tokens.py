@@ -1,0 +1,198 @@
+"""The file of tokens: who holds one, whose scenes it opens, what it allows. It holds hashes, never the tokens.
+
+A token is 32 random bytes, so that a plain SHA-256 is enough: slow hashes are for passwords, which can be guessed. The
+file is JSON, which a program can both read and write:
+
+    {"tokens": [{"name": "robot-7", "tenant": "acme", "role": "localize", "sha256": "...",
+                 "expires": "2027-01-01T00:00:00Z"}],
+     "tenants": {"acme": {"rate_ms": 500}}}
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import secrets
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from mapless.names import check_id
+
+from ..principal import DEFAULT_TENANT, Role
+from .errors import SecurityError
+from .reloading import read_file
+
+PREFIX = "mapless_"
+"""Begins every token, so that programs that look for leaked secrets find them."""
+
+_TOKEN_BYTES = 32
+_FILE_MODE = 0o600
+
+Name = Annotated[str, AfterValidator(check_id)]
+
+
+class Token(BaseModel):
+    """What is known of a token.
+
+    Attributes:
+        name: of whoever holds it; unique, and what the log calls the caller.
+        tenant: whose scenes it opens.
+        role: what it allows.
+        sha256: of the token, hexadecimal.
+        expires: when it ceases to be good; None: never.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Name
+    tenant: Name = DEFAULT_TENANT
+    role: Literal["read", "localize", "write"]
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    expires: AwareDatetime | None = None
+
+    @property
+    def allows(self) -> Role:
+        """The role."""
+        return Role[self.role.upper()]
+
+
+class TenantLimits(BaseModel):
+    """What is set for one tenant; `rate_ms` stands for the setting tenant_rate_ms, 0 for no limit."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rate_ms: float | None = Field(default=None, ge=0, allow_inf_nan=False)
+
+
+class Tokens(BaseModel):
+    """What the file holds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tokens: tuple[Token, ...] = ()
+    tenants: dict[Name, TenantLimits] = {}
+
+    @model_validator(mode="after")
+    def _check_unique(self) -> Tokens:
+        for what, values in (("name", [it.name for it in self.tokens]), ("sha256", [it.sha256 for it in self.tokens])):
+            value, count = next(iter(Counter(values).most_common(1)), ("", 0))
+            if count > 1:
+                raise ValueError(f"the {what} {value!r} stands twice")
+        return self
+
+    def find(self, token: str) -> Token | None:
+        """What is known of a token; None if it is none of these.
+
+        The look-up is by the hash: how long it takes tells of the hash of what the caller sent, and nothing of ours.
+        """
+        return self._by_hash.get(sha256_of(token))
+
+    def rate_ms(self, tenant: str) -> float | None:
+        """Computing time that a tenant may use, milliseconds a second; None if the file says nothing of it."""
+        limits = self.tenants.get(tenant)
+        return limits.rate_ms if limits else None
+
+    @cached_property
+    def _by_hash(self) -> dict[str, Token]:
+        return {it.sha256: it for it in self.tokens}
+
+
+def sha256_of(token: str) -> str:
+    """By which a token is known, hexadecimal."""
+    return hashlib.sha256(token.encode()).hexdigest()
+
+
+def read_tokens(path: Path) -> Tokens:
+    """The file of tokens.
+
+    Raises:
+        SecurityError: it cannot be read, or does not hold what it should.
+    """
+    try:
+        return Tokens.model_validate_json(read_file(path))
+    except ValidationError as error:
+        raise SecurityError(f"{path}: {_describe(error)}") from None
+
+
+def create_token(path: Path, name: str, tenant: str, role: str, expires: datetime | None) -> str:
+    """A new token, whose hash is added to the file; the file is made if there is none.
+
+    Raises:
+        SecurityError: the name is taken, something is not as it should be, or the file cannot be read or written.
+    """
+    token = PREFIX + secrets.token_urlsafe(_TOKEN_BYTES)
+    fields = {"name": name, "tenant": tenant, "role": role, "sha256": sha256_of(token), "expires": expires}
+    try:
+        new = Token.model_validate(fields)
+    except ValidationError as error:
+        raise SecurityError(_describe(error)) from None
+    with _changing(path) as file:
+        old = read_tokens(file) if file.exists() else Tokens()
+        if any(it.name == name for it in old.tokens):
+            raise SecurityError(f"there is a token of the name {name!r} already; revoke it first, or take another name")
+        _write(file, Tokens(tokens=(*old.tokens, new), tenants=old.tenants))
+    return token
+
+
+def revoke_token(path: Path, name: str) -> None:
+    """Removes a token from the file; a running server refuses it about a second later.
+
+    Raises:
+        SecurityError: there is none of this name, or the file cannot be read or written.
+    """
+    with _changing(path) as file:
+        old = read_tokens(file)
+        kept = tuple(it for it in old.tokens if it.name != name)
+        if len(kept) == len(old.tokens):
+            raise SecurityError(f"there is no token of the name {name!r}")
+        _write(file, Tokens(tokens=kept, tenants=old.tenants))
+
+
+def _describe(error: ValidationError) -> str:
+    """The first fault, without what stands there: somebody may have put a token where its hash should be."""
+    fault = error.errors()[0]
+    where = ".".join(map(str, fault["loc"]))
+    what = fault["msg"].removeprefix("Value error, ")
+    return f"{where}: {what}" if where else what
+
+
+@contextmanager
+def _changing(path: Path) -> Iterator[Path]:
+    """The file itself, should `path` be a link, while no other command changes it; SecurityError if it cannot be."""
+    file = path.resolve()
+    try:
+        folder = os.open(file.parent, os.O_RDONLY)
+    except OSError as error:
+        raise SecurityError(f"{file.parent}: {error.strerror}") from error
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield file
+    except OSError as error:
+        raise SecurityError(f"{file}: {error.strerror}") from error
+    finally:
+        os.close(folder)
+
+
+def _write(file: Path, tokens: Tokens) -> None:
+    """Puts a new file in the place of the old one, so that nobody ever reads half of it."""
+    new = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
+    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _FILE_MODE)
+    try:
+        with open(descriptor, "w") as stream:
+            if file.exists() and os.geteuid() == 0:  # the server, which is not root, must still be able to read it
+                os.fchown(descriptor, file.stat().st_uid, file.stat().st_gid)
+            stream.write(tokens.model_dump_json(indent=2, exclude_none=True) + "\n")
+            stream.flush()
+            os.fsync(descriptor)
+        os.replace(new, file)
+    except BaseException:
+        os.unlink(new)
+        raise

@@ -1,0 +1,54 @@
+"""What a caller who allows a coarse pose sends, and what it makes of one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent import futures
+
+import grpc
+import numpy as np
+import pytest
+from servers import CAMERA, PHOTO, pose
+
+from mapless import Client, DeadlineExceeded, LocalizationResult, wire
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.v1.localization_service_pb2_grpc import (
+    LocalizationServiceServicer,
+    add_LocalizationServiceServicer_to_server,
+)
+
+
+class Hasty(LocalizationServiceServicer):
+    """Never has the time to refine."""
+
+    def Localize(self, request: pb.LocalizeRequest, context: grpc.ServicerContext) -> pb.LocalizeResponse:  # noqa: N802
+        if not request.options.allow_coarse:
+            context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, "no time to refine")
+        found = pb.Localization(world_from_camera=wire.transform_to_message(pose(1.0)), pose_stage=pb.POSE_STAGE_COARSE)
+        return pb.LocalizeResponse(localization=found)
+
+
+@pytest.fixture
+def client() -> Iterator[Client]:
+    with futures.ThreadPoolExecutor(1) as pool:
+        server = grpc.server(pool)
+        add_LocalizationServiceServicer_to_server(Hasty(), server)
+        port = server.add_insecure_port("127.0.0.1:0")
+        server.start()
+        with Client(f"127.0.0.1:{port}") as connected:
+            yield connected
+        server.stop(None).wait()
+
+
+def test_a_coarse_pose_says_that_it_is_one(client: Client) -> None:
+    answer = client.localize(PHOTO, CAMERA, "s", allow_coarse=True)
+    assert isinstance(answer, LocalizationResult)
+    assert answer.pose_stage == "COARSE"
+    assert answer.covariance is None
+    assert answer.accuracy is None
+    np.testing.assert_allclose(answer.world_from_camera.translation, pose(1.0).translation)
+
+
+def test_it_is_not_allowed_unless_asked_for(client: Client) -> None:
+    with pytest.raises(DeadlineExceeded, match="no time to refine"):
+        client.localize(PHOTO, CAMERA, "s")

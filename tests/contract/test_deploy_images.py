@@ -1,0 +1,266 @@
+"""The images and the compose files say what the code says: ports, settings, times, folders; and nothing is left open.
+
+No container engine is needed: the files are read. What is true of an image holds for every target of the Dockerfile.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml  # type: ignore[import-untyped]
+
+from mapless.__main__ import _parser
+from mapless_server.security.binding import Verdict, advise
+from mapless_server.settings import PREFIX, Settings, load_settings
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[2]
+DOCKERFILE = ROOT / "docker" / "Dockerfile"
+DEPLOY = ROOT / "deploy"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+TARGETS = ["cpu", "cuda"]
+PINNED = re.compile(r"[\w./-]+:v?\d+\.\d+\.\d+[\w.-]*(@sha256:[0-9a-f]{64})?")
+SERVICE_KEYS = {
+    *("image", "build", "command", "environment", "ports", "volumes", "tmpfs", "depends_on", "healthcheck", "deploy"),
+    *("read_only", "cap_drop", "security_opt", "restart", "cpus", "mem_limit", "pids_limit", "stop_grace_period"),
+}
+"""Of the specification's keys, those in use: a misspelt one would be passed over in silence by some engines."""
+
+Json = dict[str, Any]
+Instruction = tuple[str, str]
+
+
+def parse(dockerfile: str) -> list[Instruction]:
+    """The instructions, without comments and with continued lines joined."""
+    lines = [line for line in dockerfile.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    joined = re.sub(r"\\\n\s*", "", "\n".join(lines))
+    return [(word.upper(), rest.strip()) for word, _, rest in (line.partition(" ") for line in joined.splitlines())]
+
+
+def stages_of(instructions: list[Instruction]) -> dict[str, tuple[str, list[Instruction]]]:
+    """By name: what each stage builds on, and its instructions."""
+    stages: dict[str, tuple[str, list[Instruction]]] = {}
+    here: list[Instruction] = []
+    for word, rest in instructions:
+        if word == "FROM":
+            base, _, name = rest.partition(" AS ")
+            assert name not in stages
+            assert base == "${PYTHON_IMAGE}" or base in stages, f"{base} comes later, or is no stage"
+            here = []
+            stages[name] = (base, here)
+        else:
+            here.append((word, rest))
+    return stages
+
+
+INSTRUCTIONS = parse(DOCKERFILE.read_text())
+STAGES = stages_of(INSTRUCTIONS)
+COMPOSE: Json = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+CUDA: Json = yaml.safe_load((DEPLOY / "compose.cuda.yaml").read_text())
+
+
+def chain(target: str) -> list[Instruction]:
+    """All instructions that make a target, those of its bases first."""
+    base, own = STAGES[target]
+    return (chain(base) if base in STAGES else []) + own
+
+
+def all_of(target: str, word: str) -> list[str]:
+    return [rest for found, rest in chain(target) if found == word]
+
+
+def environment_of(target: str) -> dict[str, str]:
+    pairs = [pair.partition("=") for line in all_of(target, "ENV") for pair in shlex.split(line)]
+    return {name: value for name, _, value in pairs}
+
+
+def ours(environment: Json) -> dict[str, str]:
+    return {name: str(value) for name, value in environment.items() if name.startswith(PREFIX)}
+
+
+def settings_under(environment: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> Settings:
+    """What the server makes of variables; an unknown name or a wrong value raises."""
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    return load_settings({}).settings
+
+
+def seconds(text: str) -> float:
+    number, unit = re.fullmatch(r"(\d+)(s|m)", text).groups()  # type: ignore[union-attr]
+    return float(number) * {"s": 1, "m": 60}[unit]
+
+
+def services() -> Iterator[tuple[str, Json]]:
+    yield from COMPOSE["services"].items()
+
+
+# The Dockerfile
+
+
+def test_the_base_is_pinned() -> None:
+    (base,) = [
+        rest.removeprefix("PYTHON_IMAGE=")
+        for word, rest in INSTRUCTIONS
+        if (word, rest[:13]) == ("ARG", "PYTHON_IMAGE=")
+    ]
+    assert PINNED.fullmatch(base)
+    assert set(TARGETS) <= set(STAGES)
+
+
+def test_what_is_copied_exists_and_reaches_the_build() -> None:
+    ignored, *let_through = [
+        line for line in (DOCKERFILE.parent / "Dockerfile.dockerignore").read_text().splitlines() if line[0] != "#"
+    ]
+    assert ignored == "*"
+    copied = [rest.split() for word, rest in INSTRUCTIONS if word == "COPY"]
+    for *sources, _ in copied:
+        if sources[0].startswith("--from="):
+            assert sources[0].removeprefix("--from=") in STAGES
+            continue
+        for source in sources:
+            assert (ROOT / source).exists()
+            assert f"!{source}" in let_through
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_an_image_runs_the_server_as_nobody_in_particular(target: str) -> None:
+    uid, gid = all_of(target, "USER")[-1].split(":")
+    assert int(uid) > 0 < int(gid)  # a number, since only that lets Kubernetes see that it is not root
+    assert chain(target)[-1][0] == "USER"
+    command = json.loads(all_of(target, "ENTRYPOINT")[-1]) + json.loads(all_of(target, "CMD")[-1])
+    assert command == ["mapless-server", "serve"]
+    assert command[0] in PROJECT["scripts"]
+    assert all_of(target, "STOPSIGNAL") == ["SIGTERM"]
+    assert all_of(target, "EXPOSE") == [f"{default('port')} {default('metrics_port')}"]
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_an_image_checks_its_health_with_our_client(target: str) -> None:
+    (check,) = all_of(target, "HEALTHCHECK")
+    options, _, command = check.partition(" CMD ")
+    program, *arguments = json.loads(command)
+    parsed = _parser().parse_args(arguments)
+    assert program in PROJECT["scripts"]
+    assert parsed.run.__name__ == "_health"
+    assert parsed.address == f"localhost:{default('port')}"
+    assert parsed.timeout < seconds(re.search(r"--timeout=(\w+)", options)[1])  # type: ignore[index]
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_an_image_sets_settings_that_exist_and_decides_nothing_about_security(
+    target: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = settings_under(ours(environment_of(target)), monkeypatch)
+    assert (settings.tls_certificate, settings.tokens_file, settings.insecure) == (None, None, False)
+    assert verdict_on(settings) is Verdict.REFUSED
+    assert settings.metrics_host == settings.host == "0.0.0.0"
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_what_an_image_writes_to_is_a_volume(target: str) -> None:
+    environment = environment_of(target)
+    volumes = json.loads(all_of(target, "VOLUME")[-1])
+    for name in ("MAPLESS_DATA_DIR", "MAPLESS_WEIGHTS_DIR", "HOME", "XDG_CACHE_HOME", "TORCHINDUCTOR_CACHE_DIR"):
+        assert any(environment[name] == volume or environment[name].startswith(volume + "/") for volume in volumes)
+    (created,) = [line.partition("install --directory ")[2] for line in all_of("runtime", "RUN")]
+    assert set(volumes) == {word for word in created.split() if word.startswith("/")}
+
+
+def test_versions_and_extras_are_the_projects() -> None:
+    arguments = [rest.partition("=") for word, rest in INSTRUCTIONS if word == "ARG"]
+    assert [value for name, _, value in arguments if name == "VERSION"] == [PROJECT["version"]]
+    for extras in [value for name, _, value in arguments if name == "EXTRAS"]:
+        assert set(extras.split(",")) <= set(PROJECT["optional-dependencies"])
+    (torch,) = re.findall(r"^TORCH\s+\?= (.*)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert ("TORCH", "=", torch) in arguments
+
+
+# Compose
+
+
+def test_compose_has_no_key_that_is_none() -> None:
+    for document in (COMPOSE, CUDA):
+        assert {key for key in document if not key.startswith("x-")} <= {"name", "services", "volumes"}
+        for service in document["services"].values():
+            assert set(service) <= SERVICE_KEYS
+    assert set(CUDA["services"]) <= set(COMPOSE["services"])
+
+
+def test_what_compose_refers_to_exists() -> None:
+    used = set()
+    for _, service in services():
+        for volume in service["volumes"]:
+            source = volume.split(":")[0]
+            if source.startswith("."):
+                assert (DEPLOY / source).is_dir()
+            else:
+                used.add(source)
+        assert set(service.get("depends_on", ())) <= set(COMPOSE["services"])
+    assert used == set(COMPOSE["volumes"])
+    (config,) = [word for word in COMPOSE["services"]["prometheus"]["command"] if word.startswith("--config.file=")]
+    assert (DEPLOY / "prometheus" / Path(config).name).is_file()
+    assert f"./prometheus:{Path(config.partition('=')[2]).parent}:ro" in COMPOSE["services"]["prometheus"]["volumes"]
+
+
+@pytest.mark.parametrize(("document", "target"), [(COMPOSE, "cpu"), (CUDA, "cuda")], ids=TARGETS)
+def test_compose_builds_a_target_of_the_dockerfile(document: Json, target: str) -> None:
+    service = document["services"]["mapless"]
+    assert service["build"]["target"] == target
+    assert service["image"] == f"mapless:{PROJECT['version']}-{target}"
+    build = COMPOSE["services"]["mapless"]["build"]
+    assert (DEPLOY / build["context"] / build["dockerfile"]).resolve() == DOCKERFILE
+
+
+@pytest.mark.parametrize(("name", "service"), list(services()))
+def test_every_service_is_confined(name: str, service: Json) -> None:
+    assert PINNED.fullmatch(service["image"])
+    assert service["read_only"] is True
+    assert service["cap_drop"] == ["ALL"]
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert service["cpus"] > 0
+    assert re.fullmatch(r"\d+[mg]", service["mem_limit"])
+    assert all(port.startswith("127.0.0.1:") for port in service["ports"])
+    if name != "mapless":  # whose image has one
+        assert service["healthcheck"]["test"][0] == "CMD"
+
+
+@pytest.mark.parametrize("documents", [[COMPOSE], [COMPOSE, CUDA]], ids=TARGETS)
+def test_compose_runs_the_server_within_its_means(documents: list[Json], monkeypatch: pytest.MonkeyPatch) -> None:
+    service: Json = {}
+    environment = ours(environment_of("cpu"))
+    for document in documents:
+        service |= document["services"]["mapless"]
+        environment |= ours(document["services"]["mapless"]["environment"])
+    settings = settings_under(environment, monkeypatch)
+    assert settings.workers == service["cpus"]
+    assert service["ports"] == [f"127.0.0.1:{settings.port}:{settings.port}"]
+    assert verdict_on(settings) is Verdict.WARNING  # open, since only this machine reaches it
+    assert seconds(service["stop_grace_period"]) > settings.drain_delay_s + settings.drain_grace_s
+    mounted = {volume.split(":")[1] for volume in service["volumes"]} | set(service["tmpfs"])
+    assert mounted == {*json.loads(all_of("cpu", "VOLUME")[-1]), "/tmp"}
+
+
+def default(setting: str) -> Any:
+    return Settings.model_fields[setting].default
+
+
+def verdict_on(settings: Settings) -> Verdict:
+    """Whether the server would start with these."""
+    return advise(
+        settings.host,
+        tls=settings.tls_certificate is not None,
+        client_certificates=settings.tls_client_ca is not None,
+        tokens=settings.tokens_file is not None,
+        insecure=settings.insecure,
+    ).verdict

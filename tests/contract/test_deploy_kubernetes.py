@@ -1,0 +1,352 @@
+"""The manifests are what Kubernetes takes, fit together, and say what the code says: ports, services, times, settings.
+
+Each file by itself, and what kustomize makes of them, where kubectl is there to make it; no cluster is asked.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import kubernetes_validate  # type: ignore[import-untyped]
+import pytest
+import yaml  # type: ignore[import-untyped]
+
+from mapless_server.grpc_server import SERVICE_NAMES
+from mapless_server.observability.exporter import MetricsServer
+from mapless_server.observability.metrics import Metrics
+from mapless_server.security.binding import Verdict, advise
+from mapless_server.settings import PREFIX, Settings, load_settings
+from mapless_server.weights.catalogue import CATALOGUE
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[2]
+KUBERNETES = ROOT / "deploy" / "kubernetes"
+VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+OLDEST = "1.31"
+"""The oldest Kubernetes that the manifests are checked against; the other one is the newest known."""
+BUILDS = ["base", "overlays/cpu", "overlays/cuda", "weights"]
+SERVERS = BUILDS[:3]
+IN_IMAGE = {"MAPLESS_HOST": "0.0.0.0", "MAPLESS_METRICS_HOST": "0.0.0.0"}
+needs_kubectl = pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl, which has kustomize, is not here")
+
+Json = dict[str, Any]
+
+
+def documents_in(text: str) -> list[Json]:
+    return [document for document in yaml.safe_load_all(text) if document]
+
+
+def read(path: Path) -> list[Json]:
+    return documents_in(path.read_text())
+
+
+@cache
+def built(folder: Path) -> tuple[Json, ...]:
+    """What `kubectl apply -k` would send."""
+    command = ["kubectl", "kustomize", str(folder)]
+    return tuple(documents_in(subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout))
+
+
+def of_kind(documents: tuple[Json, ...], kind: str) -> list[Json]:
+    return [document for document in documents if document["kind"] == kind]
+
+
+def the(documents: tuple[Json, ...], kind: str) -> Json:
+    (found,) = of_kind(documents, kind)
+    return found
+
+
+def pods(documents: tuple[Json, ...]) -> Iterator[Json]:
+    for document in documents:
+        if document["kind"] in ("StatefulSet", "Job"):
+            yield document["spec"]["template"]
+
+
+def server(documents: tuple[Json, ...]) -> tuple[Json, Json]:
+    """The server's pod and its one container."""
+    pod = the(documents, "StatefulSet")["spec"]["template"]
+    (container,) = pod["spec"]["containers"]
+    return pod, container
+
+
+def settings_of(container: Json, monkeypatch: pytest.MonkeyPatch) -> Settings:
+    """What the server makes of the container's environment; an unknown name or a wrong value raises."""
+    variables = dict(IN_IMAGE)
+    for variable in container["env"]:
+        assert variable["name"].startswith(PREFIX)
+        source = variable.get("valueFrom", {}).get("resourceFieldRef")
+        variables[variable["name"]] = str(limit(container, source)) if source else variable["value"]
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    return load_settings({}).settings
+
+
+def limit(container: Json, source: Json) -> int:
+    assert source == {"containerName": container["name"], "resource": "limits.cpu", "divisor": "1"}
+    return int(container["resources"]["limits"]["cpu"])
+
+
+# The files
+
+
+def test_every_file_is_named_by_its_kustomization_and_nothing_else_is() -> None:
+    for kustomization in KUBERNETES.rglob("kustomization.yaml"):
+        (document,) = read(kustomization)
+        named = [*document.get("resources", ()), *(patch["path"] for patch in document.get("patches", ()))]
+        here = {path.name for path in kustomization.parent.glob("*.yaml")} - {kustomization.name}
+        assert {name for name in named if not name.startswith("..")} == here
+        for folder in [name for name in named if name.startswith("..")] + document.get("components", []):
+            assert (kustomization.parent / folder / "kustomization.yaml").is_file()
+
+
+@pytest.mark.parametrize("version", [OLDEST, kubernetes_validate.latest_version()])
+@pytest.mark.parametrize("folder", ["base", "weights", "components/autoscaling"])
+def test_every_resource_is_valid(folder: str, version: str) -> None:
+    (kustomization,) = read(KUBERNETES / folder / "kustomization.yaml")
+    for name in kustomization["resources"]:
+        for document in read(KUBERNETES / folder / name):
+            kubernetes_validate.validate(document, version, strict=True)
+
+
+def test_no_secret_is_in_the_files() -> None:
+    kinds = {document["kind"] for path in KUBERNETES.rglob("*.yaml") for document in read(path)}
+    assert "StatefulSet" in kinds
+    assert "Secret" not in kinds
+
+
+# What kustomize makes of them
+
+
+@needs_kubectl
+@pytest.mark.parametrize("folder", BUILDS)
+def test_what_is_built_is_valid(folder: str) -> None:
+    documents = built(KUBERNETES / folder)
+    for version in (OLDEST, kubernetes_validate.latest_version()):
+        for document in documents:
+            kubernetes_validate.validate(document, version, strict=True)
+    for document in documents:
+        if document["kind"] != "Namespace":
+            assert document["metadata"]["namespace"] == "mapless"
+
+
+@needs_kubectl
+@pytest.mark.parametrize("folder", SERVERS)
+def test_the_server_takes_its_environment(folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    documents = built(KUBERNETES / folder)
+    pod, container = server(documents)
+    settings = settings_of(container, monkeypatch)
+    advice = advise(
+        settings.host,
+        tls=settings.tls_certificate is not None,
+        client_certificates=settings.tls_client_ca is not None,
+        tokens=settings.tokens_file is not None,
+        insecure=settings.insecure,
+    )
+    # The base asks for tokens and leaves encryption to a mesh; with TLS there is nothing to say.
+    assert advice.verdict is (Verdict.WARNING if folder == "base" else Verdict.FINE)
+    assert settings.workers == int(container["resources"]["limits"]["cpu"])
+    assert pod["spec"]["enableServiceLinks"] is False
+    wanted = settings.drain_delay_s + settings.drain_grace_s
+    sleep = container.get("lifecycle", {}).get("preStop", {}).get("sleep", {}).get("seconds", 0)
+    assert pod["spec"]["terminationGracePeriodSeconds"] > sleep + wanted
+
+
+@needs_kubectl
+@pytest.mark.parametrize("folder", SERVERS)
+def test_ports_are_the_settings(folder: str) -> None:
+    documents = built(KUBERNETES / folder)
+    pod, container = server(documents)
+    ports = {port["name"]: port["containerPort"] for port in container["ports"]}
+    assert ports == {"grpc": default("port"), "metrics": default("metrics_port")}
+    for service in of_kind(documents, "Service"):
+        assert [(port["port"], port["targetPort"]) for port in service["spec"]["ports"]] == [(ports["grpc"], "grpc")]
+    rules = the(documents, "NetworkPolicy")["spec"]["ingress"]
+    assert [port["port"] for rule in rules for port in rule["ports"]] == ["grpc", "metrics"]
+    assert pod["metadata"]["annotations"]["prometheus.io/port"] == str(ports["metrics"])
+
+
+@needs_kubectl
+@pytest.mark.parametrize("folder", SERVERS)
+def test_who_is_selected_is_there(folder: str) -> None:
+    documents = built(KUBERNETES / folder)
+    labels = server(documents)[0]["metadata"]["labels"].items()
+    for kind in ("StatefulSet", "PodDisruptionBudget"):
+        assert the(documents, kind)["spec"]["selector"]["matchLabels"].items() <= labels
+    assert the(documents, "NetworkPolicy")["spec"]["podSelector"]["matchLabels"].items() <= labels
+    for service in of_kind(documents, "Service"):
+        assert service["spec"]["selector"].items() <= labels
+    headless = the(documents, "StatefulSet")["spec"]["serviceName"]
+    assert [s["metadata"]["name"] for s in of_kind(documents, "Service") if s["spec"].get("clusterIP") == "None"] == [
+        headless
+    ]
+    # The job that fills the weights needs the internet, so the servers' policy must not be for it.
+    (job,) = pods(built(KUBERNETES / "weights"))
+    assert not the(documents, "NetworkPolicy")["spec"]["podSelector"]["matchLabels"].items() <= (
+        job["metadata"]["labels"].items()
+    )
+
+
+@needs_kubectl
+def test_probes_ask_for_health_by_grpc_and_never_kill_for_it() -> None:
+    _, container = server(built(KUBERNETES / "base"))
+    for probe in ("startupProbe", "readinessProbe"):
+        assert container[probe]["grpc"]["port"] == default("port")
+        assert container[probe]["grpc"]["service"] in SERVICE_NAMES
+    for folder in SERVERS:
+        _, container = server(built(KUBERNETES / folder))
+        assert container["livenessProbe"]["httpGet"] == {"port": "metrics", "path": "/metrics"}
+        assert container["startupProbe"]["periodSeconds"] * container["startupProbe"]["failureThreshold"] >= 300
+
+
+@needs_kubectl
+@pytest.mark.parametrize("folder", SERVERS[1:])
+def test_behind_tls_probes_read_health_from_the_metrics(folder: str) -> None:
+    _, container = server(built(KUBERNETES / folder))
+    startup, readiness = container["startupProbe"], container["readinessProbe"]
+    assert "grpc" not in startup | readiness
+    assert startup["exec"] == readiness["exec"]
+    python, *arguments = readiness["exec"]["command"]
+    assert python == "python"
+    metrics = Metrics()
+    port = str(default("metrics_port"))
+
+    def outcome(of: int) -> int:
+        command = [sys.executable, *(argument.replace(port, str(of)) for argument in arguments)]
+        return subprocess.run(command, check=False, capture_output=True, timeout=60).returncode
+
+    exporter = MetricsServer(metrics.registry, "127.0.0.1", 0)
+    try:
+        assert outcome(exporter.port) != 0  # starting
+        metrics.set_serving(True)
+        assert outcome(exporter.port) == 0
+        metrics.set_serving(False)
+        assert outcome(exporter.port) != 0  # draining
+    finally:
+        exporter.close()
+    assert outcome(exporter.port) != 0  # nobody there
+
+
+@needs_kubectl
+@pytest.mark.parametrize("folder", BUILDS)
+def test_pods_have_no_rights_and_write_to_volumes_alone(folder: str) -> None:
+    documents = built(KUBERNETES / folder)
+    for pod in pods(documents):
+        spec = pod["spec"]
+        security = spec["securityContext"]
+        assert security["runAsNonRoot"] is True
+        assert security["runAsUser"] == security["runAsGroup"] == security["fsGroup"] == 10001
+        assert security["seccompProfile"] == {"type": "RuntimeDefault"}
+        assert spec["automountServiceAccountToken"] is False
+        (container,) = spec["containers"]
+        assert container["securityContext"] == {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        }
+        assert {"cpu", "memory"} <= set(container["resources"]["requests"])
+        assert "memory" in container["resources"]["limits"]
+        writable = {mount["mountPath"] for mount in container["volumeMounts"] if not mount.get("readOnly")}
+        assert writable == ({"/weights", "/cache", "/tmp"} if folder == "weights" else {"/data", "/cache", "/tmp"})
+
+
+@needs_kubectl
+@pytest.mark.parametrize("folder", BUILDS)
+def test_what_is_mounted_exists(folder: str) -> None:
+    documents = built(KUBERNETES / folder)
+    claims = {claim["metadata"]["name"] for claim in of_kind(built(KUBERNETES / "weights"), "PersistentVolumeClaim")}
+    templates = {
+        claim["metadata"]["name"]
+        for workload in of_kind(documents, "StatefulSet")
+        for claim in workload["spec"]["volumeClaimTemplates"]
+    }
+    for pod in pods(documents):
+        volumes = {volume["name"]: volume for volume in pod["spec"]["volumes"]}
+        (container,) = pod["spec"]["containers"]
+        assert {mount["name"] for mount in container["volumeMounts"]} == set(volumes) | templates
+        wanted = [v["persistentVolumeClaim"]["claimName"] for v in volumes.values() if "persistentVolumeClaim" in v]
+        assert set(wanted) <= claims
+        # What the settings name lies in what is mounted.
+        secrets = [
+            mount["mountPath"] for mount in container["volumeMounts"] if "secret" in volumes.get(mount["name"], {})
+        ]
+        files = [v["value"] for v in container.get("env", ()) if v.get("value", "").startswith("/")]
+        assert {str(Path(file).parent) for file in files} == set(secrets)
+
+
+@needs_kubectl
+def test_images_are_those_that_the_dockerfile_makes() -> None:
+    for folder, target in zip(BUILDS, ("cpu", "cpu", "cuda", "cuda"), strict=True):
+        for pod in pods(built(KUBERNETES / folder)):
+            assert [container["image"] for container in pod["spec"]["containers"]] == [f"mapless:{VERSION}-{target}"]
+
+
+@needs_kubectl
+def test_the_graphics_card_is_asked_for_once() -> None:
+    pod, container = server(built(KUBERNETES / "overlays/cuda"))
+    assert container["resources"]["limits"]["nvidia.com/gpu"] == "1"
+    assert {"key": "nvidia.com/gpu", "operator": "Exists", "effect": "NoSchedule"} in pod["spec"]["tolerations"]
+
+
+def test_the_job_fetches_weights_that_nobody_restricts() -> None:
+    (job,) = read(KUBERNETES / "weights" / "job.yaml")
+    (container,) = job["spec"]["template"]["spec"]["containers"]
+    command, action, *names = container["args"]
+    assert (command, action) == ("weights", "fetch")
+    catalogue = {weights.name: weights for weights in CATALOGUE}
+    assert names
+    assert not any(catalogue[name].licence.restriction for name in names)
+
+
+# Scaling
+
+
+@needs_kubectl
+@pytest.mark.parametrize("folder", SERVERS)
+def test_scaling_joins_any_of_them(folder: str, tmp_path: Path) -> None:
+    """One server at first; with the component, as many as there is work for, and nobody else says how many."""
+    assert the(built(KUBERNETES / folder), "StatefulSet")["spec"]["replicas"] == 1
+    up = Path(*[".."] * (len(tmp_path.resolve().parts) - 1))
+    kustomization = {
+        "apiVersion": "kustomize.config.k8s.io/v1beta1",
+        "kind": "Kustomization",
+        "resources": [str(up / (KUBERNETES / folder).relative_to("/"))],
+        "components": [str(up / (KUBERNETES / "components/autoscaling").relative_to("/"))],
+    }
+    (tmp_path / "kustomization.yaml").write_text(yaml.safe_dump(kustomization))
+    documents = built(tmp_path)
+    workload = the(documents, "StatefulSet")
+    scaler = the(documents, "HorizontalPodAutoscaler")["spec"]
+    assert "replicas" not in workload["spec"]
+    assert scaler["scaleTargetRef"] == {
+        "apiVersion": workload["apiVersion"],
+        "kind": workload["kind"],
+        "name": workload["metadata"]["name"],
+    }
+    # With fewer than two, what may be disrupted is all there is.
+    assert scaler["minReplicas"] > the(documents, "PodDisruptionBudget")["spec"]["maxUnavailable"]
+
+
+def test_scaling_is_by_a_metric_that_the_adapter_gives() -> None:
+    (scaler,) = read(KUBERNETES / "components/autoscaling/autoscaler.yaml")
+    (metric,) = scaler["spec"]["metrics"]
+    (rule,) = read(ROOT / "deploy/prometheus/adapter-rules.yaml")[0]["rules"]
+    assert metric["pods"]["metric"]["name"] == rule["name"]["as"]
+    (workload,) = read(KUBERNETES / "base/statefulset.yaml")
+    (container,) = workload["spec"]["template"]["spec"]["containers"]
+    # A second of waiting work for each worker, of the four seconds that are admitted at most.
+    per_worker_s = float(metric["pods"]["target"]["averageValue"]) / int(container["resources"]["limits"]["cpu"])
+    assert per_worker_s == 1.0 < default("max_queued_s")
+
+
+def default(setting: str) -> Any:
+    return Settings.model_fields[setting].default

@@ -1,0 +1,291 @@
+"""Dashboard and alerts ask for what the server tells: every selector finds a series, every label is one it has.
+
+The series are those of a `Metrics` to which everything happened once. An alert or a panel that asks for what is not
+there stays empty for ever, and nobody notices.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import promql_parser
+import pytest
+import yaml  # type: ignore[import-untyped]
+
+from mapless_server.observability.metrics import LOCALIZED, STAGES, Metrics
+from mapless_server.settings import Settings
+
+DEPLOY = Path(__file__).parents[2] / "deploy"
+DASHBOARD = json.loads((DEPLOY / "grafana/dashboards/mapless.json").read_text())
+RULES = [
+    rule
+    for group in yaml.safe_load((DEPLOY / "prometheus/alerts.yaml").read_text())["groups"]
+    for rule in group["rules"]
+]
+ALERTS = [rule for rule in RULES if "alert" in rule]
+RECORDED = {rule["record"]: rule["expr"] for rule in RULES if "record" in rule}
+PANELS = [panel for panel in DASHBOARD["panels"] if panel["type"] != "row"]
+TARGET_LABELS = {"job": "mapless", "instance": "a:9464", "namespace": "mapless", "pod": "mapless-0"}
+"""What Prometheus adds to every series."""
+
+Labels = dict[str, str]
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What the caches of a server that computes tell of themselves."""
+
+    hits: int = 1
+    misses: int = 1
+    evictions: int = 1
+    used_bytes: int = 1
+    device_hits: int = 1
+    host_hits: int = 1
+    device_bytes: int = 1
+    host_bytes: int = 1
+
+
+@dataclass
+class Series:
+    """What Prometheus has of a server to which everything happened once: labels by name."""
+
+    by_name: dict[str, list[Labels]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for family in everything_happened().registry.collect():
+            for sample in family.samples:
+                self.by_name.setdefault(sample.name, []).append({**sample.labels, **TARGET_LABELS})
+        self.by_name["up"] = [TARGET_LABELS]
+        for name in RECORDED:
+            self.by_name[name] = [{}]
+
+    def found_by(self, selector: promql_parser.VectorSelector) -> list[Labels]:
+        return [labels for labels in self.by_name.get(selector.name or "", ()) if self._fits(labels, selector)]
+
+    def _fits(self, labels: Mapping[str, str], selector: promql_parser.VectorSelector) -> bool:
+        return all(self._matches(labels.get(m.name, ""), m) for m in selector.matchers.matchers)
+
+    def _matches(self, value: str, matcher: promql_parser.Matcher) -> bool:
+        operator = promql_parser.MatchOp
+        if matcher.op in (operator.Equal, operator.NotEqual):
+            return (value == matcher.value) is (matcher.op == operator.Equal)
+        return (re.fullmatch(matcher.value, value) is not None) is (matcher.op == operator.Re)
+
+
+def everything_happened() -> Metrics:
+    """Metrics with a series of everything; those with labels of ours exist from the start."""
+    metrics = Metrics()
+    for stage in STAGES:
+        metrics.computed(stage, "392x518x11", 2, 0.1)
+    metrics.stages({"decode": 0.01, "aliked/features": 0.1})
+    metrics.answered(
+        LOCALIZED,
+        inlier_count=100,
+        match_count=200,
+        reprojection_error_px=0.5,
+        scale_deviation=0.01,
+        accuracy_radius_m=0.01,
+    )
+    metrics.stored("read", 0.01)
+    metrics.built("0.1.0", "geometric", "sift", "")
+    metrics.watch_reference_cache(Counts)
+    metrics.watch_token_cache(Counts)
+    metrics.watch_gpu_memory(lambda: {"allocated": 1.0, "reserved": 1.0, "peak": 1.0})
+    metrics.watch_certificate(lambda: 1.0)
+    return metrics
+
+
+SERIES = Series()
+
+
+def expressions() -> Iterator[tuple[str, str]]:
+    """All of PromQL there is, and where; Grafana's variables stand for anything."""
+    for rule in RULES:
+        yield rule.get("alert") or rule["record"], rule["expr"]
+    queries = [(panel["title"], target["expr"]) for panel in PANELS for target in panel["targets"]]
+    queries += [(it["name"], it["expr"]) for it in DASHBOARD["annotations"]["list"]]
+    for where, expression in queries:
+        plain = expression.replace("$__rate_interval", "1m").replace('=~"$job"', '=~".+"')
+        yield f"panel {where}", plain.replace('=~"$instance"', '=~".+"')
+
+
+EXPRESSIONS = list(expressions())
+
+
+def nodes(expression: str) -> list[promql_parser.Expr]:
+    found: list[promql_parser.Expr] = []
+    promql_parser.walk(promql_parser.parse(expression), lambda node: found.append(node))
+    return found
+
+
+def selectors(expression: str) -> list[promql_parser.VectorSelector]:
+    return [node for node in nodes(expression) if isinstance(node, promql_parser.VectorSelector)]
+
+
+def test_every_selector_finds_a_series() -> None:
+    for where, expression in EXPRESSIONS:
+        assert selectors(expression), where
+        for selector in selectors(expression):
+            assert SERIES.found_by(selector), f"{where}: nothing is {selector}"
+
+
+def test_every_value_that_is_asked_for_is_one_that_there_is() -> None:
+    """A misspelt alternative, INTERNAL|UNKOWN, hides behind the others. grpc itself answers with UNKNOWN, we do not."""
+    for where, selector in [(where, selector) for where, it in EXPRESSIONS for selector in selectors(it)]:
+        for matcher in selector.matchers.matchers:
+            there = {labels.get(matcher.name, "") for labels in SERIES.by_name[selector.name or ""]} | {"UNKNOWN"}
+            for alternative in matcher.value.split("|"):
+                found = any(re.fullmatch(alternative, value) for value in there)
+                assert found, f"{where}: {matcher.name} is never {alternative}"
+
+
+def test_every_label_that_is_grouped_by_is_one_that_there_is() -> None:
+    for where, expression in EXPRESSIONS:
+        there = {name for selector in selectors(expression) for labels in SERIES.found_by(selector) for name in labels}
+        for node in nodes(expression):
+            if isinstance(node, promql_parser.AggregateExpr) and node.modifier is not None:
+                assert set(node.modifier.labels) <= there, where
+            if isinstance(node, promql_parser.BinaryExpr) and node.modifier is not None and node.modifier.matching:
+                assert set(node.modifier.matching.labels) <= there, where
+
+
+def test_counters_are_not_read_as_they_are() -> None:
+    """Their value depends on when the server was started. What ends the process may be compared with 0."""
+    for where, expression in EXPRESSIONS:
+        in_windows = {
+            node.vector_selector.name for node in nodes(expression) if isinstance(node, promql_parser.MatrixSelector)
+        }
+        bare = {selector.name for selector in selectors(expression)} - in_windows
+        assert not {name for name in bare if (name or "").endswith(("_total", "_bucket", "_count", "_sum"))} - {
+            "mapless_fatal_total"
+        }, where
+
+
+# Alerts
+
+
+def test_every_alert_says_how_bad_and_is_in_the_runbook() -> None:
+    names = [rule["alert"] for rule in ALERTS]
+    assert len(set(names)) == len(names)
+    for rule in ALERTS:
+        assert rule["labels"]["severity"] in ("page", "ticket")
+        assert rule["annotations"]["summary"]
+    readme = (DEPLOY / "README.md").read_text()
+    in_runbook = re.findall(r"`(Mapless\w+)`", "".join(re.findall(r"^\| `Mapless.*", readme, re.MULTILINE)))
+    assert sorted(in_runbook) == sorted(names)
+
+
+def test_burn_rates_are_of_one_objective() -> None:
+    """The panel's line, the alerts' thresholds and what the comment says of them."""
+    text = (DEPLOY / "prometheus/alerts.yaml").read_text()
+    assert "99.5 %" in text
+    for rule in ALERTS:
+        if rule["alert"].startswith("MaplessErrors"):
+            assert {float(number) for number in re.findall(r"0\.\d+", rule["expr"])} == {0.005}
+            assert len([it for it in selectors(rule["expr"]) if "ratio_rate" in (it.name or "")]) == 2
+    (burn,) = [panel for panel in PANELS if panel["title"].startswith("Burn rate")]
+    assert all(target["expr"].endswith("/ 0.005") for target in burn["targets"])
+    windows = {name: re.findall(r"\[(\w+)\]", expr) for name, expr in RECORDED.items()}
+    assert all(set(found) == set(re.findall(r"(?:ratio_rate|increase)(\w+)$", name)) for name, found in windows.items())
+
+
+@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool, of Prometheus, is not here")
+def test_alerts_come_and_stay_away() -> None:
+    tests = DEPLOY / "prometheus" / "alerts_test.yaml"
+    subprocess.run(["promtool", "test", "rules", str(tests)], check=True, timeout=60)
+
+
+def test_every_alert_is_tried_out() -> None:
+    tests = yaml.safe_load((DEPLOY / "prometheus/alerts_test.yaml").read_text())["tests"]
+    raised = {case["alertname"] for test in tests for case in test["alert_rule_test"] if case["exp_alerts"]}
+    # Each is another one with other numbers.
+    assert {rule["alert"] for rule in ALERTS} - raised == {
+        "MaplessErrorsSlow",
+        "MaplessErrorsCreeping",
+        "MaplessCertificateEndsNow",
+    }
+
+
+# The dashboard
+
+
+def test_panels_can_be_told_apart_and_do_not_overlap() -> None:
+    panels = DASHBOARD["panels"]
+    assert len({panel["id"] for panel in panels}) == len(panels)
+    assert len({panel["title"] for panel in panels}) == len(panels)
+    boxes = [(it["x"], it["y"], it["x"] + it["w"], it["y"] + it["h"]) for it in (panel["gridPos"] for panel in panels)]
+    assert all(0 <= left < right <= 24 for left, _, right, _ in boxes)
+    for one, other in combinations(boxes, 2):
+        apart = one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
+        assert apart, (one, other)
+
+
+@pytest.mark.parametrize("panel", PANELS, ids=lambda panel: panel["title"])
+def test_a_panel_says_how_to_read_it_in_which_unit(panel: dict[str, Any]) -> None:
+    assert len(panel["description"]) > 20
+    assert panel["fieldConfig"]["defaults"]["unit"]
+    assert panel["datasource"] == {"type": "prometheus", "uid": "${datasource}"}
+    references = [target["refId"] for target in panel["targets"]]
+    assert references
+    assert len(set(references)) == len(references)
+
+
+def test_variables_are_defined_and_asked_of_series_that_there_are() -> None:
+    variables = {it["name"]: it for it in DASHBOARD["templating"]["list"]}
+    builtin = {"__rate_interval"}
+    used = set(re.findall(r"\$\{?(\w+)", json.dumps([DASHBOARD["panels"], DASHBOARD["annotations"]])))
+    assert used - builtin == set(variables)
+    for name in ("job", "instance"):
+        (metric,) = re.findall(r"label_values\((\w+)", variables[name]["query"])
+        assert metric in SERIES.by_name
+
+
+def test_grafana_is_given_what_the_dashboard_wants() -> None:
+    provisioning = DEPLOY / "grafana" / "provisioning"
+    (source,) = yaml.safe_load((provisioning / "datasources/prometheus.yaml").read_text())["datasources"]
+    (provider,) = yaml.safe_load((provisioning / "dashboards/mapless.yaml").read_text())["providers"]
+    compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
+    (variable,) = [it for it in DASHBOARD["templating"]["list"] if it["type"] == "datasource"]
+    assert variable["query"] == source["type"]
+    assert variable["current"]["value"] == source["uid"]
+    assert source["url"] == "http://prometheus:9090"
+    assert "127.0.0.1:9090:9090" in compose["prometheus"]["ports"]
+    assert f"./grafana/dashboards:{provider['options']['path']}:ro" in compose["grafana"]["volumes"]
+    home = Path(compose["grafana"]["environment"]["GF_DASHBOARDS_DEFAULT_HOME_DASHBOARD_PATH"])
+    assert (home.parent, (DEPLOY / "grafana/dashboards" / home.name).is_file()) == (
+        Path(provider["options"]["path"]),
+        True,
+    )
+
+
+# Prometheus
+
+
+def test_prometheus_asks_the_server_where_it_answers() -> None:
+    config = yaml.safe_load((DEPLOY / "prometheus/prometheus.yaml").read_text())
+    (job,) = config["scrape_configs"]
+    services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
+    port = Settings.model_fields["metrics_port"].default
+    (target,) = job["static_configs"][0]["targets"]
+    assert target in {f"{name}:{port}" for name in services}
+    assert all((DEPLOY / "prometheus" / name).is_file() for name in config["rule_files"])
+    source = yaml.safe_load((DEPLOY / "grafana/provisioning/datasources/prometheus.yaml").read_text())["datasources"][0]
+    assert source["jsonData"]["timeInterval"] == config["global"]["scrape_interval"]
+
+
+def test_the_adapter_asks_for_what_is_scaled_by() -> None:
+    (rule,) = yaml.safe_load((DEPLOY / "prometheus/adapter-rules.yaml").read_text())["rules"]
+    (found,) = selectors(rule["seriesQuery"])
+    assert SERIES.found_by(found)
+    assert set(rule["resources"]["overrides"]) <= set(TARGET_LABELS)
+    query = rule["metricsQuery"].replace("<<.GroupBy>>", "pod").replace("<<.Series>>", found.name or "")
+    (selector,) = selectors(query.replace("<<.LabelMatchers>>", 'namespace="mapless",pod=~"mapless-0"'))
+    assert {labels["stage"] for labels in SERIES.found_by(selector)} == set(STAGES)

@@ -1,0 +1,350 @@
+"""Callers without a good token, of another tenant, without a certificate or over their rate, at a real server."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from certificates import Pair, authority, signed
+from google.protobuf.message import Message
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+from servers import CAMERA, PHOTO, RunningServer, failure_of, localize_request, pose, serving
+
+from mapless import (
+    Client,
+    ConnectOptions,
+    LocalizationResult,
+    NewReference,
+    NotFound,
+    PermissionDenied,
+    Reference,
+    ResourceExhausted,
+    Unauthenticated,
+    Unavailable,
+    wire,
+)
+from mapless.v1 import localization_service_pb2 as localization_pb
+from mapless.v1 import reference_service_pb2 as reference_pb
+from mapless_server.principal import Role
+from mapless_server.security.access import METHOD_ROLES
+from mapless_server.security.tokens import create_token, revoke_token, sha256_of
+from mapless_server.serve import Security, StartupError
+from mapless_server.settings import Settings
+
+LIMIT_S = 30.0
+EXPIRED = "mapless_expired"
+CALLERS = {
+    "reader": ("acme", "read"),
+    "robot": ("acme", "localize"),
+    "writer": ("acme", "write"),
+    "stranger": ("other", "write"),
+    "local": ("default", "write"),
+}
+
+
+@dataclass
+class Guarded:
+    """A server that asks for tokens, and those it takes, by who holds them."""
+
+    server: RunningServer
+    tokens: dict[str, str]
+    tokens_file: Path
+
+    def client(self, caller: str | None) -> Client:
+        token = None if caller is None else self.tokens.get(caller, caller)
+        return Client(self.server.address, ConnectOptions(timeout_s=LIMIT_S, token=token))
+
+    def call(self, method: str, request: Message, token: str | None = None) -> Any:
+        """A bare call; its answer is not looked at."""
+        metadata = () if token is None else (("authorization", f"Bearer {token}"),)
+        with grpc.insecure_channel(self.server.address) as channel:
+            stub = channel.unary_unary(method, request_serializer=lambda message: message.SerializeToString())
+            return stub(request, timeout=LIMIT_S, metadata=metadata)
+
+    def failure(self, method: str, request: Message, token: str | None = None) -> Any:
+        return failure_of(lambda _, timeout: self.call(method, request, token), request)
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
+    folder = tmp_path_factory.mktemp("guarded")
+    tokens_file = folder / "tokens.json"
+    over = (datetime.now(timezone.utc) - timedelta(seconds=1)).isoformat()
+    old = {"name": "old", "tenant": "acme", "role": "write", "sha256": sha256_of(EXPIRED), "expires": over}
+    tokens_file.write_text(json.dumps({"tokens": [old]}))
+    tokens = {caller: create_token(tokens_file, caller, *held, None) for caller, held in CALLERS.items()}
+    with serving(folder / "data", tokens_file=tokens_file) as server:
+        guarded = Guarded(server, tokens, tokens_file)
+        for caller, x_m in (("writer", 1.0), ("stranger", 2.0), ("local", 3.0)):
+            with guarded.client(caller) as client:
+                client.create_scene("shared")
+                client.add_references("shared", [NewReference("r", PHOTO, CAMERA, pose(x_m))])
+        with guarded.client("writer") as client:
+            client.create_scene("secret")
+            client.add_references("secret", [NewReference("r", PHOTO, CAMERA, pose(0.0))])
+        yield guarded
+
+
+def requests_on(scene_id: str) -> dict[str, Message]:
+    """A good request of every method that names a scene, none of which would harm it; deletions come last."""
+    scene = f"scenes/{scene_id}"
+    reference = reference_pb.CreateReferenceRequest(scene=scene, reference_id="r", reference=_reference())
+    requests: dict[str, Message] = {
+        "LocalizationService/Localize": localize_request(scene_id),
+        "ReferenceService/GetScene": reference_pb.GetSceneRequest(name=scene),
+        "ReferenceService/ListReferences": reference_pb.ListReferencesRequest(scene=scene),
+        "ReferenceService/GetReference": reference_pb.GetReferenceRequest(name=f"{scene}/references/r"),
+        "ReferenceService/CreateReference": reference,
+        "ReferenceService/BatchCreateReferences": reference_pb.BatchCreateReferencesRequest(
+            scene=scene, requests=[reference]
+        ),
+        "ReferenceService/DeleteReference": reference_pb.DeleteReferenceRequest(name=f"{scene}/references/r"),
+        "ReferenceService/DeleteScene": reference_pb.DeleteSceneRequest(name=scene),
+    }
+    return {f"/mapless.v1.{method}": request for method, request in requests.items()}
+
+
+def _reference() -> reference_pb.Reference:
+    return reference_pb.Reference(
+        image=PHOTO,
+        intrinsics=wire.camera_to_message(CAMERA),
+        world_from_camera=wire.transform_to_message(pose(0.0)),
+    )
+
+
+ALL_REQUESTS = requests_on("shared") | {
+    "/mapless.v1.ReferenceService/CreateScene": reference_pb.CreateSceneRequest(scene_id="shared"),
+    "/mapless.v1.ReferenceService/ListScenes": reference_pb.ListScenesRequest(),
+}
+
+
+def test_every_method_is_tried() -> None:
+    assert set(ALL_REQUESTS) == set(METHOD_ROLES)
+
+
+@pytest.mark.parametrize("method", sorted(METHOD_ROLES))
+@pytest.mark.parametrize(
+    ("token", "reason"),
+    [(None, "TOKEN_MISSING"), ("mapless_wrong", "TOKEN_INVALID"), (EXPIRED, "TOKEN_EXPIRED")],
+    ids=["missing", "wrong", "expired"],
+)
+def test_without_a_good_token_no_method_answers(guarded: Guarded, method: str, token: str | None, reason: str) -> None:
+    failure = guarded.failure(method, ALL_REQUESTS[method], token)
+    assert isinstance(failure, Unauthenticated)
+    assert failure.reason == reason
+    assert failure.request_id
+
+
+@pytest.mark.parametrize(
+    ("caller", "method"),
+    [
+        (caller, method)
+        for caller in ("reader", "robot")
+        for method, role in METHOD_ROLES.items()
+        if role > Role[CALLERS[caller][1].upper()]
+    ],
+)
+def test_a_role_that_is_too_low_is_refused(guarded: Guarded, caller: str, method: str) -> None:
+    failure = guarded.failure(method, ALL_REQUESTS[method], guarded.tokens[caller])
+    assert isinstance(failure, PermissionDenied)
+    assert failure.reason == "ROLE_TOO_LOW"
+
+
+def test_health_and_the_interface_are_open(guarded: Guarded) -> None:
+    with guarded.client(None) as client:
+        assert client.is_serving()
+        with pytest.raises(Unauthenticated):
+            next(client.list_scenes())
+    with grpc.insecure_channel(guarded.server.address) as channel:
+        stub = reflection_pb2_grpc.ServerReflectionStub(channel)
+        question = reflection_pb2.ServerReflectionRequest(list_services="")
+        (answer,) = stub.ServerReflectionInfo(iter([question]), timeout=LIMIT_S)
+        assert "mapless.v1.ReferenceService" in {it.name for it in answer.list_services_response.service}
+
+
+def test_malformed_messages_and_unknown_methods_tell_strangers_nothing(guarded: Guarded) -> None:
+    with grpc.insecure_channel(guarded.server.address) as channel:
+        failure = failure_of(channel.unary_unary("/mapless.v1.ReferenceService/GetScene"), b"\xff\xff")
+        assert failure.code == "UNAUTHENTICATED"
+        assert failure_of(channel.unary_unary("/mapless.v1.ReferenceService/Other"), b"").code == "UNIMPLEMENTED"
+
+
+@pytest.mark.parametrize("method", sorted(requests_on("secret")))
+def test_a_scene_of_another_tenant_is_not_there_in_any_method(guarded: Guarded, method: str) -> None:
+    for stranger in ("stranger", "local"):
+        failures = []
+        for scene_id in ("secret", "absent"):
+            failure = guarded.failure(method, requests_on(scene_id)[method], guarded.tokens[stranger])
+            assert isinstance(failure, NotFound)
+            failures.append((str(failure).replace(scene_id, "..."), failure.reason, failure.field))
+        assert failures[0] == failures[1]
+        assert "acme" not in failures[0][0]
+    with guarded.client("writer") as client:
+        assert client.get_scene("secret").reference_count == 1
+
+
+def test_each_tenant_lists_and_localizes_in_its_own_scene_under_its_plain_name(guarded: Guarded) -> None:
+    theirs = (("writer", 1.0, ["secret", "shared"]), ("stranger", 2.0, ["shared"]), ("local", 3.0, ["shared"]))
+    for caller, x_m, scenes in theirs:
+        with guarded.client(caller) as client:
+            assert [scene.scene_id for scene in client.list_scenes(page_size=1)] == scenes
+            (reference,) = client.list_references("shared", page_size=1)
+            assert isinstance(reference, Reference)
+            assert (reference.scene_id, reference.reference_id) == ("shared", "r")
+            for named in ([], ["r"]):
+                answer = client.localize(PHOTO, CAMERA, "shared", named)
+                assert isinstance(answer, LocalizationResult)
+                assert answer.world_from_camera.translation[0] == pytest.approx(x_m)
+    with guarded.client("robot") as client:
+        assert isinstance(client.localize(PHOTO, CAMERA, "secret"), LocalizationResult)
+    answer = localization_pb.LocalizeResponse.FromString(
+        guarded.call("/mapless.v1.LocalizationService/Localize", localize_request("shared"), guarded.tokens["robot"])
+    )
+    assert [it.name for it in answer.diagnostics.references] == ["scenes/shared/references/r"]
+    assert "acme" not in str(answer)
+
+
+def test_a_token_that_is_made_or_revoked_while_the_server_runs(guarded: Guarded) -> None:
+    token = create_token(guarded.tokens_file, "passing", "acme", "read", None)
+
+    def is_known() -> bool:
+        try:
+            with guarded.client(token) as client:
+                return client.get_scene("secret").scene_id == "secret"
+        except Unauthenticated:
+            return False
+
+    wait_until(is_known)
+    revoke_token(guarded.tokens_file, "passing")
+    wait_until(lambda: not is_known())
+    with guarded.client("reader") as client:
+        assert client.get_scene("secret").scene_id == "secret"
+
+
+def test_the_log_names_who_called_and_never_shows_a_token(guarded: Guarded, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.DEBUG), guarded.client("reader") as client:
+        client.get_scene("secret")
+        with pytest.raises(Unauthenticated), guarded.client("mapless_wrong") as unknown:
+            unknown.get_scene("secret")
+    told = "\n".join(f"{record.getMessage()} {record.__dict__}" for record in caplog.records)
+    assert "reader" in told
+    assert guarded.tokens["reader"] not in told
+    assert "mapless_wrong" not in told
+
+
+def test_a_tenant_over_its_rate_is_told_when_to_come_back_and_the_others_are_not_delayed(tmp_path: Path) -> None:
+    tokens_file = tmp_path / "tokens.json"
+    tokens_file.write_text('{"tenants": {"acme": {"rate_ms": 0.001}}}')
+    tokens = {tenant: create_token(tokens_file, tenant, tenant, "write", None) for tenant in ("acme", "other")}
+    with serving(tmp_path / "data", tokens_file=tokens_file, tenant_burst_ms=1) as server:
+        for tenant, token in tokens.items():
+            with Client(server.address, ConnectOptions(timeout_s=LIMIT_S, token=token)) as client:
+                client.create_scene("s")
+                refusals = [it for it in (refusal_of_upload(client, f"r{i}") for i in range(3)) if it]
+            assert bool(refusals) == (tenant == "acme")
+            for refusal in refusals:
+                assert refusal.retry_after_s is not None
+                assert refusal.retry_after_s > 0
+
+
+def refusal_of_upload(client: Client, reference_id: str) -> ResourceExhausted | None:
+    try:
+        client.add_reference("s", NewReference(reference_id, PHOTO, CAMERA, pose(0.0)))
+    except ResourceExhausted as error:
+        return error
+    return None
+
+
+class TestEncryption:
+    def options(self, root: Pair, client: Pair | None = None, token: str | None = None) -> ConnectOptions:
+        return ConnectOptions(
+            timeout_s=LIMIT_S,
+            max_attempts=1,
+            tls=True,
+            root_certificates=root.certificate_pem,
+            client_certificate=client.certificate_pem if client else None,
+            client_key=client.key_pem if client else None,
+            token=token,
+        )
+
+    def test_the_server_follows_its_files_and_needs_both_certificate_and_token(self, tmp_path: Path) -> None:
+        root, new_root = authority(), authority("new")
+        paths: dict[str, Any] = {
+            name: tmp_path / name for name in ("tls_certificate", "tls_key", "tls_client_ca", "tokens_file")
+        }
+        signed(root, "server").write(paths["tls_certificate"], paths["tls_key"])
+        paths["tls_client_ca"].write_bytes(root.certificate_pem)
+        token = create_token(paths["tokens_file"], "robot", "acme", "write", None)
+        robot = signed(root, "robot-7")
+
+        def attempt(options: ConnectOptions) -> str:
+            with Client(address, options) as client:
+                return client.create_scene(f"s{time.monotonic_ns()}").scene_id[:1]
+
+        with serving(tmp_path / "data", **paths) as server:
+            address = server.address.replace("127.0.0.1", "localhost")
+            assert attempt(self.options(root, robot, token)) == "s"
+            with pytest.raises(Unauthenticated):
+                attempt(self.options(root, robot))
+            with pytest.raises(Unavailable):
+                attempt(self.options(root, None, token))
+            with pytest.raises(Unavailable):
+                attempt(self.options(new_root, robot, token))
+            signed(new_root, "server").write(paths["tls_certificate"], paths["tls_key"])
+
+            def sees_the_new_one() -> bool:
+                try:
+                    return attempt(self.options(new_root, robot, token)) == "s"
+                except Unavailable:
+                    return False
+
+            wait_until(sees_the_new_one)
+            with pytest.raises(Unavailable):
+                attempt(self.options(root, robot, token))
+
+    def test_without_tokens_callers_are_the_default_tenant_under_the_name_of_their_certificate(
+        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        root = authority()
+        paths: dict[str, Any] = {name: tmp_path / name for name in ("tls_certificate", "tls_key", "tls_client_ca")}
+        signed(root, "server").write(paths["tls_certificate"], paths["tls_key"])
+        paths["tls_client_ca"].write_bytes(root.certificate_pem)
+        with serving(tmp_path / "data", **paths) as server, caplog.at_level(logging.INFO):
+            with Client(server.address, self.options(root, signed(root, "robot-7"))) as client:
+                assert client.create_scene("s").scene_id == "s"
+            assert any("robot-7" in str(record.__dict__) for record in caplog.records)
+
+
+class TestStart:
+    @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1"])
+    def test_a_server_that_nothing_protects_does_not_listen_beyond_this_machine(self, host: str) -> None:
+        with pytest.raises(StartupError, match="neither TLS nor tokens"):
+            Security.of(Settings(host=host))
+
+    def test_unless_the_operator_wants_it_or_something_protects_it(self, tmp_path: Path) -> None:
+        assert Security.of(Settings(host="0.0.0.0", insecure=True)).tls is None
+        create_token(tmp_path / "tokens.json", "a", "t", "read", None)
+        assert len(Security.of(Settings(host="0.0.0.0", tokens_file=tmp_path / "tokens.json")).refreshable) == 1
+
+    @pytest.mark.parametrize("missing", ["tokens_file", "tls_certificate"])
+    def test_a_missing_file_is_one_sentence(self, tmp_path: Path, missing: str) -> None:
+        signed(authority(), "server").write(tmp_path / "cert", tmp_path / "key")
+        files: dict[str, Any] = {"tls_certificate": tmp_path / "cert", "tls_key": tmp_path / "key"}
+        files[missing] = tmp_path / "absent"
+        with pytest.raises(StartupError, match=r"absent: No such file or directory$"):
+            Security.of(Settings(**files))
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < end_s, "it did not come about"
+        time.sleep(0.05)

@@ -1,0 +1,107 @@
+"""Deficit round robin: shares are equal whatever is sent, tenants before their clients, and nobody starves."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapless_server.scheduling.fair import FairQueue, Flow
+
+QUANTUM_S = 1.0
+COSTS = st.floats(0.01, 3.0)
+
+
+def served(queue: FairQueue[str], count: int) -> list[str]:
+    return [queue.pop() for _ in range(count)]
+
+
+def test_one_caller_is_served_in_order() -> None:
+    queue: FairQueue[str] = FairQueue(QUANTUM_S)
+    for name in "abc":
+        queue.push(name, Flow("t", "c"), 0.7)
+    assert len(queue) == 3
+    assert queue.cost_s == pytest.approx(2.1)
+    assert served(queue, 3) == ["a", "b", "c"]
+    assert (len(queue), queue.cost_s) == (0, 0.0)
+    with pytest.raises(IndexError):
+        queue.pop()
+
+
+def test_a_hundred_requests_of_one_do_not_delay_the_one_of_another() -> None:
+    queue: FairQueue[str] = FairQueue(QUANTUM_S)
+    for i in range(100):
+        queue.push(f"many {i}", Flow("t", "many"), 1.0)
+    assert served(queue, 3) == ["many 0", "many 1", "many 2"]
+    queue.push("one", Flow("t", "one"), 1.0)
+    assert "one" in served(queue, 2)
+
+
+def test_tenants_share_equally_however_many_clients_they_have() -> None:
+    queue: FairQueue[str] = FairQueue(QUANTUM_S)
+    for i in range(100):
+        queue.push(f"a {i}", Flow("a", "only"), 1.0)
+        queue.push(f"b {i}", Flow("b", f"client {i % 4}"), 1.0)
+    counts = Counter(name.split()[0] for name in served(queue, 60))
+    assert abs(counts["a"] - counts["b"]) <= 8
+
+
+@given(
+    st.dictionaries(st.integers(0, 4), st.lists(COSTS, min_size=1, max_size=30), min_size=2, max_size=5),
+    st.integers(1, 60),
+)
+def test_what_two_waiting_callers_get_differs_by_a_quantum_and_two_jobs(
+    costs: dict[int, list[float]], count: int
+) -> None:
+    queue: FairQueue[tuple[int, int]] = FairQueue(QUANTUM_S)
+    for flow, of_flow in costs.items():
+        for i, cost_s in enumerate(of_flow):
+            queue.push((flow, i), Flow("t", str(flow)), cost_s)
+    got: Counter[int] = Counter()
+    for _ in range(min(count, len(queue))):
+        flow, i = queue.pop()
+        got[flow] += costs[flow][i]  # type: ignore[assignment]
+        if i + 1 == len(costs[flow]):
+            return  # from here on not all of them wait
+        most = max(max(it) for it in costs.values())
+        assert max(got[it] for it in costs) - min(got[it] for it in costs) <= QUANTUM_S + 2 * most + 1e-9
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 2), COSTS), max_size=40), st.data())
+def test_everything_comes_out_once_whatever_is_taken_along_or_removed(
+    pushed: list[tuple[int, int, float]], data: st.DataObject
+) -> None:
+    queue: FairQueue[int] = FairQueue(QUANTUM_S)
+    for job, (tenant, client, cost_s) in enumerate(pushed):
+        queue.push(job, Flow(str(tenant), str(client)), cost_s)
+    out: list[int] = []
+    while queue:
+        how = data.draw(st.sampled_from(["pop", "along", "remove"]))
+        if how == "remove":
+            out.append(data.draw(st.sampled_from(sorted(queue))))
+            queue.remove(out[-1])
+            continue
+        out.append(queue.pop())
+        if how == "along":
+            parity, at_most = out[-1] % 2, data.draw(st.integers(0, 3))
+            along = queue.pop_alike(lambda job: job % 2 == parity, at_most)  # noqa: B023
+            assert len(along) <= at_most
+            assert all(job % 2 == parity for job in along)
+            out += along
+        waiting_s = sum(cost_s for job, (_, _, cost_s) in enumerate(pushed) if job not in out)
+        assert queue.cost_s == pytest.approx(waiting_s, abs=1e-6)
+    assert sorted(out) == list(range(len(pushed)))
+
+
+def test_who_was_taken_along_pays_it_back() -> None:
+    queue: FairQueue[str] = FairQueue(QUANTUM_S)
+    for i in range(20):
+        queue.push(f"a {i}", Flow("t", "a"), 1.0)
+        queue.push(f"b {i}", Flow("t", "b"), 1.0)
+    first = queue.pop()
+    along = queue.pop_alike(lambda job: job.startswith("a"), 4)
+    assert first.startswith("a")
+    assert len(along) == 4
+    assert Counter(name[0] for name in served(queue, 6)) == {"b": 5, "a": 1}

@@ -1,0 +1,430 @@
+"""The schedule's laws, on a virtual clock with toy stages, under every order of events that can be thought of."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from mapless_server.scheduling.fair import Flow
+from mapless_server.scheduling.jobs import Batch, Done, Expired, Fallback, Job, Next, Refused, Stage, Step, Verdict
+from mapless_server.scheduling.observer import Ending, Refusal, Unobserved
+from mapless_server.scheduling.schedule import Schedule, ScheduleOptions
+
+STAGES = [
+    Stage("describe", "host"),
+    Stage("prepare", "host", "coarse"),
+    Stage("coarse", "device", "refine", max_batch=3),
+    Stage("refine", "host"),
+]
+LANES = {"host": 2, "device": 1}
+COST_S = {"describe": 0.5, "prepare": 0.1, "coarse": 0.3, "refine": 0.2}
+OPTIONS = ScheduleOptions(max_queued_s=2.0, max_bytes=1000, quantum_s=0.2)
+FAR_S = 1e6
+
+
+class Counting(Unobserved):
+    """Keeps what it hears."""
+
+    def __init__(self) -> None:
+        self.refusals: Counter[Refusal] = Counter()
+        self.endings: Counter[Ending] = Counter()
+        self.depth: dict[str, int] = {}
+        self.inflight: dict[str, int] = {}
+        self.admissions = 0
+
+    def admitted(self, cost_s: float) -> None:
+        self.admissions += 1
+
+    def refused(self, reason: Refusal) -> None:
+        self.refusals[reason] += 1
+
+    def queued(self, stage: str, jobs: int, cost_s: float) -> None:
+        self.depth[stage] = jobs
+
+    def running(self, stage: str, jobs: int) -> None:
+        self.inflight[stage] = jobs
+
+    def ended(self, stage: str, ending: Ending) -> None:
+        self.endings[ending] += 1
+
+
+class Toy:
+    """A schedule that knows what its stages cost, and the jobs that were put to it."""
+
+    def __init__(self, options: ScheduleOptions = OPTIONS, quota: Any = None) -> None:
+        self.observer = Counting()
+        self.schedule = Schedule(STAGES, LANES, options, self.observer, quota=quota)
+        for stage, cost_s in COST_S.items():
+            self.schedule.costs.observe(stage, "toy", cost_s)
+        self.ends: dict[int, list[tuple[Ending, Any]]] = {}
+        self.jobs: list[Job] = []
+        self.now_s = 0.0
+
+    def job(
+        self,
+        client: str = "c",
+        deadline_s: float = FAR_S,
+        size_bytes: int = 1,
+        stage: str = "prepare",
+        bucket: str = "b",
+    ) -> Job:
+        number = len(self.jobs)
+        ends = self.ends[number] = []
+        step = Step(stage, "toy", bucket, number)
+        job = Job(Flow("t", client), step, deadline_s, size_bytes, lambda ending, value: ends.append((ending, value)))
+        self.jobs.append(job)
+        return job
+
+    def admit(self, **what: Any) -> Job:
+        job = self.job(**what)
+        self.schedule.admit(job, self.now_s)
+        return job
+
+    def ending_of(self, job: Job) -> Ending | None:
+        ends = self.ends[self.jobs.index(job)]
+        assert len(ends) <= 1
+        return ends[0][0] if ends else None
+
+    def take(self, lane: str) -> Batch:
+        batch = self.schedule.take(lane, self.now_s)
+        assert batch is not None
+        return batch
+
+    def finish(self, batch: Batch, *verdicts: Verdict, seconds: float | None = None) -> None:
+        cost_s = COST_S[batch.stage.name] * len(batch.jobs)  # so that predictions stay what they are
+        self.now_s = max(self.now_s, batch.start_s + (cost_s if seconds is None else seconds))
+        self.schedule.finish(batch, verdicts, self.now_s)
+
+    def refusal(self, **what: Any) -> Refused:
+        with pytest.raises(Refused) as caught:
+            self.admit(**what)
+        return caught.value
+
+
+def onward(job: Job, fallback: Fallback | None = None) -> Verdict:
+    """To the stage that usually follows."""
+    stage = next(it for it in STAGES if it.name == job.step.stage)
+    if stage.then is None:
+        return Done("result")
+    return Next(Step(stage.then, "toy", job.step.bucket, job.step.payload), fallback)
+
+
+def run_through(toy: Toy, most_batches: int = 1000) -> list[tuple[str, int]]:
+    """Computes until nothing waits; stage and payload of what was computed, in order."""
+    done: list[tuple[str, int]] = []
+    for _ in range(most_batches):
+        batches = [batch for lane in LANES if (batch := toy.schedule.take(lane, toy.now_s)) is not None]
+        if not batches:
+            return done
+        for batch in batches:
+            done += [(batch.stage.name, job.step.payload) for job in batch.jobs]
+            toy.finish(batch, *map(onward, batch.jobs))
+    raise AssertionError("it never ends")
+
+
+class TestAdmission:
+    def test_a_queue_is_bounded_by_predicted_time_and_always_has_room_for_another_caller(self) -> None:
+        toy = Toy()
+        for _ in range(5):
+            toy.admit(client="greedy")
+        refused = toy.refusal(client="greedy")
+        assert refused.reason is Refusal.QUEUE_FULL
+        assert refused.retry_after_s is not None
+        assert refused.retry_after_s > 0
+        # The device is what there is least of: 0.3 s each, and three quarters of 2 s.
+        toy.admit(client="another")
+
+    def test_a_job_is_booked_for_no_more_than_it_was_admitted_for(self) -> None:
+        toy = Toy()
+        job = toy.admit()
+        toy.finish(toy.take("host"), onward(job))
+        for _ in range(100):
+            toy.schedule.costs.observe("refine", "toy", 9.0)
+        toy.finish(toy.take("device"), onward(job))
+        assert job.booked_s["host"] == pytest.approx(COST_S["refine"])
+
+    def test_memory_is_bounded(self) -> None:
+        toy = Toy()
+        toy.admit(size_bytes=700)
+        assert toy.refusal(size_bytes=100).reason is Refusal.TOO_MUCH_MEMORY
+        toy.admit(size_bytes=100, client="another")
+        too_large = toy.refusal(size_bytes=1001)
+        assert (too_large.reason, too_large.retry_after_s) == (Refusal.TOO_LARGE, None)
+
+    def test_what_cannot_be_done_in_time_is_refused_at_once(self) -> None:
+        toy = Toy()
+        for _ in range(3):
+            toy.admit()
+        late = toy.refusal(deadline_s=1.0)
+        assert late.reason is Refusal.DEADLINE_INFEASIBLE
+        assert late.retry_after_s is not None
+        hopeless = toy.refusal(deadline_s=0.5)  # 0.6 s of computing alone
+        assert (hopeless.reason, hopeless.retry_after_s) == (Refusal.DEADLINE_INFEASIBLE, None)
+        toy.admit(deadline_s=2.5)
+
+    def test_an_idle_server_tries_what_it_believes_impossible(self) -> None:
+        """Else a prediction that is wrong once would be wrong for ever."""
+        Toy().admit(deadline_s=0.01)
+
+    def test_a_light_caller_is_not_refused_for_what_a_heavy_one_has_waiting(self) -> None:
+        toy = Toy()
+        for _ in range(5):
+            toy.admit(client="heavy")
+        assert toy.refusal(client="heavy", deadline_s=1.7).reason is Refusal.QUEUE_FULL
+        toy.admit(client="light", deadline_s=1.7)
+
+    def test_nobody_is_admitted_any_more_when_it_drains(self) -> None:
+        toy = Toy()
+        before = toy.admit()
+        toy.schedule.drain()
+        assert toy.refusal().reason is Refusal.DRAINING
+        run_through(toy)
+        assert toy.ending_of(before) is Ending.OK
+
+    def test_a_tenant_pays_for_what_it_used(self) -> None:
+        class Quota:
+            def __init__(self) -> None:
+                self.charged: list[float] = []
+                self.settled: list[tuple[float, float]] = []
+
+            def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
+                self.charged.append(cost_s)
+                return 0.0 if len(self.charged) < 3 else 7.0
+
+            def settle(self, tenant: str, predicted_s: float, actual_s: float, now_s: float) -> None:
+                self.settled.append((predicted_s, actual_s))
+
+        quota = Quota()
+        toy = Toy(quota=quota)
+        toy.admit()
+        cancelled = toy.admit()
+        refused = toy.refusal()
+        assert (refused.reason, refused.retry_after_s) == (Refusal.TENANT_QUOTA, 7.0)
+        toy.schedule.cancel(cancelled, toy.now_s)
+        run_through(toy)
+        np.testing.assert_allclose(quota.settled, [(0.6, 0.0), (0.6, 0.6)])
+
+
+class TestOrder:
+    def test_what_is_begun_is_finished_first_but_the_others_are_not_forgotten(self) -> None:
+        toy = Toy(ScheduleOptions(max_queued_s=1000))
+        for _ in range(12):
+            toy.admit(stage="refine")
+            toy.admit(stage="prepare")
+        order = []
+        for _ in range(12):
+            batch = toy.take("host")
+            order.append(batch.stage.name)
+            toy.finish(batch, Done(None))
+        assert order == ["refine", "refine", "refine", "prepare"] * 3
+
+    def test_a_batch_is_of_one_bucket_and_as_large_as_what_waits(self) -> None:
+        toy = Toy(ScheduleOptions(max_queued_s=1000))
+        for i in range(8):
+            toy.admit(stage="coarse", bucket="ab"[i % 2], client=str(i))
+        sizes = []
+        while (batch := toy.schedule.take("device", toy.now_s)) is not None:
+            assert len({job.step.bucket for job in batch.jobs}) == 1
+            sizes.append(len(batch.jobs))
+            toy.finish(batch, *(Done(None) for _ in batch.jobs))
+        assert sizes == [3, 3, 1, 1]
+        assert toy.observer.inflight["coarse"] == toy.observer.depth["coarse"] == 0
+
+    def test_a_batch_that_did_not_fit_is_not_tried_again(self) -> None:
+        toy = Toy(ScheduleOptions(max_queued_s=1000))
+        toy.schedule.limit_batch("coarse", "b", 1)
+        for _ in range(3):
+            toy.admit(stage="coarse")
+        assert len(toy.take("device").jobs) == 1
+
+    def test_a_lane_computes_as_much_at_a_time_as_it_has_threads(self) -> None:
+        toy = Toy(ScheduleOptions(max_queued_s=1000))
+        for _ in range(3):
+            toy.admit()
+        first, _ = toy.take("host"), toy.take("host")
+        assert toy.schedule.take("host", toy.now_s) is None
+        toy.finish(first, Done(None))
+        toy.take("host")
+
+
+class TestTime:
+    def test_a_job_expires_at_its_deadline_where_it_waits(self) -> None:
+        toy = Toy()
+        job = toy.admit(deadline_s=5.0)
+        assert toy.schedule.next_due_s == 5.0
+        toy.schedule.expire(4.99)
+        assert toy.ending_of(job) is None
+        toy.schedule.expire(5.0)
+        assert job.is_over
+        assert isinstance(toy.ends[0][0][1], Expired)
+        assert toy.schedule.next_due_s is None
+        assert toy.schedule.take("host", 5.0) is None
+
+    def test_and_while_it_is_computed_and_what_comes_of_it_is_dropped(self) -> None:
+        toy = Toy()
+        job = toy.admit(deadline_s=5.0)
+        batch = toy.take("host")
+        job.check()
+        toy.schedule.expire(6.0)
+        assert toy.ending_of(job) is Ending.EXPIRED
+        assert job.is_over
+        toy.finish(batch, onward(job), seconds=7.0)
+        assert toy.schedule.take("device", toy.now_s) is None
+        assert not toy.schedule.jobs
+
+    def test_a_cancelled_job_frees_its_place(self) -> None:
+        toy = Toy()
+        jobs = [toy.admit() for _ in range(5)]
+        assert toy.refusal().reason is Refusal.QUEUE_FULL
+        toy.schedule.cancel(jobs[2], toy.now_s)
+        toy.schedule.cancel(jobs[2], toy.now_s)  # nothing more happens
+        toy.admit()
+        assert toy.ending_of(jobs[2]) is Ending.CANCELLED
+
+    def test_what_is_known_is_given_when_the_rest_comes_too_late(self) -> None:
+        toy = Toy()
+        job = toy.admit(stage="coarse", deadline_s=5.0)
+        fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), 4.5)
+        toy.finish(toy.take("device"), onward(job, fallback))
+        assert toy.schedule.next_due_s == 4.5
+        toy.take("host")
+        toy.schedule.expire(4.5)
+        assert toy.ends[0] == [(Ending.DEGRADED, "coarse")]
+
+    def test_and_at_once_if_that_is_foreseen(self) -> None:
+        toy = Toy()
+        job = toy.admit(stage="coarse", deadline_s=0.45)
+        fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), 0.4)
+        toy.finish(toy.take("device"), onward(job, fallback))  # it is 0.3, and refining takes 0.2
+        assert toy.ends[0] == [(Ending.DEGRADED, "coarse")]
+
+    def test_more_than_was_admitted_is_computed_only_where_there_is_room(self) -> None:
+        """As when stronger features are to be tried."""
+        for others, expected in ((0, None), (6, Ending.OK)):
+            toy = Toy()
+            job = toy.admit(stage="refine", client="mine")
+            for i in range(others):
+                toy.admit(client=f"other {i}")
+            again = Step("prepare", "toy", "b", "again")
+            toy.finish(toy.take("host"), Next(again, Fallback(lambda: Done("first"), 100.0)))
+            assert toy.ending_of(job) is expected
+
+
+class Events(RuleBasedStateMachine):
+    """Any order of arrivals, batches, failures, cancellations and passing time."""
+
+    @initialize()
+    def begin(self) -> None:
+        self.toy = Toy()
+        self.batches: list[Batch] = []
+        self.admitted: list[Job] = []
+        self.refused = 0
+
+    @rule(
+        client=st.sampled_from(["a", "b", "c"]),
+        lasts_s=st.floats(0.05, 6.0),
+        size_bytes=st.integers(1, 400),
+        stage=st.sampled_from(["describe", "prepare"]),
+        bucket=st.sampled_from(["x", "y"]),
+    )
+    def arrive(self, client: str, lasts_s: float, size_bytes: int, stage: str, bucket: str) -> None:
+        idle = not self.toy.schedule.jobs
+        job = self.toy.job(client, self.toy.now_s + lasts_s, size_bytes, stage, bucket)
+        try:
+            self.toy.schedule.admit(job, self.toy.now_s)
+        except Refused:
+            assert not idle
+            assert not job.is_over
+            self.refused += 1
+            return
+        self.admitted.append(job)
+        if not idle:
+            for lane, threads in LANES.items():
+                booked_s = sum(it.booked_s[lane] for it in self.toy.schedule.jobs)
+                assert booked_s <= OPTIONS.max_queued_s * threads + 0.9  # one that an idle server tried may be over
+            assert sum(it.size_bytes for it in self.toy.schedule.jobs) <= OPTIONS.max_bytes
+
+    @rule(lane=st.sampled_from(sorted(LANES)))
+    def compute(self, lane: str) -> None:
+        batch = self.toy.schedule.take(lane, self.toy.now_s)
+        if batch is None:
+            running = sum(it.stage.lane == lane for it in self.batches)
+            waiting = [job for job in self.toy.schedule.jobs if self._waits(job, lane)]
+            assert running == LANES[lane] or not waiting
+            return
+        assert len(batch.jobs) <= batch.stage.max_batch
+        for job in batch.jobs:
+            assert not job.is_over
+            assert self.toy.now_s < job.deadline_s
+        self.batches.append(batch)
+
+    @precondition(lambda self: self.batches)
+    @rule(data=st.data())
+    def complete(self, data: st.DataObject) -> None:
+        batch = self.batches.pop(data.draw(st.integers(0, len(self.batches) - 1)))
+        verdicts: list[Verdict] = []
+        for job in batch.jobs:
+            fate = data.draw(st.sampled_from(["onward", "onward", "done", "fails", "fallback"]))
+            due_s = self.toy.now_s + data.draw(st.floats(0.0, 3.0))
+            fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), due_s) if fate == "fallback" else None
+            planted: dict[str, Verdict] = {"done": Done(None), "fails": ValueError("planted")}
+            verdicts.append(planted.get(fate) or onward(job, fallback))
+        self.toy.schedule.finish(batch, verdicts, self.toy.now_s)
+
+    @precondition(lambda self: self.toy.schedule.jobs)
+    @rule(data=st.data())
+    def cancel(self, data: st.DataObject) -> None:
+        jobs = sorted(self.toy.schedule.jobs, key=self.toy.jobs.index)
+        self.toy.schedule.cancel(data.draw(st.sampled_from(jobs)), self.toy.now_s)
+
+    @rule(seconds=st.floats(0.0, 1.0), timer_is_late=st.booleans())
+    def wait(self, seconds: float, timer_is_late: bool) -> None:
+        self.toy.now_s += seconds
+        if not timer_is_late:
+            self.toy.schedule.expire(self.toy.now_s)
+            assert all(self.toy.now_s < job.due_s for job in self.toy.schedule.jobs)
+
+    def _waits(self, job: Job, lane: str) -> bool:
+        of_lane = {stage.name for stage in STAGES if stage.lane == lane}
+        return job.step.stage in of_lane and not any(job in batch.jobs for batch in self.batches)
+
+    @invariant()
+    def every_admitted_job_has_ended_once_or_is_alive(self) -> None:
+        alive = self.toy.schedule.jobs
+        for job in self.admitted:
+            ends = self.toy.ends[self.toy.jobs.index(job)]
+            assert len(ends) == (job not in alive)
+        assert self.toy.observer.admissions == len(self.admitted)
+        assert self.toy.observer.refusals.total() == self.refused
+        assert self.toy.observer.endings.total() == len(self.admitted) - len(alive)
+
+    @invariant()
+    def what_is_told_is_so(self) -> None:
+        waiting = Counter(
+            job.step.stage for job in self.toy.schedule.jobs if not any(job in it.jobs for it in self.batches)
+        )
+        running = Counter(job_stage for it in self.batches for job_stage in [it.stage.name] * len(it.jobs))
+        for stage in COST_S:
+            assert self.toy.observer.depth.get(stage, 0) == waiting[stage]
+            assert self.toy.observer.inflight.get(stage, 0) == running[stage]
+
+    def teardown(self) -> None:
+        """Nothing starves: let alone, everything comes to its end."""
+        if not hasattr(self, "toy"):
+            return
+        for batch in self.batches:
+            self.toy.schedule.finish(batch, [onward(job) for job in batch.jobs], self.toy.now_s)
+        run_through(self.toy)
+        assert not self.toy.schedule.jobs
+        assert all(job.is_over for job in self.admitted)
+        assert not any(job.booked_s for job in self.admitted)
+
+
+TestEvents = Events.TestCase
+TestEvents.settings = hypothesis_settings(max_examples=150, stateful_step_count=60, deadline=None)
