@@ -6,6 +6,7 @@ Nothing here imports torch unless the settings ask for a network.
 from __future__ import annotations
 
 import logging
+import sys
 
 from .extras import install_hint
 from .method.coarse.make import make_reconstructor
@@ -99,6 +100,18 @@ def choose_device(device: str) -> str:
         # number of keypoints; to be set once, before there are threads.
         torch.backends.cuda.enable_cudnn_sdp(False)
     return chosen
+
+
+def gpu_memory() -> dict[str, float]:
+    """Bytes of the device that networks use, by kind; empty without one. Imports nothing."""
+    torch = sys.modules.get("torch")
+    if torch is None or not torch.cuda.is_initialized():
+        return {}
+    return {
+        "allocated": torch.cuda.memory_allocated(),
+        "reserved": torch.cuda.memory_reserved(),
+        "peak": torch.cuda.max_memory_allocated(),
+    }
 
 
 def _find_device(device: str) -> str:

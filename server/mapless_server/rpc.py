@@ -26,6 +26,7 @@ from .observability.trail import Trail
 from .principal import Principal
 from .query import Caller
 from .scheduling.fair import Flow
+from .security.access import OPEN_METHODS
 
 log = logging.getLogger(__name__)
 
@@ -103,7 +104,7 @@ class Call:
 
 
 class CallInterceptor(grpc.aio.ServerInterceptor):
-    """Wraps the methods of mapless (health and reflection pass); servicers get a `Call` in place of the context."""
+    """Wraps all methods but the open ones (health, reflection); servicers get a `Call` in place of the context."""
 
     def __init__(
         self,
@@ -134,7 +135,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         """Implements grpc.aio.ServerInterceptor."""
         handler = await continuation(handler_call_details)
         method = handler_call_details.method
-        if handler is None or not method.startswith("/mapless."):
+        if handler is None or method in OPEN_METHODS:
             return handler
 
         async def answer(data: bytes, context: Context) -> bytes:
@@ -169,8 +170,24 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             finally:
                 self._end(method, code, call, span)
 
+        async def refuse(_: object, context: Context) -> bytes:
+            return await answer(b"", context)
+
+        if not self._is_welcome(method, handler_call_details.invocation_metadata):
+            # A stream's messages are read when asked for, and nobody asks: strangers shall not fill the memory.
+            return grpc.stream_unary_rpc_method_handler(refuse, None, None)
         # Without a deserializer the bytes arrive as they are, so that a malformed message is answered here too.
         return grpc.unary_unary_rpc_method_handler(answer, None, None)
+
+    def _is_welcome(self, method: str, metadata: Metadata) -> bool:
+        """Whether the caller may call the method, as far as its metadata tell."""
+        if self._authenticate is None:
+            return True
+        try:
+            self._authenticate(metadata or (), method, {})
+        except Exception:  # it is raised again when the call is answered
+            return False
+        return True
 
     def _begin(self, context: Context) -> Call:
         now_s = time.monotonic()

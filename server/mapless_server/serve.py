@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from . import __version__
-from .assembly import make_tiers, what_is_missing
+from .assembly import gpu_memory, make_tiers, what_is_missing
 from .decode import ImageLimits
 from .engine import Engine, EngineOptions
 from .grpc_server import AddressTaken, GrpcServer
@@ -29,7 +29,7 @@ from .security.access import Authenticator
 from .security.binding import Verdict, advise
 from .security.errors import SecurityError
 from .security.rate import RateLimiter
-from .security.reloading import LOOK_INTERVAL_S, Refreshable, Reloading
+from .security.reloading import Refreshable, Reloading, keep_fresh
 from .security.tls import Tls, TlsFiles
 from .security.tokens import Tokens, read_tokens
 from .settings import Settings
@@ -202,9 +202,10 @@ async def running_server(
         engine = await asyncio.to_thread(make, settings, store, metrics, security.quota)
         stack.push_async_callback(engine.close)
         failed: asyncio.Future[Fatal] = asyncio.get_running_loop().create_future()
+        _watch_engine(engine, metrics)
         engine.queue.on_fatal = lambda fatal: _announce_failure(fatal, failed, metrics)
         _keep(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
-        _keep(stack, _refresh(security.refreshable))
+        _keep(stack, keep_fresh(security.refreshable))
         await _warm_up(settings, engine, metrics)
         await server.open(engine)
         stack.push_async_callback(server.drain, settings.drain_delay_s, settings.drain_grace_s)
@@ -274,6 +275,16 @@ def _serve_metrics(
     return address
 
 
+def _watch_engine(engine: Engine, metrics: Metrics) -> None:
+    first = engine.tiers[0]
+    reconstructor = first.pipeline.reconstructor
+    metrics.built(__version__, reconstructor.name, first.extractor.name, reconstructor.weights_sha256)
+    metrics.watch_gpu_memory(gpu_memory)
+    cache = getattr(reconstructor, "cache", None)  # of tokens; only networks have one
+    if cache is not None:
+        metrics.watch_token_cache(lambda: cache.counters)
+
+
 def _make_server(settings: Settings, store: Store, metrics: Metrics, security: Security, tracer: Tracer) -> GrpcServer:
     try:
         return GrpcServer(
@@ -289,9 +300,6 @@ def _make_server(settings: Settings, store: Store, metrics: Metrics, security: S
 
 
 async def _warm_up(settings: Settings, engine: Engine, metrics: Metrics) -> None:
-    first = engine.tiers[0]
-    reconstructor = first.pipeline.reconstructor
-    metrics.built(__version__, reconstructor.name, first.extractor.name, reconstructor.weights_sha256)
     engine.queue.start()
     if not settings.warm_up:
         return
@@ -310,14 +318,6 @@ def _announce_failure(fatal: Fatal, failed: asyncio.Future[Fatal], metrics: Metr
         metrics.failed_fatally()
         log.critical("the server cannot go on and ends: %s", fatal)
         failed.set_result(fatal)
-
-
-async def _refresh(refreshable: list[Refreshable]) -> None:
-    """Follows the files until it is cancelled."""
-    while True:
-        await asyncio.sleep(LOOK_INTERVAL_S)
-        for it in refreshable:
-            await asyncio.to_thread(it.refresh)
 
 
 def _keep(stack: AsyncExitStack, work: Coroutine[Any, Any, None]) -> None:

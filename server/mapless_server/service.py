@@ -48,7 +48,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         result, visits = await engine.localize(query, call.caller)
         for visit in visits:
             call.waited(visit.stage, visit.queued_s, visit.start_s)
-            call.computed(visit.stage, visit.start_s, visit.end_s, jobs=visit.jobs)
+            call.computed(visit.stage, visit.start_s, visit.end_s, batch=visit.batch, batch_size=visit.jobs)
         self._count(result, call)
         response = pb.LocalizeResponse()
         outcome = result.attempt.answer.outcome

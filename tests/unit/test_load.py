@@ -4,6 +4,8 @@ import asyncio
 import json
 import math
 import os
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
@@ -32,7 +34,7 @@ from mapless_server.load.requests import photo_request, read_answer
 from mapless_server.load.scrape import Scrape, parse_metrics, reconcile
 from mapless_server.load.sender import Target, connected, send_closed_loop, send_open_loop
 from mapless_server.load.step import ServerUnderLoad, Step, run_step
-from mapless_server.load.watch import ProcessSample, read_process, trend
+from mapless_server.load.watch import ProcessSample, going_first, read_process, trend
 
 METHOD = "/toy.Toy/Call"
 GOOD, BAD = b"good", b"bad"
@@ -336,6 +338,18 @@ def test_a_process_is_read_and_its_threads_and_files_are_counted() -> None:
     assert after.threads >= 1
     assert after.resident_mib > 1
     assert after.cpu_s >= before.cpu_s
+
+
+def test_the_generator_goes_before_the_server_while_it_measures_and_not_after() -> None:
+    def niceness(process_id: int) -> int:
+        return os.getpriority(os.PRIO_PROCESS, process_id)
+
+    before = niceness(0)
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as server:
+        with going_first(server.pid):
+            assert niceness(server.pid) - niceness(0) == 5
+        assert niceness(0) == before
+        server.communicate(b"\n")
 
 
 def test_a_trend_finds_the_planted_slope_and_doubts_one_that_is_only_noise() -> None:

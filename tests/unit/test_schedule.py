@@ -263,8 +263,8 @@ class TestTime:
         toy.schedule.expire(5.0)
         assert job.is_over
         assert isinstance(toy.ends[0][0][1], Expired)
-        assert toy.schedule.next_due_s is None
         assert toy.schedule.take("host", 5.0) is None
+        assert not toy.schedule.jobs
 
     def test_and_while_it_is_computed_and_what_comes_of_it_is_dropped(self) -> None:
         toy = Toy()

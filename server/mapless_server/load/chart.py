@@ -72,7 +72,7 @@ LATENCY = (
 RATES = (
     Curve("answered in time", GREEN, lambda step: step.account.goodput_per_s),
     Curve("refused", BLUE, lambda step: step.account.refused_per_s),
-    Curve("neither, in vain", RED, lambda step: step.account.overdue_per_s),
+    Curve("overdue, in vain", RED, lambda step: step.account.overdue_per_s),
 )
 
 
@@ -96,7 +96,7 @@ def draw_load(result: PipelineResult) -> bytes:
         _write(canvas, title, (_LEFT_PX, panel.top_px - 12), 0.6, INK)
     _level(canvas, upper, 1000 * result.options.deadline_s, "deadline")
     if unloaded_ms is not None:
-        _level(canvas, upper, unloaded_ms, "one call at a time, p50")
+        _level(canvas, upper, unloaded_ms, "one call at a time, p50", at_right=True)
     _level(canvas, lower, result.saturation_per_s, "saturation: the most it can answer")
     _dashed(canvas, lower.place(0, 0), lower.place(lower.y_range[1], lower.y_range[1]), FAINT)
     for panel, curves in ((upper, LATENCY), (lower, RATES)):
@@ -160,10 +160,11 @@ def _x_axis(canvas: Canvas, panel: Panel, result: PipelineResult) -> None:
     _write(canvas, "of saturation", (_RIGHT_PX + 24, panel.bottom_px + 58), 0.55, FAINT)
 
 
-def _level(canvas: Canvas, panel: Panel, value: float, label: str) -> None:
+def _level(canvas: Canvas, panel: Panel, value: float, label: str, at_right: bool = False) -> None:
     start, end = panel.place(0, value), panel.place(panel.x_max, value)
     _dashed(canvas, start, end, FAINT)
-    _write(canvas, label, (start[0] + 10, start[1] - 8), 0.5, FAINT)
+    place = (end[0] - 200, end[1] + 20) if at_right else (start[0] + 10, start[1] - 8)
+    _write(canvas, label, place, 0.5, FAINT)
 
 
 def _dashed(canvas: Canvas, start: tuple[int, int], end: tuple[int, int], colour: Colour) -> None:

@@ -23,8 +23,8 @@ class SoakOptions:
 
     Attributes:
         minutes: how long.
-        share: of saturation that is offered.
-        cancelled_share, bad_share: of the calls; these ask less of the server than a query, and count as calls.
+        share: of saturation that is offered in good queries, those that are cancelled among them.
+        cancelled_share, bad_share: of all calls; bad images come on top of the good ones.
         clients: that call independently.
         deadline_s: of every call.
         ramp_s: with each number of calls side by side, to find saturation.
@@ -47,8 +47,8 @@ class SoakOptions:
     def __post_init__(self) -> None:
         if not min(self.minutes, self.share, self.deadline_s, self.ramp_s, self.sample_every_s) > 0 or self.clients < 1:
             raise ValueError("times, share and clients must be above 0")
-        if not 0 <= self.settle_share < 1:
-            raise ValueError("settle_share must be at least 0 and below 1")
+        if not (0 <= self.settle_share < 1 and 0 <= self.bad_share < 1):
+            raise ValueError("settle_share and bad_share must be at least 0 and below 1")
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ async def _measure(place: Place, server: LoadedServer, options: SoakOptions, pro
             "soak",
             server,
             target,
-            options.share * saturation_per_s,
+            options.share * saturation_per_s / (1 - options.bad_share),
             seconds,
             settle_s=options.settle_share * seconds,
             seed=options.seed,

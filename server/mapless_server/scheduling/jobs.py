@@ -101,13 +101,15 @@ class Visit:
         queued_s: when it began to wait.
         start_s: when it began to be computed.
         end_s: when that ended.
-        jobs: computed together.
+        batch: number of the batch.
+        jobs: in it.
     """
 
     stage: str
     queued_s: float
     start_s: float
     end_s: float
+    batch: int
     jobs: int
 
 
@@ -172,11 +174,13 @@ class Batch:
         stage: which.
         jobs: one at least.
         start_s: when it began, by the queue's clock.
+        number: of the batch since the start.
     """
 
     stage: Stage
     jobs: tuple[Job, ...]
     start_s: float
+    number: int
 
 
 Verdict = Next | Done | Exception

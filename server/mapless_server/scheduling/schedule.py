@@ -122,6 +122,7 @@ class Schedule:
         self._ledger = Ledger()
         self._due: list[tuple[float, int, Job]] = []
         self._tick = itertools.count()
+        self._batch_number = itertools.count(1)
         self._draining = False
 
     @property
@@ -169,7 +170,7 @@ class Schedule:
             self._observer.waited(stage.name, now_s - job.waits_since_s)
         self._running[stage.name] += len(jobs)
         self._tell(stage)
-        return Batch(stage, jobs, now_s)
+        return Batch(stage, jobs, now_s, next(self._batch_number))
 
     def finish(self, batch: Batch, verdicts: Sequence[Verdict], now_s: float) -> None:
         """A batch was computed: each of its jobs ends or goes on, unless it has ended meanwhile."""
@@ -182,7 +183,7 @@ class Schedule:
             if not isinstance(verdict, Exception):  # what fails, fails early
                 self.costs.observe(stage.name, job.step.kind, share_s)
             job.used_s += share_s
-            job.visits.append(Visit(stage.name, job.waits_since_s, batch.start_s, now_s, len(batch.jobs)))
+            job.visits.append(Visit(stage.name, job.waits_since_s, batch.start_s, now_s, batch.number, len(batch.jobs)))
             if job.is_over:
                 continue
             if isinstance(verdict, Next):

@@ -67,6 +67,7 @@ class TokenCacheCounters:
     misses: int = 0
     device_bytes: int = 0
     host_bytes: int = 0
+    evictions: int = 0
 
 
 class TokenCache:
@@ -119,11 +120,14 @@ class TokenCache:
             self._spill(old_key, old_tokens)
 
     def _spill(self, key: TokenKey, tokens: Tensor) -> None:
-        # What came from the host has stayed there.
-        if self._on_host.takes(tokens) and self._on_host.get(key) is None:
+        forgotten = 1
+        if self._on_host.get(key) is not None:
+            forgotten = 0  # what came from the host has stayed there
+        elif self._on_host.takes(tokens):
             spilled = torch.empty(tokens.shape, dtype=tokens.dtype, pin_memory=self._pins)
             # It is only ever read by a copy to the device, which queues up behind this one.
-            self._on_host.put(key, spilled.copy_(tokens, non_blocking=self._pins))
+            forgotten = len(self._on_host.put(key, spilled.copy_(tokens, non_blocking=self._pins)))
+        self._counters = replace(self._counters, evictions=self._counters.evictions + forgotten)
 
 
 class _Level:
