@@ -126,7 +126,7 @@ def test_what_leaves_the_device_stays_at_hand() -> None:
     for i in range(4):
         cache.put(key(i), tokens(i))
     cache.release_device()
-    assert cache.counters == TokenCacheCounters(0, 0, 0, 0, 2 * SIZE)
+    assert cache.counters == TokenCacheCounters(host_bytes=2 * SIZE, evictions=2)
     assert held(cache, 4) == [2, 3]
     assert cache.counters.host_hits == 2
 

@@ -85,15 +85,17 @@ def _overhead(quick: bool, output: Path) -> list[Check]:
 
 
 def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
+    from ..evaluation.command import usage_errors
     from .chart import draw_load
     from .pipeline import PipelineOptions, measure_pipeline, pipeline_checks, pipeline_json
     from .report import step_lines
     from .requests import place_of
 
     brief = {"unloaded_s": 4.0, "ramp_s": 4.0, "step_s": 6.0, "settle_s": 1.0} if quick else {}
-    options = PipelineOptions(**(given | brief))
     with _measuring() as progress:
-        result = measure_pipeline(place_of(data), options, progress)
+        with usage_errors():
+            options, place = PipelineOptions(**(given | brief)), place_of(data)
+        result = measure_pipeline(place, options, progress)
     checks = pipeline_checks(result)
     output.mkdir(parents=True, exist_ok=True)
     (output / "load.png").write_bytes(draw_load(result))
@@ -102,14 +104,16 @@ def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> lis
 
 
 def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
+    from ..evaluation.command import usage_errors
     from .report import step_lines
     from .requests import place_of
     from .soak import SoakOptions, measure_soak, soak_checks, soak_json
 
     brief = {"minutes": 0.25, "ramp_s": 4.0, "sample_every_s": 0.5} if quick else {}
-    options = SoakOptions(**(given | brief))
     with _measuring() as progress:
-        result = measure_soak(place_of(data), options, progress)
+        with usage_errors():
+            options, place = SoakOptions(**(given | brief)), place_of(data)
+        result = measure_soak(place, options, progress)
     checks = soak_checks(result)
     lines = [f"{result.scene}:", "", *step_lines([result.unloaded, *result.ramp, result.soak])]
     _report(output, "soak", lines, checks, soak_json(result))
@@ -132,14 +136,15 @@ def _measuring() -> Iterator[Progress]:
 
     from ..child import ServerFailed
     from ..evaluation.command import progress_bars
+    from ..evaluation.plan import UsageError
     from ..signals import terminable
 
     try:
         with terminable(), progress_bars() as progress:
             yield progress
-    except (ValueError, ServerFailed, MaplessError) as error:
+    except (UsageError, ServerFailed, MaplessError) as error:
         print(f"mapless-server: {error}", file=sys.stderr)
-        raise typer.Exit(2 if isinstance(error, ValueError) else 1) from None
+        raise typer.Exit(2 if isinstance(error, UsageError) else 1) from None
 
 
 def _finish(checks: list[Check]) -> None:

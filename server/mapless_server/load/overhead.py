@@ -16,8 +16,8 @@ from ..child import ChildServer, child_module
 from ..demo.run import Photograph
 from ..evaluation.plan import Progress
 from . import no_op
+from .driving import CLOSED_SETTLE_SHARE
 from .echo import ECHO_METHOD, SHORT_METHOD
-from .pipeline import CLOSED_SETTLE_SHARE
 from .records import Fate
 from .report import Check
 from .requests import METHOD, photo_request, read_answer, store_references

@@ -3,29 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
-import socket
-import tempfile
-from collections.abc import AsyncIterator, Iterator, Sequence
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from mapless import Client
-
-from ..child import child_server
 from ..demo.run import Place
 from ..evaluation.plan import Progress
-from ..evaluation.run import CONNECT
 from ..settings import available_cores
-from .arrivals import Mix, Requests, plan_calls
-from .records import CallRecord, Fate
+from .driving import LoadedServer, calling, closed_step, find_saturation, open_step, server_with_scene
+from .records import Fate
 from .report import Check, loop_lag_check, trend_check
-from .requests import METHOD, read_answer, requests_for, store_references
-from .sender import Target, connected, send_closed_loop, send_open_loop
-from .step import ServerUnderLoad, Step, run_step
-from .watch import going_first
+from .step import Step
 
 MIN_SHARE_OF_IDEAL = 0.9
 MAX_P99_OVER_UNLOADED_P50 = 3.0
@@ -35,8 +23,6 @@ COMFORTABLE, EXCESSIVE = 0.7, 3.0
 """Shares of saturation that have bars of their own."""
 COMFORTABLE_STEPS = 3
 """The step whose p99 has a bar takes so many times as long as the others."""
-CLOSED_SETTLE_SHARE = 0.2
-_RAMP_GAIN = 1.03
 
 
 @dataclass(frozen=True)
@@ -100,51 +86,6 @@ class PipelineResult:
         return dict(zip(self.options.shares, self.steps, strict=True)).get(share)
 
 
-@dataclass(frozen=True)
-class LoadedServer:
-    """A server with a scene and what to ask of it.
-
-    Attributes:
-        address: of its services.
-        under_load: its process and metrics.
-        requests: that are ready to be sent.
-    """
-
-    address: str
-    under_load: ServerUnderLoad
-    requests: Requests
-
-
-@contextmanager
-def server_with_scene(place: Place, progress: Progress) -> Iterator[LoadedServer]:
-    """A server of its own with the references of a place stored, that has answered every query once.
-
-    Settings of the environment hold for it.
-
-    Raises:
-        ServerFailed: it did not start.
-        MaplessError: a call failed.
-    """
-    port = free_port()
-    with tempfile.TemporaryDirectory(prefix="mapless-load-") as data_dir:
-        flags = {"--metrics-port": str(port), "--metrics-host": "127.0.0.1"}
-        with child_server(Path(data_dir), flags) as server:
-            with Client(server.address, CONNECT) as client:
-                progress("storing references", 0, len(place.references))
-                store_references(client, place.references)
-                progress("first answers", 0, len(place.queries))
-                requests = requests_for(client, place.queries)
-            with going_first(server.process_id):
-                yield LoadedServer(server.address, ServerUnderLoad(server.process_id, f"127.0.0.1:{port}"), requests)
-
-
-def free_port() -> int:
-    """A port of the loopback interface that nobody has at the moment."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
-
-
 def measure_pipeline(place: Place, options: PipelineOptions, progress: Progress) -> PipelineResult:
     """Starts a server, finds what it can do at most, and offers it shares of that.
 
@@ -155,74 +96,6 @@ def measure_pipeline(place: Place, options: PipelineOptions, progress: Progress)
     """
     with server_with_scene(place, progress) as server:
         return asyncio.run(_measure(place, server, options, progress))
-
-
-@asynccontextmanager
-async def calling(server: LoadedServer, clients: int, deadline_s: float) -> AsyncIterator[Target]:
-    """Connections to Localize."""
-    async with connected(server.address, METHOD, clients, deadline_s, read_answer) as target:
-        yield target
-
-
-async def find_saturation(
-    server: LoadedServer, target: Target, seconds: float, progress: Progress
-) -> tuple[list[Step], float]:
-    """Ever more calls side by side, until more of them bring no more answers; and the most answers a second."""
-    steps: list[Step] = []
-    best_per_s = 0.0
-    for power in itertools.count(1):
-        concurrency = 2**power
-        progress(f"saturation, {concurrency} calls side by side", 0, 1)
-        step = await closed_step(f"{concurrency} at a time", server, target, concurrency, seconds)
-        steps.append(step)
-        per_s = step.account.completed_per_s
-        if per_s < _RAMP_GAIN * best_per_s or step.account.count(Fate.REFUSED) or step.answers == 0:
-            best_per_s = max(best_per_s, per_s)
-            break
-        best_per_s = per_s
-    if best_per_s == 0:
-        raise RuntimeError(f"the server answered nothing: {dict(steps[-1].account.outcomes)}")
-    return steps, best_per_s
-
-
-async def closed_step(name: str, server: LoadedServer, target: Target, concurrency: int, seconds: float) -> Step:
-    """A step of so many calls side by side."""
-    return await run_step(
-        name,
-        server.under_load,
-        lambda: send_closed_loop(target, server.requests.good, concurrency, seconds),
-        seconds,
-        settle_s=CLOSED_SETTLE_SHARE * seconds,
-    )
-
-
-async def open_step(
-    name: str,
-    server: LoadedServer,
-    target: Target,
-    rate_per_s: float,
-    seconds: float,
-    *,
-    settle_s: float,
-    seed: int,
-    mix: Mix | None = None,
-    sample_every_s: float = 1.0,
-) -> Step:
-    """A step of Poisson arrivals."""
-    plan = plan_calls(rate_per_s, seconds, len(target.methods), server.requests, mix or Mix(), seed)
-
-    async def send() -> list[CallRecord]:
-        return await send_open_loop(target, plan)
-
-    return await run_step(
-        name,
-        server.under_load,
-        send,
-        seconds,
-        asked_per_s=rate_per_s,
-        settle_s=settle_s,
-        sample_every_s=sample_every_s,
-    )
 
 
 def pipeline_checks(result: PipelineResult) -> list[Check]:

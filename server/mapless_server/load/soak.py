@@ -10,7 +10,7 @@ from typing import Any
 from ..demo.run import Place
 from ..evaluation.plan import Progress
 from .arrivals import Mix
-from .pipeline import LoadedServer, calling, closed_step, find_saturation, open_step, server_with_scene
+from .driving import LoadedServer, calling, closed_step, find_saturation, open_step, server_with_scene
 from .records import Fate
 from .report import Check, loop_lag_check, trend_check
 from .scrape import Reconciliation, reconcile

@@ -34,7 +34,7 @@ class Ending(str, Enum):
 
 
 class Observer(Protocol):
-    """Hears what happens; called on the event loop, so it must return at once and never raise."""
+    """Hears what happens; called from any thread with the queue locked, so it must return at once and never raise."""
 
     def admitted(self, cost_s: float) -> None:
         """A job was admitted, and so much computing is predicted for it."""

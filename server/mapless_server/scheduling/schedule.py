@@ -212,7 +212,7 @@ class Schedule:
 
     def limit_batch(self, stage: str, bucket: str, size: int) -> None:
         """From now on no more jobs of a bucket are computed together: more did not fit the device."""
-        self._max_batch[stage, bucket] = max(1, size)
+        self._max_batch[stage, bucket] = max(1, min(size, self._max_batch.get((stage, bucket), size)))
 
     def drain(self) -> None:
         """Admits nothing from now on."""
@@ -221,8 +221,14 @@ class Schedule:
     def fail_all(self, error: Exception, now_s: float) -> None:
         """Ends every job, because nothing will be computed any more."""
         self._draining = True
-        for job in self.jobs:
-            self._end(job, Ending.FAILED, error, now_s)
+        jobs = self.jobs
+        try:
+            for job in jobs:
+                self._end(job, Ending.FAILED, error, now_s)
+        finally:  # though it be the books that are broken, or whoever is told of them
+            for job in jobs:
+                if not job.is_over:
+                    job.end(Ending.FAILED, error)
 
     def _predict(self, step: Step) -> Counter[str]:
         """Computing time of a step and of those that usually follow, by lane."""
@@ -307,6 +313,7 @@ class Schedule:
 
     def _end(self, job: Job, ending: Ending, value: Any, now_s: float) -> None:
         stage = self._stages[job.step.stage]
+        job.end(ending, value)  # first, so that it is told whatever fails below
         waits = job in self._queues[stage.name]
         if waits:
             self._queues[stage.name].remove(job)
@@ -317,7 +324,6 @@ class Schedule:
             used_s = job.used_s if waits or ending not in _UNASKED else max(job.used_s, job.charged_s)
             self._quota.settle(job.flow.tenant, job.charged_s, used_s, now_s)
         self._observer.ended(stage.name, ending)
-        job.end(ending, value)
 
     def _give_fallback(self, job: Job, fallback: Fallback, now_s: float) -> None:
         done = fallback.give()

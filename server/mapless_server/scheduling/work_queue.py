@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
@@ -72,7 +73,11 @@ class WorkQueueOptions:
 
 
 class WorkQueue:
-    """Computes jobs. All methods are called on one event loop."""
+    """Computes jobs. Its methods are called on one event loop, but for those that say otherwise.
+
+    The threads take what they compute from the schedule themselves, one at a time: going through the event loop for
+    every step would cost as much as a small step does, and leave threads idle whenever the loop is busy.
+    """
 
     def __init__(
         self,
@@ -97,6 +102,7 @@ class WorkQueue:
         self._observer = observer
         self._failure_of = failure_of
         self._compute = {stage.name: compute for stage, compute in stages.items()}
+        self._lanes = tuple(lanes)
         self._schedule = Schedule(
             list(stages),
             {lane.name: lane.threads for lane in lanes},
@@ -105,27 +111,42 @@ class WorkQueue:
             lambda error: failure_of(error).value or Ending.FAILED,
             quota,
         )
-        self._pools = {lane.name: ThreadPoolExecutor(lane.threads, lane.name) for lane in lanes}
+        # Whoever touches the schedule holds it, for microseconds; each lane's idle threads wait for news.
+        self._lock = threading.Lock()
+        self._news = {lane.name: threading.Condition(self._lock) for lane in lanes}
         self._computing: set[Batch] = set()
-        self._wake = asyncio.Event()
+        self._threads: list[threading.Thread] = []
+        self._is_closed = False
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
+        self._wake = asyncio.Event()
+        self._wakes_at_s = math.inf
         self.on_fatal: Callable[[Fatal], None] = lambda _: None
         self.heartbeat_s = time.monotonic()
 
     @property
     def job_count(self) -> int:
         """Those that are admitted and have not ended."""
-        return len(self._schedule.jobs)
+        with self._lock:
+            return len(self._schedule.jobs)
 
     def is_alive_within(self, limit_s: float) -> bool:
         """Whether what is admitted will be computed, as far as was seen in so many seconds."""
-        runs = self._task is not None and not self._task.done()
+        runs = self._task is not None and not self._task.done() and not self._is_closed
         return runs and time.monotonic() - self.heartbeat_s < limit_s
 
     def start(self) -> None:
         """Begins to compute; the first job does so, too."""
         if self._task is None:
-            self._task = asyncio.get_running_loop().create_task(self._run(), name="work queue")
+            self._loop = asyncio.get_running_loop()
+            self._task = self._loop.create_task(self._keep_time(), name="work queue")
+            self._threads = [
+                threading.Thread(target=self._work, args=(lane.name,), name=f"{lane.name}_{i}", daemon=True)
+                for lane in self._lanes
+                for i in range(lane.threads)
+            ]
+            for thread in self._threads:
+                thread.start()
 
     async def submit(self, flow: Flow, step: Step, deadline_s: float, size_bytes: int) -> tuple[Any, Sequence[Visit]]:
         """Lets a job in, and waits for it; whoever is cancelled while waiting gives up the job's place.
@@ -146,77 +167,77 @@ class WorkQueue:
             Exception: whatever its stage gave for it.
         """
         self.start()
-        future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[Any] = loop.create_future()
 
-        def on_end(_: Ending, value: Any) -> None:
-            if future.done():
-                return
-            if isinstance(value, Exception):
-                future.set_exception(value)
-            else:
-                future.set_result(value)
+        def on_end(_: Ending, value: Any) -> None:  # in whatever thread ends the job
+            loop.call_soon_threadsafe(_resolve, future, value)
 
         job = Job(flow, step, deadline_s, size_bytes, on_end)
-        self._schedule.admit(job, time.monotonic())
-        self._wake.set()
+        with self._lock:
+            self._schedule.admit(job, time.monotonic())
+            self._spread_news()
         try:
             return await future, job.visits
         finally:
-            self._schedule.cancel(job, time.monotonic())  # unless it has ended
+            if not job.is_over:
+                with self._lock:
+                    self._schedule.cancel(job, time.monotonic())
 
     def drain(self) -> None:
         """Lets nobody in any more."""
-        self._schedule.drain()
+        with self._lock:
+            self._schedule.drain()
 
-    async def close(self) -> None:
-        """Ends everything; returns when the threads are through with the step that they are at."""
-        self._schedule.fail_all(Fatal("the server has stopped"), time.monotonic())
+    async def close(self, limit_s: float = 30.0) -> None:
+        """Ends everything; returns when the threads are through with the step that they are at.
+
+        A thread that is not by then is left behind: it ends with the process.
+        """
+        self._end_all(Fatal("the server has stopped"))
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
-        for pool in self._pools.values():
-            await asyncio.to_thread(pool.shutdown, wait=True, cancel_futures=True)
+        await asyncio.to_thread(self._join, time.monotonic() + limit_s)
 
-    async def _run(self) -> None:
-        loop = asyncio.get_running_loop()
+    def _join(self, until_s: float) -> None:
+        for thread in self._threads:
+            thread.join(max(0.0, until_s - time.monotonic()))
+            if thread.is_alive():
+                log.error("the thread %s still computes and is left behind", thread.name)
+
+    def _end_all(self, error: Fatal) -> None:
+        with self._lock:
+            self._is_closed = True
+            self._schedule.fail_all(error, time.monotonic())
+            for news in self._news.values():
+                news.notify_all()
+
+    async def _keep_time(self) -> None:
+        """Ends what is due and looks for threads that hang, as long as the queue lives."""
         try:
             while True:
                 self._wake.clear()
-                now_s = self.heartbeat_s = time.monotonic()
-                self._look_for_stalls(now_s)
-                self._schedule.expire(now_s)
-                self._start_batches(loop)
-                due_s = self._schedule.next_due_s
-                wait_s = self._options.heartbeat_s if due_s is None else min(due_s - now_s, self._options.heartbeat_s)
-                timer = loop.call_later(max(0.0, wait_s), self._wake.set)
+                with self._lock:
+                    now_s = self.heartbeat_s = time.monotonic()
+                    self._schedule.expire(now_s)
+                    self._look_for_stalls(now_s)
+                    due_s = self._schedule.next_due_s
+                    self._wakes_at_s = min(math.inf if due_s is None else due_s, now_s + self._options.heartbeat_s)
+                timer = asyncio.get_running_loop().call_later(max(0.0, self._wakes_at_s - now_s), self._wake.set)
                 await self._wake.wait()
                 timer.cancel()
         except Exception as error:
             self._die(error)
 
-    def _start_batches(self, loop: asyncio.AbstractEventLoop) -> None:
-        for lane, pool in self._pools.items():
-            while (batch := self._schedule.take(lane, time.monotonic())) is not None:
-                self._computing.add(batch)
-                pool.submit(self._compute_batch, batch, loop)
-
-    def _compute_batch(self, batch: Batch, loop: asyncio.AbstractEventLoop) -> None:
-        """In a lane's thread."""
-        try:
-            verdicts: list[Verdict] | BaseException = self._verdicts(batch.stage, batch.jobs)
-        except BaseException as error:  # whatever it is, it must reach the loop, or nobody would hear of it
-            verdicts = error
-        loop.call_soon_threadsafe(self._completed, batch, verdicts, time.monotonic())
-
-    def _completed(self, batch: Batch, verdicts: list[Verdict] | BaseException, now_s: float) -> None:
-        self._computing.discard(batch)
-        try:
-            if isinstance(verdicts, BaseException):
-                raise verdicts
-            self._schedule.finish(batch, verdicts, now_s)
-        except BaseException as error:
-            self._die(error)
-        self._wake.set()
+    def _spread_news(self) -> None:
+        """With the lock held, after the schedule has changed: wakes who has something to do now."""
+        for news in self._news.values():
+            news.notify()
+        due_s = self._schedule.next_due_s
+        if due_s is not None and due_s < self._wakes_at_s and self._loop is not None:
+            self._wakes_at_s = due_s
+            self._loop.call_soon_threadsafe(self._wake.set)
 
     def _look_for_stalls(self, now_s: float) -> None:
         for batch in self._computing:
@@ -225,15 +246,43 @@ class WorkQueue:
 
     def _die(self, error: BaseException) -> None:
         """Nothing will be computed any more: everybody is told, and so is the owner."""
+        if self._is_closed:
+            return
         fatal = error if isinstance(error, Fatal) else Fatal(f"the work queue failed: {error!r}")
         log.critical("%s", fatal, exc_info=error)
-        self._schedule.fail_all(fatal, time.monotonic())
+        self._end_all(fatal)
         if self._task is not None:
             self._task.cancel()
         self.on_fatal(fatal)
 
+    def _work(self, lane: str) -> None:
+        """A lane's thread."""
+        assert self._loop is not None
+        try:
+            while (batch := self._next_batch(lane)) is not None:
+                verdicts = self._verdicts(batch.stage, batch.jobs)
+                with self._lock:
+                    self._computing.discard(batch)
+                    self._schedule.finish(batch, verdicts, time.monotonic())
+                    self._spread_news()
+                # What a thread that waits for news still holds is not freed.
+                del batch, verdicts
+        except BaseException as error:  # whatever it is, it must be heard of
+            self._loop.call_soon_threadsafe(self._die, error)
+
+    def _next_batch(self, lane: str) -> Batch | None:
+        """What is to be computed next, as soon as there is something; None if there will be nothing any more."""
+        with self._lock:
+            while not self._is_closed:
+                batch = self._schedule.take(lane, time.monotonic())
+                if batch is not None:
+                    self._computing.add(batch)
+                    return batch
+                self._news[lane].wait()
+        return None
+
     def _verdicts(self, stage: Stage, jobs: Sequence[Job]) -> list[Verdict]:
-        """In a lane's thread: what the stage says of each job."""
+        """What the stage says of each job."""
         try:
             verdicts = list(self._compute[stage.name](jobs))
             if len(verdicts) != len(jobs):
@@ -244,7 +293,8 @@ class WorkQueue:
                 return [error]
             half = len(jobs) // 2
             if failure is Failure.OF_MEMORY:
-                self._schedule.limit_batch(stage.name, jobs[0].step.bucket, half)
+                with self._lock:
+                    self._schedule.limit_batch(stage.name, jobs[0].step.bucket, half)
             log.warning("%s: %d jobs at a time failed, trying them in halves: %r", stage.name, len(jobs), error)
             return self._verdicts(stage, jobs[:half]) + self._verdicts(stage, jobs[half:])
         for verdict in verdicts:
@@ -260,3 +310,12 @@ class WorkQueue:
         if failure is Failure.OF_DEVICE:
             raise Fatal(f"the device is lost: {error}") from error
         return failure
+
+
+def _resolve(future: asyncio.Future[Any], value: Any) -> None:
+    if future.done():
+        return
+    if isinstance(value, Exception):
+        future.set_exception(value)
+    else:
+        future.set_result(value)

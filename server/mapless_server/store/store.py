@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
 
-from sqlalchemy import delete, insert, select
+from sqlalchemy import Connection, delete, insert, select
 
 from mapless_server.errors import AlreadyExists
 from mapless_server.method.views import View
@@ -28,6 +30,9 @@ DEFAULT_CACHE_BYTES = 512 * 2**20
 """About 500 references with 2048 SIFT features each; 0 reads the database every time."""
 
 POSE_CACHE_BYTES = 32 * 2**20
+NAME_CACHE_BYTES = 16 * 2**20
+NAME_BYTES = 300
+"""About the size of a reference's id and key in memory."""
 POSE_BYTES = 700
 """About the size of a ReferencePose in memory, arrays and strings included."""
 
@@ -47,6 +52,9 @@ class Store:
         self._described = described
         # By (scene_key, generation), which are never reused either.
         self._poses: LruCache[tuple[ReferencePose, ...]] = LruCache(POSE_CACHE_BYTES)
+        # What names meant, by scene and names, as long as nothing was written since: this process alone writes.
+        self._resolved: LruCache[_Resolved] = LruCache(NAME_CACHE_BYTES)
+        self._state = object()
 
     @staticmethod
     def open(data_dir: Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
@@ -80,6 +88,15 @@ class Store:
     ) -> None:
         self.close()
 
+    @contextmanager
+    def _changing(self) -> Iterator[Connection]:
+        """A transaction that writes; what is remembered of before is void when it is over, however it ends."""
+        try:
+            with self._database.write() as connection:
+                yield connection
+        finally:
+            self._state = object()
+
     def create_scene(self, scene_key: SceneKey) -> SceneRecord:
         """Create an empty scene.
 
@@ -87,7 +104,7 @@ class Store:
             AlreadyExists: the id is taken.
         """
         scene, generation = tables.scene, tables.scene_generation
-        with self._database.write() as connection:
+        with self._changing() as connection:
             if not queries.raise_generation(connection, scene_key):
                 connection.execute(insert(generation).values(scene_id=scene_key, generation=1))
             if connection.scalar(select(scene.c.scene_id).where(scene.c.scene_id == scene_key)) is not None:
@@ -116,7 +133,7 @@ class Store:
         Raises:
             NotFound: there is no such scene.
         """
-        with self._database.write() as connection:
+        with self._changing() as connection:
             queries.begin_change(connection, scene_key)
             connection.execute(delete(tables.scene).where(tables.scene.c.scene_id == scene_key))
 
@@ -142,7 +159,7 @@ class Store:
         for record, new in zip(records, references, strict=True):
             image_rows.append({"reference_key": record.key, "data": new.image})
             features_rows += [rows.features_row(record.key, *described) for described in new.views.items()]
-        with self._database.write() as connection:
+        with self._changing() as connection:
             queries.begin_change(connection, scene_key)
             queries.refuse_taken_ids(connection, scene_key, [new.reference_id for new in references])
             connection.execute(insert(tables.reference), reference_rows)
@@ -164,7 +181,7 @@ class Store:
             ValueError: features are not float32, or a number of the camera is not finite.
         """
         row = rows.features_row(key, extractor, view)
-        with self._database.write() as connection:
+        with self._changing() as connection:
             reference_id = queries.find_id(connection, key)
             if queries.has_features(connection, key, extractor):
                 raise AlreadyExists(f"reference {reference_id!r} has features of {extractor!r} already")
@@ -229,7 +246,7 @@ class Store:
         Raises:
             NotFound: there is no such scene or reference.
         """
-        with self._database.write() as connection:
+        with self._changing() as connection:
             queries.begin_change(connection, scene_key)
             key = queries.find_key(connection, scene_key, reference_id)
             connection.execute(delete(tables.reference).where(tables.reference.c.key == key))
@@ -270,8 +287,15 @@ class Store:
             NotFound: there is no such scene (field "scene") or reference (field "references[i]").
             DataLoss: features, camera or pose of one of them are damaged.
         """
+        state = self._state
+        resolved = None if reference_ids is None else self._resolved.get((scene_key, tuple(reference_ids)))
+        if resolved is not None and resolved.state is state:
+            in_memory = [self._described.get((key, extractor)) for key in resolved.keys]
+            if None not in in_memory:
+                return SceneSnapshot(resolved.generation, tuple(it for it in in_memory if it is not None), ())
         with self._database.read() as connection:
             generation = queries.read_generation(connection, scene_key)
+            names = None if reference_ids is None else tuple(reference_ids)
             if reference_ids is None:
                 keys = queries.list_keys(connection, scene_key)
                 reference_ids = list(keys)
@@ -286,6 +310,9 @@ class Store:
             found = queries.features_by_key(connection, [key for key in wanted if key not in described], extractor)
             lacking = [key for key in wanted if key not in described and key not in found]
             undescribed = queries.rows_by_key(connection, lacking)
+        if names is not None:
+            size_bytes = NAME_BYTES * (1 + len(names))
+            self._resolved.put((scene_key, names), _Resolved(state, generation, tuple(wanted)), size_bytes)
         for key, row in found.items():
             described[key] = rows.described_reference(row)
             self._described.put((key, extractor), described[key], len(row.data) + POSE_BYTES)
@@ -294,6 +321,15 @@ class Store:
             tuple(described[key] for key in wanted if key in described),
             tuple(rows.reference_record(undescribed[key]) for key in lacking),
         )
+
+
+@dataclass(frozen=True)
+class _Resolved:
+    """What a scene's reference ids meant while the store was in a state."""
+
+    state: object
+    generation: int
+    keys: tuple[str, ...]
 
 
 def _now() -> datetime:
