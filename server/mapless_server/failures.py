@@ -10,7 +10,7 @@ from .scheduling.work_queue import Failure
 _LOST = re.compile(r"CUDA error|CUBLAS_STATUS_(?!ALLOC_FAILED)|CUDNN_STATUS_(?!ALLOC_FAILED)|device-side assert")
 """After any of these every later call fails too, or worse, gives garbage: the context is poisoned."""
 
-_FULL = re.compile(r"CUDA out of memory|_STATUS_ALLOC_FAILED|CUDA error: out of memory")
+_FULL = re.compile(r"CUDA out of memory|_STATUS_ALLOC_FAILED|CUDA error: out of memory|DefaultCPUAllocator")
 
 
 def failure_of(error: BaseException) -> Failure:

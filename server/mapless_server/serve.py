@@ -308,7 +308,8 @@ async def _warm_up(settings: Settings, engine: Engine, metrics: Metrics) -> None
         await warm_up(engine)
     except Exception as error:
         log.critical("the first localization failed", exc_info=error)
-        raise StartupError(f"the first localization failed, so none would succeed: {error}") from error
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise StartupError(f"the first localization failed, so none would succeed: {reason}") from error
     metrics.warmed_up(time.monotonic() - start_s)
     log.info("warm after %.1f s", time.monotonic() - start_s)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections import Counter
 from typing import Any
 
@@ -277,6 +279,16 @@ class TestTime:
         toy.finish(batch, onward(job), seconds=7.0)
         assert toy.schedule.take("device", toy.now_s) is None
         assert not toy.schedule.jobs
+
+    def test_what_has_ended_is_let_go_long_before_its_deadline(self) -> None:
+        """A job holds photographs; a deadline may be minutes away."""
+        toy = Toy()
+        ended = [
+            weakref.ref(toy.admit(stage="describe", deadline_s=1e5)) for _ in range(100) if run_through(toy) or True
+        ]
+        toy.jobs.clear()
+        gc.collect()
+        assert sum(job() is not None for job in ended) < 40
 
     def test_a_cancelled_job_frees_its_place(self) -> None:
         toy = Toy()

@@ -27,7 +27,7 @@ from mapless_server.scheduling.schedule import ScheduleOptions
 from mapless_server.scheduling.work_queue import Compute, Failure, Fatal, Lane, WorkQueue, WorkQueueOptions
 
 ROOMY = ScheduleOptions(max_queued_s=1e6)
-LIMIT_S = 3.0
+LIMIT_S = 20.0
 FAR_S = 600.0
 MAX_BATCH = 8
 LANES = [Lane("toy-host", 2), Lane("toy-device", 1)]
@@ -112,9 +112,7 @@ class Shop:
     async def open(self) -> AsyncIterator[WorkQueue]:
         """The queue, which is closed at the end; then neither threads nor tasks of it may be left."""
         first, then = Stage("first", "toy-host", "then"), Stage("then", "toy-device", max_batch=MAX_BATCH)
-        queue = WorkQueue(
-            {first: self._serve, then: self._serve}, LANES, self.options, self.observer, failure_of
-        )
+        queue = WorkQueue({first: self._serve, then: self._serve}, LANES, self.options, self.observer, failure_of)
         queue.on_fatal = self.fatals.append
         others = asyncio.all_tasks()
         try:
@@ -228,6 +226,26 @@ class TestResults:
             assert before_s <= first.queued_s
             assert then.queued_s == first.end_s  # nothing lies between two stages
             assert shop.account.batches[-1] == ("then", 3)
+
+        run(test())
+
+    def test_all_that_a_batch_sends_on_is_taken_up_at_once_by_as_many_threads(self) -> None:
+        """One piece of news, work for two."""
+        both = threading.Barrier(2, timeout=LIMIT_S)
+
+        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+            if jobs[0].step.stage == "then":
+                time.sleep(0.05)  # until both have heard that there is nothing to do
+                return [Next(Step("first", "toy", "b", job.step.payload)) for job in jobs]
+            both.wait()
+            return [Done(job.step.payload) for job in jobs]
+
+        async def test() -> None:
+            shop = Shop(compute)
+            async with shop.open() as queue:
+                calls = await waiting(shop, queue, range(2))
+                shop.gate.set()
+                assert await outcomes(calls) == [0, 1]
 
         run(test())
 
@@ -513,6 +531,19 @@ class TestEndOfAll:
                 assert not shop.fatals
 
         run(test())
+
+    def test_closing_does_not_wait_for_ever(self, caplog: pytest.LogCaptureFixture) -> None:
+        async def test() -> None:
+            shop = Shop()
+            async with shop.open() as queue:
+                await shop.plug(queue)
+                await asyncio.wait_for(queue.close(limit_s=0.1), LIMIT_S)
+                assert not shop.gate.is_set()
+
+        run(test())
+        (said,) = [it.getMessage() for it in caplog.records if it.levelname == "ERROR"]
+        assert "toy-device" in said
+        assert "left behind" in said
 
     def test_a_queue_that_never_began_can_be_closed_and_takes_nothing_then(self) -> None:
         async def test() -> None:

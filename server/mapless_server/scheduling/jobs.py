@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -129,6 +130,7 @@ class Job:
         waits_since_s: when it began to wait for the step, by the queue's clock.
         booked_s: computing time that is still predicted for it, by lane.
         charged_s: computing time that its tenant was charged at admission.
+        timer_s: the `due_s` that the schedule has noted.
     """
 
     flow: Flow
@@ -142,6 +144,7 @@ class Job:
     waits_since_s: float = 0.0
     booked_s: Counter[str] = field(default_factory=Counter)
     charged_s: float = 0.0
+    timer_s: float = -math.inf
     _over: threading.Event = field(default_factory=threading.Event)
 
     @property

@@ -22,6 +22,8 @@ MIN_RETRY_S = 0.1
 RETRY_ELSEWHERE_S = 1.0
 """When to come again where nothing tells when there will be room."""
 
+_ENDED_HELD = 16
+
 _UNASKED = frozenset({Ending.CANCELLED, Ending.EXPIRED})
 """Endings that come from outside, while a stage may be at the job."""
 
@@ -42,7 +44,7 @@ class ScheduleOptions:
         quantum_s: of the fair queues; about what one job of a stage takes.
     """
 
-    max_queued_s: float = 4.0
+    max_queued_s: float = 2.0
     max_bytes: int = 256 * 2**20
     flow_share: float = 0.75
     caution: float = 1.2
@@ -221,14 +223,13 @@ class Schedule:
     def fail_all(self, error: Exception, now_s: float) -> None:
         """Ends every job, because nothing will be computed any more."""
         self._draining = True
-        jobs = self.jobs
         try:
-            for job in jobs:
+            for job in self.jobs:
                 self._end(job, Ending.FAILED, error, now_s)
-        finally:  # though it be the books that are broken, or whoever is told of them
-            for job in jobs:
-                if not job.is_over:
-                    job.end(Ending.FAILED, error)
+        finally:  # it may be the observer that is broken
+            for job in self.jobs:
+                self._ledger.close(job)
+                job.end(Ending.FAILED, error)
 
     def _predict(self, step: Step) -> Counter[str]:
         """Computing time of a step and of those that usually follow, by lane."""
@@ -301,8 +302,17 @@ class Schedule:
         stage = self._stages[job.step.stage]
         job.waits_since_s = now_s
         self._queues[stage.name].push(job, job.flow, self.costs.predict(stage.name, job.step.kind))
-        heapq.heappush(self._due, (job.due_s, next(self._tick), job))
+        if job.timer_s != job.due_s:
+            job.timer_s = job.due_s
+            heapq.heappush(self._due, (job.due_s, next(self._tick), job))
+            self._forget_ended()
         self._tell(stage)
+
+    def _forget_ended(self) -> None:
+        """Jobs that ended long before they were due must not be held until then: their photographs are large."""
+        if len(self._due) > 2 * len(self._ledger.jobs) + _ENDED_HELD:
+            self._due = [(due_s, tick, job) for due_s, tick, job in self._due if not job.is_over]
+            heapq.heapify(self._due)
 
     def _pop_batch(self, stage: Stage) -> tuple[Job, ...]:
         queue = self._queues[stage.name]
@@ -313,12 +323,13 @@ class Schedule:
 
     def _end(self, job: Job, ending: Ending, value: Any, now_s: float) -> None:
         stage = self._stages[job.step.stage]
-        job.end(ending, value)  # first, so that it is told whatever fails below
         waits = job in self._queues[stage.name]
         if waits:
             self._queues[stage.name].remove(job)
-            self._tell(stage)
         self._ledger.close(job)
+        job.end(ending, value)  # before anybody else is told, who may fail
+        if waits:
+            self._tell(stage)
         if self._quota is not None:
             # What is computed just now was not counted yet.
             used_s = job.used_s if waits or ending not in _UNASKED else max(job.used_s, job.charged_s)

@@ -166,7 +166,6 @@ class WorkQueue:
             Fatal: the queue has ended.
             Exception: whatever its stage gave for it.
         """
-        self.start()
         loop = asyncio.get_running_loop()
         future: asyncio.Future[Any] = loop.create_future()
 
@@ -177,6 +176,7 @@ class WorkQueue:
         with self._lock:
             self._schedule.admit(job, time.monotonic())
             self._spread_news()
+        self.start()
         try:
             return await future, job.visits
         finally:
@@ -209,9 +209,11 @@ class WorkQueue:
     def _end_all(self, error: Fatal) -> None:
         with self._lock:
             self._is_closed = True
-            self._schedule.fail_all(error, time.monotonic())
-            for news in self._news.values():
-                news.notify_all()
+            try:
+                self._schedule.fail_all(error, time.monotonic())
+            finally:  # it may be the schedule that is broken
+                for news in self._news.values():
+                    news.notify_all()
 
     async def _keep_time(self) -> None:
         """Ends what is due and looks for threads that hang, as long as the queue lives."""
@@ -250,10 +252,12 @@ class WorkQueue:
             return
         fatal = error if isinstance(error, Fatal) else Fatal(f"the work queue failed: {error!r}")
         log.critical("%s", fatal, exc_info=error)
-        self._end_all(fatal)
         if self._task is not None:
             self._task.cancel()
-        self.on_fatal(fatal)
+        try:
+            self._end_all(fatal)
+        finally:
+            self.on_fatal(fatal)
 
     def _work(self, lane: str) -> None:
         """A lane's thread."""
@@ -277,6 +281,7 @@ class WorkQueue:
                 batch = self._schedule.take(lane, time.monotonic())
                 if batch is not None:
                     self._computing.add(batch)
+                    self._news[lane].notify()  # one piece of news may be work for several
                     return batch
                 self._news[lane].wait()
         return None
@@ -315,6 +320,8 @@ class WorkQueue:
 def _resolve(future: asyncio.Future[Any], value: Any) -> None:
     if future.done():
         return
+    if isinstance(value, StopIteration):  # which a future takes for its own
+        value = RuntimeError(f"the stage raised {value!r}")
     if isinstance(value, Exception):
         future.set_exception(value)
     else:

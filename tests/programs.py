@@ -1,0 +1,145 @@
+"""Servers as processes of their own, the real command or one whose method does as it is told.
+
+Run as a program, this file is the latter: everything is the real thing but the features and the method, which first
+appends a line to the file "began" and goes on when there is a file "gate". So tests hold it where they want it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from servers import StandInExtractor, StandInMethod, StandInReconstructor, whole
+
+from mapless_server.engine import Engine
+from mapless_server.method.localize import Answer, Pipeline
+from mapless_server.observability.logs import configure_logging
+from mapless_server.observability.metrics import Metrics
+from mapless_server.security.rate import RateLimiter
+from mapless_server.serve import engine_options, serve
+from mapless_server.settings import Settings, load_settings
+from mapless_server.store import Store
+from mapless_server.tiers import Tier
+
+LIMIT_S = 60.0
+_ANNOUNCEMENT = "mapless-server listening on "
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    """Returns when it holds, and fails where it never does."""
+    deadline_s = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+@dataclass
+class Program:
+    """A server that runs, or begins to.
+
+    Attributes:
+        process: the server's.
+        folder: of its store, its log and the files that lead it.
+    """
+
+    process: subprocess.Popen[str]
+    folder: Path
+
+    @property
+    def log(self) -> str:
+        """What it has logged so far."""
+        return (self.folder / "log").read_text()
+
+    @property
+    def began(self) -> int:
+        """How many calls have come to the method."""
+        path = self.folder / "began"
+        return len(path.read_text().splitlines()) if path.exists() else 0
+
+    def open_gate(self) -> None:
+        """The method goes on."""
+        (self.folder / "gate").touch()
+
+    def address(self) -> str:
+        """Where it listens, once it is ready."""
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line.startswith(_ANNOUNCEMENT), self.log
+        return line.removeprefix(_ANNOUNCEMENT).strip()
+
+    def wait(self) -> int:
+        """Its exit code."""
+        return self.process.wait(LIMIT_S)
+
+
+@contextmanager
+def program(folder: Path, arguments: Sequence[str]) -> Iterator[Program]:
+    """A Python program with its log in the folder; it is gone when the block is left."""
+    folder.mkdir(exist_ok=True)
+    with (folder / "log").open("a") as log:
+        process = subprocess.Popen(
+            [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=log, text=True, env={**os.environ}
+        )
+    deadline = threading.Timer(LIMIT_S, process.kill)  # reading its output has no deadline
+    deadline.start()
+    try:
+        yield Program(process, folder)
+    finally:
+        deadline.cancel()
+        process.kill()
+        process.communicate(timeout=LIMIT_S)
+
+
+@contextmanager
+def real(folder: Path, **settings: Any) -> Iterator[Program]:
+    """`mapless-server serve`."""
+    given = {"port": 0, "metrics_port": 0, "data_dir": folder / "data", "workers": 2} | settings
+    flags = [part for name, value in given.items() for part in (f"--{name.replace('_', '-')}", str(value))]
+    with program(folder, ["-m", "mapless_server", "serve", *flags]) as running:
+        yield running
+
+
+@contextmanager
+def gated(folder: Path, kind: str = "asks", **settings: Any) -> Iterator[Program]:
+    """This file as a program; its method "asks" whether anybody still waits for it, or "hangs" for good."""
+    given = [f"{name}={value}" for name, value in settings.items()]
+    with program(folder, [__file__, str(folder), kind, *given]) as running:
+        yield running
+
+
+def _main(folder: Path, kind: str, given: Sequence[str]) -> None:
+    flags: dict[str, Any] = {"port": 0, "data_dir": folder / "data", "metrics": False, "warm_up": False}
+    flags |= dict(it.split("=", 1) for it in given)
+    settings = load_settings(flags).settings
+    configure_logging(settings)
+    stand_in = StandInMethod()
+    stand_in.gate.set()
+
+    def localize(*arguments: Any) -> Answer:
+        *_, check = arguments
+        with (folder / "began").open("a") as began:
+            began.write("began\n")
+        while not (folder / "gate").exists():
+            time.sleep(0.005)
+            if kind == "asks":
+                check()
+        return stand_in(*arguments)
+
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+        tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
+        return Engine(store, tiers, engine_options(settings), metrics, quota, whole(localize))
+
+    asyncio.run(serve(settings, make))
+
+
+if __name__ == "__main__":
+    _main(Path(sys.argv[1]), sys.argv[2], sys.argv[3:])
