@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -15,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -60,6 +62,19 @@ class Program:
         return (self.folder / "log").read_text()
 
     @property
+    def metrics_address(self) -> str:
+        """Where its metrics are, as the log says."""
+        found = re.search(r"metrics on http://([^/]+)/metrics", self.log)
+        assert found
+        return found.group(1)
+
+    @property
+    def output(self) -> str:
+        """What else it prints until it ends."""
+        assert self.process.stdout is not None
+        return self.process.stdout.read()
+
+    @property
     def began(self) -> int:
         """How many calls have come to the method."""
         path = self.folder / "began"
@@ -69,8 +84,9 @@ class Program:
         """The method goes on."""
         (self.folder / "gate").touch()
 
+    @cached_property
     def address(self) -> str:
-        """Where it listens, once it is ready."""
+        """Where it listens; waits until it does."""
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         assert line.startswith(_ANNOUNCEMENT), self.log
@@ -82,12 +98,16 @@ class Program:
 
 
 @contextmanager
-def program(folder: Path, arguments: Sequence[str]) -> Iterator[Program]:
+def program(folder: Path, arguments: Sequence[str], **environment: str) -> Iterator[Program]:
     """A Python program with its log in the folder; it is gone when the block is left."""
     folder.mkdir(exist_ok=True)
     with (folder / "log").open("a") as log:
         process = subprocess.Popen(
-            [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=log, text=True, env={**os.environ}
+            [sys.executable, *arguments],
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            env={**os.environ, **environment},
         )
     deadline = threading.Timer(LIMIT_S, process.kill)  # reading its output has no deadline
     deadline.start()
@@ -101,16 +121,16 @@ def program(folder: Path, arguments: Sequence[str]) -> Iterator[Program]:
 
 @contextmanager
 def real(folder: Path, **settings: Any) -> Iterator[Program]:
-    """`mapless-server serve`."""
+    """`mapless-server serve`, at once."""
     given = {"port": 0, "metrics_port": 0, "data_dir": folder / "data", "workers": 2} | settings
     flags = [part for name, value in given.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-    with program(folder, ["-m", "mapless_server", "serve", *flags]) as running:
+    with program(folder, ["-m", "mapless_server", "serve", *flags], MAPLESS_WARM_UP="false") as running:
         yield running
 
 
 @contextmanager
 def gated(folder: Path, kind: str = "asks", **settings: Any) -> Iterator[Program]:
-    """This file as a program; its method "asks" whether anybody still waits for it, or "hangs" for good."""
+    """The program that is this file; its method "asks" whether anybody still waits for it, or "hangs" for good."""
     given = [f"{name}={value}" for name, value in settings.items()]
     with program(folder, [__file__, str(folder), kind, *given]) as running:
         yield running

@@ -120,6 +120,11 @@ class Engine:
         with _as_request_errors():
             return await self.queue.submit(caller.flow, step, caller.deadline_s, len(query.photo.image))
 
+    def check_room(self) -> None:
+        """Raises RequestError if no query of anybody would be admitted now: then none has to be looked at."""
+        with _as_request_errors():
+            self.queue.check_room(Step(PREPARE, "", "", None))
+
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[dict[str, View]]:
         """What the extractors of all tiers find in photographs, in order, by the extractor's name; without the pixels.
 

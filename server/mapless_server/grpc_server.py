@@ -35,6 +35,8 @@ SERVICE_NAMES = (
     reference_service_pb2.DESCRIPTOR.services_by_name["ReferenceService"].full_name,
 )
 
+LOCALIZE_METHOD = f"/{SERVICE_NAMES[0]}/Localize"
+
 MAX_CONCURRENT_RPCS = 1024
 """Calls that are received at a time, from all connections. Far above what the queue admits, and health probes count."""
 
@@ -72,6 +74,7 @@ class GrpcServer:
             settings.default_deadline_s,
             settings.max_deadline_s,
             authenticate=authenticate,
+            check_door=self._check_door,
             observer=metrics,
             tracer=tracer,
         )
@@ -132,6 +135,12 @@ class GrpcServer:
         for service in ("", *SERVICE_NAMES):
             await self._health.set(service, status.SERVING if is_serving else status.NOT_SERVING)
         self._metrics.set_serving(is_serving)
+
+    def _check_door(self, method: str) -> None:
+        """Raises Unavailable while the server starts, and Overloaded while nobody's query would be admitted."""
+        engine = self._ready_engine()
+        if method == LOCALIZE_METHOD:
+            engine.check_room()
 
     def _ready_engine(self) -> Engine:
         if self._engine is None:

@@ -112,6 +112,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         max_deadline_s: float = 600.0,
         *,
         authenticate: Authenticate | None = None,
+        check_door: Callable[[str], None] = lambda method: None,
         observer: CallObserver | None = None,
         tracer: Tracer | None = None,
     ) -> None:
@@ -121,12 +122,14 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             default_deadline_s: for calls without one.
             max_deadline_s: for calls with a later one.
             authenticate: who calls.
+            check_door: raises RequestError if nobody can be let in to this method now; called on the event loop.
             observer: counts calls.
             tracer: traces them; closed by whoever made it.
         """
         self._default_deadline_s = default_deadline_s
         self._max_deadline_s = max_deadline_s
         self._authenticate = authenticate
+        self._check_door = check_door
         self._observer = observer
         self._tracer = tracer or NoTracer()
         self._abandoned: set[asyncio.Task[Message]] = set()  # the loop itself would forget them
@@ -138,7 +141,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         if handler is None or method in OPEN_METHODS:
             return handler
 
-        async def answer(data: bytes, context: Context) -> bytes:
+        async def answer(data: bytes, context: Context, refusal: Exception | None = None) -> bytes:
             call = self._begin(context)
             span = self._tracer.begin(method, _metadata(context), call.arrived_s)
             if self._observer is not None:
@@ -147,6 +150,8 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             call.note(bytes_in=len(data))
             code = "UNKNOWN"
             try:
+                if refusal is not None:
+                    raise refusal
                 response = await self._answer(handler, data, method, call, context)
                 call.note(bytes_out=len(response))
                 context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id),))
@@ -170,24 +175,26 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             finally:
                 self._end(method, code, call, span)
 
-        async def refuse(_: object, context: Context) -> bytes:
-            return await answer(b"", context)
+        try:
+            self._check_in(method, handler_call_details.invocation_metadata or (), {})
+        except Exception as error:
+            refusal = error
 
-        if not self._is_welcome(method, handler_call_details.invocation_metadata):
-            # A stream's messages are read when asked for, and nobody asks: strangers shall not fill the memory.
+            async def refuse(_: object, context: Context) -> bytes:
+                return await answer(b"", context, refusal)
+
+            # A stream's messages are read when asked for, and nobody asks: what is refused shall cost nothing.
             return grpc.stream_unary_rpc_method_handler(refuse, None, None)
         # Without a deserializer the bytes arrive as they are, so that a malformed message is answered here too.
         return grpc.unary_unary_rpc_method_handler(answer, None, None)
 
-    def _is_welcome(self, method: str, metadata: Metadata) -> bool:
-        """Whether the caller may call the method, as far as its metadata tell."""
-        if self._authenticate is None:
-            return True
-        try:
-            self._authenticate(metadata or (), method, {})
-        except Exception:  # it is raised again when the call is answered
-            return False
-        return True
+    def _check_in(self, method: str, metadata: Metadata, auth_context: Mapping[str, Iterable[bytes]]) -> Principal:
+        """Who calls; raises whatever keeps them out before a byte of the message is looked at."""
+        principal = Principal()
+        if self._authenticate is not None:
+            principal = self._authenticate(metadata, method, auth_context)
+        self._check_door(method)
+        return principal
 
     def _begin(self, context: Context) -> Call:
         now_s = time.monotonic()
@@ -203,9 +210,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
 
     async def _answer(self, handler: Any, data: bytes, method: str, call: Call, context: Context) -> bytes:
         """The servicer's answer; whatever is wrong with the request is a RequestError."""
-        if self._authenticate is not None:
-            principal = self._authenticate(_metadata(context), method, context.auth_context())
-            call = replace(call, principal=principal)
+        call = replace(call, principal=self._check_in(method, _metadata(context), context.auth_context()))
         call.note(tenant=call.principal.tenant, **({"principal": call.principal.name} if call.principal.name else {}))
         try:
             request = handler.request_deserializer(data)

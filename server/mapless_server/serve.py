@@ -265,7 +265,9 @@ def _serve_metrics(
     if not settings.metrics:
         return ""
     try:
-        exporter = MetricsServer(metrics.registry, settings.metrics_host, settings.metrics_port)
+        exporter = MetricsServer(
+            metrics.registry, settings.metrics_host, settings.metrics_port, lambda: metrics.is_serving
+        )
     except OSError as error:
         address = f"{settings.metrics_host}:{settings.metrics_port}"
         raise StartupError(f"cannot serve metrics on {address}: {error.strerror or error}") from error

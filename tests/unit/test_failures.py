@@ -113,6 +113,6 @@ class TestTorch:
         assert failure_of(caught(lambda: torch.ones(2, 3) @ torch.ones(2, 3))) is Failure.OF_ITEM
 
     def test_memory_of_the_host(self) -> None:
-        """torch says it with a RuntimeError of its own words."""
+        """Torch says it with a RuntimeError of its own words."""
         torch = pytest.importorskip("torch", reason="the networks' extra is not installed")
         assert failure_of(caught(lambda: torch.empty(2**60))) is Failure.OF_MEMORY

@@ -9,6 +9,7 @@ import re
 import socket
 import threading
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -339,7 +340,7 @@ def test_one_that_cannot_be_read_blinds_nobody_to_the_others(
 
 @pytest.fixture
 def server(metrics: Metrics) -> Iterator[MetricsServer]:
-    running = MetricsServer(metrics.registry, "127.0.0.1", 0)
+    running = MetricsServer(metrics.registry, "127.0.0.1", 0, lambda: metrics.is_serving)
     yield running
     running.close()
 
@@ -358,6 +359,33 @@ def test_the_port_serves_what_the_registry_has(metrics: Metrics, server: Metrics
     assert "\nmapless_fatal_total 1.0\n" in scrape(server.port)
 
 
+def ask(port: int, path: str) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=30) as response:
+            return response.status, response.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def test_the_port_is_ready_while_health_says_serving_and_at_no_other_time(
+    metrics: Metrics, server: MetricsServer
+) -> None:
+    assert ask(server.port, "/ready") == (503, "not serving\n")  # starting
+    metrics.set_serving(True)
+    assert ask(server.port, "/ready") == (200, "serving\n")
+    assert ask(server.port, "/ready?from=probe") == (200, "serving\n")
+    metrics.set_serving(False)
+    assert ask(server.port, "/ready") == (503, "not serving\n")  # draining
+    assert ask(server.port, "/metrics")[0] == 200
+
+
+@pytest.mark.parametrize("path", ["/", "/favicon.ico", "/ready/", "/metrics/", "/metrics/../etc/passwd", "/live"])
+def test_nothing_else_is_on_the_port(metrics: Metrics, server: MetricsServer, path: str) -> None:
+    metrics.set_serving(True)
+    assert ask(server.port, path) == (404, "there are /metrics and /ready\n")
+
+
 def test_the_port_serves_exemplars_to_who_asks_for_open_metrics(metrics: Metrics, server: MetricsServer) -> None:
     metrics.call_handled(LOCALIZE, "OK", 0.25, "0af7651916cd43dd8448eb211c80319c")
     request = urllib.request.Request(
@@ -371,20 +399,20 @@ def test_the_port_serves_exemplars_to_who_asks_for_open_metrics(metrics: Metrics
 
 def test_a_port_that_is_taken_is_an_error(metrics: Metrics, server: MetricsServer) -> None:
     with pytest.raises(OSError, match="in use"):
-        MetricsServer(metrics.registry, "127.0.0.1", server.port)
+        MetricsServer(metrics.registry, "127.0.0.1", server.port, lambda: metrics.is_serving)
     with pytest.raises(OSError):  # noqa: PT011  the resolver's words differ
-        MetricsServer(metrics.registry, "no-such-host.invalid", 0)
+        MetricsServer(metrics.registry, "no-such-host.invalid", 0, lambda: metrics.is_serving)
 
 
 def test_closing_frees_the_port_and_ends_the_threads_even_of_open_connections(metrics: Metrics) -> None:
     before = set(threading.enumerate())
-    server = MetricsServer(metrics.registry, "127.0.0.1", 0)
+    server = MetricsServer(metrics.registry, "127.0.0.1", 0, lambda: metrics.is_serving)
     with socket.create_connection(("127.0.0.1", server.port), 10) as idle:
         scrape(server.port)
         server.close()
         assert set(threading.enumerate()) <= before
         assert idle.recv(1) == b""
-    again = MetricsServer(metrics.registry, "127.0.0.1", server.port)
+    again = MetricsServer(metrics.registry, "127.0.0.1", server.port, lambda: metrics.is_serving)
     again.close()
 
 
@@ -405,7 +433,7 @@ def test_idle_connections_take_few_threads_and_keep_nobody_out(server: MetricsSe
 
 def test_a_silent_connection_is_closed(metrics: Metrics, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exporter._Handler, "timeout", 0.05)
-    server = MetricsServer(metrics.registry, "127.0.0.1", 0)
+    server = MetricsServer(metrics.registry, "127.0.0.1", 0, lambda: metrics.is_serving)
     try:
         with socket.create_connection(("127.0.0.1", server.port), 30) as silent:
             assert silent.recv(1) == b""
@@ -437,7 +465,7 @@ def test_the_port_listens_on_ipv6(metrics: Metrics) -> None:
     if not socket.has_ipv6:
         pytest.skip("no IPv6 on this machine")
     try:
-        server = MetricsServer(metrics.registry, "::1", 0)
+        server = MetricsServer(metrics.registry, "::1", 0, lambda: metrics.is_serving)
     except OSError:
         pytest.skip("no IPv6 on this machine")
     assert "mapless_fatal_total" in scrape(server.port, "[::1]")

@@ -201,4 +201,4 @@ def test_sigterm_during_the_start_ends_it(tmp_path: Path) -> None:
         server.process.send_signal(signal.SIGTERM)
         assert server.wait() == 0
         assert "stopping before the start was over" in server.log
-        assert not server.process.stdout.read()
+        assert not server.output

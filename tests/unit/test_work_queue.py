@@ -679,8 +679,8 @@ class TestCallersWhoLeave:
                 for _ in range(1 + fates.randrange(30)):  # it has begun
                     await asyncio.sleep(0)
                 call.cancel()
-            (outcome,) = await asyncio.gather(call, return_exceptions=True)
-            return outcome
+            (told,) = await asyncio.gather(call, return_exceptions=True)
+            return told
 
         async def test() -> None:
             shop = Shop(compute)
@@ -695,7 +695,7 @@ class TestCallersWhoLeave:
             assert account.endings.total() == account.admissions
             assert set(kinds) <= {int, Guilty, Expired, Refused, asyncio.CancelledError}
             assert kinds[int] > 20
-            assert all(outcome == number for number, outcome in enumerate(told) if isinstance(outcome, int))
+            assert all(it == number for number, it in enumerate(told) if isinstance(it, int))
             assert not shop.fatals
 
         run(test())

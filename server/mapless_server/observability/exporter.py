@@ -1,4 +1,7 @@
-"""The port that Prometheus asks: plain HTTP in threads of its own, so that it answers while the event loop is busy.
+"""The port that Prometheus and probes ask: plain HTTP in threads of its own, which answer while the event loop is busy.
+
+"/metrics" is the registry; "/ready" is 200 while the server serves and 503 before and after, for probes that do not
+speak gRPC.
 
 The library's own server starts a thread for every connection and waits for its request without end, so that a thousand
 idle connections take a thousand threads and file descriptors from the server beside it. This one holds a few, lets go
@@ -13,11 +16,16 @@ import socketserver
 import sys
 import threading
 from collections import OrderedDict
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import Any
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from prometheus_client import CollectorRegistry, make_wsgi_app
+
+if TYPE_CHECKING:
+    from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
 log = logging.getLogger(__name__)
 
@@ -29,16 +37,22 @@ _POLL_S = 0.2
 
 
 class MetricsServer:
-    """Serves a registry until it is closed."""
+    """Serves a registry, and whether the server is ready, until it is closed."""
 
-    def __init__(self, registry: CollectorRegistry, host: str, port: int) -> None:
-        """Listens and serves; port 0 takes any free one.
+    def __init__(self, registry: CollectorRegistry, host: str, port: int, is_serving: Callable[[], bool]) -> None:
+        """Listens and serves.
+
+        Args:
+            registry: the metrics.
+            host: address to listen on.
+            port: 0 takes any free one.
+            is_serving: whether health says SERVING; called in threads of its own.
 
         Raises:
             OSError: the address cannot be listened on.
         """
         self._server = _HttpServer(host, port)
-        self._server.set_app(make_wsgi_app(registry))
+        self._server.set_app(_application(registry, is_serving))
         self.port: int = self._server.server_port
         self._thread = threading.Thread(target=self._server.serve_forever, args=(_POLL_S,), name="metrics", daemon=True)
         self._thread.start()
@@ -49,6 +63,27 @@ class MetricsServer:
         self._thread.join()
         self._server.close_connections()
         self._server.server_close()
+
+
+def _application(registry: CollectorRegistry, is_serving: Callable[[], bool]) -> WSGIApplication:
+    metrics: WSGIApplication = make_wsgi_app(registry)
+
+    def answer(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
+        path = environ["PATH_INFO"]
+        if path == "/metrics":
+            return metrics(environ, start_response)
+        if path != "/ready":
+            return _say(start_response, HTTPStatus.NOT_FOUND, "there are /metrics and /ready")
+        if is_serving():
+            return _say(start_response, HTTPStatus.OK, "serving")
+        return _say(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "not serving")
+
+    return answer
+
+
+def _say(start_response: StartResponse, status: HTTPStatus, text: str) -> list[bytes]:
+    start_response(f"{status.value} {status.phrase}", [("Content-Type", "text/plain; charset=utf-8")])
+    return [f"{text}\n".encode()]
 
 
 class _Handler(WSGIRequestHandler):

@@ -94,13 +94,19 @@ class _Children(Generic[M]):
 
 
 class Metrics:
-    """The metrics of one server. Implements `scheduling.observer.Observer` and `rpc.CallObserver`; never raises."""
+    """The metrics of one server. Implements `scheduling.observer.Observer` and `rpc.CallObserver`; never raises.
+
+    Attributes:
+        registry: what a scrape reads.
+        is_serving: what `set_serving` was told last; False before.
+    """
 
     def __init__(self) -> None:
         self.registry = Registry()
         ProcessMetrics(registry=self.registry)
         PlatformCollector(registry=self.registry)
         GCCollector(registry=self.registry)
+        self.is_serving = False
         self._scraped = Scraped()
         self.registry.register(self._scraped)
         self._make_call_metrics()
@@ -220,6 +226,7 @@ class Metrics:
 
     def set_serving(self, is_serving: bool) -> None:
         """What health says of the server as a whole."""
+        self.is_serving = is_serving
         self._serving.set(is_serving)
 
     def warmed_up(self, seconds: float) -> None:

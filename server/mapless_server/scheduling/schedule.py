@@ -22,6 +22,9 @@ MIN_RETRY_S = 0.1
 RETRY_ELSEWHERE_S = 1.0
 """When to come again where nothing tells when there will be room."""
 
+_NOBODY = Flow("", "")
+"""A caller without jobs."""
+
 _ENDED_HELD = 16
 
 _UNASKED = frozenset({Ending.CANCELLED, Ending.EXPIRED})
@@ -156,6 +159,17 @@ class Schedule:
         self._ledger.open(job, cost_s)
         self._enqueue(job, now_s)
 
+    def check_room(self, step: Step) -> None:
+        """Raises Refused if even a caller with no other jobs would not be admitted with a job that begins like this."""
+        try:
+            if self._draining:
+                raise Refused(Refusal.DRAINING, "the server is stopping", RETRY_ELSEWHERE_S)
+            if self._ledger.jobs:
+                self._check_queue(_NOBODY, self._predict(step))
+        except Refused as refused:
+            self._observer.refused(refused.reason)
+            raise
+
     def take(self, lane_name: str, now_s: float) -> Batch | None:
         """What a free thread of a lane computes now; None if all are busy or nothing waits."""
         self.expire(now_s)
@@ -254,17 +268,20 @@ class Schedule:
         held_bytes = ledger.size_bytes(job.flow)
         if held_bytes + job.size_bytes > self._share(options.max_bytes, ledger.size_bytes(), held_bytes):
             raise Refused(Refusal.TOO_MUCH_MEMORY, "the calls in progress hold too much memory", RETRY_ELSEWHERE_S)
-        for lane, own_s in cost_s.items():
-            excess_s = self._excess_s(job.flow, lane, own_s)
-            if excess_s > 0:
-                in_progress = f"{len(ledger.jobs)} calls are in progress or wait"
-                raise Refused(Refusal.QUEUE_FULL, in_progress, max(MIN_RETRY_S, excess_s / self._lanes[lane].threads))
+        self._check_queue(job.flow, cost_s)
         own_s = cost_s.total()
         waits_s = (ledger.ahead_s(job.flow, lane, it) / self._lanes[lane].threads for lane, it in cost_s.items())
         late_s = now_s + options.caution * (max(waits_s) + own_s) - job.deadline_s
         if late_s > 0:
             retry_s = None if now_s + own_s > job.deadline_s else max(MIN_RETRY_S, late_s)
             raise Refused(Refusal.DEADLINE_INFEASIBLE, "the answer would come after the deadline", retry_s)
+
+    def _check_queue(self, flow: Flow, cost_s: Counter[str]) -> None:
+        for lane, own_s in cost_s.items():
+            excess_s = self._excess_s(flow, lane, own_s)
+            if excess_s > 0:
+                message = f"{len(self._ledger.jobs)} calls are in progress or wait"
+                raise Refused(Refusal.QUEUE_FULL, message, max(MIN_RETRY_S, excess_s / self._lanes[lane].threads))
 
     def _share(self, bound: float, held: float, held_by_flow: float) -> float:
         """What one caller may hold of a bound, given what all hold and it does."""

@@ -184,6 +184,11 @@ class WorkQueue:
                 with self._lock:
                     self._schedule.cancel(job, time.monotonic())
 
+    def check_room(self, step: Step) -> None:
+        """Raises Refused if nobody would be admitted who began with a step like this."""
+        with self._lock:
+            self._schedule.check_room(step)
+
     def drain(self) -> None:
         """Lets nobody in any more."""
         with self._lock:

@@ -1,0 +1,378 @@
+"""Clients that vanish, misbehave or flood; methods that raise, hang or give nonsense; processes that are killed.
+
+Whatever one of them does, the others are answered, each call ends in one way, and what was acknowledged is there.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import grpc
+import numpy as np
+import pytest
+import raw_http2
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from images import encode
+from programs import gated, real, wait_until
+from servers import (
+    CAMERA,
+    PHOTO,
+    RunningServer,
+    StandInExtractor,
+    StandInMethod,
+    StandInReconstructor,
+    Stubs,
+    failure_of,
+    listening,
+    localize_request,
+    pose,
+    serving,
+    whole,
+)
+
+from mapless import (
+    AlreadyExists,
+    Client,
+    ConnectOptions,
+    DeadlineExceeded,
+    Internal,
+    LocalizationResult,
+    MaplessError,
+    NewReference,
+    Unavailable,
+)
+from mapless.geometry import Camera
+from mapless.v1 import reference_service_pb2 as reference_pb
+from mapless_server.engine import Engine
+from mapless_server.load.scrape import Scrape, read_metrics
+from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless_server.observability.metrics import Metrics
+from mapless_server.security.rate import RateLimiter
+from mapless_server.serve import engine_options
+from mapless_server.settings import Settings
+from mapless_server.store import Store
+from mapless_server.tiers import Tier
+
+ONCE = ConnectOptions(max_attempts=1)
+PATIENT = ConnectOptions(max_attempts=5, initial_backoff_s=1.0, max_backoff_s=5.0)
+SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
+
+
+def free_port() -> int:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return int(taken.getsockname()[1])
+
+
+def scraped(address: str) -> Scrape:
+    scrape = read_metrics(address)
+    assert scrape is not None
+    return scrape
+
+
+def make_scene(client: Client) -> None:
+    client.create_scene("s")
+    client.add_reference("s", NewReference("r", PHOTO, CAMERA, pose(0)))
+
+
+def is_served(client: Client, scene: str) -> bool:
+    return client.is_serving() and isinstance(client.localize(PHOTO, CAMERA, scene), LocalizationResult)
+
+
+class TestClients:
+    def test_one_that_is_killed_while_it_waits_frees_its_place(self, tmp_path: Path) -> None:
+        caller = """if True:
+            import sys
+            from mapless import Client
+            from mapless.geometry import Camera
+            camera = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
+            Client(sys.argv[1]).localize(sys.argv[2], camera, "s", timeout_s=300)
+        """
+        photo = tmp_path / "photo.png"
+        photo.write_bytes(PHOTO)
+        with (
+            serving(tmp_path / "data", metrics=True, metrics_port=0) as server,
+            Client(server.address) as client,
+        ):
+            make_scene(client)
+            with server.method.held():
+                victim = subprocess.Popen([sys.executable, "-c", caller, server.address, str(photo)])
+                assert server.method.started.acquire(timeout=30)
+                victim.kill()
+                victim.wait(30)
+                wait_until(lambda: server.engine.queue.job_count == 0)
+                wait_until(lambda: scraped(server.metrics_address).handled["CANCELLED"] == 1)
+                assert scraped(server.metrics_address).terminated["cancelled"] == 1
+            assert is_served(client, "s")
+
+    def test_one_that_never_reads_holds_up_nobody(self, server: RunningServer, client: Client, scene: str) -> None:
+        camera = Camera(800, 600, 700.0, 700.0, 399.5, 299.5)
+        noise = np.random.default_rng(0).integers(0, 256, (600, 800, 3)).astype(np.uint8)
+        client.add_reference(scene, NewReference("large", encode(".png", noise), camera, pose(9)))
+        asked = reference_pb.GetReferenceRequest(name=f"scenes/{scene}/references/large", include_image=True)
+        with ExitStack() as stack:
+            for window_bytes in (0, 65_535):
+                slow = stack.enter_context(raw_http2.connect(server.address))
+                slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+                calls = (
+                    raw_http2.call(stream, "/mapless.v1.ReferenceService/GetReference", asked.SerializeToString())
+                    for stream in range(1, 40, 2)
+                )
+                slow.sendall(raw_http2.hello(window_bytes) + b"".join(calls))
+            for _ in range(5):
+                assert is_served(client, scene)
+                assert len(client.get_reference(scene, "large", include_image=True).image or b"") > 1_000_000
+
+    def test_a_flood_of_garbage(self, server: RunningServer, client: Client, scene: str) -> None:
+        noise = random.Random(0)
+        starts = [b"", raw_http2.PREFACE, raw_http2.hello(), b"GET / HTTP/1.1\r\n\r\n", b"\x16\x03\x01\x02\x00\x01"]
+        for i in range(150):
+            said = starts[i % len(starts)] + noise.randbytes(noise.randrange(5000))
+            # The server may have heard enough before it is over.
+            with raw_http2.connect(server.address) as garbage, suppress(ConnectionResetError, BrokenPipeError):
+                garbage.sendall(said)
+            if i % 50 == 0:
+                assert is_served(client, scene)
+        assert is_served(client, scene)
+
+    def test_metadata_over_the_limit(self, stubs: Stubs, scene: str) -> None:
+        too_much = [(f"x-padding-{i}", "x" * 4000) for i in range(20)]
+        error = failure_of(stubs.localization.Localize, localize_request(scene), metadata=too_much)
+        assert error.code == "RESOURCE_EXHAUSTED"
+        assert stubs.localization.Localize(localize_request(scene), timeout=30).HasField("localization")
+
+    def test_a_thousand_that_say_nothing(self, tmp_path: Path) -> None:
+        with enough_files(2500), real(tmp_path / "server") as server, ExitStack() as stack:
+            address, process = server.address, Path(f"/proc/{server.process.pid}")
+            client = stack.enter_context(Client(address))
+            client.create_scene("s")
+            files, memory_mib = open_files(process), resident_mib(process)
+            idle = [stack.enter_context(raw_http2.connect(address)) for _ in range(1000)]
+            for connection in idle[:800]:  # the others do not even say hello
+                connection.sendall(raw_http2.hello())
+            wait_until(lambda: open_files(process) >= files + 1000)
+            for _ in range(20):
+                assert client.get_scene("s").reference_count == 0
+            assert client.is_serving()
+            assert resident_mib(process) < memory_mib + 150
+            for connection in idle:
+                connection.close()
+            wait_until(lambda: open_files(process) < files + 20)
+            assert client.get_scene("s").reference_count == 0
+
+
+@contextmanager
+def enough_files(count: int) -> Iterator[None]:
+    """So many files may be open here and in children, meanwhile."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard not in (-1, resource.RLIM_INFINITY) and hard < count:
+        pytest.skip(f"at most {hard} open files are allowed here")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, count), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def open_files(process: Path) -> int:
+    return len(os.listdir(process / "fd"))
+
+
+def resident_mib(process: Path) -> float:
+    return int((process / "statm").read_text().split()[1]) * resource.getpagesize() / 2**20
+
+
+class TestMethods:
+    def test_one_that_raises_costs_others_nothing(self, server: RunningServer, client: Client, scene: str) -> None:
+        server.method.failure = RuntimeError("planted")
+        try:
+            with ThreadPoolExecutor(8) as pool:
+                calls = [pool.submit(client.localize, PHOTO, CAMERA, scene) for _ in range(8)]
+                errors = [call.exception(30) for call in calls]
+                assert client.get_scene(scene).reference_count == 3
+        finally:
+            server.method.failure = None
+        ids = set()
+        for error in errors:
+            assert isinstance(error, Internal)
+            assert error.message == f"internal error, id={error.request_id}"
+            ids.add(error.request_id)
+        assert len(ids) == 8
+        assert is_served(client, scene)
+
+    @pytest.mark.parametrize("where", ["rotation", "translation", "covariance", "reprojection_error_px"])
+    @pytest.mark.parametrize("number", [np.nan, np.inf])
+    def test_one_that_gives_nonsense_is_internal(self, tmp_path: Path, where: str, number: float) -> None:
+        def spoil(answer: Answer) -> Answer:
+            found = answer.outcome
+            assert isinstance(found, Localization)
+            at = found.world_from_camera
+            spoilt: dict[str, dict[str, Any]] = {
+                "rotation": {"world_from_camera": replace(at, rotation=at.rotation * number)},
+                "translation": {"world_from_camera": replace(at, translation=np.array([0.0, number, 0.0]))},
+                "covariance": {"covariance": np.diag([0.01] * 5 + [number])},
+                "reprojection_error_px": {"reprojection_error_px": number},
+            }
+            return replace(answer, outcome=replace(found, **spoilt[where]))
+
+        with answering(tmp_path, spoil) as address, Client(address) as client:
+            make_scene(client)
+            with pytest.raises(Internal):
+                client.localize(PHOTO, CAMERA, "s")
+            assert client.is_serving()
+
+    def test_one_that_hangs_ends_the_process_and_every_caller_is_told(self, tmp_path: Path) -> None:
+        with (
+            gated(tmp_path / "server", "hangs", workers=1, stall_limit_s=2.5) as server,
+            Client(server.address, ONCE) as client,
+            grpc.insecure_channel(server.address) as channel,
+            ThreadPoolExecutor(2) as pool,
+        ):
+            make_scene(client)
+            watch = health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest(), timeout=60)
+            assert next(watch).status == SERVING
+            hangs = pool.submit(client.localize, PHOTO, CAMERA, "s", timeout_s=1.0)
+            wait_until(lambda: server.began)
+            waits = pool.submit(client.localize, PHOTO, CAMERA, "s", timeout_s=60.0)
+            assert isinstance(hangs.exception(30), DeadlineExceeded)
+            failed = waits.exception(30)
+            assert isinstance(failed, Unavailable)
+            assert failed.reason == "SERVER_FAILED"
+            assert next(watch).status == NOT_SERVING
+            assert server.wait() == 70
+            assert "the stage refine has computed for" in server.log
+            assert "the server cannot go on and ends" in server.log
+            with pytest.raises(grpc.RpcError, match="UNAVAILABLE"):
+                next(watch)
+
+
+@contextmanager
+def answering(data_dir: Path, change: Callable[[Answer], Answer]) -> Iterator[str]:
+    """A server whose every answer is changed."""
+    stand_in = StandInMethod()
+    stand_in.gate.set()
+
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+        tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
+        method = whole(lambda *asked: change(stand_in(*asked)))
+        return Engine(store, tiers, engine_options(settings), metrics, quota, method)
+
+    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, workers=1, metrics=False, warm_up=False)
+    with listening(settings, Store.open(data_dir), make) as (running, _):
+        yield running.address
+
+
+def code_of(call: Callable[[], object]) -> str:
+    """How a call ends."""
+    try:
+        call()
+    except MaplessError as error:
+        return error.code
+    return "OK"
+
+
+class TestProcess:
+    def test_killed_under_load_and_started_again_nothing_acknowledged_is_lost(self, tmp_path: Path) -> None:
+        """Clients go on as if nothing had happened: the service config of each tries again."""
+        port = free_port()
+        stop, acknowledged = threading.Event(), [list[str]() for _ in range(3)]
+
+        def work(number: int) -> None:
+            with Client(f"127.0.0.1:{port}", PATIENT) as client:
+                for i in range(10_000):
+                    if stop.is_set():
+                        return
+                    name = f"r-{number}-{i}"
+                    with suppress(AlreadyExists):  # it was stored, and its answer was lost
+                        client.add_reference("s", NewReference(name, PHOTO, CAMERA, pose(i)), timeout_s=50)
+                    acknowledged[number].append(name)
+                    client.localize(PHOTO, CAMERA, "s", [name], timeout_s=50)
+
+        with ExitStack() as stack:
+            pool = stack.enter_context(ThreadPoolExecutor(3))
+            stack.callback(stop.set)
+            with real(tmp_path / "server", port=port) as server:
+                with Client(server.address) as client:
+                    client.create_scene("s")
+                workers = [pool.submit(work, i) for i in range(3)]
+                wait_until(lambda: all(len(it) >= 3 for it in acknowledged) or any(it.done() for it in workers))
+                server.process.kill()
+                assert server.wait() == -signal.SIGKILL
+            before = [len(it) for it in acknowledged]
+            with real(tmp_path / "server", port=port) as server:
+                assert server.address == f"127.0.0.1:{port}"
+                wait_until(
+                    lambda: (
+                        all(len(it) >= n + 3 for it, n in zip(acknowledged, before, strict=True))
+                        or any(it.done() for it in workers)
+                    )
+                )
+                stop.set()
+                for worker in workers:
+                    assert worker.exception(60) is None
+                with Client(server.address) as client:
+                    stored = {it.reference_id for it in client.list_references("s")}
+        assert {name for names in acknowledged for name in names} <= stored
+
+    @pytest.mark.parametrize("signals", [1, 2])
+    def test_sigterm_drains_in_order(self, tmp_path: Path, signals: int) -> None:
+        """Health first, while calls are still taken; then none; what runs and what waits is answered; exit code 0."""
+        settings: dict[str, Any] = {
+            "workers": 1,
+            "drain_delay_s": 2.0,
+            "drain_grace_s": 50,
+            "metrics": True,
+            "metrics_port": 0,
+        }
+        with (
+            gated(tmp_path / "server", **settings) as server,
+            Client(server.address, ONCE) as client,
+            grpc.insecure_channel(server.address) as channel,
+            ThreadPoolExecutor(2) as pool,
+        ):
+            make_scene(client)
+            watch = health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest(), timeout=60)
+            assert next(watch).status == SERVING
+            calls = [pool.submit(client.localize, PHOTO, CAMERA, "s") for _ in range(2)]
+            wait_until(lambda: server.began == 1 and scraped(server.metrics_address).started == 2)
+            for _ in range(signals):
+                server.process.send_signal(signal.SIGTERM)
+            assert next(watch).status == NOT_SERVING
+            watch.cancel()
+            assert client.get_scene("s").reference_count == 1
+            assert not client.is_serving()
+            codes = []
+            wait_until(lambda: codes.append(code_of(lambda: client.get_scene("s"))) or codes[-1] == "UNAVAILABLE")
+            # A call that arrives in the moment of the shutdown is cancelled by grpc itself: grpc/grpc#41785.
+            assert codes[0] == "OK"
+            assert set(codes) <= {"OK", "CANCELLED", "UNAVAILABLE"}
+            assert not any(call.done() for call in calls)
+            assert server.began == 1
+            server.open_gate()
+            for call in calls:
+                assert isinstance(call.result(30), LocalizationResult)
+            assert server.began == 2
+            assert server.wait() == 0
+
+    def test_a_port_of_the_metrics_that_is_taken(self, tmp_path: Path) -> None:
+        with socket.socket() as taken:
+            taken.bind(("127.0.0.1", 0))
+            taken.listen()
+            port = taken.getsockname()[1]
+            with real(tmp_path / "server", metrics_port=port, log_level="error") as server:
+                assert server.wait() == 2
+                (line,) = server.log.strip().splitlines()
+        assert line.startswith(f"mapless-server: cannot serve metrics on 127.0.0.1:{port}: ")

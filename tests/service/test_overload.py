@@ -1,0 +1,312 @@
+"""More calls than the server can take: some are refused at once and told when to come again, the others are answered.
+
+And every one of them is in the books, of the caller and of the server, once.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import grpc
+import numpy as np
+import pytest
+from images import encode, textured
+from programs import wait_until
+from prometheus_client.parser import text_string_to_metric_families
+from servers import (
+    CAMERA,
+    PHOTO,
+    StandInExtractor,
+    StandInMethod,
+    StandInReconstructor,
+    listening,
+    localize_request,
+    pose,
+    whole,
+)
+
+from mapless import (
+    Client,
+    ConnectOptions,
+    DeadlineExceeded,
+    LocalizationResult,
+    NewReference,
+    Rejected,
+    ResourceExhausted,
+)
+from mapless.errors import from_rpc_error
+from mapless.geometry import Camera, RigidTransform
+from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless_server.engine import Engine
+from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless_server.method.pnp import PoseStage
+from mapless_server.observability.metrics import Metrics
+from mapless_server.query_stages import Method
+from mapless_server.security.rate import RateLimiter
+from mapless_server.serve import engine_options
+from mapless_server.settings import Settings
+from mapless_server.store import Store
+from mapless_server.tiers import Tier
+
+COST_S = 0.04
+WORKERS = 2
+
+
+@dataclass(frozen=True)
+class Overloaded:
+    """A server that takes its time.
+
+    Attributes:
+        address: "host:port".
+        engine: what computes.
+        scrape: its metrics now: sums over labels that are not given.
+    """
+
+    address: str
+    engine: Engine
+    scrape: Callable[..., float]
+
+
+@contextmanager
+def overloaded(data_dir: Path, method: Method, tier: Tier | None = None, **options: Any) -> Iterator[Overloaded]:
+    """A server with this method, and stand-ins for the rest unless there is a tier."""
+    given = {"workers": WORKERS, "warm_up": False, "metrics_port": 0} | options
+    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, **given)
+
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+        stand_in = Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))
+        return Engine(store, [tier or stand_in], engine_options(settings), metrics, quota, method)
+
+    with listening(settings, Store.open(data_dir), make) as (running, _):
+        address = running.metrics_address
+        yield Overloaded(running.address, running.engine, lambda name, **labels: scrape(address, name, **labels))
+
+
+def scrape(address: str, name: str, **labels: str) -> float:
+    """A metric's value, summed over the labels that are not given."""
+    with urllib.request.urlopen(f"http://{address}/metrics", timeout=30) as response:
+        page = response.read().decode()
+    return sum(
+        sample.value
+        for family in text_string_to_metric_families(page)
+        for sample in family.samples
+        if sample.name == name and labels.items() <= sample.labels.items()
+    )
+
+
+def slow(seconds: float) -> Method:
+    """Takes so long for every query, whatever else goes on."""
+    stand_in = StandInMethod()
+    stand_in.gate.set()
+
+    def localize(*asked: Any) -> Answer:
+        time.sleep(seconds)
+        return stand_in(*asked)
+
+    return whole(localize)
+
+
+def make_scene(client: Client, calls: int = 0) -> None:
+    """A scene "s", and so many calls by which the queue learns what to expect."""
+    client.create_scene("s")
+    client.add_reference("s", NewReference("r", PHOTO, CAMERA, pose(0)))
+    for _ in range(calls):
+        client.localize(PHOTO, CAMERA, "s")
+
+
+def test_three_times_as_many_as_fit_are_answered_or_refused_and_all_are_counted(tmp_path: Path) -> None:
+    sent, rate = 300, 3 * WORKERS / COST_S
+    request = localize_request("s")
+    with overloaded(tmp_path, slow(COST_S), max_queued_s=1.0) as server, ExitStack() as stack:
+        with Client(server.address) as client:
+            make_scene(client, calls=10)
+        stubs = [LocalizationServiceStub(stack.enter_context(grpc.insecure_channel(server.address))) for _ in range(4)]
+        before = {code: calls_handled(server, code) for code in ("OK", "RESOURCE_EXHAUSTED")}
+        start_s, calls = time.monotonic(), []
+        for i in range(sent):
+            time.sleep(max(0.0, start_s + i / rate - time.monotonic()))
+            metadata = [("x-client-id", f"robot-{i % 4}")]
+            calls.append(stubs[i % 4].Localize.future(request, timeout=20, metadata=metadata))
+        errors = [from_rpc_error(call.exception()) for call in calls if call.exception() is not None]
+        answered, refused = sent - len(errors), len(errors)
+        assert {error.code for error in errors} == {"RESOURCE_EXHAUSTED"}
+        for error in errors:
+            assert error.reason in ("QUEUE_FULL", "DEADLINE_INFEASIBLE")
+            assert error.retry_after_s is not None
+            assert 0 < error.retry_after_s < 20
+        # A full queue keeps all threads busy: what was answered is at least what they can do in that time.
+        assert answered > 0.2 * sent
+        assert refused > 0.2 * sent
+        wait_until(lambda: calls_handled(server) == sent + 10)
+        assert calls_handled(server, "OK") - before["OK"] == answered
+        assert calls_handled(server, "RESOURCE_EXHAUSTED") - before["RESOURCE_EXHAUSTED"] == refused
+        assert server.scrape("mapless_admission_rejected_total") == refused
+        of_localize = [
+            server.scrape("mapless_jobs_terminated_total", stage=it) for it in ("prepare", "coarse", "refine")
+        ]
+        assert sum(of_localize) == answered + 10
+        assert server.scrape("mapless_jobs_terminated_total", outcome="expired") == 0
+        assert server.engine.queue.job_count == 0
+
+
+def calls_handled(server: Overloaded, code: str | None = None) -> float:
+    labels = {"grpc_method": "Localize"} | ({} if code is None else {"grpc_code": code})
+    return server.scrape("grpc_server_handled_total", **labels)
+
+
+def test_one_who_asks_little_is_served_while_another_floods(tmp_path: Path) -> None:
+    stop, refused = threading.Event(), threading.Event()
+
+    def flood(client: Client) -> None:
+        while not stop.is_set():
+            with suppress(ResourceExhausted):
+                client.localize(PHOTO, CAMERA, "s")
+                continue
+            refused.set()
+            stop.wait(0.2)
+
+    with (
+        overloaded(tmp_path, slow(COST_S), max_queued_s=0.5) as server,
+        Client(server.address, ConnectOptions(client_id="heavy")) as heavy,
+        Client(server.address, ConnectOptions(client_id="light")) as light,
+        ThreadPoolExecutor(40) as pool,
+    ):
+        make_scene(light, calls=10)
+        floods = [pool.submit(flood, heavy) for _ in range(40)]
+        try:
+            assert refused.wait(30)
+            for _ in range(10):
+                assert isinstance(light.localize(PHOTO, CAMERA, "s"), LocalizationResult)
+        finally:
+            stop.set()
+        for it in floods:
+            assert it.exception(30) is None
+
+
+class Refining:
+    """A method that has a coarse pose at once and takes its time to refine it.
+
+    Attributes:
+        seconds: for that.
+        began: how often.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self.began = 0
+        self._stand_in = StandInMethod()
+        self._stand_in.gate.set()
+
+    def method(self) -> Method:
+        return replace(whole(self._refine), coarse_answer=self._coarse_answer)
+
+    def _refine(self, *asked: Any) -> Answer:
+        self.began += 1
+        end_s = time.monotonic() + self.seconds
+        while time.monotonic() < end_s:
+            asked[-1]()  # nobody may wait any more
+            time.sleep(0.005)
+        return self._stand_in(*asked)
+
+    def _coarse_answer(self, coarse: Any) -> Answer:
+        answer = whole(self._stand_in).refine(coarse, lambda: None)
+        found = answer.outcome
+        assert isinstance(found, Localization)
+        return replace(answer, outcome=replace(found, pose_stage=PoseStage.COARSE, covariance=None, inlier_count=0))
+
+
+def test_the_coarse_pose_is_answered_where_there_is_no_time_to_refine_it_if_that_is_allowed(tmp_path: Path) -> None:
+    refining = Refining(60.0)
+    with overloaded(tmp_path, refining.method()) as server, Client(server.address) as client:
+        make_scene(client)
+        coarse = client.localize(PHOTO, CAMERA, "s", allow_coarse=True, timeout_s=2.0)
+        assert isinstance(coarse, LocalizationResult)
+        assert (coarse.pose_stage, coarse.covariance, coarse.accuracy) == ("COARSE", None, None)
+        np.testing.assert_allclose(coarse.world_from_camera.matrix(), pose(0).matrix(), atol=1e-9)
+        with pytest.raises(DeadlineExceeded):
+            client.localize(PHOTO, CAMERA, "s", timeout_s=2.0)
+        assert refining.began == 2
+        for outcome in ("degraded", "expired"):
+            wait_until(lambda: server.scrape("mapless_jobs_terminated_total", outcome=outcome) == 1)  # noqa: B023
+
+
+def test_what_is_foreseen_to_come_too_late_is_not_even_begun(tmp_path: Path) -> None:
+    refining = Refining(1.0)
+    with overloaded(tmp_path, refining.method()) as server, Client(server.address) as client:
+        make_scene(client)
+        full = client.localize(PHOTO, CAMERA, "s", allow_coarse=True, timeout_s=20.0)
+        assert isinstance(full, LocalizationResult)
+        assert full.pose_stage == "REFINED"
+        coarse = client.localize(PHOTO, CAMERA, "s", allow_coarse=True, timeout_s=0.8)
+        assert isinstance(coarse, LocalizationResult)
+        assert coarse.pose_stage == "COARSE"
+        assert refining.began == 1
+
+
+def test_what_waits_for_a_network_is_one_batch_and_its_references_are_encoded_once(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch", reason="the networks' extra is not installed")
+    pytest.importorskip("PIL", reason="the networks' extra is not installed")
+    from small_networks import GRIDS, small_network
+
+    from mapless_server.method import localize as real
+    from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
+    from mapless_server.method.features import SiftExtractor
+    from mapless_server.networks.runner import NetworkRunner
+
+    torch.set_num_threads(1)
+    camera = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
+    wall = textured(800, 240, seed=8)
+
+    def photograph_at(x_m: float) -> bytes:
+        start = round(x_m * 100)  # a wall 3 m away
+        return encode(".png", wall[:, start : start + camera.width_px])
+
+    sizes: list[int] = []
+    entered, gate = threading.Semaphore(0), threading.Event()
+
+    def reconstruct(batch: Any, checks: Any) -> Any:
+        entered.release()
+        assert gate.wait(60)
+        sizes.append(len(batch))
+        return real.reconstruct(batch, checks)
+
+    with closing(
+        NetworkReconstructor(NetworkRunner(small_network("pi3"), "pi3", "sha", "cpu"), NetworkOptions(grids=GRIDS))
+    ) as backend:
+        tier = Tier(SiftExtractor(), Pipeline(backend))
+        with (
+            overloaded(tmp_path, Method(reconstruct=reconstruct), tier=tier, max_batch=4, max_queued_s=60.0) as server,
+            Client(server.address) as client,
+            ThreadPoolExecutor(5) as pool,
+        ):
+            client.create_scene("s")
+            references = [
+                NewReference(f"r{i}", photograph_at(x_m), camera, RigidTransform(np.eye(3), np.array([x_m, 0.0, 0.0])))
+                for i, x_m in enumerate((0.0, 0.5, 1.0, 1.5))
+            ]
+            client.add_references("s", references)
+            names = [it.reference_id for it in references]
+            calls = [pool.submit(client.localize, photograph_at(0.2), camera, "s", names, timeout_s=60)]
+            try:
+                assert entered.acquire(timeout=30)
+                calls += [
+                    pool.submit(client.localize, photograph_at(x_m), camera, "s", names, timeout_s=60)
+                    for x_m in (0.3, 0.6, 0.9, 1.2)
+                ]
+                wait_until(lambda: server.scrape("mapless_queue_depth", stage="coarse") == 4)
+            finally:
+                gate.set()
+            assert all(isinstance(call.result(60), LocalizationResult | Rejected) for call in calls)
+            assert sizes == [1, 4]
+            assert server.scrape("mapless_batch_size_sum", stage="coarse") == 5
+            assert server.scrape("mapless_batch_size_count", stage="coarse") == 2
+        # Each reference was encoded once: by the first query, for all of them.
+        assert backend.cache.counters.misses == 4
