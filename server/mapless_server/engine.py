@@ -18,7 +18,7 @@ from .query import Caller, Photo, Query, Result
 from .query_stages import COARSE, PREPARE, REFINE, Method, QueryStages, ReferenceSource, Work
 from .query_views import QueryViews
 from .scheduling.jobs import Done, Expired, Job, Next, Refused, Stage, Step, Verdict, Visit
-from .scheduling.observer import Observer, Refusal, Unobserved
+from .scheduling.observer import Observer, Refusal
 from .scheduling.schedule import Quota
 from .scheduling.work_queue import Failure, Fatal, Lane, WorkQueue, WorkQueueOptions
 from .store import Store
@@ -93,7 +93,7 @@ class Engine:
             },
             [Lane(HOST, options.workers), *([] if on_cpu else [Lane(DEVICE, 1)])],
             options.queue,
-            observer or Unobserved(),
+            observer or Observer(),
             failure_of,
             quota,
         )

@@ -14,12 +14,11 @@ from urllib.parse import unquote
 
 import grpc
 from google.protobuf.message import DecodeError, Message
-from google.rpc import error_details_pb2, status_pb2
 from grpc_status import rpc_status
 
 from mapless.wire import FieldError
 
-from .errors import AlreadyExists, DeadlineExceeded, InvalidArgument, NotFound, RequestError, Unavailable
+from .errors import DeadlineExceeded, InvalidArgument, RequestError, Unavailable
 from .observability.logs import as_extra
 from .observability.tracing import CallSpan, Metadata, NoTracer, Tracer
 from .observability.trail import Trail
@@ -27,6 +26,7 @@ from .principal import Principal
 from .query import Caller
 from .scheduling.fair import Flow
 from .security.access import OPEN_METHODS
+from .status import to_status
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +39,6 @@ ANSWER_MARGIN_S = 0.01
 _MAX_MARGIN_SHARE = 0.1
 """... where there is time for that."""
 _ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it enters the log: no line breaks, no escapes
-_DOMAIN = "mapless"
-_MAX_MESSAGE_CHARACTERS = 1000  # trailers hold about 8 KB, and the text stands in them twice
 
 
 Context = Any
@@ -288,23 +286,3 @@ def _ms(seconds: float) -> float:
 async def _abort(context: Context, call: Call, error: RequestError) -> None:
     status = rpc_status.to_status(to_status(error))
     await context.abort(status.code, status.details, (*status.trailing_metadata, (REQUEST_ID_KEY, call.request_id)))
-
-
-def to_status(error: RequestError) -> status_pb2.Status:
-    """The error as google.rpc.Status: one ErrorInfo, and what belongs to its kind."""
-    message = str(error)[:_MAX_MESSAGE_CHARACTERS]
-    field = {} if error.field is None else {"field": error.field}
-    details: list[Message] = [error_details_pb2.ErrorInfo(reason=error.reason, domain=_DOMAIN, metadata=field)]
-    if isinstance(error, NotFound | AlreadyExists):
-        details.append(error_details_pb2.ResourceInfo(description=message))
-    elif error.field is not None:
-        violation = error_details_pb2.BadRequest.FieldViolation(field=error.field, description=message)
-        details.append(error_details_pb2.BadRequest(field_violations=[violation]))
-    if error.retry_after_s is not None:
-        retry = error_details_pb2.RetryInfo()
-        retry.retry_delay.FromMilliseconds(round(1000 * error.retry_after_s))
-        details.append(retry)
-    status = status_pb2.Status(code=grpc.StatusCode[error.code].value[0], message=message)
-    for detail in details:
-        status.details.add().Pack(detail)
-    return status

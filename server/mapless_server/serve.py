@@ -23,15 +23,12 @@ from .observability.event_loop import watch_event_loop
 from .observability.exporter import MetricsServer
 from .observability.metrics import Metrics
 from .observability.tracing import Tracer, make_tracer
-from .scheduling.schedule import ScheduleOptions
+from .scheduling.admission import ScheduleOptions
 from .scheduling.work_queue import Fatal, WorkQueueOptions
-from .security.access import Authenticator
-from .security.binding import Verdict, advise
 from .security.errors import SecurityError
+from .security.protection import Protection
 from .security.rate import RateLimiter
-from .security.reloading import Refreshable, Reloading, keep_fresh
-from .security.tls import Tls, TlsFiles
-from .security.tokens import Tokens, read_tokens
+from .security.reloading import keep_fresh
 from .settings import Settings
 from .store import Store, StoreError
 from .warm_up import warm_up
@@ -86,60 +83,6 @@ def open_store(settings: Settings) -> Store:
         raise StartupError(str(error)) from error
 
 
-@dataclass
-class Security:
-    """What protects the server; made from the settings' files, and kept up to date with them."""
-
-    tls: Tls | None
-    tokens: Reloading[Tokens] | None
-    quota: RateLimiter | None
-
-    @staticmethod
-    def of(settings: Settings) -> Security:
-        """StartupError if a file cannot be used, or the server would be open to the world by accident."""
-        advice = advise(
-            settings.host,
-            tls=settings.tls_certificate is not None,
-            client_certificates=settings.tls_client_ca is not None,
-            tokens=settings.tokens_file is not None,
-            insecure=settings.insecure,
-        )
-        if advice.verdict is Verdict.REFUSED:
-            raise StartupError(advice.sentence)
-        if advice.sentence:
-            log.log(logging.WARNING if advice.verdict is Verdict.WARNING else logging.INFO, "%s", advice.sentence)
-        tls = tokens = None
-        try:
-            if settings.tls_certificate is not None and settings.tls_key is not None:
-                tls = Tls(TlsFiles(settings.tls_certificate, settings.tls_key, settings.tls_client_ca))
-            if (path := settings.tokens_file) is not None:
-                tokens = Reloading([path], lambda: read_tokens(path), "tokens")
-        except SecurityError as error:
-            raise StartupError(str(error)) from error
-        return Security(tls, tokens, _make_quota(settings, tokens))
-
-    @property
-    def authenticator(self) -> Authenticator:
-        """Finds out who calls."""
-        tokens = self.tokens
-        return Authenticator(None if tokens is None else lambda: tokens.value)
-
-    @property
-    def refreshable(self) -> list[Refreshable]:
-        """What follows files."""
-        return [it for it in (self.tls, self.tokens) if it is not None]
-
-
-def _make_quota(settings: Settings, tokens: Reloading[Tokens] | None) -> RateLimiter | None:
-    def own_rate(tenant: str) -> float | None:
-        own_ms = None if tokens is None else tokens.value.rate_ms(tenant)
-        return None if own_ms is None else own_ms / 1000
-
-    if not settings.tenant_rate_ms and tokens is None:
-        return None
-    return RateLimiter(settings.tenant_rate_ms / 1000, settings.tenant_burst_ms / 1000, own_rate)
-
-
 MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], Engine]
 
 
@@ -192,20 +135,20 @@ async def running_server(
     async with AsyncExitStack() as stack:
         store = store or open_store(settings)
         stack.push_async_callback(asyncio.to_thread, store.close)
-        security = Security.of(settings)
+        protection = _make_protection(settings)
         tracer = _make_tracer(settings)
         stack.push_async_callback(asyncio.to_thread, tracer.close, _TRACES_FLUSH_S)
-        metrics_address = _serve_metrics(settings, metrics, store, security, stack)
-        server = _make_server(settings, store, metrics, security, tracer)
+        metrics_address = _serve_metrics(settings, metrics, store, protection, stack)
+        server = _make_server(settings, store, metrics, protection, tracer)
         stack.push_async_callback(server.close)
         await server.start()
-        engine = await asyncio.to_thread(make, settings, store, metrics, security.quota)
+        engine = await asyncio.to_thread(make, settings, store, metrics, protection.quota)
         stack.push_async_callback(engine.close)
         failed: asyncio.Future[Fatal] = asyncio.get_running_loop().create_future()
         _watch_engine(engine, metrics)
         engine.queue.on_fatal = lambda fatal: _announce_failure(fatal, failed, metrics)
         _keep(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
-        _keep(stack, keep_fresh(security.refreshable))
+        _keep(stack, keep_fresh(protection.refreshable))
         await _warm_up(settings, engine, metrics)
         await server.open(engine)
         stack.push_async_callback(server.drain, settings.drain_delay_s, settings.drain_grace_s)
@@ -247,6 +190,13 @@ async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
         log.info("stopping: running calls get %g s", settings.drain_grace_s)
 
 
+def _make_protection(settings: Settings) -> Protection:
+    try:
+        return Protection.of(settings)
+    except SecurityError as error:
+        raise StartupError(str(error)) from error
+
+
 def _make_tracer(settings: Settings) -> Tracer:
     try:
         return make_tracer(settings.otlp_endpoint)
@@ -255,12 +205,12 @@ def _make_tracer(settings: Settings) -> Tracer:
 
 
 def _serve_metrics(
-    settings: Settings, metrics: Metrics, store: Store, security: Security, stack: AsyncExitStack
+    settings: Settings, metrics: Metrics, store: Store, protection: Protection, stack: AsyncExitStack
 ) -> str:
     """Where the metrics are served, "host:port"; empty if they are not."""
     metrics.watch_reference_cache(lambda: store.reference_cache)
-    if security.tls is not None:
-        tls = security.tls
+    if protection.tls is not None:
+        tls = protection.tls
         metrics.watch_certificate(lambda: tls.expiry_s)
     if not settings.metrics:
         return ""
@@ -287,15 +237,17 @@ def _watch_engine(engine: Engine, metrics: Metrics) -> None:
         metrics.watch_token_cache(lambda: cache.counters)
 
 
-def _make_server(settings: Settings, store: Store, metrics: Metrics, security: Security, tracer: Tracer) -> GrpcServer:
+def _make_server(
+    settings: Settings, store: Store, metrics: Metrics, protection: Protection, tracer: Tracer
+) -> GrpcServer:
     try:
         return GrpcServer(
             settings,
             store,
             metrics,
-            authenticate=security.authenticator.authenticate,
+            authenticate=protection.authenticator.authenticate,
             tracer=tracer,
-            credentials=None if security.tls is None else security.tls.server_credentials(),
+            credentials=None if protection.tls is None else protection.tls.server_credentials(),
         )
     except AddressTaken as error:
         raise StartupError(str(error)) from error

@@ -36,7 +36,7 @@ from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless_server.principal import Role
 from mapless_server.security.access import METHOD_ROLES
 from mapless_server.security.tokens import create_token, revoke_token, sha256_of
-from mapless_server.serve import Security, StartupError
+from mapless_server.serve import StartupError
 from mapless_server.settings import Settings
 
 LIMIT_S = 30.0
@@ -327,12 +327,12 @@ class TestStart:
     @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1"])
     def test_a_server_that_nothing_protects_does_not_listen_beyond_this_machine(self, host: str) -> None:
         with pytest.raises(StartupError, match="neither TLS nor tokens"):
-            Security.of(Settings(host=host))
+            Protection.of(Settings(host=host))
 
     def test_unless_the_operator_wants_it_or_something_protects_it(self, tmp_path: Path) -> None:
-        assert Security.of(Settings(host="0.0.0.0", insecure=True)).tls is None
+        assert Protection.of(Settings(host="0.0.0.0", insecure=True)).tls is None
         create_token(tmp_path / "tokens.json", "a", "t", "read", None)
-        assert len(Security.of(Settings(host="0.0.0.0", tokens_file=tmp_path / "tokens.json")).refreshable) == 1
+        assert len(Protection.of(Settings(host="0.0.0.0", tokens_file=tmp_path / "tokens.json")).refreshable) == 1
 
     @pytest.mark.parametrize("missing", ["tokens_file", "tls_certificate"])
     def test_a_missing_file_is_one_sentence(self, tmp_path: Path, missing: str) -> None:
@@ -340,7 +340,7 @@ class TestStart:
         files: dict[str, Any] = {"tls_certificate": tmp_path / "cert", "tls_key": tmp_path / "key"}
         files[missing] = tmp_path / "absent"
         with pytest.raises(StartupError, match=r"absent: No such file or directory$"):
-            Security.of(Settings(**files))
+            Protection.of(Settings(**files))
 
 
 def wait_until(condition: Callable[[], bool]) -> None:

@@ -13,10 +13,11 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+from mapless_server.scheduling.admission import ScheduleOptions
 from mapless_server.scheduling.fair import Flow
 from mapless_server.scheduling.jobs import Batch, Done, Expired, Fallback, Job, Next, Refused, Stage, Step, Verdict
-from mapless_server.scheduling.observer import Ending, Refusal, Unobserved
-from mapless_server.scheduling.schedule import Schedule, ScheduleOptions
+from mapless_server.scheduling.observer import Ending, Observer, Refusal
+from mapless_server.scheduling.schedule import Schedule
 
 STAGES = [
     Stage("describe", "host"),
@@ -30,7 +31,7 @@ OPTIONS = ScheduleOptions(max_queued_s=2.0, max_bytes=1000, quantum_s=0.2)
 FAR_S = 1e6
 
 
-class Counting(Unobserved):
+class Counting(Observer):
     """Keeps what it hears."""
 
     def __init__(self) -> None:

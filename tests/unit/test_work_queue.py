@@ -20,10 +20,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapless_server.scheduling.admission import ScheduleOptions
 from mapless_server.scheduling.fair import Flow
 from mapless_server.scheduling.jobs import Done, Expired, Fallback, Job, Next, Over, Refused, Stage, Step, Verdict
-from mapless_server.scheduling.observer import Ending, Observer, Refusal, Unobserved
-from mapless_server.scheduling.schedule import ScheduleOptions
+from mapless_server.scheduling.observer import Ending, Observer, Refusal
 from mapless_server.scheduling.work_queue import Compute, Failure, Fatal, Lane, WorkQueue, WorkQueueOptions
 
 ROOMY = ScheduleOptions(max_queued_s=1e6)
@@ -47,7 +47,7 @@ def failure_of(error: Exception) -> Failure:
     return Failure.OF_MEMORY if isinstance(error, MemoryError) else Failure.OF_ITEM
 
 
-class Account(Unobserved):
+class Account(Observer):
     """Keeps what it hears."""
 
     def __init__(self) -> None:

@@ -20,7 +20,7 @@ from prometheus_client.metrics_core import Metric
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 
 from ..method.rejection import RejectionReason
-from ..scheduling.observer import Ending, Refusal
+from ..scheduling.observer import Ending, Observer, Refusal
 from .scraped import CacheCounts, Scraped, TokenCacheCounts
 
 STAGES = ("prepare", "coarse", "refine", "describe")
@@ -93,8 +93,8 @@ class _Children(Generic[M]):
         return child
 
 
-class Metrics:
-    """The metrics of one server. Implements `scheduling.observer.Observer` and `rpc.CallObserver`; never raises.
+class Metrics(Observer):
+    """The metrics of one server. Implements `rpc.CallObserver`, too; never raises.
 
     Attributes:
         registry: what a scrape reads.

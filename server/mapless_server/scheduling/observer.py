@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from enum import Enum
-from typing import Protocol
 
 
 class Refusal(str, Enum):
@@ -33,8 +32,11 @@ class Ending(str, Enum):
     FAILED = "backend_error"
 
 
-class Observer(Protocol):
-    """Hears what happens; called from any thread with the queue locked, so it must return at once and never raise."""
+class Observer:
+    """Hears what happens, and here does nothing about it.
+
+    It is called from any thread with the queue locked, so it must return at once and never raise.
+    """
 
     def admitted(self, cost_s: float) -> None:
         """A job was admitted, and so much computing is predicted for it."""
@@ -59,31 +61,3 @@ class Observer(Protocol):
 
     def ran_out_of_memory(self) -> None:
         """A batch was too large for the device; called in the thread that computed it."""
-
-
-class Unobserved:
-    """Hears nothing."""
-
-    def admitted(self, cost_s: float) -> None:
-        """See Observer."""
-
-    def refused(self, reason: Refusal) -> None:
-        """See Observer."""
-
-    def queued(self, stage: str, jobs: int, cost_s: float) -> None:
-        """See Observer."""
-
-    def running(self, stage: str, jobs: int) -> None:
-        """See Observer."""
-
-    def waited(self, stage: str, seconds: float) -> None:
-        """See Observer."""
-
-    def computed(self, stage: str, bucket: str, jobs: int, seconds: float) -> None:
-        """See Observer."""
-
-    def ended(self, stage: str, ending: Ending) -> None:
-        """See Observer."""
-
-    def ran_out_of_memory(self) -> None:
-        """See Observer."""

@@ -12,15 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from .admission import Admission, ScheduleOptions
 from .costs import Costs
 from .fair import FairQueue, Flow
 from .jobs import Batch, Done, Expired, Fallback, Job, Next, Refused, Stage, Step, Verdict, Visit
 from .ledger import Ledger
 from .observer import Ending, Observer, Refusal
-
-MIN_RETRY_S = 0.1
-RETRY_ELSEWHERE_S = 1.0
-"""When to come again where nothing tells when there will be room."""
 
 _NOBODY = Flow("", "")
 """A caller without jobs."""
@@ -29,35 +26,6 @@ _ENDED_HELD = 16
 
 _UNASKED = frozenset({Ending.CANCELLED, Ending.EXPIRED})
 """Endings that come from outside, while a stage may be at the job."""
-
-
-@dataclass(frozen=True)
-class ScheduleOptions:
-    """Options of the schedule.
-
-    Attributes:
-        max_queued_s: predicted computing time that may be admitted and not done, seconds a thread. Whoever is let in
-            later would get an old answer; and a full queue never drains sooner for being longer.
-        max_bytes: memory that admitted jobs may hold.
-        flow_share: of what others have left of either bound, what one caller may fill. So there is always room for one
-            who comes later.
-        caution: a job is let in if so many times the time predicted for it is left. Predictions are means, and what is
-            computed and comes too late is lost for everybody.
-        floor: every so many batches of a lane one is of the stage that was passed over for later ones.
-        quantum_s: of the fair queues; about what one job of a stage takes.
-    """
-
-    max_queued_s: float = 2.0
-    max_bytes: int = 256 * 2**20
-    flow_share: float = 0.75
-    caution: float = 1.2
-    floor: int = 4
-    quantum_s: float = 0.2
-
-    def __post_init__(self) -> None:
-        bounds = (self.max_queued_s, self.max_bytes, self.flow_share, self.quantum_s)
-        if not (all(bound > 0 for bound in bounds) and self.flow_share <= 1 <= self.caution and self.floor >= 2):
-            raise ValueError(f"senseless options: {self}")
 
 
 class Quota(Protocol):
@@ -125,10 +93,10 @@ class Schedule:
         }
         self._max_batch: dict[tuple[str, str], int] = {}
         self._ledger = Ledger()
+        self._admission = Admission(options, lanes, self._ledger)
         self._due: list[tuple[float, int, Job]] = []
         self._tick = itertools.count()
         self._batch_number = itertools.count(1)
-        self._draining = False
 
     @property
     def jobs(self) -> frozenset[Job]:
@@ -146,7 +114,7 @@ class Schedule:
         """Lets a job in, which from then on ends exactly once; Refused, with nothing changed, if there is no room."""
         cost_s = self._predict(job.step)
         try:
-            self._check_room(job, cost_s, now_s)
+            self._admission.check(job, cost_s, now_s)
             if self._quota is not None:
                 job.charged_s = cost_s.total()
                 wait_s = self._quota.charge(job.flow.tenant, job.charged_s, now_s)
@@ -162,10 +130,7 @@ class Schedule:
     def check_room(self, step: Step) -> None:
         """Raises Refused if even a caller with no other jobs would not be admitted with a job that begins like this."""
         try:
-            if self._draining:
-                raise Refused(Refusal.DRAINING, "the server is stopping", RETRY_ELSEWHERE_S)
-            if self._ledger.jobs:
-                self._check_queue(_NOBODY, self._predict(step))
+            self._admission.check_queue(_NOBODY, self._predict(step))
         except Refused as refused:
             self._observer.refused(refused.reason)
             raise
@@ -232,11 +197,11 @@ class Schedule:
 
     def drain(self) -> None:
         """Admits nothing from now on."""
-        self._draining = True
+        self._admission.close()
 
     def fail_all(self, error: Exception, now_s: float) -> None:
         """Ends every job, because nothing will be computed any more."""
-        self._draining = True
+        self._admission.close()
         try:
             for job in self.jobs:
                 self._end(job, Ending.FAILED, error, now_s)
@@ -253,45 +218,6 @@ class Schedule:
             cost_s[stage.lane] += self.costs.predict(stage.name, step.kind)  # type: ignore[assignment]  # not int
             stage = self._stages[stage.then] if stage.then else None
         return cost_s
-
-    def _check_room(self, job: Job, cost_s: Counter[str], now_s: float) -> None:
-        """Raises Refused if the job cannot be admitted."""
-        options, ledger = self._options, self._ledger
-        if self._draining:
-            raise Refused(Refusal.DRAINING, "the server is stopping", RETRY_ELSEWHERE_S)
-        if job.size_bytes > options.max_bytes:
-            raise Refused(Refusal.TOO_LARGE, f"the call holds {job.size_bytes} bytes, {options.max_bytes} are allowed")
-        if now_s >= job.deadline_s:
-            raise Refused(Refusal.DEADLINE_INFEASIBLE, "the deadline has passed")
-        if not ledger.jobs:
-            return  # an idle server tries anything: what is predicted may be wrong, and only trying mends that
-        held_bytes = ledger.size_bytes(job.flow)
-        if held_bytes + job.size_bytes > self._share(options.max_bytes, ledger.size_bytes(), held_bytes):
-            raise Refused(Refusal.TOO_MUCH_MEMORY, "the calls in progress hold too much memory", RETRY_ELSEWHERE_S)
-        self._check_queue(job.flow, cost_s)
-        own_s = cost_s.total()
-        waits_s = (ledger.ahead_s(job.flow, lane, it) / self._lanes[lane].threads for lane, it in cost_s.items())
-        late_s = now_s + options.caution * (max(waits_s) + own_s) - job.deadline_s
-        if late_s > 0:
-            retry_s = None if now_s + own_s > job.deadline_s else max(MIN_RETRY_S, late_s)
-            raise Refused(Refusal.DEADLINE_INFEASIBLE, "the answer would come after the deadline", retry_s)
-
-    def _check_queue(self, flow: Flow, cost_s: Counter[str]) -> None:
-        for lane, own_s in cost_s.items():
-            excess_s = self._excess_s(flow, lane, own_s)
-            if excess_s > 0:
-                message = f"{len(self._ledger.jobs)} calls are in progress or wait"
-                raise Refused(Refusal.QUEUE_FULL, message, max(MIN_RETRY_S, excess_s / self._lanes[lane].threads))
-
-    def _share(self, bound: float, held: float, held_by_flow: float) -> float:
-        """What one caller may hold of a bound, given what all hold and it does."""
-        return self._options.flow_share * (bound - (held - held_by_flow))
-
-    def _excess_s(self, flow: Flow, lane: str, added_s: float) -> float:
-        """Computing time by which a caller would be over what it may hold, if it got so much more."""
-        bound_s = self._options.max_queued_s * self._lanes[lane].threads
-        held_s = self._ledger.booked_s(lane, flow)
-        return held_s + added_s - self._share(bound_s, self._ledger.booked_s(lane), held_s)
 
     def _go_on(self, job: Job, verdict: Next, now_s: float) -> None:
         """Lets a job wait for its next step, or gives what is at hand if that would come too late or cost too much."""
@@ -311,14 +237,13 @@ class Schedule:
         lane = self._lanes[lane_name]
         coming_first = lane.stages[lane.stages.index(self._stages[job.step.stage]) :]
         wait_s = sum(self._queues[stage.name].cost_s for stage in coming_first) / lane.threads
-        added_s = {name: own_s - job.booked_s[name] for name, own_s in cost_s.items()}
-        fits = all(it <= 0 or self._excess_s(job.flow, name, it) <= 0 for name, it in added_s.items())
-        return fits and now_s + wait_s + cost_s.total() <= job.due_s
+        return self._admission.fits(job, cost_s) and now_s + wait_s + cost_s.total() <= job.due_s
 
     def _enqueue(self, job: Job, now_s: float) -> None:
         stage = self._stages[job.step.stage]
         job.waits_since_s = now_s
-        self._queues[stage.name].push(job, job.flow, self.costs.predict(stage.name, job.step.kind))
+        # Its whole way counts, not this stage alone: where the first one is cheap, whoever comes in order comes first.
+        self._queues[stage.name].push(job, job.flow, self._predict(job.step).total())
         if job.timer_s != job.due_s:
             job.timer_s = job.due_s
             heapq.heappush(self._due, (job.due_s, next(self._tick), job))

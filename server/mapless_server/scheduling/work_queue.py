@@ -12,10 +12,11 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+from .admission import ScheduleOptions
 from .fair import Flow
 from .jobs import Batch, Job, Stage, Step, Verdict, Visit
 from .observer import Ending, Observer
-from .schedule import Quota, Schedule, ScheduleOptions
+from .schedule import Quota, Schedule
 
 log = logging.getLogger(__name__)
 
