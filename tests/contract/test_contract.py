@@ -41,7 +41,7 @@ SERVER = ROOT / "server" / "mapless_server"
 # What answers, guards and counts calls, what starts that, and what calls it; all else is below, and knows neither grpc
 # nor messages.
 ABOVE = {
-    *("__init__", "__main__", "cli", "serve", "service", "reference_service", "rpc", "grpc_server"),
+    *("__init__", "__main__", "cli", "serve", "service", "reference_service", "rpc", "grpc_server", "status"),
     *("security", "observability", "demo", "evaluation", "bench", "load"),
 }
 BELOW = sorted(

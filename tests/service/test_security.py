@@ -35,8 +35,9 @@ from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless_server.principal import Role
 from mapless_server.security.access import METHOD_ROLES
+from mapless_server.security.errors import SecurityError
+from mapless_server.security.protection import Protection
 from mapless_server.security.tokens import create_token, revoke_token, sha256_of
-from mapless_server.serve import StartupError
 from mapless_server.settings import Settings
 
 LIMIT_S = 30.0
@@ -326,7 +327,7 @@ class TestEncryption:
 class TestStart:
     @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1"])
     def test_a_server_that_nothing_protects_does_not_listen_beyond_this_machine(self, host: str) -> None:
-        with pytest.raises(StartupError, match="neither TLS nor tokens"):
+        with pytest.raises(SecurityError, match="neither TLS nor tokens"):
             Protection.of(Settings(host=host))
 
     def test_unless_the_operator_wants_it_or_something_protects_it(self, tmp_path: Path) -> None:
@@ -339,7 +340,7 @@ class TestStart:
         signed(authority(), "server").write(tmp_path / "cert", tmp_path / "key")
         files: dict[str, Any] = {"tls_certificate": tmp_path / "cert", "tls_key": tmp_path / "key"}
         files[missing] = tmp_path / "absent"
-        with pytest.raises(StartupError, match=r"absent: No such file or directory$"):
+        with pytest.raises(SecurityError, match=r"absent: No such file or directory$"):
             Protection.of(Settings(**files))
 
 

@@ -265,6 +265,32 @@ class TestResults:
 
         run(test())
 
+    def test_nor_where_only_what_follows_costs_anything(self) -> None:
+        """A turn is measured by all that it brings about, not by its first stage alone."""
+
+        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+            if jobs[0].step.stage == "first":
+                return [Next(Step("then", "toy", "b", job.step.payload)) for job in jobs]
+            time.sleep(0.1)
+            return [Done(job.step.payload) for job in jobs]
+
+        async def test() -> None:
+            shop = Shop(compute)
+            async with shop.open() as queue:
+                for _ in range(3):  # it is learned what they cost
+                    await submit(queue, "first of all", "first")
+                shop.seen.clear()
+                plugs = await shop.plug(queue, "first", threads=2)
+                heavy = [submit(queue, f"heavy {i}", "first", client="heavy") for i in range(40)]
+                await until(lambda: queue.job_count == 42)
+                light = submit(queue, "light", "first", client="light")
+                await until(lambda: queue.job_count == 43)
+                shop.gate.set()
+                await outcomes([*plugs, *heavy, light])
+            assert [it for it in shop.seen if len(it) == 1].index(["light"]) < 10
+
+        run(test())
+
 
 class TestFailure:
     @settings(max_examples=25, deadline=None)
