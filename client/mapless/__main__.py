@@ -120,6 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     localize.add_argument("--variant", default="", help="best, full, no_structure or coarse")
     localize.add_argument("--scale-strategy", default="", help="two_stage, triangulation or trajectory")
+    localize.add_argument("--allow-coarse", action="store_true", help="a coarse pose will do if time runs out")
     localize.set_defaults(run=_localize)
     return parser
 
@@ -190,6 +191,7 @@ def _localize(client: Client, arguments: argparse.Namespace) -> int:
         arguments.reference,
         position_prior=PositionPrior(np.array(near[:3]), near[3]) if near else None,
         variant=arguments.variant,
+        allow_coarse=arguments.allow_coarse,
         scale_strategy=arguments.scale_strategy,
         reference_count=arguments.count,
     )

@@ -41,6 +41,10 @@ MAX_CONCURRENT_RPCS = 1024
 """Calls that are received at a time, from all connections. Far above what the queue admits, and health probes count."""
 
 
+_LAST_BYTES_S = 0.5
+"""For answers that are on their way when the last call has ended."""
+
+
 class AddressTaken(Exception):
     """The address cannot be listened on; the message is for the operator."""
 
@@ -70,7 +74,8 @@ class GrpcServer:
         self._metrics = metrics
         self._engine: Engine | None = None
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]
-        interceptor = CallInterceptor(
+        self._is_draining = False
+        self._interceptor = CallInterceptor(
             settings.default_deadline_s,
             settings.max_deadline_s,
             authenticate=authenticate,
@@ -79,7 +84,7 @@ class GrpcServer:
             tracer=tracer,
         )
         self._server = grpc.aio.server(
-            interceptors=[interceptor], options=_options(settings), maximum_concurrent_rpcs=MAX_CONCURRENT_RPCS
+            interceptors=[self._interceptor], options=_options(settings), maximum_concurrent_rpcs=MAX_CONCURRENT_RPCS
         )
         self._references = ReferenceService(self._ready_engine, store, metrics)
         reference_service_pb2_grpc.add_ReferenceServiceServicer_to_server(self._references, self._server)
@@ -120,9 +125,12 @@ class GrpcServer:
         await self.set_serving(False)
         if delay_s:
             await asyncio.sleep(delay_s)
+        self._is_draining = True
         if self._engine is not None:
             self._engine.queue.drain()
-        await self._server.stop(grace_s)
+        # Not by `stop`, which would wait for those who watch the health as well.
+        await self._interceptor.wait_until_idle(grace_s)
+        await self._server.stop(_LAST_BYTES_S)
 
     async def close(self) -> None:
         """Ends at once; returns when the store is not used any more."""
@@ -137,7 +145,9 @@ class GrpcServer:
         self._metrics.set_serving(is_serving)
 
     def _check_door(self, method: str) -> None:
-        """Raises Unavailable while the server starts, and Overloaded while nobody's query would be admitted."""
+        """Raises Unavailable while the server starts or stops, and Overloaded while it has no room for any query."""
+        if self._is_draining:
+            raise Unavailable("the server is stopping", reason="DRAINING", retry_after_s=1.0)
         engine = self._ready_engine()
         if method == LOCALIZE_METHOD:
             engine.check_room()

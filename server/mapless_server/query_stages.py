@@ -13,8 +13,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
-import numpy as np
-
 from .errors import FailedPrecondition, NotFound, Unavailable
 from .failures import failure_of
 from .library import NotDescribedYet
@@ -285,8 +283,7 @@ class QueryStages:
         return Done(Result(work.best, work.seconds_before | unfinished), _ending(work.best))
 
     def _attempt(self, work: Work, found: Found, answer: Answer) -> Attempt:
-        if isinstance(answer.outcome, Localization):
-            _check_finite(answer.outcome)
+        _check_finite(answer)
         answer = _gated(answer, work.query.prior)
         return Attempt(self._tiers[work.tier], answer, found.references, found.generation, found.view.camera)
 
@@ -300,12 +297,15 @@ def _ending(attempt: Attempt) -> Ending:
     return Ending.OK if isinstance(attempt.answer.outcome, Localization) else Ending.LOW_CONFIDENCE
 
 
-def _check_finite(localization: Localization) -> None:
+def _check_finite(answer: Answer) -> None:
     """A pose of NaN must never leave the server: ArithmeticError."""
-    covariance = () if localization.covariance is None else localization.covariance
-    for numbers in (localization.world_from_camera.matrix(), covariance, localization.reprojection_error_px):
-        if not np.isfinite(numbers).all():
-            raise ArithmeticError(f"the method gave a pose that is not finite: {localization}")
+    numbers = [] if answer.scale is None else [answer.scale.metres_per_unit, answer.scale.deviation]
+    if isinstance(answer.outcome, Localization):
+        outcome = answer.outcome
+        covariance = [] if outcome.covariance is None else outcome.covariance.ravel().tolist()
+        numbers += [*outcome.world_from_camera.matrix().ravel(), *covariance, outcome.reprojection_error_px]
+    if not all(map(math.isfinite, numbers)):
+        raise ArithmeticError(f"the method's answer is not finite: {answer.outcome}, {answer.scale}")
 
 
 def _gated(answer: Answer, prior: PositionPrior | None) -> Answer:

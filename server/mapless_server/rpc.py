@@ -8,6 +8,7 @@ import re
 import time
 import uuid
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 from urllib.parse import unquote
@@ -130,6 +131,9 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         self._check_door = check_door
         self._observer = observer
         self._tracer = tracer or NoTracer()
+        self._active = 0
+        self._idle = asyncio.Event()
+        self._idle.set()
         self._abandoned: set[asyncio.Task[Message]] = set()  # the loop itself would forget them
 
     async def intercept_service(self, continuation: Callable[[Any], Awaitable[Any]], handler_call_details: Any) -> Any:
@@ -140,6 +144,8 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             return handler
 
         async def answer(data: bytes, context: Context, refusal: Exception | None = None) -> bytes:
+            self._active += 1
+            self._idle.clear()
             call = self._begin(context)
             span = self._tracer.begin(method, _metadata(context), call.arrived_s)
             if self._observer is not None:
@@ -171,6 +177,9 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
                 await _abort(context, call, RequestError(f"internal error, id={call.request_id}"))
                 raise
             finally:
+                self._active -= 1
+                if not self._active:
+                    self._idle.set()
                 self._end(method, code, call, span)
 
         try:
@@ -185,6 +194,11 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             return grpc.stream_unary_rpc_method_handler(refuse, None, None)
         # Without a deserializer the bytes arrive as they are, so that a malformed message is answered here too.
         return grpc.unary_unary_rpc_method_handler(answer, None, None)
+
+    async def wait_until_idle(self, limit_s: float) -> None:
+        """Returns when no call is being answered, or the time is over."""
+        with suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(self._idle.wait(), limit_s)
 
     def _check_in(self, method: str, metadata: Metadata, auth_context: Mapping[str, Iterable[bytes]]) -> Principal:
         """Who calls; raises whatever keeps them out before a byte of the message is looked at."""

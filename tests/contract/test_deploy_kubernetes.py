@@ -345,8 +345,8 @@ def test_scaling_is_by_a_metric_that_the_adapter_gives() -> None:
     assert metric["pods"]["metric"]["name"] == rule["name"]["as"]
     (workload,) = read(KUBERNETES / "base/statefulset.yaml")
     (container,) = workload["spec"]["template"]["spec"]["containers"]
-    # For each worker. A full queue is about half of what is admitted, for what is computed does not wait, and one caller
-    # may not fill it; the target must be well below, or nothing would ever be scaled.
+    # For each worker. A full queue is about half of what is admitted, for what is computed does not wait, and one
+    # caller may not fill it; the target must be well below, or nothing would ever be scaled.
     per_worker_s = float(metric["pods"]["target"]["averageValue"]) / int(container["resources"]["limits"]["cpu"])
     assert per_worker_s == 0.5 <= default("max_queued_s") / 4
 

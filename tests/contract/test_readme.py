@@ -1,18 +1,30 @@
-"""What the README says is so: its Python runs, and its tables are complete."""
+"""What the README says is so: its Python runs, its tables are complete, its commands and metrics exist."""
 
 from __future__ import annotations
 
 import re
+import shlex
+from collections.abc import Iterator
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
+import typer.main
 from images import encode, textured
+from prometheus_client import generate_latest
 from servers import pose, serving
 
+from mapless import errors as client_errors
+from mapless.__main__ import _parser
+from mapless_server import errors
+from mapless_server.cli import app
 from mapless_server.method.localize import Variant
 from mapless_server.method.rejection import RejectionReason
+from mapless_server.observability.metrics import Metrics
+from mapless_server.scheduling.observer import Refusal
 from mapless_server.settings import Settings
 
+SERVER = Path(errors.__file__).parent
 README = (Path(__file__).parents[2] / "README.md").read_text()
 
 
@@ -26,6 +38,60 @@ def test_tables_are_complete() -> None:
     assert first_cells("setting") == list(Settings.model_fields)
     assert first_cells("reason") == [reason.name for reason in RejectionReason]
     assert first_cells("variant") == [variant.value for variant in Variant]
+
+
+def rows(heading: str) -> list[list[str]]:
+    """What stands in backticks in the first two columns of the table with this first heading."""
+    (table,) = re.findall(rf"^\| {heading} \|.*\n\|.*\n((?:\|.*\n)+)", README, re.MULTILINE)
+    return [re.findall(r"`([\w*]+)`", "|".join(row.split("|")[1:3])) for row in table.splitlines()]
+
+
+def test_the_table_of_errors_has_every_reason_and_none_that_is_not() -> None:
+    """A class's own reason is its status's name, which stands in the table in any case."""
+    sources = "".join(path.read_text() for path in SERVER.rglob("*.py"))
+    there = set(re.findall(r'(?:reason=|_Malformed\(".*", )"([A-Z_]+)"', sources))
+    there |= {refusal.name for refusal in Refusal}
+    assert {"QUEUE_FULL", "IMAGE_UNKNOWN_FORMAT", "TOKEN_EXPIRED", "STORE_FULL"} <= there
+    told = {name for row in rows("status") for name in row}
+    statuses = set(client_errors._BY_CODE)
+    assert statuses <= told
+    assert not {reason for reason in there if not any(fnmatch(reason, it) for it in told)}
+    assert {it for it in told - statuses if not any(fnmatch(reason, it) for reason in there)} == {"RetryInfo"}
+
+
+def test_the_metrics_exist() -> None:
+    there = generate_latest(Metrics().registry).decode()
+    named = {name for row in rows("metric") for name in row if "_" in name}
+    assert "mapless_queue_cost_seconds" in named
+    for name in named:
+        assert re.search(rf"^# TYPE {name} ", there, re.MULTILINE), name
+
+
+def commands(program: str) -> Iterator[list[str]]:
+    """The arguments of every line of the README that runs a program."""
+    text = README.replace("\\\n", " ")
+    for line in re.findall(rf"^ {{4}}(?:\S+/|[A-Z_]+=\S+ )?{program} (.*)$", text, re.MULTILINE):
+        yield shlex.split(re.sub(r"[>|].*", "", line))
+
+
+def test_the_commands_of_the_client_are_understood() -> None:
+    seen = list(commands("mapless"))
+    assert len(seen) >= 7
+    for arguments in seen:
+        _parser().parse_args(arguments)  # exits where it does not understand
+
+
+def test_the_commands_of_the_server_are_understood() -> None:
+    group = typer.main.get_command(app)
+    seen = list(commands("mapless-server"))
+    assert len(seen) >= 10
+    for arguments in seen:
+        command, rest = group, arguments
+        context = typer.Context(command)
+        while hasattr(command, "resolve_command"):
+            _, command, rest = command.resolve_command(context, rest)
+            context = typer.Context(command, parent=context)
+        command.parse_args(context, rest)  # raises where it does not understand
 
 
 def test_the_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,19 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from mapless_server.scheduling.admission import ScheduleOptions
 from mapless_server.scheduling.fair import Flow
-from mapless_server.scheduling.jobs import Batch, Done, Expired, Fallback, Job, Next, Refused, Stage, Step, Verdict
+from mapless_server.scheduling.jobs import (
+    Batch,
+    Done,
+    Expired,
+    Fallback,
+    Job,
+    Next,
+    Over,
+    Refused,
+    Stage,
+    Step,
+    Verdict,
+)
 from mapless_server.scheduling.observer import Ending, Observer, Refusal
 from mapless_server.scheduling.schedule import Schedule
 
@@ -290,6 +302,15 @@ class TestTime:
         toy.jobs.clear()
         gc.collect()
         assert sum(job() is not None for job in ended) < 40
+
+    @pytest.mark.parametrize(("seconds", "learns"), [(2.0, True), (0.001, False)])
+    def test_what_is_given_up_late_teaches_that_it_takes_longer(self, seconds: float, learns: bool) -> None:
+        """Else a server that is too slow for its callers would go on admitting them."""
+        toy = Toy()
+        toy.admit(stage="describe")
+        toy.finish(toy.take("host"), Over(), seconds=seconds)
+        predicted_s = toy.schedule.costs.predict("describe", "toy")
+        assert predicted_s > COST_S["describe"] if learns else predicted_s == COST_S["describe"]
 
     def test_a_cancelled_job_frees_its_place(self) -> None:
         toy = Toy()

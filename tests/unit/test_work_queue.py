@@ -705,8 +705,7 @@ class TestCallersWhoLeave:
                 for _ in range(1 + fates.randrange(30)):  # it has begun
                     await asyncio.sleep(0)
                 call.cancel()
-            (told,) = await asyncio.gather(call, return_exceptions=True)
-            return told
+            return (await asyncio.gather(call, return_exceptions=True))[0]
 
         async def test() -> None:
             shop = Shop(compute)

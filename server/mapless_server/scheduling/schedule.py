@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from .admission import Admission, ScheduleOptions
 from .costs import Costs
 from .fair import FairQueue, Flow
-from .jobs import Batch, Done, Expired, Fallback, Job, Next, Refused, Stage, Step, Verdict, Visit
+from .jobs import Batch, Done, Expired, Fallback, Job, Next, Over, Refused, Stage, Step, Verdict, Visit
 from .ledger import Ledger
 from .observer import Ending, Observer, Refusal
 
@@ -161,7 +161,9 @@ class Schedule:
         self._observer.computed(stage.name, batch.jobs[0].step.bucket, len(batch.jobs), seconds)
         share_s = seconds / len(batch.jobs)
         for job, verdict in zip(batch.jobs, verdicts, strict=True):
-            if not isinstance(verdict, Exception):  # what fails, fails early
+            # What fails, fails early. What was given up would have taken longer yet.
+            longer = isinstance(verdict, Over) and share_s > self.costs.predict(stage.name, job.step.kind)
+            if longer or not isinstance(verdict, Exception):
                 self.costs.observe(stage.name, job.step.kind, share_s)
             job.used_s += share_s
             job.visits.append(Visit(stage.name, job.waits_since_s, batch.start_s, now_s, batch.number, len(batch.jobs)))

@@ -82,7 +82,8 @@ class Authenticator:
             raise Unauthenticated("the token has expired", reason="TOKEN_EXPIRED")
         if token.allows < needed:
             raise PermissionDenied(
-                f"this takes a token of the role {needed.name.lower()}; the one given has the role {token.role}",
+                f"this takes a token of the role {needed.name.lower()}; the one given, {token.name!r}, has the role "
+                f"{token.role}",
                 reason="ROLE_TOO_LOW",
             )
         return Principal(token.tenant, token.allows, token.name)
