@@ -54,11 +54,11 @@ async def warm_up(engine: Engine) -> None:
     # Before the queue's clock runs: describing references is no part of a usual query.
     references = await asyncio.to_thread(_RenderedReferences, [tier.extractor for tier in engine.tiers])
     query_pose = _pose(_QUERY_X_M)
-    _, image = cv2.imencode(".jpg", cv2.cvtColor(_render(query_pose), cv2.COLOR_RGB2BGR))
+    image = await asyncio.to_thread(_photograph, query_pose)
     query = Query(
         scene_key=SceneKey("warm-up"),
         reference_ids=tuple(f"r{i}" for i in range(len(_CENTRES_X_M))),
-        photo=Photo(image.tobytes(), _CAMERA, "image"),
+        photo=Photo(image, _CAMERA, "image"),
         prior=None,
         reference_count=len(_CENTRES_X_M),
         options=LocalizeOptions(),
@@ -92,6 +92,11 @@ class _RenderedReferences:
     ) -> tuple[int, tuple[PosedView, ...]]:
         """See ReferenceSource."""
         return 1, self._views[extractor.name]
+
+
+def _photograph(world_from_camera: RigidTransform) -> bytes:
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(_render(world_from_camera), cv2.COLOR_RGB2BGR))
+    return jpeg.tobytes()
 
 
 def _posed_view(name: str, world_from_camera: RigidTransform, extractor: FeatureExtractor) -> PosedView:
