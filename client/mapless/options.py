@@ -23,7 +23,8 @@ class ConnectOptions:
             lost server would block the caller for ever.
         upload_timeout_s: the same for one message of a bulk upload; it returns when its photographs are described.
         max_message_mib: largest message that is sent or received; the server's own limit (32 by default) holds too.
-        batch_mib: a bulk upload sends messages of about this size at most; must fit the server's limit.
+        batch_mib: a bulk upload sends messages of about this size at most; must fit the server's limit. Large ones take
+            the server longer to receive, which its other callers feel.
         batch_count: and of so many references at most, so that progress shows.
         max_attempts: tries of a call that finds the server UNAVAILABLE, 1 to 5.
         initial_backoff_s, max_backoff_s: pause before the second try, doubled for each further one up to the maximum.
@@ -39,7 +40,7 @@ class ConnectOptions:
     timeout_s: float = 30.0
     upload_timeout_s: float = 300.0
     max_message_mib: int = 64
-    batch_mib: float = 24.0
+    batch_mib: float = 8.0
     batch_count: int = 32
     max_attempts: int = 4
     initial_backoff_s: float = 0.2

@@ -100,7 +100,10 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             if item.reference_id in seen:
                 raise FieldError(f"requests[{i}].reference_id", f"{names.shown(item.reference_id)} stands twice")
             seen.add(item.reference_id)
-        drafts = [self._draft(item, f"requests[{i}]") for i, item in enumerate(request.requests)]
+        # Every look at a photograph copies it: too much for the event loop.
+        drafts = await asyncio.to_thread(
+            lambda: [self._draft(item, f"requests[{i}]") for i, item in enumerate(request.requests)]
+        )
         records = await self._add(scene_key, drafts, call)
         return pb.BatchCreateReferencesResponse(references=map(_reference_to_message, records))
 

@@ -39,6 +39,8 @@ ANSWER_MARGIN_S = 0.01
 """And at least so early, because the answer has to be written and sent as well ..."""
 _MAX_MARGIN_SHARE = 0.1
 """... where there is time for that."""
+_LARGE_BYTES = 2**20
+"""Reading a message takes a millisecond for so much; larger ones are read off the event loop."""
 _ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it enters the log: no line breaks, no escapes
 
 
@@ -225,7 +227,10 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         call = replace(call, principal=self._check_in(method, _metadata(context), context.auth_context()))
         call.note(tenant=call.principal.tenant, **({"principal": call.principal.name} if call.principal.name else {}))
         try:
-            request = handler.request_deserializer(data)
+            if len(data) < _LARGE_BYTES:
+                request = handler.request_deserializer(data)
+            else:
+                request = await asyncio.to_thread(handler.request_deserializer, data)
         except (DecodeError, ValueError):
             raise InvalidArgument("the request is not a well-formed message", reason="MALFORMED_MESSAGE") from None
         try:
