@@ -99,7 +99,11 @@ class Engine:
         )
 
     async def localize(
-        self, query: Query, caller: Caller, source: ReferenceSource | None = None
+        self,
+        query: Query,
+        caller: Caller,
+        source: ReferenceSource | None = None,
+        visits: list[Visit] | None = None,
     ) -> tuple[Result, Sequence[Visit]]:
         """Localizes a photograph.
 
@@ -107,6 +111,7 @@ class Engine:
             query: the photograph and what to compare it with.
             caller: whose query it is.
             source: of the references; None for the store.
+            visits: gets the stages that the query goes through, for who wants to know how far it came if it fails.
 
         Returns:
             The answer, and the stages that the query went through.
@@ -118,7 +123,8 @@ class Engine:
         work = Work(query, source or self._library, views, caller.deadline_s)
         step = self._stages.first_step(work)
         with _as_request_errors():
-            return await self.queue.submit(caller.flow, step, caller.deadline_s, len(query.photo.image))
+            size_bytes = len(query.photo.image)
+            return await self.queue.submit(caller.flow, step, caller.deadline_s, size_bytes, visits)
 
     def check_room(self) -> None:
         """Raises RequestError if no query of anybody would be admitted now: then none has to be looked at."""

@@ -175,26 +175,26 @@ class QueryStages:
         except Exception as error:
             if isinstance(error, Over) or failure_of(error) is Failure.OF_DEVICE:
                 return error
-            if isinstance(error, NotFound) and error.field != "scene" and not work.query.reference_ids:
-                return self._list_again(work)
+            # One that was deleted since it was listed was not the caller's choice: the next list is without it.
+            is_outdated = isinstance(error, NotFound) and error.field != "scene" and not work.query.reference_ids
+            if is_outdated and work.listings < MAX_LISTINGS:
+                return self._next(work, self.first_step(replace(work, listings=work.listings + 1)))
             if work.best is None:
-                return error
+                return _emptied() if is_outdated else error
             # What fails was to be better than the answer at hand, so it must not cost that one.
             if not isinstance(error, NotDescribedYet):
                 name = self._tiers[work.tier].extractor.name
                 log.warning("%s failed; the first answer is given", name, exc_info=error)
             return self._unfinished(work)
 
-    def _list_again(self, work: Work) -> Verdict:
-        """One that was deleted since it was listed was not the caller's choice: the next list is without it."""
-        if work.listings < MAX_LISTINGS:
-            return self._next(work, self.first_step(replace(work, listings=work.listings + 1)))
-        return Unavailable("the scene's references are being deleted", reason="SCENE_CHANGED", retry_after_s=1.0)
-
     def _prepare(self, work: Work, job: Job) -> Verdict:
         tier = self._tiers[work.tier]
         turn = Turn(job.check)
-        found = self._find(work, tier, turn)
+        try:
+            found = self._find(work, tier, turn)
+        finally:
+            # Once and for all: the queries to come find them described.
+            job.unusual_s = turn.stage_seconds.get("describe", 0.0)
         if not found.references:
             where = "the scene has no references" if work.query.prior is None else "no reference is near the prior"
             return self._conclude(work, found, Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, where)))
@@ -291,6 +291,10 @@ class QueryStages:
         prefix = "" if work.best is None else f"{self._tiers[work.tier].extractor.name}/"
         seconds = {f"{prefix}{stage}": value for stage, value in (found.seconds | answer.stage_seconds).items()}
         return Result(best, work.seconds_before | seconds)
+
+
+def _emptied() -> Unavailable:
+    return Unavailable("the scene's references are being deleted", reason="SCENE_CHANGED", retry_after_s=1.0)
 
 
 def _ending(attempt: Attempt) -> Ending:

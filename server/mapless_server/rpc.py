@@ -25,6 +25,7 @@ from .observability.tracing import CallSpan, Metadata, NoTracer, Tracer
 from .observability.trail import Trail
 from .principal import Principal
 from .query import Caller
+from .receiving import Context, OpenMethods, Receiver
 from .scheduling.fair import Flow
 from .security.access import OPEN_METHODS
 from .status import to_status
@@ -39,13 +40,7 @@ ANSWER_MARGIN_S = 0.01
 """And at least so early, because the answer has to be written and sent as well ..."""
 _MAX_MARGIN_SHARE = 0.1
 """... where there is time for that."""
-_LARGE_BYTES = 2**20
-"""Reading a message takes a millisecond for so much; larger ones are read off the event loop."""
 _ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it enters the log: no line breaks, no escapes
-
-
-Context = Any
-"""grpc.aio.ServicerContext, whose annotations are wrong in places."""
 
 Authenticate = Callable[[Metadata, str, Mapping[str, Iterable[bytes]]], Principal]
 """Who calls a method ("/package.Service/Method"), from the call's metadata and the connection's auth_context.
@@ -70,7 +65,7 @@ class Call:
 
     Attributes:
         request_id: identifies it in the log; the caller's own if it sent a well-formed one.
-        arrived_s: when it arrived, `time.monotonic`.
+        arrived_s: when its headers arrived, `time.monotonic`; its message may take longer.
         deadline_s: when the servicer must have answered, `time.monotonic`.
         principal: who calls.
         client: what tells callers apart: the id that they give, else the address of their connection.
@@ -137,15 +132,20 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         self._idle = asyncio.Event()
         self._idle.set()
         self._abandoned: set[asyncio.Task[Message]] = set()  # the loop itself would forget them
+        self._receiver = Receiver()
+        self._open = OpenMethods(self._receiver)
 
     async def intercept_service(self, continuation: Callable[[Any], Awaitable[Any]], handler_call_details: Any) -> Any:
         """Implements grpc.aio.ServerInterceptor."""
         handler = await continuation(handler_call_details)
         method = handler_call_details.method
-        if handler is None or method in OPEN_METHODS:
+        if handler is None:
             return handler
+        if method in OPEN_METHODS:
+            return self._open.guarded(handler)
+        refusal: Exception | None = None
 
-        async def answer(data: bytes, context: Context, refusal: Exception | None = None) -> bytes:
+        async def answer(_: object, context: Context) -> bytes:
             self._active += 1
             self._idle.clear()
             call = self._begin(context)
@@ -153,12 +153,11 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             if self._observer is not None:
                 self._observer.call_started(method)
             log.debug("%s begins", method, extra={"request_id": call.request_id})
-            call.note(bytes_in=len(data))
             code = "UNKNOWN"
             try:
                 if refusal is not None:
                     raise refusal
-                response = await self._answer(handler, data, method, call, context)
+                response = await self._answer(handler, method, call, context)
                 call.note(bytes_out=len(response))
                 context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id),))
                 code = "OK"
@@ -188,14 +187,9 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             self._check_in(method, handler_call_details.invocation_metadata or (), {})
         except Exception as error:
             refusal = error
-
-            async def refuse(_: object, context: Context) -> bytes:
-                return await answer(b"", context, refusal)
-
-            # A stream's messages are read when asked for, and nobody asks: what is refused shall cost nothing.
-            return grpc.stream_unary_rpc_method_handler(refuse, None, None)
-        # Without a deserializer the bytes arrive as they are, so that a malformed message is answered here too.
-        return grpc.unary_unary_rpc_method_handler(answer, None, None)
+        # Not as a unary method, whose message grpc receives first: what is refused shall cost nothing, and who sends no
+        # message shall not hold a place. Without a deserializer a malformed message is answered here, too.
+        return grpc.stream_unary_rpc_method_handler(answer, None, None)
 
     async def wait_until_idle(self, limit_s: float) -> None:
         """Returns when no call is being answered, or the time is over."""
@@ -222,17 +216,19 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         call.note(deadline_ms=round(1000 * given_s))
         return call
 
-    async def _answer(self, handler: Any, data: bytes, method: str, call: Call, context: Context) -> bytes:
+    async def _answer(self, handler: Any, method: str, call: Call, context: Context) -> bytes:
         """The servicer's answer; whatever is wrong with the request is a RequestError."""
+        data = await self._receiver.message(context, call.deadline_s - time.monotonic())
+        call.note(bytes_in=len(data))
         call = replace(call, principal=self._check_in(method, _metadata(context), context.auth_context()))
         call.note(tenant=call.principal.tenant, **({"principal": call.principal.name} if call.principal.name else {}))
         try:
-            if len(data) < _LARGE_BYTES:
-                request = handler.request_deserializer(data)
-            else:
-                request = await asyncio.to_thread(handler.request_deserializer, data)
+            # Reading holds the interpreter, about 1 ms for a MiB, in whatever thread: in another one it would hold up
+            # the event loop no less. Clients send uploads in pieces (`batch_mib`).
+            request = handler.request_deserializer(data)
         except (DecodeError, ValueError):
             raise InvalidArgument("the request is not a well-formed message", reason="MALFORMED_MESSAGE") from None
+        del data  # the request has its own copy
         try:
             response = await self._in_time(lambda: handler.unary_unary(request, call), call.deadline_s)
         except FieldError as error:

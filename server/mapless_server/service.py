@@ -24,6 +24,7 @@ from .observability.metrics import LOCALIZED, Metrics
 from .photos import photo_from_message
 from .query import PositionPrior, Query, Result
 from .rpc import Call
+from .scheduling.jobs import Visit
 from .tenancy import key_of
 
 MAX_REFERENCES = 64
@@ -45,10 +46,14 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         engine = self._engine()
         query = _query_from_message(request, call.principal.tenant, engine.options.image_limits)
         call.note(scene=query.scene_key, references=len(query.reference_ids))
-        result, visits = await engine.localize(query, call.caller)
-        for visit in visits:
-            call.waited(visit.stage, visit.queued_s, visit.start_s)
-            call.computed(visit.stage, visit.start_s, visit.end_s, batch=visit.batch, batch_size=visit.jobs)
+        visits: list[Visit] = []
+        try:
+            result, _ = await engine.localize(query, call.caller, visits=visits)
+        finally:
+            for visit in visits:
+                call.waited(visit.stage, visit.queued_s, visit.start_s)
+                if visit.jobs:
+                    call.computed(visit.stage, visit.start_s, visit.end_s, batch=visit.batch, batch_size=visit.jobs)
         self._count(result, call)
         response = pb.LocalizeResponse()
         outcome = result.attempt.answer.outcome

@@ -73,7 +73,7 @@ class Settings(BaseSettings):
     workers: int = Field(default_factory=available_cores, ge=1, description="Threads that compute; default: all cores.")
     max_batch: int = Field(default=4, ge=1, le=64, description="Queries a network reconstructs at a time.")
     max_queued_s: float = Field(
-        default=2.0, gt=0, description="Predicted computing time that may wait, seconds a worker; more is refused."
+        default=2.0, gt=0, description="Predicted computing time that may be admitted and not done, seconds a worker."
     )
     max_queued_mib: int = Field(default=256, ge=1, description="Memory for photographs of calls in progress, MiB.")
     stall_limit_s: float = Field(

@@ -71,11 +71,14 @@ def test_kept_tokens_give_the_same_bits(name: str, views_on_device: int) -> None
     assert (counters.host_hits == 0) == (views_on_device == 100)
 
 
-def test_a_batch_that_does_not_fit_is_halved() -> None:
+def test_a_batch_that_does_not_fit_leaves_the_device_as_it_was() -> None:
+    """Its tokens are in the host's memory, and each query alone is answered as ever."""
     runner, requests = runner_of("pi3", TightRunner), [small_request(3, i) for i in range(4)]
     backend = NetworkReconstructor(runner, OPTIONS)
-    together = backend.reconstruct_many([Request(*request) for request in requests])
+    with pytest.raises(torch.OutOfMemoryError):
+        backend.reconstruct_many([Request(*request) for request in requests])
     assert backend.cache.counters.device_bytes == 0
-    for actual, expected in zip(together, outcomes_of(backend, requests, 1), strict=True):
+    plain = outcomes_of(NetworkReconstructor(runner, UNCACHED), requests, 1)
+    for actual, expected in zip(outcomes_of(backend, requests, 1), plain, strict=True):
         assert_same_bits(actual, expected)
     assert backend.cache.counters.host_hits == 12

@@ -19,13 +19,18 @@ from servers import CAMERA, PHOTO, StandInExtractor, StandInReconstructor, pose,
 from mapless.geometry import RigidTransform
 from mapless_server.decode import ImageLimits, decode_image
 from mapless_server.engine import Engine, EngineOptions
-from mapless_server.errors import DeadlineExceeded, InvalidArgument
+from mapless_server.errors import DeadlineExceeded, InvalidArgument, Unavailable
 from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.views import PosedView, View
+from mapless_server.method.views import Features, PosedView, View
 from mapless_server.query import Caller, Photo, PositionPrior, Query, Result
+from mapless_server.query_stages import MAX_LISTINGS, Work
+from mapless_server.query_views import QueryViews
+from mapless_server.scheduling.costs import Costs
 from mapless_server.scheduling.fair import Flow
+from mapless_server.scheduling.jobs import Job, Over
+from mapless_server.scheduling.observer import Ending
 from mapless_server.store import NewReference, Store
 from mapless_server.tenancy import SceneKey
 from mapless_server.tiers import EscalationOptions, Tier
@@ -34,6 +39,7 @@ SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
 ESCALATION = EscalationOptions(doubtful_inliers=50, doubtful_radius_m=0.2)
 SCENE = SceneKey("s")
 PIXELS = decode_image(PHOTO, ImageLimits())
+FEATURES = Features(np.zeros((1, 2), np.float32), np.full((1, 4), 0.5, np.float32), np.ones(1, np.float32))
 
 
 def localized(inliers: int, at: RigidTransform | None = None) -> Answer:
@@ -283,6 +289,85 @@ class TestPhotograph:
         assert setting.asked == ["cheap", "cheap"]
         assert len(result.attempt.references) == 2
         assert len(setting.extractors["cheap"].seen) == 1, "the photograph is described once"
+
+    @pytest.mark.parametrize("tier", ["cheap", "strong"])
+    def test_a_scene_that_is_being_emptied_costs_no_answer_at_hand(self, setting: Setting, tier: str) -> None:
+        """Whatever the scene was listed for, it is listed again only so often."""
+
+        def look(_: View, references: Sequence[PosedView], __: Any) -> Answer:
+            (photograph,) = {it.view.photograph for it in references[:1]}
+            assert photograph is not None
+            setting.store.delete_reference(SCENE, references[0].name.rpartition("/")[2])
+            photograph.read()
+            raise AssertionError("it was deleted")
+
+        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": localized(SURE_INLIERS)} | {tier: look}
+        if tier == "cheap":
+            with pytest.raises(Unavailable) as caught:
+                setting.localize(reference_ids=())
+            assert caught.value.reason == "SCENE_CHANGED"
+        else:
+            result = setting.localize(reference_ids=())
+            assert result.attempt.tier.extractor.name == "cheap"
+            assert list(result.stage_seconds)[-1] == "strong/unfinished"
+        assert setting.asked.count(tier) == MAX_LISTINGS
+
+
+class TestDescribingReferences:
+    """A store that was filled under other features: the first call that needs a reference describes it."""
+
+    STEP_S = 0.2
+
+    def test_teaches_the_queue_nothing_of_the_queries_to_come(
+        self, setting: Setting, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        seen: list[tuple[str, float]] = []
+        monkeypatch.setattr(Costs, "observe", lambda _, stage, __, seconds: seen.append((stage, seconds)))
+        setting.replies["cheap"] = localized(SURE_INLIERS)
+        add_undescribed(setting, 2)
+        extract = setting.extractors["cheap"].extract
+
+        def slow(*arguments: Any) -> View:
+            time.sleep(self.STEP_S)
+            return extract(*arguments)
+
+        monkeypatch.setattr(setting.extractors["cheap"], "extract", slow)
+        query = query_of(("new0", "new1"))
+        _, visits = setting.loop.run_until_complete(setting.engine.localize(query, caller()))
+        (seconds,) = (it for stage, it in seen if stage == "prepare")
+        (took_s,) = (visit.end_s - visit.start_s for visit in visits if visit.stage == "prepare")
+        assert took_s - seconds >= 2 * self.STEP_S
+        assert seconds >= self.STEP_S, "the photograph's own description is part of it"
+
+    def test_nor_does_one_that_is_given_up(self, setting: Setting) -> None:
+        add_undescribed(setting, 2)
+        stages = setting.engine._stages
+        views = QueryViews(Photo(PHOTO, CAMERA, "image"), ImageLimits())
+        work = Work(query_of(("new0", "new1")), setting.engine._library, views, time.monotonic() + 60)
+        job = Job(Flow("t", "c"), stages.first_step(work), time.monotonic() + 60, 1, lambda *_: None)
+
+        def extract(*_: Any) -> View:
+            time.sleep(self.STEP_S)
+            job.end(Ending.CANCELLED, None)
+            return View(CAMERA, FEATURES)
+
+        setting.extractors["cheap"].extract = extract  # type: ignore[method-assign]
+        (verdict,) = stages.prepare([job])
+        assert isinstance(verdict, Over)
+        assert job.unusual_s >= self.STEP_S
+
+
+def query_of(reference_ids: tuple[str, ...]) -> Query:
+    photo = Photo(PHOTO, CAMERA, "image")
+    return Query(SCENE, reference_ids, photo, prior=None, reference_count=2, options=LocalizeOptions())
+
+
+def add_undescribed(setting: Setting, count: int) -> None:
+    """References new0, new1, ... with features that no tier has."""
+    of_others = {"others": View(CAMERA, FEATURES)}
+    photos = [encode(".png", textured(seed=20 + i)) for i in range(count)]
+    news = [NewReference(f"new{i}", photo, CAMERA, pose(9.0 + i), of_others) for i, photo in enumerate(photos)]
+    setting.store.add_references(SCENE, news)
 
 
 class TestDescribe:

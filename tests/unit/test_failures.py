@@ -66,8 +66,10 @@ def test_the_words_alone_do_nothing_in_an_exception_of_another_kind(message: str
 @pytest.mark.parametrize(
     "kind", [it for it in vars(errors).values() if isinstance(it, type) and issubclass(it, errors.RequestError)]
 )
-def test_what_is_told_to_the_caller_is_of_the_request(kind: type[errors.RequestError]) -> None:
-    assert failure_of(kind("text")) is Failure.OF_REQUEST
+def test_only_what_the_caller_can_mend_is_of_the_request(kind: type[errors.RequestError]) -> None:
+    """Stored bytes that are damaged, or a scene that is being emptied, are told to the caller, who has done nothing."""
+    of_server = kind.__name__ in ("RequestError", "Overloaded", "DeadlineExceeded", "Unavailable", "DataLoss")
+    assert failure_of(kind("text")) is (Failure.OF_ITEM if of_server else Failure.OF_REQUEST)
 
 
 def test_memory_of_the_host() -> None:

@@ -95,6 +95,17 @@ def test_everything_comes_out_once_whatever_is_taken_along_or_removed(
     assert sorted(out) == list(range(len(pushed)))
 
 
+def test_callers_who_come_once_leave_nothing_behind() -> None:
+    """Each connection is a caller, and there is no end of them."""
+    queue: FairQueue[int] = FairQueue(QUANTUM_S)
+    for job in range(12):
+        queue.push(job, Flow("t", str(job)), 3.0)
+    for job in range(12, 2000):
+        queue.pop()
+        queue.push(job, Flow("t", str(job)), 3.0)
+        assert queue.callers == len(queue) == 12
+
+
 def test_who_was_taken_along_pays_it_back() -> None:
     queue: FairQueue[str] = FairQueue(QUANTUM_S)
     for i in range(20):

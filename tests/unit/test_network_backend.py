@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import logging
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
@@ -23,6 +27,7 @@ from safetensors.torch import save_file
 from small_networks import GRIDS, SMALL, photograph, references_of, small_network, small_request, small_runner, view_of
 
 from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless_server.failures import failure_of
 from mapless_server.method.coarse import Bucket, Outcome, Reconstruction, Request, reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.geometric import GeometricReconstructor
@@ -37,6 +42,11 @@ from mapless_server.networks.conditions import normalize_poses
 from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.runner import NetworkRunner
+from mapless_server.scheduling.admission import ScheduleOptions
+from mapless_server.scheduling.fair import Flow
+from mapless_server.scheduling.jobs import Done, Job, Stage, Step, Verdict
+from mapless_server.scheduling.observer import Observer
+from mapless_server.scheduling.work_queue import Lane, WorkQueue, WorkQueueOptions
 from mapless_server.weights import CheckpointError, WeightsMissing
 
 OPTIONS = NetworkOptions(grids=GRIDS)
@@ -55,7 +65,7 @@ class GreyRunner:
 
     Attributes:
         most_scenes: more at a time are out of memory.
-        poison: scenes with a view of this grey are out of memory.
+        failing_batches: so many first calls of `reconstruct` are out of memory.
         failing_encodings: so many first calls of `encode` are out of memory.
         encoded: views of each call of `encode`.
         batches: scenes of each call of `reconstruct`.
@@ -67,7 +77,7 @@ class GreyRunner:
     dtype: torch.dtype = torch.float32
     conditioned: bool = False
     most_scenes: int = 100
-    poison: float | None = None
+    failing_batches: int = 0
     failing_encodings: int = 0
     encoded: list[int] = field(default_factory=list)
     batches: list[int] = field(default_factory=list)
@@ -81,7 +91,7 @@ class GreyRunner:
     def reconstruct(self, tokens: torch.Tensor, grid: tuple[int, int], mapped: int, *_: Any) -> NetworkOutput:
         scenes, views = tokens.shape[:2]
         self.batches.append(scenes)
-        if scenes > self.most_scenes or (self.poison is not None and (255 * tokens - self.poison).abs().min() < 0.5):
+        if scenes > self.most_scenes or len(self.batches) <= self.failing_batches:
             raise torch.OutOfMemoryError("no room to reconstruct")
         poses = torch.eye(4).repeat(scenes, views, 1, 1)
         poses[:, :, 0, 3] = 255 * tokens[..., 0, 0]
@@ -299,27 +309,62 @@ def test_one_requests_fault_is_its_own() -> None:
 # Out of memory
 
 
-def test_a_batch_that_does_not_fit_is_halved() -> None:
-    runner = GreyRunner(most_scenes=2)
+def test_what_does_not_fit_is_tried_again_when_tokens_have_made_room() -> None:
+    runner = GreyRunner(failing_batches=1)
     backend = grey_backend(runner)
     outcomes = backend.reconstruct_many([Request(*grey_request(i, 50, 100)) for i in range(4)])
     assert [greys_of(outcome) for outcome in outcomes] == [[i, 50, 100] for i in range(4)]
-    assert runner.batches == [4, 2, 2]
+    assert runner.batches == [4, 4]
+    assert sum(runner.encoded) == 2 + 4, "the batch's own tokens stay"
     assert backend.cache.counters.device_bytes == 0
 
 
-def test_only_the_query_that_never_fits_is_lost(caplog: pytest.LogCaptureFixture) -> None:
-    runner = GreyRunner(poison=33)
-    outcomes = grey_backend(runner).reconstruct_many([Request(*grey_request(i, 50)) for i in (31, 32, 33, 34)])
-    assert [type(outcome) for outcome in outcomes] == [
-        Reconstruction,
-        Reconstruction,
-        torch.OutOfMemoryError,
-        Reconstruction,
-    ]
-    assert [greys_of(outcomes[i]) for i in (0, 1, 3)] == [[31, 50], [32, 50], [34, 50]]
-    assert runner.batches == [4, 2, 2, 1, 1]
-    assert all("grey" in record.message for record in caplog.records)
+def test_a_batch_that_does_not_fit_then_is_nobodys_alone() -> None:
+    runner = GreyRunner(most_scenes=2)
+    with pytest.raises(torch.OutOfMemoryError):
+        grey_backend(runner).reconstruct_many([Request(*grey_request(i, 50, 100)) for i in range(4)])
+    assert runner.batches == [4, 4]
+
+
+def test_the_queue_splits_it_counts_it_and_keeps_to_what_fits() -> None:
+    """Else each full batch would fail anew, and empty the cache each time."""
+    runner = GreyRunner(most_scenes=2)
+    backend, observer, gate = grey_backend(runner), CountingObserver(), threading.Event()
+
+    def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        if jobs[0].step.bucket == "plug":
+            assert gate.wait(20)
+            return [Done(None)]
+        made = backend.reconstruct_many([job.step.payload for job in jobs])
+        return [it if isinstance(it, Exception) else Done(it) for it in made]
+
+    async def test() -> None:
+        options = WorkQueueOptions(ScheduleOptions(max_queued_s=1e6))
+        stages = {Stage("coarse", "toy-device", max_batch=4): compute}
+        queue = WorkQueue(stages, [Lane("toy-device", 1)], options, observer, failure_of)
+
+        def submit(bucket: str, payload: Request | None = None) -> asyncio.Task[Any]:
+            step = Step("coarse", "toy", bucket, payload)
+            return asyncio.ensure_future(queue.submit(Flow("t", "c"), step, time.monotonic() + 600, 1))
+
+        try:
+            for expected in ([4, 4, 2, 2], [2, 2]):
+                runner.batches.clear()
+                gate.clear()
+                plug = submit("plug")
+                calls = [submit("b", Request(*grey_request(i, 50))) for i in range(4)]
+                while queue.job_count < 5:
+                    await asyncio.sleep(0.002)
+                gate.set()
+                results = await asyncio.wait_for(asyncio.gather(*calls, plug), 20)
+                assert [greys_of(outcome) for outcome, _ in results[:4]] == [[i, 50] for i in range(4)]
+                assert runner.batches == expected
+                assert observer.out_of_memory == 1
+        finally:
+            gate.set()
+            await queue.close()
+
+    asyncio.run(test())
 
 
 def test_a_query_alone_is_tried_again_once() -> None:
@@ -330,15 +375,29 @@ def test_a_query_alone_is_tried_again_once() -> None:
 
 
 @pytest.mark.parametrize("failing", [1, 2])
-def test_encoding_is_tried_again_once(failing: int) -> None:
-    outcomes = grey_backend(GreyRunner(failing_encodings=failing)).reconstruct_many(
-        [Request(*grey_request(1, 50)), Request(*grey_request(2, 50))]
-    )
-    assert greys_of(outcomes[1]) == [2, 50]
+@pytest.mark.parametrize("queries", [1, 2])
+def test_encoding_is_tried_again_once(failing: int, queries: int) -> None:
+    backend = grey_backend(GreyRunner(failing_encodings=failing))
+    requests = [Request(*grey_request(i, 50)) for i in range(queries)]
     if failing == 1:
-        assert greys_of(outcomes[0]) == [1, 50]
-    else:
-        assert isinstance(outcomes[0], torch.OutOfMemoryError)
+        assert [greys_of(outcome) for outcome in backend.reconstruct_many(requests)] == [
+            [i, 50] for i in range(queries)
+        ]
+    elif queries == 1:
+        assert isinstance(backend.reconstruct_many(requests)[0], torch.OutOfMemoryError)
+    else:  # it may be the others that have taken the room
+        with pytest.raises(torch.OutOfMemoryError):
+            backend.reconstruct_many(requests)
+
+
+class CountingObserver(Observer):
+    """Counts how often memory did not suffice."""
+
+    def __init__(self) -> None:
+        self.out_of_memory = 0
+
+    def ran_out_of_memory(self) -> None:
+        self.out_of_memory += 1
 
 
 class LostDevice(RuntimeError):

@@ -9,6 +9,7 @@ import asyncio
 import signal
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -43,6 +44,7 @@ from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.observability.metrics import Metrics
 from mapless_server.query import Caller, Query, Result
+from mapless_server.scheduling.costs import Costs
 from mapless_server.security.rate import RateLimiter
 from mapless_server.serve import MakeEngine, StartupError, engine_options
 from mapless_server.settings import Settings
@@ -113,6 +115,56 @@ def engine_of(localize: Callable[..., Answer], begin: Callable[[], object] = lam
         return Engine(store, tiers, engine_options(settings), metrics, quota, whole(localize))
 
     return make
+
+
+def test_the_queue_expects_what_the_last_round_took_and_not_what_the_first_did(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Kernels are compiled and pages are read in the first."""
+    seen: list[tuple[str, str, float]] = []
+    observe = Costs.observe
+
+    def watched(costs: Costs, stage: str, kind: str, seconds: float) -> None:
+        seen.append((stage, kind, seconds))
+        observe(costs, stage, kind, seconds)
+
+    monkeypatch.setattr(Costs, "observe", watched)
+
+    def localize(*_: Any) -> Answer:
+        time.sleep(0.0 if any(stage == "refine" for stage, _, _ in seen) else 0.3)
+        return answer_at(TRUTH)
+
+    async def test() -> None:
+        with Store.open(tmp_path) as store:
+            tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
+            engine = Engine(store, tiers, EngineOptions(), method=whole(localize))
+            try:
+                await warm_up(engine)
+            finally:
+                await engine.close()
+            assert [stage for stage, _, _ in seen] == ["prepare", "coarse", "refine"] * ROUNDS
+            for stage, kind, seconds in seen[-3:]:
+                assert engine.queue._schedule.costs.predict(stage, kind) == pytest.approx(seconds)
+
+    asyncio.run(test())
+
+
+def test_the_servers_own_localization_is_charged_to_nobody(tmp_path: Path) -> None:
+    """However little computing a tenant may use, and however long the first photograph takes."""
+
+    def localize(*_: Any) -> Answer:
+        time.sleep(0.5)
+        return answer_at(TRUTH)
+
+    settings = Settings(
+        host="127.0.0.1", port=0, data_dir=tmp_path, metrics=False, tenant_rate_ms=50, tenant_burst_ms=200
+    )
+    with (
+        listening(settings, Store.open(tmp_path), engine_of(localize)) as (running, _),
+        grpc.insecure_channel(running.address) as channel,
+    ):
+        status = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=10).status
+        assert status == health_pb2.HealthCheckResponse.SERVING
 
 
 def raising(error: Exception) -> Callable[..., Answer]:

@@ -10,6 +10,7 @@ import asyncio
 import random
 import threading
 import time
+import weakref
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager
@@ -395,6 +396,28 @@ class TestFailure:
 
         run(test())
 
+    def test_what_a_failed_attempt_held_is_free_when_its_halves_are_computed(self) -> None:
+        """An exception that is still handled holds the frames that it came through, and the tensors in them."""
+        held: list[weakref.ref[Any]] = []
+
+        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+            assert not any(it() for it in held)
+            tensor = {len(jobs)} - {1}
+            if tensor:
+                held.append(weakref.ref(tensor))
+                raise MemoryError
+            return [Done(job.step.payload) for job in jobs]
+
+        async def test() -> None:
+            shop = Shop(compute)
+            async with shop.open() as queue:
+                calls = await waiting(shop, queue, range(4))
+                shop.gate.set()
+                assert await outcomes(calls) == [*range(4)]
+            assert len(held) == 3
+
+        run(test())
+
     def test_a_batch_size_that_was_too_much_once_stays_so(self) -> None:
         """Though a later half of the same batch would have allowed more."""
         tried: list[int] = []
@@ -539,6 +562,29 @@ class TestEndOfAll:
                 await self._ends(shop, queue, [*plugs, submit(queue, "waits")])
                 assert "the stage then has computed for" in str(shop.fatals[0])
                 assert "hangs" in str(shop.fatals[0])
+
+        run(test())
+
+    def test_a_long_stage_that_asks_between_its_steps_does_not_hang_until_a_step_does(self) -> None:
+        steps_s, limit_s = 3.0, 1.0
+        shop = Shop(options=WorkQueueOptions(ROOMY, stall_limit_s=limit_s, heartbeat_s=0.05))
+
+        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+            until_s = time.monotonic() + steps_s
+            while time.monotonic() < until_s:
+                jobs[-1].check()
+                time.sleep(0.02)
+            if jobs[0].step.payload == "hangs":
+                assert shop.gate.wait(LIMIT_S)
+            return [Done(job.step.payload) for job in jobs]
+
+        shop.compute = compute
+
+        async def test() -> None:
+            async with shop.open() as queue:
+                assert await outcomes([submit(queue, "long")]) == ["long"]
+                assert not shop.fatals
+                await self._ends(shop, queue, [submit(queue, "hangs")])
 
         run(test())
 

@@ -208,7 +208,7 @@ def reconstruct(batch: Sequence[Prepared], checks: Sequence[Check] = ()) -> list
     Returns:
         For each query, in their order, what is known of it; or its answer, if no more was asked for or nothing more
         can be done; or the exception that is its own, unchanged: what its check raised, or what was raised while it
-        alone was computed, such as a torch.OutOfMemoryError when halving the batch did not help any more.
+        alone was computed, such as a torch.OutOfMemoryError when it was alone.
 
     Raises:
         ValueError: several reconstructors.

@@ -89,7 +89,7 @@ class Admission:
         for lane, own_s in cost_s.items() if self._ledger.jobs else ():
             excess_s = self._excess_s(flow, lane, own_s)
             if excess_s > 0:
-                message = f"{len(self._ledger.jobs)} calls are in progress or wait"
+                message = "as much is admitted already as can be computed soon"
                 raise Refused(Refusal.QUEUE_FULL, message, max(MIN_RETRY_S, excess_s / self._threads[lane]))
 
     def fits(self, job: Job, cost_s: Counter[str]) -> bool:

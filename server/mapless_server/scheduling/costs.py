@@ -16,6 +16,10 @@ class Costs:
         self._memory = memory
         self._kinds: OrderedDict[tuple[str, str], tuple[int, float]] = OrderedDict()
 
+    def forget(self) -> None:
+        """Nothing is known any more."""
+        self._kinds.clear()
+
     def predict(self, stage: str, kind: str) -> float:
         """Seconds. Of an unknown kind, those of the stage's kind that was seen last."""
         known = self._kinds.get((stage, kind)) or self._kinds.get((stage, ""))

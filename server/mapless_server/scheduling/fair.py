@@ -30,15 +30,15 @@ class FairQueue(Generic[J]):
     """Waiting jobs in the order in which they are to be computed.
 
     Deficit round robin (Shreedhar and Varghese, 1996) in its overdrawing form: each caller in turn is given a quantum
-    of time and served while it has credit; what its last job costs beyond that it pays back in later rounds. So over
-    any time in which two callers both wait, what they get differs by no more than a quantum and two jobs, whatever
-    they send and however much.
+    of time and served while it has credit; what its last job costs beyond that it pays back in later rounds, as long as
+    it goes on waiting for more. So over any time in which two callers both wait, what they get differs by no more than
+    a quantum and two jobs, whatever they send and however much.
     """
 
     def __init__(self, quantum_s: float) -> None:
         """A caller alone in its tenant gets `quantum_s` a round; it needs to be no smaller than a typical job."""
         self._quantum_s = quantum_s
-        # In the order of their turns. Who owes time stays until it is paid back, though it have no jobs.
+        # Of those who wait, in the order of their turns.
         self._accounts: OrderedDict[Flow, _Account[J]] = OrderedDict()
         self._members: Counter[str] = Counter()
         self._flow_of: dict[J, Flow] = {}
@@ -52,6 +52,11 @@ class FairQueue(Generic[J]):
 
     def __iter__(self) -> Iterator[J]:
         return iter(self._flow_of)
+
+    @property
+    def callers(self) -> int:
+        """Those whose jobs wait; of nobody else is anything kept."""
+        return len(self._accounts)
 
     @property
     def cost_s(self) -> float:
@@ -78,13 +83,23 @@ class FairQueue(Generic[J]):
         """Takes out the job whose turn it is. IndexError if nothing waits."""
         if not self._flow_of:
             raise IndexError("nothing waits")
-        while True:
-            flow, account = next(iter(self._accounts.items()))
-            if account.jobs and account.credit_s > 0:
-                return self._charge(flow, next(iter(account.jobs)))
-            account.credit_s += self._quantum_s / self._members[flow.tenant]
-            self._accounts.move_to_end(flow)
-            self._forget_idle(flow)
+        for flow in list(self._accounts):
+            if self._accounts[flow].credit_s > 0:
+                return self._charge(flow, next(iter(self._accounts[flow].jobs)))
+            self._begin_turn(flow, 1)
+        # All were in debt: the further rounds in which nobody would be served are gone through at once.
+        idle_rounds = min(int(-it.credit_s / self._share_s(flow)) for flow, it in self._accounts.items())
+        for flow in list(self._accounts):
+            self._begin_turn(flow, max(0, idle_rounds))
+        return self.pop()
+
+    def _begin_turn(self, flow: Flow, rounds: int) -> None:
+        self._accounts[flow].credit_s += rounds * self._share_s(flow)
+        self._accounts.move_to_end(flow)
+
+    def _share_s(self, flow: Flow) -> float:
+        """What a caller is credited in a round."""
+        return self._quantum_s / self._members[flow.tenant]
 
     def pop_alike(self, is_alike: Callable[[J], bool], at_most: int) -> list[J]:
         """Takes out further jobs, to be computed along with one, of each caller in turn; all are charged."""
@@ -105,10 +120,9 @@ class FairQueue(Generic[J]):
         return job
 
     def _forget_idle(self, flow: Flow) -> None:
-        """Credit is not saved up by those who do not wait, and debts end where nobody competes."""
-        if not self._flow_of:
-            self._accounts.clear()
-            self._members.clear()
-        elif not self._accounts[flow].jobs and self._accounts[flow].credit_s >= 0:
+        """Neither credit nor debt is kept of those who do not wait: callers come and go without end."""
+        if not self._accounts[flow].jobs:
             del self._accounts[flow]
             self._members[flow.tenant] -= 1
+            if not self._members[flow.tenant]:
+                del self._members[flow.tenant]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -100,9 +101,9 @@ class Visit:
     Attributes:
         stage: which.
         queued_s: when it began to wait.
-        start_s: when it began to be computed.
+        start_s: when it began to be computed, or its waiting ended for good.
         end_s: when that ended.
-        batch: number of the batch.
+        batch: number of the batch; 0 if it was not computed.
         jobs: in it.
     """
 
@@ -130,6 +131,9 @@ class Job:
         waits_since_s: when it began to wait for the step, by the queue's clock.
         booked_s: computing time that is still predicted for it, by lane.
         charged_s: computing time that its tenant was charged at admission.
+        unusual_s: computing time of the batch at hand that tells nothing of the jobs to come; its stage says so.
+        is_computed: whether it is in a batch.
+        checked_s: when a stage last called `check`, `time.monotonic`: a sign of life of the thread that computes it.
         timer_s: the `due_s` that the schedule has noted.
     """
 
@@ -144,6 +148,9 @@ class Job:
     waits_since_s: float = 0.0
     booked_s: Counter[str] = field(default_factory=Counter)
     charged_s: float = 0.0
+    unusual_s: float = 0.0
+    is_computed: bool = False
+    checked_s: float = -math.inf
     timer_s: float = -math.inf
     _over: threading.Event = field(default_factory=threading.Event)
 
@@ -159,6 +166,7 @@ class Job:
 
     def check(self) -> None:
         """For stages, between their steps, from any thread: raises Over if nobody wants the result any more."""
+        self.checked_s = time.monotonic()
         if self._over.is_set():
             raise Over
 

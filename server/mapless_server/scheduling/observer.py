@@ -45,7 +45,7 @@ class Observer:
         """A job was not."""
 
     def queued(self, stage: str, jobs: int, cost_s: float) -> None:
-        """So many jobs now wait for a stage, and so much computing is predicted for them there."""
+        """So many jobs now wait for a stage, and so much computing is predicted for them from there on."""
 
     def running(self, stage: str, jobs: int) -> None:
         """So many jobs are now computed in a stage."""

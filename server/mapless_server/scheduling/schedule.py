@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import weakref
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,13 +20,12 @@ from .jobs import Batch, Done, Expired, Fallback, Job, Next, Over, Refused, Stag
 from .ledger import Ledger
 from .observer import Ending, Observer, Refusal
 
+_TRY_ONE_IN = 8
+
 _NOBODY = Flow("", "")
 """A caller without jobs."""
 
-_ENDED_HELD = 16
-
-_UNASKED = frozenset({Ending.CANCELLED, Ending.EXPIRED})
-"""Endings that come from outside, while a stage may be at the job."""
+_ENDED_LISTED = 16
 
 
 class Quota(Protocol):
@@ -92,9 +92,11 @@ class Schedule:
             for name, count in lanes.items()
         }
         self._max_batch: dict[tuple[str, str], int] = {}
+        self._declined: Counter[tuple[str, str]] = Counter()
         self._ledger = Ledger()
         self._admission = Admission(options, lanes, self._ledger)
-        self._due: list[tuple[float, int, Job]] = []
+        # By reference: a job that has ended holds photographs, and must not be held until it would have been due.
+        self._due: list[tuple[float, int, weakref.ref[Job]]] = []
         self._tick = itertools.count()
         self._batch_number = itertools.count(1)
 
@@ -106,16 +108,20 @@ class Schedule:
     @property
     def next_due_s(self) -> float | None:
         """When `expire` is to be called next; None if there is no job."""
-        while self._due and (self._due[0][2].is_over or self._due[0][0] != self._due[0][2].due_s):
+        while self._due:
+            due_s, _, reference = self._due[0]
+            job = reference()
+            if job is not None and not job.is_over and job.due_s == due_s:
+                return due_s
             heapq.heappop(self._due)  # it ended, or is due at another time by now
-        return self._due[0][0] if self._due else None
+        return None
 
     def admit(self, job: Job, now_s: float) -> None:
         """Lets a job in, which from then on ends exactly once; Refused, with nothing changed, if there is no room."""
         cost_s = self._predict(job.step)
         try:
             self._admission.check(job, cost_s, now_s)
-            if self._quota is not None:
+            if self._quota is not None and job.flow.tenant:  # nobody's jobs, the server's own, are free
                 job.charged_s = cost_s.total()
                 wait_s = self._quota.charge(job.flow.tenant, job.charged_s, now_s)
                 if wait_s > 0:
@@ -148,6 +154,7 @@ class Schedule:
         lane.free -= 1
         jobs = self._pop_batch(stage)
         for job in jobs:
+            job.is_computed = True
             self._observer.waited(stage.name, now_s - job.waits_since_s)
         self._running[stage.name] += len(jobs)
         self._tell(stage)
@@ -159,13 +166,17 @@ class Schedule:
         self._lanes[stage.lane].free += 1
         self._running[stage.name] -= len(batch.jobs)
         self._observer.computed(stage.name, batch.jobs[0].step.bucket, len(batch.jobs), seconds)
+        unusual_s = max(job.unusual_s for job in batch.jobs)
         share_s = seconds / len(batch.jobs)
         for job, verdict in zip(batch.jobs, verdicts, strict=True):
             # What fails, fails early. What was given up would have taken longer yet.
-            longer = isinstance(verdict, Over) and share_s > self.costs.predict(stage.name, job.step.kind)
+            usual_s = max(0.0, seconds - unusual_s) / len(batch.jobs)
+            longer = isinstance(verdict, Over) and usual_s > self.costs.predict(stage.name, job.step.kind)
             if longer or not isinstance(verdict, Exception):
-                self.costs.observe(stage.name, job.step.kind, share_s)
+                self.costs.observe(stage.name, job.step.kind, usual_s)
             job.used_s += share_s
+            job.unusual_s = 0.0
+            job.is_computed = False
             job.visits.append(Visit(stage.name, job.waits_since_s, batch.start_s, now_s, batch.number, len(batch.jobs)))
             if job.is_over:
                 continue
@@ -185,7 +196,8 @@ class Schedule:
     def expire(self, now_s: float) -> None:
         """Ends the jobs whose time is over, wherever they are."""
         while (due_s := self.next_due_s) is not None and due_s <= now_s:
-            _, _, job = heapq.heappop(self._due)
+            job = heapq.heappop(self._due)[2]()
+            assert job is not None
             if job.fallback is None:
                 self._end(
                     job, Ending.EXPIRED, Expired("the deadline passed while the call waited or was computed"), now_s
@@ -227,7 +239,7 @@ class Schedule:
         cost_s = self._predict(job.step)
         if job.fallback is None:
             cost_s &= job.booked_s  # it was admitted for no more
-        elif not self._is_worthwhile(job, cost_s, now_s):
+        elif not self._is_worthwhile(job, cost_s, now_s) and not self._tries_anyway(job.step):
             self._give_fallback(job, job.fallback, now_s)
             return
         self._ledger.rebook(job, cost_s)
@@ -238,8 +250,17 @@ class Schedule:
         lane_name = self._stages[job.step.stage].lane
         lane = self._lanes[lane_name]
         coming_first = lane.stages[lane.stages.index(self._stages[job.step.stage]) :]
-        wait_s = sum(self._queues[stage.name].cost_s for stage in coming_first) / lane.threads
-        return self._admission.fits(job, cost_s) and now_s + wait_s + cost_s.total() <= job.due_s
+        wait_s = sum(
+            self.costs.predict(stage.name, other.step.kind)
+            for stage in coming_first
+            for other in self._queues[stage.name]
+        )
+        return self._admission.fits(job, cost_s) and now_s + wait_s / lane.threads + cost_s.total() <= job.due_s
+
+    def _tries_anyway(self, step: Step) -> bool:
+        """One in so many: only what is computed mends a prediction, and the fallback is given in time all the same."""
+        self._declined[step.stage, step.kind] += 1
+        return self._declined[step.stage, step.kind] % _TRY_ONE_IN == 0
 
     def _enqueue(self, job: Job, now_s: float) -> None:
         stage = self._stages[job.step.stage]
@@ -248,14 +269,15 @@ class Schedule:
         self._queues[stage.name].push(job, job.flow, self._predict(job.step).total())
         if job.timer_s != job.due_s:
             job.timer_s = job.due_s
-            heapq.heappush(self._due, (job.due_s, next(self._tick), job))
+            heapq.heappush(self._due, (job.due_s, next(self._tick), weakref.ref(job)))
             self._forget_ended()
         self._tell(stage)
 
     def _forget_ended(self) -> None:
-        """Jobs that ended long before they were due must not be held until then: their photographs are large."""
-        if len(self._due) > 2 * len(self._ledger.jobs) + _ENDED_HELD:
-            self._due = [(due_s, tick, job) for due_s, tick, job in self._due if not job.is_over]
+        """Keeps the list of what is due about as long as that of the jobs."""
+        if len(self._due) > 2 * len(self._ledger.jobs) + _ENDED_LISTED:
+            alive = {id(job) for job in self._ledger.jobs}
+            self._due = [entry for entry in self._due if id(entry[2]()) in alive]
             heapq.heapify(self._due)
 
     def _pop_batch(self, stage: Stage) -> tuple[Job, ...]:
@@ -270,13 +292,14 @@ class Schedule:
         waits = job in self._queues[stage.name]
         if waits:
             self._queues[stage.name].remove(job)
+            job.visits.append(Visit(stage.name, job.waits_since_s, now_s, now_s, batch=0, jobs=0))
         self._ledger.close(job)
         job.end(ending, value)  # before anybody else is told, who may fail
         if waits:
             self._tell(stage)
-        if self._quota is not None:
+        if self._quota is not None and job.flow.tenant:
             # What is computed just now was not counted yet.
-            used_s = job.used_s if waits or ending not in _UNASKED else max(job.used_s, job.charged_s)
+            used_s = max(job.used_s, job.charged_s) if job.is_computed else job.used_s
             self._quota.settle(job.flow.tenant, job.charged_s, used_s, now_s)
         self._observer.ended(stage.name, ending)
 

@@ -60,7 +60,8 @@ class WorkQueueOptions:
     """Options of the work queue.
 
     Attributes:
-        stall_limit_s: a batch that is computed for longer hangs: its thread is lost, and so, in the end, is the server.
+        stall_limit_s: a batch of which nothing is heard for longer, neither its end nor a job's `check`, hangs: its
+            thread is lost, and so, in the end, is the server.
         heartbeat_s: the queue looks after itself at least so often.
     """
 
@@ -157,6 +158,7 @@ class WorkQueue:
             step: its first.
             deadline_s: when its result is of no use any more, `time.monotonic`.
             size_bytes: memory that it holds.
+            visits: gets the stages that it goes through, for who wants to know how far it came if it fails.
 
         Returns:
             Its result, and the stages that it went through.
@@ -173,7 +175,7 @@ class WorkQueue:
         def on_end(_: Ending, value: Any) -> None:  # in whatever thread ends the job
             loop.call_soon_threadsafe(_resolve, future, value)
 
-        job = Job(flow, step, deadline_s, size_bytes, on_end)
+        job = Job(flow, step, deadline_s, size_bytes, on_end, [] if visits is None else visits)
         with self._lock:
             self._schedule.admit(job, time.monotonic())
             self._spread_news()
@@ -189,6 +191,11 @@ class WorkQueue:
         """Raises Refused if nobody would be admitted who began with a step like this."""
         with self._lock:
             self._schedule.check_room(step)
+
+    def forget_costs(self) -> None:
+        """What was computed up to now tells nothing of what is to come."""
+        with self._lock:
+            self._schedule.costs.forget()
 
     def drain(self) -> None:
         """Lets nobody in any more."""
@@ -249,8 +256,9 @@ class WorkQueue:
 
     def _look_for_stalls(self, now_s: float) -> None:
         for batch in self._computing:
-            if now_s - batch.start_s > self._options.stall_limit_s:
-                raise Fatal(f"the stage {batch.stage.name} has computed for {now_s - batch.start_s:.0f} s: it hangs")
+            silent_s = now_s - max(batch.start_s, *(job.checked_s for job in batch.jobs))
+            if silent_s > self._options.stall_limit_s:
+                raise Fatal(f"the stage {batch.stage.name} has computed for {silent_s:.0f} s in one step: it hangs")
 
     def _die(self, error: BaseException) -> None:
         """Nothing will be computed any more: everybody is told, and so is the owner."""
@@ -302,16 +310,18 @@ class WorkQueue:
             failure = self._checked(error)
             if len(jobs) == 1:
                 return [error]
-            half = len(jobs) // 2
-            if failure is Failure.OF_MEMORY:
-                with self._lock:
-                    self._schedule.limit_batch(stage.name, jobs[0].step.bucket, half)
-            log.warning("%s: %d jobs at a time failed, trying them in halves: %r", stage.name, len(jobs), error)
-            return self._verdicts(stage, jobs[:half]) + self._verdicts(stage, jobs[half:])
-        for verdict in verdicts:
-            if isinstance(verdict, Exception):
-                self._checked(verdict)
-        return verdicts
+            log.warning("%s: %d jobs at a time failed, trying them in halves: %s", stage.name, len(jobs), repr(error))
+        else:
+            for verdict in verdicts:
+                if isinstance(verdict, Exception):
+                    self._checked(verdict)
+            return verdicts
+        # Out here the exception is gone, and with it what the failed attempt held of the device's memory.
+        half = len(jobs) // 2
+        if failure is Failure.OF_MEMORY:
+            with self._lock:
+                self._schedule.limit_batch(stage.name, jobs[0].step.bucket, half)
+        return self._verdicts(stage, jobs[:half]) + self._verdicts(stage, jobs[half:])
 
     def _checked(self, error: Exception) -> Failure:
         """What the exception means; Fatal if nothing is to be trusted any more."""

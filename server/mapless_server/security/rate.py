@@ -1,6 +1,6 @@
 """How much computing each tenant may use: a bucket of seconds that fills at a steady rate and is drawn from by jobs.
 
-Time is passed in. Nothing is locked: all calls come from one thread, the event loop's.
+Time is passed in. Nothing is locked here: calls come from many threads, one at a time, with the work queue locked.
 """
 
 from __future__ import annotations

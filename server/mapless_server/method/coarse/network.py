@@ -92,14 +92,25 @@ class NetworkReconstructor:
         """See Reconstructor.reconstruct_many: in one go those that have the same grid and number of references.
 
         Each view is encoded once, however many requests show it. When the device's memory does not suffice, tokens
-        that are kept there leave it and the batch is halved.
+        that are kept there leave it, and what failed is tried once more.
 
         Returns:
             The outcomes, among them the exceptions:
             ValueError: a view has no photograph.
             torch.OutOfMemoryError: there is not even room for this query alone.
             RequestError: a reference's photograph cannot be read any more.
+
+        Raises:
+            torch.OutOfMemoryError: there is no room for so many queries; for fewer there may be.
         """
+        try:
+            return self._reconstruct_many(requests)
+        except torch.OutOfMemoryError as error:
+            if len(requests) > 1:
+                raise
+            return [error]
+
+    def _reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
         outcomes: list[Outcome | Exception | None] = [None] * len(requests)
         batches: dict[tuple[Grid, int], list[tuple[int, _EncodedScene]]] = defaultdict(list)
         encoded: dict[TokenKey, Tensor] = {}
@@ -110,13 +121,15 @@ class NetworkReconstructor:
             try:
                 scene = _Scene.of(request.query, request.references, self._options.grids)
                 tokens = self._with_room(partial(self._encode, scene, encoded))
+            except torch.OutOfMemoryError:
+                raise
             except Exception as error:  # one request's fault is not the others'
                 outcomes[i] = error
             else:
                 batches[scene.grid, len(request.references)].append((i, _EncodedScene(scene, tokens)))
         for batch in batches.values():
             indices, scenes = zip(*batch, strict=True)
-            for i, outcome in zip(indices, self._solve(scenes), strict=True):
+            for i, outcome in zip(indices, self._with_room(partial(self._run, scenes)), strict=True):
                 outcomes[i] = outcome
         return [outcome for outcome in outcomes if outcome is not None]
 
@@ -125,31 +138,15 @@ class NetworkReconstructor:
         try:
             return work()
         except torch.OutOfMemoryError as error:
-            log.warning("%s: %s", self.name, error)
+            log.warning("%s: tokens make room: %s", self.name, str(error))
         # Out here nothing of the failed attempt is left.
-        self._make_room()
-        return work()
-
-    def _make_room(self) -> None:
         self.cache.release_device()
         if self._runner.device.type == "cuda":
             torch.cuda.empty_cache()
-
-    def _solve(self, scenes: Sequence[_EncodedScene], has_room: bool = False) -> list[Outcome | Exception]:
-        """Outcomes of scenes of one grid and number of views."""
-        try:
-            return [*self._run(scenes)]
-        except torch.OutOfMemoryError as error:
-            log.warning("%s: %d queries at a time: %s", self.name, len(scenes), error)
-            if has_room and len(scenes) == 1:
-                return [error]
-        self._make_room()
-        if len(scenes) == 1:
-            return self._solve(scenes, has_room=True)
-        half = len(scenes) // 2
-        return self._solve(scenes[:half], has_room=True) + self._solve(scenes[half:], has_room=True)
+        return work()
 
     def _run(self, scenes: Sequence[_EncodedScene]) -> list[Outcome]:
+        """Outcomes of scenes of one grid and number of views."""
         grid, references = scenes[0].scene.grid, scenes[0].scene.references
         poses = posed = None
         if self._runner.conditioned:
