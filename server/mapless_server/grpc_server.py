@@ -37,9 +37,11 @@ SERVICE_NAMES = (
 
 LOCALIZE_METHOD = f"/{SERVICE_NAMES[0]}/Localize"
 
-MAX_CONCURRENT_RPCS = 1024
-"""Calls that are received at a time, from all connections. Far above what the queue admits, and health probes count."""
-
+MAX_CONCURRENT_RPCS = 2048
+"""Calls at a time, from all connections. Far above what the queue admits; health probes count, and calls of which only
+the headers have come, each of which `receiving` gives but a time."""
+MAX_CALLS_PER_CONNECTION = 128
+"""Far below that, so that no connection can use it up; a client with more at a time sends them one after another."""
 
 _LAST_BYTES_S = 0.5
 """For answers that are on their way when the last call has ended."""
@@ -86,7 +88,7 @@ class GrpcServer:
         self._server = grpc.aio.server(
             interceptors=[self._interceptor], options=_options(settings), maximum_concurrent_rpcs=MAX_CONCURRENT_RPCS
         )
-        self._references = ReferenceService(self._ready_engine, store, metrics)
+        self._references = ReferenceService(self._ready_engine, store)
         reference_service_pb2_grpc.add_ReferenceServiceServicer_to_server(self._references, self._server)
         localization_service_pb2_grpc.add_LocalizationServiceServicer_to_server(
             LocalizationService(self._ready_engine, metrics), self._server
@@ -177,8 +179,7 @@ def _options(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.max_send_message_length", max_message_bytes),
         # With reuseport, the default, a second server silently shares the port and takes half of the calls.
         ("grpc.so_reuseport", 0),
-        # Above the queue's own bound, so that callers are told of overload instead of waiting unseen in their channel.
-        ("grpc.max_concurrent_streams", 256),
+        ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
         ("grpc.max_metadata_size", 16 * 1024),
         # Clients may ping every 30 s, but only while they have a call.
         ("grpc.http2.min_recv_ping_interval_without_data_ms", 30_000),

@@ -6,7 +6,6 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -18,8 +17,7 @@ from mapless.v1 import reference_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
 
 from .engine import Engine
-from .errors import AlreadyExists, DataLoss, RequestError
-from .observability.metrics import Metrics
+from .errors import AlreadyExists
 from .photos import photo_from_message
 from .query import Photo
 from .rpc import Call
@@ -33,6 +31,7 @@ STORE_THREADS = 4  # writers queue for one lock anyhow; these keep readers from 
 
 T = TypeVar("T")
 Record = TypeVar("Record")
+M = TypeVar("M", pb.Scene, pb.Reference)
 Draft = tuple[str, Photo, RigidTransform]
 """Reference id, photograph and world_from_camera."""
 PageRequest = pb.ListScenesRequest | pb.ListReferencesRequest
@@ -41,11 +40,10 @@ PageRequest = pb.ListScenesRequest | pb.ListReferencesRequest
 class ReferenceService(rpcs.ReferenceServiceServicer):
     """Keeps scenes and their references."""
 
-    def __init__(self, engine: Callable[[], Engine], store: Store, metrics: Metrics) -> None:
+    def __init__(self, engine: Callable[[], Engine], store: Store) -> None:
         """`engine` gives it, or raises Unavailable as long as there is none."""
         self._engine = engine
         self._store = store
-        self._metrics = metrics
         self._threads = ThreadPoolExecutor(STORE_THREADS, thread_name_prefix="store")
 
     def close(self) -> None:
@@ -69,7 +67,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         page = Page(request, tenant, "scenes")
         found = await self._stored(self._store.list_scenes, tenant, page.limit, page.after)
         scenes, token = page.cut(found, lambda scene: scene.scene_id)
-        return pb.ListScenesResponse(scenes=map(_scene_to_message, scenes), next_page_token=token)
+        return pb.ListScenesResponse(scenes=await _many(_scene_to_message, scenes), next_page_token=token)
 
     async def DeleteScene(self, request: pb.DeleteSceneRequest, call: Call) -> pb.DeleteSceneResponse:
         """Implements ReferenceService.DeleteScene."""
@@ -105,7 +103,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             lambda: [self._draft(item, f"requests[{i}]") for i, item in enumerate(request.requests)]
         )
         records = await self._add(scene_key, drafts, call)
-        return pb.BatchCreateReferencesResponse(references=map(_reference_to_message, records))
+        return pb.BatchCreateReferencesResponse(references=await _many(_reference_to_message, records))
 
     async def GetReference(self, request: pb.GetReferenceRequest, call: Call) -> pb.GetReferenceResponse:
         """Implements ReferenceService.GetReference."""
@@ -121,7 +119,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         page = Page(request, call.principal.tenant, request.scene)
         found = await self._stored(self._store.list_references, scene_key, page.limit, page.after)
         references, token = page.cut(found, lambda reference: reference.reference_id)
-        return pb.ListReferencesResponse(references=map(_reference_to_message, references), next_page_token=token)
+        messages = await _many(_reference_to_message, references)
+        return pb.ListReferencesResponse(references=messages, next_page_token=token)
 
     async def DeleteReference(self, request: pb.DeleteReferenceRequest, call: Call) -> pb.DeleteReferenceResponse:
         """Implements ReferenceService.DeleteReference."""
@@ -156,21 +155,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def _stored(self, operation: Callable[..., T], *arguments: object) -> T:
         """An operation of the store, off the event loop; Unavailable while the server starts."""
         self._engine()
-        return await asyncio.get_running_loop().run_in_executor(self._threads, self._timed, operation, *arguments)
-
-    def _timed(self, operation: Callable[..., T], *arguments: object) -> T:
-        start_s = time.monotonic()
-        try:
-            return operation(*arguments)
-        except RequestError as error:
-            if isinstance(error, DataLoss):
-                self._metrics.store_failed()
-            raise
-        except Exception:
-            self._metrics.store_failed()
-            raise
-        finally:
-            self._metrics.stored(operation.__name__, time.monotonic() - start_s)
+        return await asyncio.get_running_loop().run_in_executor(self._threads, operation, *arguments)
 
 
 class Page:
@@ -217,6 +202,11 @@ def _reference_key(name: str, field: str, call: Call) -> tuple[SceneKey, str]:
     """The key of the caller's scene, and the reference's id within it; FieldError if the name is none."""
     scene_id, reference_id = wire.reference_ids_from_name(name, field)
     return key_of(call.principal.tenant, scene_id), reference_id
+
+
+async def _many(to_message: Callable[[Record], M], records: Sequence[Record]) -> list[M]:
+    """The messages of a page; a thousand take tens of milliseconds, too long for the event loop."""
+    return await asyncio.to_thread(lambda: [to_message(record) for record in records])
 
 
 def _scene_to_message(scene: SceneRecord) -> pb.Scene:

@@ -12,7 +12,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 from . import __version__
 from .assembly import gpu_memory, make_tiers, what_is_missing
@@ -43,6 +43,10 @@ _LAST_WORDS_S = 1.0
 """For callers and health watchers to be told before a broken process ends."""
 
 _TRACES_FLUSH_S = 3.0
+
+_CLOSING_LIMIT_S = 15.0
+"""After the calls' own time, for threads to be through with their step, traces and the store; then whatever still runs
+hangs. With the drain's times it must be less than what the supervisor gives, see deploy/kubernetes."""
 
 _SWITCH_INTERVAL_S = 0.001
 """How long a computing thread keeps the interpreter from the event loop; Python's own 5 ms add up to late answers."""
@@ -105,7 +109,6 @@ class Running:
         metrics_address: the same of the metrics; empty if there are none.
         engine: what computes.
         failed: done when something inside is broken and nothing will be computed any more.
-        begin_draining: says that the server stops, takes no new calls, and returns when the running ones have ended.
     """
 
     address: str
@@ -134,6 +137,7 @@ async def running_server(
     metrics = Metrics()
     async with AsyncExitStack() as stack:
         store = store or open_store(settings)
+        store.observer = metrics
         stack.push_async_callback(asyncio.to_thread, store.close)
         protection = _make_protection(settings)
         tracer = _make_tracer(settings)
@@ -149,17 +153,18 @@ async def running_server(
         engine.queue.on_fatal = lambda fatal: _announce_failure(fatal, failed, metrics)
         _keep(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
         _keep(stack, keep_fresh(protection.refreshable))
+        _keep(stack, _stop_serving(server, failed))
         await _warm_up(settings, engine, metrics)
         await server.open(engine)
         stack.push_async_callback(server.drain, settings.drain_delay_s, settings.drain_grace_s)
-        failed.add_done_callback(lambda _: asyncio.ensure_future(server.set_serving(False)))
         yield Running(server.address, metrics_address, engine, failed)
 
 
 async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
     """Serves until SIGTERM or SIGINT, then lets running calls finish; StartupError if it cannot begin.
 
-    If something inside breaks that cannot be mended, the process ends with FATAL_EXIT_CODE.
+    If something inside breaks that cannot be mended, even while it stops, or hangs when all calls have had their time,
+    the process ends with FATAL_EXIT_CODE.
     """
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     stop = asyncio.Event()
@@ -184,10 +189,29 @@ async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
         ended: set[asyncio.Future[Any]] = {stopped, running.failed}
         await asyncio.wait(ended, return_when=asyncio.FIRST_COMPLETED)
         if running.failed.done():
-            await asyncio.sleep(_LAST_WORDS_S)
-            logging.shutdown()
-            os._exit(FATAL_EXIT_CODE)  # threads may hang, so none is waited for
+            await _end_broken()
         log.info("stopping: running calls get %g s", settings.drain_grace_s)
+        closing = asyncio.ensure_future(stack.aclose())
+        limit_s = settings.drain_delay_s + settings.drain_grace_s + _CLOSING_LIMIT_S
+        await asyncio.wait({closing, running.failed}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
+        if running.failed.done():
+            await _end_broken()
+        if not closing.done():
+            log.critical("the server hangs: it has not stopped after %g s", limit_s)
+            await _end_broken()
+        await closing
+
+
+async def _end_broken() -> NoReturn:
+    await asyncio.sleep(_LAST_WORDS_S)
+    logging.shutdown()
+    os._exit(FATAL_EXIT_CODE)  # threads may hang, so none is waited for
+
+
+async def _stop_serving(server: GrpcServer, failed: asyncio.Future[Fatal]) -> None:
+    """Health says so when the server has failed."""
+    await asyncio.wait({failed})
+    await server.set_serving(False)
 
 
 def _make_protection(settings: Settings) -> Protection:
@@ -215,9 +239,7 @@ def _serve_metrics(
     if not settings.metrics:
         return ""
     try:
-        exporter = MetricsServer(
-            metrics.registry, settings.metrics_host, settings.metrics_port, lambda: metrics.is_serving
-        )
+        exporter = MetricsServer(metrics.registry, settings.metrics_host, settings.metrics_port, metrics)
     except OSError as error:
         address = f"{settings.metrics_host}:{settings.metrics_port}"
         raise StartupError(f"cannot serve metrics on {address}: {error.strerror or error}") from error

@@ -22,7 +22,7 @@ class LoopObserver(Protocol):
         """A timer ran so late."""
 
     def beat(self) -> None:
-        """The scheduler is alive."""
+        """The loop and the scheduler are alive."""
 
 
 async def watch_event_loop(observer: LoopObserver, is_alive: Callable[[], bool] = lambda: True) -> None:

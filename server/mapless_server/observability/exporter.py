@@ -1,7 +1,8 @@
 """The port that Prometheus and probes ask: plain HTTP in threads of its own, which answer while the event loop is busy.
 
-"/metrics" is the registry; "/ready" is 200 while the server serves and 503 before and after, for probes that do not
-speak gRPC.
+"/metrics" is the registry. "/ready", for probes that do not speak gRPC, is 200 while the server serves and 503 before
+and after, and when its event loop or its queue have not been heard of for a moment. "/live" is 503 when they have not
+been for long: that server answers nobody any more, and whoever supervises it should start it anew.
 
 The library's own server starts a thread for every connection and waits for its request without end, so that a thousand
 idle connections take a thousand threads and file descriptors from the server beside it. This one holds a few, lets go
@@ -15,11 +16,12 @@ import socket
 import socketserver
 import sys
 import threading
+import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from prometheus_client import CollectorRegistry, make_wsgi_app
@@ -33,26 +35,42 @@ MAX_CONNECTIONS = 8
 """Prometheus needs one, its twin another; a person looks as well."""
 SILENCE_S = 5.0
 """A connection on which nothing comes or goes for so long is closed."""
+READY_LIMIT_S = 5.0
+"""A heartbeat may be so old; the loop beats a hundred times a second."""
+LIVE_LIMIT_S = 60.0
+"""As old as no machine, however busy, makes it; longer than closing takes, during which it does not beat."""
 _POLL_S = 0.2
 
 
-class MetricsServer:
-    """Serves a registry, and whether the server is ready, until it is closed."""
+class State(Protocol):
+    """How the server does; read in threads of its own.
 
-    def __init__(self, registry: CollectorRegistry, host: str, port: int, is_serving: Callable[[], bool]) -> None:
+    Attributes:
+        is_serving: whether health says SERVING.
+        beaten_s: when its heart beat last, `time.monotonic`; None while it starts.
+    """
+
+    is_serving: bool
+    beaten_s: float | None
+
+
+class MetricsServer:
+    """Serves a registry, and whether the server is ready and alive, until it is closed."""
+
+    def __init__(self, registry: CollectorRegistry, host: str, port: int, state: State) -> None:
         """Listens and serves.
 
         Args:
             registry: the metrics.
             host: address to listen on.
             port: 0 takes any free one.
-            is_serving: whether health says SERVING; called in threads of its own.
+            state: of the server.
 
         Raises:
             OSError: the address cannot be listened on.
         """
         self._server = _HttpServer(host, port)
-        self._server.set_app(_application(registry, is_serving))
+        self._server.set_app(_application(registry, state))
         self.port: int = self._server.server_port
         self._thread = threading.Thread(target=self._server.serve_forever, args=(_POLL_S,), name="metrics", daemon=True)
         self._thread.start()
@@ -65,18 +83,28 @@ class MetricsServer:
         self._server.server_close()
 
 
-def _application(registry: CollectorRegistry, is_serving: Callable[[], bool]) -> WSGIApplication:
+def _application(registry: CollectorRegistry, state: State) -> WSGIApplication:
     metrics: WSGIApplication = make_wsgi_app(registry)
+
+    def beats_within(limit_s: float) -> bool:
+        beaten_s = state.beaten_s
+        return beaten_s is None or time.monotonic() - beaten_s < limit_s
 
     def answer(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         path = environ["PATH_INFO"]
         if path == "/metrics":
             return metrics(environ, start_response)
-        if path != "/ready":
-            return _say(start_response, HTTPStatus.NOT_FOUND, "there are /metrics and /ready")
-        if is_serving():
-            return _say(start_response, HTTPStatus.OK, "serving")
-        return _say(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "not serving")
+        if path == "/ready":
+            if not beats_within(READY_LIMIT_S):
+                return _say(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "hanging")
+            if state.is_serving:
+                return _say(start_response, HTTPStatus.OK, "serving")
+            return _say(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "not serving")
+        if path == "/live":
+            if beats_within(LIVE_LIMIT_S):
+                return _say(start_response, HTTPStatus.OK, "alive")
+            return _say(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "hanging")
+        return _say(start_response, HTTPStatus.NOT_FOUND, "there are /metrics, /ready and /live")
 
     return answer
 

@@ -61,7 +61,9 @@ _CODES = (
     "UNAUTHENTICATED",
 )
 _OTHER = "other"
-_MAX_CHILDREN = 64  # stages, buckets and operations have names of ours, far fewer than this
+_MAX_CHILDREN = 64
+"""Stages and operations have names of ours, far fewer than this. Buckets, of which there is one for every number of
+references and size of image, may be more: those that come later are counted together, as "other"."""
 
 M = TypeVar("M", bound=MetricWrapperBase)
 
@@ -99,6 +101,7 @@ class Metrics(Observer):
     Attributes:
         registry: what a scrape reads.
         is_serving: what `set_serving` was told last; False before.
+        beaten_s: when `beat` was called last, `time.monotonic`; None before.
     """
 
     def __init__(self) -> None:
@@ -107,6 +110,7 @@ class Metrics(Observer):
         PlatformCollector(registry=self.registry)
         GCCollector(registry=self.registry)
         self.is_serving = False
+        self.beaten_s: float | None = None
         self._scraped = Scraped()
         self.registry.register(self._scraped)
         self._make_call_metrics()
@@ -163,7 +167,8 @@ class Metrics(Observer):
         self._ended(stage, ending.value).inc()
 
     def beat(self) -> None:
-        """The scheduler is alive."""
+        """The event loop and the scheduler are alive."""
+        self.beaten_s = time.monotonic()
         self._heartbeat.set(time.time())
 
     # Answers

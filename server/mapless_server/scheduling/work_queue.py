@@ -150,7 +150,9 @@ class WorkQueue:
             for thread in self._threads:
                 thread.start()
 
-    async def submit(self, flow: Flow, step: Step, deadline_s: float, size_bytes: int) -> tuple[Any, Sequence[Visit]]:
+    async def submit(
+        self, flow: Flow, step: Step, deadline_s: float, size_bytes: int, visits: list[Visit] | None = None
+    ) -> tuple[Any, Sequence[Visit]]:
         """Lets a job in, and waits for it; whoever is cancelled while waiting gives up the job's place.
 
         Args:

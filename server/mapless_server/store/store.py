@@ -15,6 +15,7 @@ from mapless_server.errors import AlreadyExists
 from mapless_server.method.views import View
 from mapless_server.store import queries, rows, tables
 from mapless_server.store.cache import LruCache
+from mapless_server.store.observed import StoreObserver, Unobserved, observed
 from mapless_server.store.records import (
     DescribedReference,
     NewReference,
@@ -44,10 +45,14 @@ class Store:
 
     DataLoss is raised wherever stored bytes turn out not to be what was stored; other references are still served, and
     the damaged one can be deleted.
+
+    Attributes:
+        observer: hears of every operation.
     """
 
     def __init__(self, database: SqliteDatabase, described: LruCache[DescribedReference]) -> None:
         self._database = database
+        self.observer: StoreObserver = Unobserved()
         # By (key, extractor): references never change and keys are never reused, so no entry is ever stale.
         self._described = described
         # By (scene_key, generation), which are never reused either.
@@ -97,6 +102,7 @@ class Store:
         finally:
             self._state = object()
 
+    @observed
     def create_scene(self, scene_key: SceneKey) -> SceneRecord:
         """Create an empty scene.
 
@@ -112,6 +118,7 @@ class Store:
             connection.execute(insert(scene).values(scene_id=scene_key, create_time_us=rows.time_us(_now())))
             return rows.scene_record(queries.find_scene(connection, scene_key))
 
+    @observed
     def get_scene(self, scene_key: SceneKey) -> SceneRecord:
         """A scene.
 
@@ -121,12 +128,14 @@ class Store:
         with self._database.read() as connection:
             return rows.scene_record(queries.find_scene(connection, scene_key))
 
+    @observed
     def list_scenes(self, tenant: str, limit: int, after: str = "") -> list[SceneRecord]:
         """At most ``limit`` scenes of a tenant, by id, of those whose id is greater than ``after``."""
         page = queries.select_scenes_of(tenant, after).limit(limit)
         with self._database.read() as connection:
             return [rows.scene_record(row) for row in connection.execute(page)]
 
+    @observed
     def delete_scene(self, scene_key: SceneKey) -> None:
         """Delete a scene and all its references.
 
@@ -137,6 +146,7 @@ class Store:
             queries.begin_change(connection, scene_key)
             connection.execute(delete(tables.scene).where(tables.scene.c.scene_id == scene_key))
 
+    @observed
     def add_references(self, scene_key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
         """Add references, all or none, each with the features of all its extractors; one change of the scene.
 
@@ -167,6 +177,7 @@ class Store:
             connection.execute(insert(tables.features), features_rows)
         return records
 
+    @observed
     def add_features(self, key: str, extractor: str, view: View) -> None:
         """Store what another extractor found in a reference's image; no change of the scene, see SceneRecord.
 
@@ -187,11 +198,13 @@ class Store:
                 raise AlreadyExists(f"reference {reference_id!r} has features of {extractor!r} already")
             connection.execute(insert(tables.features).values(row))
 
+    @observed
     def has_features(self, key: str, extractor: str) -> bool:
         """Whether a reference has features of this extractor; False if it was deleted."""
         with self._database.read() as connection:
             return queries.has_features(connection, key, extractor)
 
+    @observed
     def get_reference(self, scene_key: SceneKey, reference_id: str) -> ReferenceRecord:
         """A reference without its image.
 
@@ -204,6 +217,7 @@ class Store:
             row = connection.execute(select(tables.reference).where(tables.reference.c.key == key)).one()
         return rows.reference_record(row)
 
+    @observed
     def read_image(self, scene_key: SceneKey, reference_id: str) -> bytes:
         """The image's bytes as they came.
 
@@ -215,6 +229,7 @@ class Store:
             row = queries.find_image(connection, queries.find_key(connection, scene_key, reference_id))
         return rows.image(row)
 
+    @observed
     def read_image_of(self, key: str) -> bytes:
         """The image's bytes as they came, by the reference's key: the very image that a snapshot spoke of.
 
@@ -226,6 +241,7 @@ class Store:
             row = queries.find_image(connection, key)
         return rows.image(row)
 
+    @observed
     def list_references(self, scene_key: SceneKey, limit: int, after: str = "") -> list[ReferenceRecord]:
         """At most ``limit`` references of a scene, by id, of those whose id is greater than ``after``.
 
@@ -240,6 +256,7 @@ class Store:
             found = connection.execute(page.order_by(column.reference_id).limit(limit)).all()
         return [rows.reference_record(row) for row in found]
 
+    @observed
     def delete_reference(self, scene_key: SceneKey, reference_id: str) -> None:
         """Delete a reference with its image and features; works on a damaged one, too.
 
@@ -251,6 +268,7 @@ class Store:
             key = queries.find_key(connection, scene_key, reference_id)
             connection.execute(delete(tables.reference).where(tables.reference.c.key == key))
 
+    @observed
     def list_poses(self, scene_key: SceneKey) -> tuple[int, tuple[ReferencePose, ...]]:
         """The scene's generation and the poses of all its references, by id; from memory when nothing has changed.
 
@@ -271,6 +289,7 @@ class Store:
         self._poses.put((scene_key, generation), poses, POSE_BYTES * len(poses))
         return generation, poses
 
+    @observed
     def load_references(
         self, scene_key: SceneKey, reference_ids: Sequence[str] | None, extractor: str
     ) -> SceneSnapshot:
@@ -289,10 +308,12 @@ class Store:
         """
         state = self._state
         resolved = None if reference_ids is None else self._resolved.get((scene_key, tuple(reference_ids)))
+        remembered: dict[str, DescribedReference | None] = {}  # each is asked for once: hits and misses are counted
         if resolved is not None and resolved.state is state:
-            in_memory = [self._described.get((key, extractor)) for key in resolved.keys]
-            if None not in in_memory:
-                return SceneSnapshot(resolved.generation, tuple(it for it in in_memory if it is not None), ())
+            remembered = {key: self._described.get((key, extractor)) for key in resolved.keys}
+            in_memory = tuple(it for it in map(remembered.get, resolved.keys) if it is not None)
+            if len(in_memory) == len(resolved.keys):
+                return SceneSnapshot(resolved.generation, in_memory, ())
         with self._database.read() as connection:
             generation = queries.read_generation(connection, scene_key)
             names = None if reference_ids is None else tuple(reference_ids)
@@ -305,7 +326,7 @@ class Store:
                 if reference_id not in keys:
                     raise queries.reference_not_found(scene_key, reference_id, field=f"references[{index}]")
             wanted = [keys[reference_id] for reference_id in reference_ids]
-            remembered = {key: self._described.get((key, extractor)) for key in wanted}
+            remembered |= {key: self._described.get((key, extractor)) for key in wanted if key not in remembered}
             described = {key: it for key, it in remembered.items() if it is not None}
             found = queries.features_by_key(connection, [key for key in wanted if key not in described], extractor)
             lacking = [key for key in wanted if key not in described and key not in found]
