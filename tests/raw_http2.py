@@ -1,7 +1,8 @@
-"""HTTP/2 by hand (RFC 9113, 7541), for clients that no library would be: those that never read what they asked for."""
+"""HTTP/2 by hand (RFC 9113, 7541), for clients no library would be: they never read, or never send, what they began."""
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import struct
 from collections.abc import Mapping
@@ -19,7 +20,13 @@ def hello(window_bytes: int = 65_535) -> bytes:
 
 def call(stream: int, method: str, message: bytes) -> bytes:
     """A unary gRPC call on a stream, an odd number that was not used before."""
-    headers = {
+    body = struct.pack(">?I", False, len(message)) + message
+    return begin(stream, method) + _frame(_DATA, _END_STREAM, stream, body)
+
+
+def begin(stream: int, method: str, headers: Mapping[str, str] | None = None) -> bytes:
+    """The headers of a gRPC call and nothing else, some of them the caller's own."""
+    every = {
         ":method": "POST",
         ":scheme": "http",
         ":path": method,
@@ -27,8 +34,17 @@ def call(stream: int, method: str, message: bytes) -> bytes:
         "content-type": "application/grpc",
         "te": "trailers",
     }
-    body = struct.pack(">?I", False, len(message)) + message
-    return _frame(_HEADERS, _END_HEADERS, stream, _pack(headers)) + _frame(_DATA, _END_STREAM, stream, body)
+    return _frame(_HEADERS, _END_HEADERS, stream, _pack(every | dict(headers or {})))
+
+
+async def until_ended(reader: asyncio.StreamReader, stream: int) -> None:
+    """Returns when the server has ended a stream by its trailers."""
+    while True:
+        head = await reader.readexactly(9)
+        kind, flags, of = struct.unpack(">BBI", head[3:])
+        await reader.readexactly(int.from_bytes(head[:3], "big"))
+        if (kind, of) == (_HEADERS, stream) and flags & _END_STREAM:
+            return
 
 
 def connect(address: str) -> socket.socket:

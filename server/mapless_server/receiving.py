@@ -53,11 +53,11 @@ class Receiver:
         await asyncio.wait(awaited, timeout=max(0.0, limit_s), return_when=asyncio.FIRST_COMPLETED)
         if not reading.done():
             if gives_way is not None and gives_way.done():
-                raise Overloaded("too many calls of which no message has come", reason="MESSAGE_LATE")
+                raise Overloaded("too many calls of which no message has come")
             raise DeadlineExceeded("the message did not come in time", reason="MESSAGE_LATE")
         message = reading.result()
         if message is grpc.aio.EOF:
-            raise InvalidArgument("the call has no message, or one that is too large", reason="NO_MESSAGE")
+            raise InvalidArgument("the call has no message, or one that is too large", reason="MALFORMED_MESSAGE")
         return bytes(message)
 
     def _forget(self, reading: asyncio.Future[Any]) -> None:

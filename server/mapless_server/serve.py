@@ -39,12 +39,12 @@ log = logging.getLogger(__name__)
 FATAL_EXIT_CODE = 70
 """EX_SOFTWARE: something inside is broken; whoever supervises the process starts it anew."""
 
-_LAST_WORDS_S = 1.0
+LAST_WORDS_S = 1.0
 """For callers and health watchers to be told before a broken process ends."""
 
 _TRACES_FLUSH_S = 3.0
 
-_CLOSING_LIMIT_S = 15.0
+CLOSING_LIMIT_S = 15.0
 """After the calls' own time, for threads to be through with their step, traces and the store; then whatever still runs
 hangs. With the drain's times it must be less than what the supervisor gives, see deploy/kubernetes."""
 
@@ -192,8 +192,9 @@ async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
             await _end_broken()
         log.info("stopping: running calls get %g s", settings.drain_grace_s)
         closing = asyncio.ensure_future(stack.aclose())
-        limit_s = settings.drain_delay_s + settings.drain_grace_s + _CLOSING_LIMIT_S
-        await asyncio.wait({closing, running.failed}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
+        limit_s = settings.drain_delay_s + settings.drain_grace_s + CLOSING_LIMIT_S
+        ended = {closing, running.failed}
+        await asyncio.wait(ended, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
         if running.failed.done():
             await _end_broken()
         if not closing.done():
@@ -203,7 +204,7 @@ async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
 
 
 async def _end_broken() -> NoReturn:
-    await asyncio.sleep(_LAST_WORDS_S)
+    await asyncio.sleep(LAST_WORDS_S)
     logging.shutdown()
     os._exit(FATAL_EXIT_CODE)  # threads may hang, so none is waited for
 

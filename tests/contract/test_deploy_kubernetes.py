@@ -24,6 +24,7 @@ from mapless_server.grpc_server import SERVICE_NAMES
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.binding import Verdict, advise
+from mapless_server.serve import CLOSING_LIMIT_S, LAST_WORDS_S
 from mapless_server.settings import PREFIX, Settings, load_settings
 from mapless_server.weights.catalogue import CATALOGUE
 
@@ -159,7 +160,7 @@ def test_the_server_takes_its_environment(folder: str, monkeypatch: pytest.Monke
     assert advice.verdict is (Verdict.WARNING if folder == "base" else Verdict.FINE)
     assert settings.workers == int(container["resources"]["limits"]["cpu"])
     assert pod["spec"]["enableServiceLinks"] is False
-    wanted = settings.drain_delay_s + settings.drain_grace_s
+    wanted = settings.drain_delay_s + settings.drain_grace_s + CLOSING_LIMIT_S + LAST_WORDS_S
     sleep = container.get("lifecycle", {}).get("preStop", {}).get("sleep", {}).get("seconds", 0)
     assert pod["spec"]["terminationGracePeriodSeconds"] > sleep + wanted
 
@@ -207,7 +208,7 @@ def test_probes_ask_for_health_by_grpc_and_never_kill_for_it() -> None:
         assert container[probe]["grpc"]["service"] in SERVICE_NAMES
     for folder in SERVERS:
         _, container = server(built(KUBERNETES / folder))
-        assert container["livenessProbe"]["httpGet"] == {"port": "metrics", "path": "/metrics"}
+        assert container["livenessProbe"]["httpGet"] == {"port": "metrics", "path": "/live"}
         assert container["startupProbe"]["periodSeconds"] * container["startupProbe"]["failureThreshold"] >= 300
 
 
@@ -227,7 +228,7 @@ def test_behind_tls_probes_ask_the_port_of_the_metrics(folder: str) -> None:
             return int(response.status)
         return 0
 
-    exporter = MetricsServer(metrics.registry, "127.0.0.1", 0, lambda: metrics.is_serving)
+    exporter = MetricsServer(metrics.registry, "127.0.0.1", 0, metrics)
     try:
         assert not 200 <= outcome() < 400  # starting
         metrics.set_serving(True)

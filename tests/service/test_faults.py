@@ -22,11 +22,12 @@ from typing import Any, cast
 
 import grpc
 import numpy as np
+import programs
 import pytest
 import raw_http2
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from images import encode
-from programs import gated, real, wait_until
+from programs import gated, program, real, wait_until
 from servers import (
     CAMERA,
     PHOTO,
@@ -56,6 +57,7 @@ from mapless import (
 )
 from mapless.geometry import Camera
 from mapless.v1 import reference_service_pb2 as reference_pb
+from mapless_server import grpc_server, receiving
 from mapless_server.engine import Engine
 from mapless_server.load.scrape import Scrape, read_metrics
 from mapless_server.method.localize import Answer, Localization, Pipeline
@@ -135,6 +137,26 @@ class TestClients:
             for _ in range(5):
                 assert is_served(client, scene)
                 assert len(client.get_reference(scene, "large", include_image=True).image or b"") > 1_000_000
+
+    @pytest.mark.parametrize("method", ["grpc.health.v1.Health/Check", "grpc.health.v1.Health/Watch"])
+    def test_those_who_never_send_their_message_keep_nobody_out(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+    ) -> None:
+        """Open methods take no token, so these are strangers; a tenth of the real numbers."""
+        for module, name in (
+            (grpc_server, "MAX_CONCURRENT_RPCS"),
+            (receiving, "MAX_OPEN_WAITING"),
+            (receiving, "MAX_OPEN_STREAMS"),
+        ):
+            monkeypatch.setattr(module, name, getattr(module, name) // 10)
+        with serving(tmp_path) as server, Client(server.address) as client, ExitStack() as stack:
+            make_scene(client)
+            for _ in range(5):
+                stranger = stack.enter_context(raw_http2.connect(server.address))
+                calls = (raw_http2.begin(stream, f"/{method}") for stream in range(1, 2 * 100, 2))
+                stranger.sendall(raw_http2.hello() + b"".join(calls))
+                assert is_served(client, "s")
+            assert is_served(client, "s")
 
     def test_a_flood_of_garbage(self, server: RunningServer, client: Client, scene: str) -> None:
         noise = random.Random(0)
@@ -257,6 +279,45 @@ class TestMethods:
             assert "the server cannot go on and ends" in server.log
             with pytest.raises(grpc.RpcError, match="UNAVAILABLE"):
                 next(watch)
+
+    def test_one_that_hangs_while_the_server_drains_is_a_failure_as_well(self, tmp_path: Path) -> None:
+        with (
+            gated(tmp_path / "server", "hangs", workers=1, stall_limit_s=2.5, drain_grace_s=50) as server,
+            Client(server.address, ONCE) as client,
+            ThreadPoolExecutor(1) as pool,
+        ):
+            make_scene(client)
+            hangs = pool.submit(client.localize, PHOTO, CAMERA, "s", timeout_s=60.0)
+            wait_until(lambda: server.began)
+            server.process.send_signal(signal.SIGTERM)
+            assert server.wait() == 70
+            assert isinstance(hangs.exception(30), Unavailable)
+            assert "the server cannot go on and ends" in server.log
+
+    def test_one_that_hangs_keeps_no_server_from_stopping(self, tmp_path: Path) -> None:
+        """Not noticed as hanging; and with the real limit, in the time that deploy/kubernetes gives."""
+        folder = tmp_path / "server"
+        script = f"""if True:
+            import sys
+            from pathlib import Path
+            sys.path.insert(0, {str(Path(programs.__file__).parent)!r})
+            import programs
+            from mapless_server import serve
+            serve.CLOSING_LIMIT_S = 0.5
+            programs._main(Path({str(folder)!r}), "hangs", ["workers=1", "drain_grace_s=0.1"])
+        """
+        with (
+            program(folder, ["-c", script]) as server,
+            Client(server.address, ONCE) as client,
+            ThreadPoolExecutor(1) as pool,
+        ):
+            make_scene(client)
+            hangs = pool.submit(client.localize, PHOTO, CAMERA, "s", timeout_s=60.0)
+            wait_until(lambda: server.began)
+            server.process.send_signal(signal.SIGTERM)
+            assert server.wait() == 70
+            assert isinstance(hangs.exception(30), MaplessError)
+            assert "the server hangs" in server.log
 
 
 @contextmanager

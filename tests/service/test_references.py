@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import threading
+import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +15,8 @@ from servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, pose, servi
 
 from mapless import AlreadyExists, Client, ConnectOptions, InvalidArgument, NewReference, NotFound, wire
 from mapless.v1 import reference_service_pb2 as pb
+from mapless_server import reference_service
+from mapless_server.store import ReferenceRecord
 
 
 def create_request(reference_id: str) -> pb.CreateReferenceRequest:
@@ -196,3 +200,31 @@ def test_references_of_an_unknown_scene(client: Client) -> None:
         list(client.list_references("nowhere"))
     with pytest.raises(NotFound):
         client.get_reference("nowhere", "r")
+
+
+def test_a_page_is_made_off_the_event_loop(client: Client, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand messages take tens of milliseconds, in which nobody else would be answered."""
+    to_message, threads = reference_service._reference_to_message, set[str]()
+
+    def told(record: ReferenceRecord) -> pb.Reference:
+        threads.add(threading.current_thread().name)
+        return to_message(record)
+
+    monkeypatch.setattr(reference_service, "_reference_to_message", told)
+    assert [it.reference_id for it in client.list_references(scene)] == ["r0", "r1", "r2"]
+    client.add_references(scene, [NewReference(f"new{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
+    assert threads
+    assert all(name.startswith("asyncio_") for name in threads)  # the loop's default executor
+
+
+def test_what_a_localization_asks_of_the_store_is_in_the_metrics(tmp_path: Path) -> None:
+    with serving(tmp_path, metrics=True, metrics_port=0) as server, Client(server.address) as client:
+        client.create_scene("s")
+        client.add_reference("s", NewReference("r", PHOTO, CAMERA, pose(0)))
+        for _ in range(3):
+            client.localize(PHOTO, CAMERA, "s", ["r"])
+        with urllib.request.urlopen(f"http://{server.metrics_address}/metrics", timeout=30) as response:
+            text = response.read().decode()
+    assert '\nmapless_store_op_seconds_count{op="load_references"} 3.0\n' in text
+    assert '\nmapless_store_op_seconds_count{op="add_references"} 1.0\n' in text
+    assert "\nmapless_store_errors_total 0.0\n" in text

@@ -339,7 +339,7 @@ class TestDescribingReferences:
         assert took_s - seconds >= 2 * self.STEP_S
         assert seconds >= self.STEP_S, "the photograph's own description is part of it"
 
-    def test_nor_does_one_that_is_given_up(self, setting: Setting) -> None:
+    def test_nor_does_one_that_is_given_up(self, setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
         add_undescribed(setting, 2)
         stages = setting.engine._stages
         views = QueryViews(Photo(PHOTO, CAMERA, "image"), ImageLimits())
@@ -351,7 +351,7 @@ class TestDescribingReferences:
             job.end(Ending.CANCELLED, None)
             return View(CAMERA, FEATURES)
 
-        setting.extractors["cheap"].extract = extract  # type: ignore[method-assign]
+        monkeypatch.setattr(setting.extractors["cheap"], "extract", extract)
         (verdict,) = stages.prepare([job])
         assert isinstance(verdict, Over)
         assert job.unusual_s >= self.STEP_S

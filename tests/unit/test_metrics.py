@@ -340,7 +340,7 @@ def test_one_that_cannot_be_read_blinds_nobody_to_the_others(
 
 @pytest.fixture
 def server(metrics: Metrics) -> Iterator[MetricsServer]:
-    running = MetricsServer(metrics.registry, "127.0.0.1", 0, lambda: metrics.is_serving)
+    running = MetricsServer(metrics.registry, "127.0.0.1", 0, metrics)
     yield running
     running.close()
 
@@ -380,10 +380,28 @@ def test_the_port_is_ready_while_health_says_serving_and_at_no_other_time(
     assert ask(server.port, "/metrics")[0] == 200
 
 
-@pytest.mark.parametrize("path", ["/", "/favicon.ico", "/ready/", "/metrics/", "/metrics/../etc/passwd", "/live"])
+@pytest.mark.parametrize(
+    ("silent_s", "ready", "live"), [(None, 200, 200), (0, 200, 200), (6, 503, 200), (50, 503, 200), (61, 503, 503)]
+)
+def test_a_server_whose_heart_stands_still_is_not_ready_and_after_a_minute_not_alive(
+    metrics: Metrics, server: MetricsServer, silent_s: float | None, ready: int, live: int
+) -> None:
+    metrics.set_serving(True)
+    if silent_s is not None:
+        metrics.beat()
+        assert metrics.beaten_s is not None
+        metrics.beaten_s -= silent_s
+    assert (ask(server.port, "/ready")[0], ask(server.port, "/live")[0]) == (ready, live)
+    metrics.beat()
+    assert (ask(server.port, "/ready")[0], ask(server.port, "/live")[0]) == (200, 200)
+    metrics.set_serving(False)
+    assert ask(server.port, "/live") == (200, "alive\n")  # draining kills nobody
+
+
+@pytest.mark.parametrize("path", ["/", "/favicon.ico", "/ready/", "/metrics/", "/metrics/../etc/passwd", "/live/"])
 def test_nothing_else_is_on_the_port(metrics: Metrics, server: MetricsServer, path: str) -> None:
     metrics.set_serving(True)
-    assert ask(server.port, path) == (404, "there are /metrics and /ready\n")
+    assert ask(server.port, path) == (404, "there are /metrics, /ready and /live\n")
 
 
 def test_the_port_serves_exemplars_to_who_asks_for_open_metrics(metrics: Metrics, server: MetricsServer) -> None:
@@ -399,20 +417,20 @@ def test_the_port_serves_exemplars_to_who_asks_for_open_metrics(metrics: Metrics
 
 def test_a_port_that_is_taken_is_an_error(metrics: Metrics, server: MetricsServer) -> None:
     with pytest.raises(OSError, match="in use"):
-        MetricsServer(metrics.registry, "127.0.0.1", server.port, lambda: metrics.is_serving)
+        MetricsServer(metrics.registry, "127.0.0.1", server.port, metrics)
     with pytest.raises(OSError):  # noqa: PT011  the resolver's words differ
-        MetricsServer(metrics.registry, "no-such-host.invalid", 0, lambda: metrics.is_serving)
+        MetricsServer(metrics.registry, "no-such-host.invalid", 0, metrics)
 
 
 def test_closing_frees_the_port_and_ends_the_threads_even_of_open_connections(metrics: Metrics) -> None:
     before = set(threading.enumerate())
-    server = MetricsServer(metrics.registry, "127.0.0.1", 0, lambda: metrics.is_serving)
+    server = MetricsServer(metrics.registry, "127.0.0.1", 0, metrics)
     with socket.create_connection(("127.0.0.1", server.port), 10) as idle:
         scrape(server.port)
         server.close()
         assert set(threading.enumerate()) <= before
         assert idle.recv(1) == b""
-    again = MetricsServer(metrics.registry, "127.0.0.1", server.port, lambda: metrics.is_serving)
+    again = MetricsServer(metrics.registry, "127.0.0.1", server.port, metrics)
     again.close()
 
 
@@ -433,7 +451,7 @@ def test_idle_connections_take_few_threads_and_keep_nobody_out(server: MetricsSe
 
 def test_a_silent_connection_is_closed(metrics: Metrics, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exporter._Handler, "timeout", 0.05)
-    server = MetricsServer(metrics.registry, "127.0.0.1", 0, lambda: metrics.is_serving)
+    server = MetricsServer(metrics.registry, "127.0.0.1", 0, metrics)
     try:
         with socket.create_connection(("127.0.0.1", server.port), 30) as silent:
             assert silent.recv(1) == b""
@@ -465,7 +483,7 @@ def test_the_port_listens_on_ipv6(metrics: Metrics) -> None:
     if not socket.has_ipv6:
         pytest.skip("no IPv6 on this machine")
     try:
-        server = MetricsServer(metrics.registry, "::1", 0, lambda: metrics.is_serving)
+        server = MetricsServer(metrics.registry, "::1", 0, metrics)
     except OSError:
         pytest.skip("no IPv6 on this machine")
     assert "mapless_fatal_total" in scrape(server.port, "[::1]")

@@ -12,16 +12,19 @@ from typing import Any
 
 import grpc
 import pytest
+import raw_http2
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
+from mapless_server import receiving
 from mapless_server.errors import NotFound, Overloaded, PermissionDenied, Unauthenticated
 from mapless_server.observability.trail import MAX_STEPS, Step
 from mapless_server.principal import Principal, Role
 from mapless_server.rpc import ANSWER_MARGIN_SHARE, Call, CallInterceptor
 
+CHECK = "/grpc.health.v1.Health/Check"
 METHOD = "/mapless.v1.LocalizationService/Localize"
 LIMIT_S = 30.0
 
@@ -65,6 +68,13 @@ class Counted:
 @asynccontextmanager
 async def serving(answer: Answer, counted: Counted, **options: Any) -> AsyncIterator[Channel]:
     """A channel to a server on loopback whose Localize is answered so."""
+    async with listening(answer, counted, **options) as port, grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
+        yield channel
+
+
+@asynccontextmanager
+async def listening(answer: Answer, counted: Counted, **options: Any) -> AsyncIterator[int]:
+    """The port of such a server."""
     interceptor = CallInterceptor(observer=counted, tracer=counted, **options)
     server = grpc.aio.server(interceptors=[interceptor], options=[("grpc.max_receive_message_length", 2**20)])
     method = grpc.unary_unary_rpc_method_handler(
@@ -79,8 +89,7 @@ async def serving(answer: Answer, counted: Counted, **options: Any) -> AsyncIter
     port = server.add_insecure_port("127.0.0.1:0")
     await server.start()
     try:
-        async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
-            yield channel
+        yield port
     finally:
         await server.stop(5)
 
@@ -305,6 +314,125 @@ def test_who_calls_is_known_before_anything_is_read(counted: Counted, caplog: py
     assert "tenant" not in unknown
     assert (known["tenant"], known["principal"], known["client"]) == ("acme", "robot-7", "headset-3")
     assert not any("good-secret" in str(value) for line in lines_of(caplog) for value in line.values())
+
+
+class TestCallsOfWhichOnlyTheHeadersCome:
+    @staticmethod
+    async def ended(port: int, *begun: bytes, stream: int = 1) -> None:
+        """Returns when the server has ended the stream, one of those begun."""
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(raw_http2.hello() + b"".join(begun))
+        await asyncio.wait_for(raw_http2.until_ended(reader, stream), LIMIT_S)
+        writer.close()
+
+    def test_what_is_refused_is_refused_without_its_message(self, counted: Counted) -> None:
+        def authenticate(*_: Any) -> Principal:
+            raise Unauthenticated("a token is needed", reason="TOKEN_MISSING")
+
+        async def run() -> None:
+            async with listening(echo, counted, authenticate=authenticate) as port:
+                await self.ended(port, raw_http2.begin(1, METHOD))
+
+        asyncio.run(run())
+        assert counted.codes == ["UNAUTHENTICATED"]
+
+    def test_the_message_has_to_come_before_the_deadline(
+        self, counted: Counted, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        async def run() -> None:
+            async with listening(echo, counted, default_deadline_s=0.2) as port:
+                await self.ended(port, raw_http2.begin(1, METHOD))
+
+        asyncio.run(run())
+        assert counted.codes == ["DEADLINE_EXCEEDED"]
+        assert lines_of(caplog)[0]["reason"] == "MESSAGE_LATE"
+
+    @pytest.mark.parametrize("method", [CHECK, "/grpc.health.v1.Health/Watch"])
+    def test_the_message_of_an_open_method_has_little_time(
+        self, counted: Counted, monkeypatch: pytest.MonkeyPatch, method: str
+    ) -> None:
+        monkeypatch.setattr(receiving, "OPEN_MESSAGE_LIMIT_S", 0.2)
+
+        async def run() -> None:
+            async with listening(echo, counted) as port:
+                await self.ended(port, raw_http2.begin(1, method))
+
+        asyncio.run(run())
+
+    def test_of_many_that_wait_the_oldest_gives_way(self, counted: Counted, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(receiving, "OPEN_MESSAGE_LIMIT_S", 1000.0)
+        monkeypatch.setattr(receiving, "MAX_OPEN_WAITING", 2)
+
+        async def run() -> None:
+            async with listening(echo, counted) as port:
+                await self.ended(port, *(raw_http2.begin(stream, CHECK) for stream in (1, 3, 5)), stream=1)
+                async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
+                    await check_health(channel)
+
+        asyncio.run(run())
+
+
+async def check_health(channel: Channel) -> None:
+    answer = await health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=LIMIT_S)
+    assert answer.status == health_pb2.HealthCheckResponse.SERVING
+
+
+def test_streams_that_anybody_may_open_are_few_and_keep_no_probe_out(
+    counted: Counted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(receiving, "MAX_OPEN_STREAMS", 2)
+
+    async def run() -> None:
+        async with serving(echo, counted) as channel:
+            stub = health_pb2_grpc.HealthStub(channel)
+
+            async def watch() -> Any:
+                """One that has begun."""
+                watching = stub.Watch(health_pb2.HealthCheckRequest(), timeout=LIMIT_S)
+                assert (await watching.read()).status == health_pb2.HealthCheckResponse.SERVING
+                return watching
+
+            async def is_let_in() -> bool:
+                try:
+                    await watch()
+                except grpc.RpcError as error:
+                    codes.add(from_rpc_error(error).code)
+                    return False
+                return True
+
+            codes: set[str] = set()
+            first, _ = await watch(), await watch()
+            assert not await is_let_in()
+            await check_health(channel)
+            first.cancel()
+            while not await is_let_in():
+                await asyncio.sleep(0.01)
+            assert not await is_let_in()
+            assert codes == {"RESOURCE_EXHAUSTED"}
+
+    asyncio.run(run())
+
+
+def test_a_call_that_ends_without_a_message_is_told_so(counted: Counted) -> None:
+    async def run() -> None:
+        async with serving(echo, counted) as channel:
+            with pytest.raises(grpc.RpcError) as caught:
+                await channel.stream_unary(METHOD)(iter(()), timeout=LIMIT_S)
+            assert from_rpc_error(caught.value).reason == "MALFORMED_MESSAGE"
+
+    asyncio.run(run())
+    assert counted.codes == ["INVALID_ARGUMENT"]
+
+
+def test_a_message_that_is_too_large_is_counted_once(counted: Counted) -> None:
+    async def run() -> None:
+        async with serving(echo, counted) as channel:
+            assert (await failure(channel, bytes(2**20 + 1))).code == "RESOURCE_EXHAUSTED"
+            await until(lambda: len(counted.ended) == 1)
+
+    asyncio.run(run())
+    # grpc tells the caller itself, and lets the call go at the same moment: either may be seen first.
+    assert counted.codes in (["CANCELLED"], ["INVALID_ARGUMENT"])
 
 
 def test_a_fault_in_authentication_admits_nobody(counted: Counted) -> None:

@@ -24,7 +24,6 @@ from mapless.wire import FieldError
 from mapless_server.decode import ImageLimits
 from mapless_server.errors import NotFound, RequestError
 from mapless_server.method.views import Features, View
-from mapless_server.observability.metrics import Metrics
 from mapless_server.principal import DEFAULT_TENANT, Principal
 from mapless_server.reference_service import ReferenceService
 from mapless_server.rpc import Call
@@ -110,7 +109,7 @@ class Server:
 def serving(folder: Path) -> Iterator[Server]:
     with Store.open(folder) as store:
         engine = cast(Any, StandInEngine())
-        service = ReferenceService(lambda: engine, store, Metrics())
+        service = ReferenceService(lambda: engine, store)
         try:
             yield Server(service, store)
         finally:
