@@ -128,10 +128,10 @@ class GrpcServer:
         if delay_s:
             await asyncio.sleep(delay_s)
         self._is_draining = True
-        if self._engine is not None:
-            self._engine.queue.drain()
         # Not by `stop`, which would wait for those who watch the health as well.
         await self._interceptor.wait_until_idle(grace_s)
+        if self._engine is not None:
+            self._engine.queue.drain()
         await self._server.stop(_LAST_BYTES_S)
 
     async def close(self) -> None:

@@ -184,7 +184,8 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
                 self._end(method, code, call, span)
 
         try:
-            self._check_in(method, handler_call_details.invocation_metadata or (), {})
+            self._who_calls(method, handler_call_details.invocation_metadata or (), {})
+            self._check_door(method)
         except Exception as error:
             refusal = error
         # Not as a unary method, whose message grpc receives first: what is refused shall cost nothing, and who sends no
@@ -196,13 +197,8 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(self._idle.wait(), limit_s)
 
-    def _check_in(self, method: str, metadata: Metadata, auth_context: Mapping[str, Iterable[bytes]]) -> Principal:
-        """Who calls; raises whatever keeps them out before a byte of the message is looked at."""
-        principal = Principal()
-        if self._authenticate is not None:
-            principal = self._authenticate(metadata, method, auth_context)
-        self._check_door(method)
-        return principal
+    def _who_calls(self, method: str, metadata: Metadata, auth_context: Mapping[str, Iterable[bytes]]) -> Principal:
+        return Principal() if self._authenticate is None else self._authenticate(metadata, method, auth_context)
 
     def _begin(self, context: Context) -> Call:
         now_s = time.monotonic()
@@ -220,7 +216,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         """The servicer's answer; whatever is wrong with the request is a RequestError."""
         data = await self._receiver.message(context, call.deadline_s - time.monotonic())
         call.note(bytes_in=len(data))
-        call = replace(call, principal=self._check_in(method, _metadata(context), context.auth_context()))
+        call = replace(call, principal=self._who_calls(method, _metadata(context), context.auth_context()))
         call.note(tenant=call.principal.tenant, **({"principal": call.principal.name} if call.principal.name else {}))
         try:
             # Reading holds the interpreter, about 1 ms for a MiB, in whatever thread: in another one it would hold up
