@@ -103,6 +103,8 @@ class FairQueue(Generic[J]):
 
     def pop_alike(self, is_alike: Callable[[J], bool], at_most: int) -> list[J]:
         """Takes out further jobs, to be computed along with one, of each caller in turn; all are charged."""
+        if at_most < 1:
+            return []
         flows = list(self._accounts)
         alike = [list(filter(is_alike, self._accounts[flow].jobs)) for flow in flows]
         in_turn = [
