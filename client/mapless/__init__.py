@@ -4,7 +4,7 @@
 ...     answer = client.localize("photo.jpg", camera, scene="kitchen")
 """
 
-from .client import Client, NewReference, PositionPrior
+from .client import Client
 from .errors import (
     AlreadyExists,
     DataLoss,
@@ -21,7 +21,20 @@ from .errors import (
 )
 from .geometry import Camera, Fisheye, Quaternion, RadialTangential, RigidTransform
 from .options import ConnectOptions
-from .results import Accuracy, Diagnostics, LocalizationResult, Reference, ReferenceUse, Rejected, ScaleEstimate, Scene
+from .requests import HeadingPrior, NewReference, PositionPrior
+from .results import (
+    Accuracy,
+    Coverage,
+    Diagnostics,
+    LocalizationResult,
+    Reference,
+    ReferenceAudit,
+    ReferenceUse,
+    Rejected,
+    RetrievedReference,
+    ScaleEstimate,
+    Scene,
+)
 
 __all__ = [
     "Accuracy",
@@ -29,11 +42,13 @@ __all__ = [
     "Camera",
     "Client",
     "ConnectOptions",
+    "Coverage",
     "DataLoss",
     "DeadlineExceeded",
     "Diagnostics",
     "FailedPrecondition",
     "Fisheye",
+    "HeadingPrior",
     "Internal",
     "InvalidArgument",
     "LocalizationResult",
@@ -45,9 +60,11 @@ __all__ = [
     "Quaternion",
     "RadialTangential",
     "Reference",
+    "ReferenceAudit",
     "ReferenceUse",
     "Rejected",
     "ResourceExhausted",
+    "RetrievedReference",
     "RigidTransform",
     "ScaleEstimate",
     "Scene",

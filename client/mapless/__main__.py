@@ -21,10 +21,11 @@ from google.protobuf import json_format
 from google.protobuf.message import Message
 
 from . import wire
-from .client import Client, NewReference, PositionPrior
+from .client import Client
 from .errors import MaplessError
 from .geometry import Camera, RigidTransform
 from .options import ConnectOptions
+from .requests import HeadingPrior, NewReference, PositionPrior
 from .results import Rejected
 from .v1 import geometry_pb2
 
@@ -115,14 +116,48 @@ def _parser() -> argparse.ArgumentParser:
     localize.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
     localize.add_argument("--reference", action="append", default=[], help="compare with this one; may be repeated")
     localize.add_argument("--count", type=int, default=0, help="how many references the server chooses")
-    localize.add_argument(
-        "--near", type=float, nargs=4, metavar=("X", "Y", "Z", "RADIUS"), help="position prior, metres"
-    )
+    localize.add_argument("--rerank", action="store_true", help="the server chooses among those given")
+    _add_priors(localize)
     localize.add_argument("--variant", default="", help="best, full, no_structure or coarse")
     localize.add_argument("--scale-strategy", default="", help="two_stage, triangulation or trajectory")
     localize.add_argument("--allow-coarse", action="store_true", help="a coarse pose will do if time runs out")
     localize.set_defaults(run=_localize)
+
+    retrieve = commands.add_parser("retrieve", help="the references that resemble a photograph most")
+    retrieve.add_argument("scene")
+    retrieve.add_argument("photo", type=Path)
+    retrieve.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
+    retrieve.add_argument("--count", type=int, default=0, help="how many")
+    _add_priors(retrieve)
+    retrieve.set_defaults(run=_retrieve)
+
+    coverage = commands.add_parser("coverage", help="whether a photograph taken somewhere would be localized")
+    coverage.add_argument("scene")
+    coverage.add_argument("--camera", required=True, help="the camera, see `mapless --help`")
+    coverage.add_argument("--pose", required=True, help="where it would be: its world_from_camera, likewise")
+    coverage.set_defaults(run=_coverage)
     return parser
+
+
+def _add_priors(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--near", type=float, nargs=4, metavar=("X", "Y", "Z", "RADIUS"), help="position prior, metres"
+    )
+    command.add_argument(
+        "--looking",
+        type=float,
+        nargs=4,
+        metavar=("X", "Y", "Z", "ANGLE"),
+        help="heading prior: direction in the world, and degrees around it",
+    )
+
+
+def _priors(arguments: argparse.Namespace) -> tuple[PositionPrior | None, HeadingPrior | None]:
+    near, looking = arguments.near, arguments.looking
+    return (
+        PositionPrior(np.array(near[:3]), near[3]) if near else None,
+        HeadingPrior(np.array(looking[:3]), looking[3]) if looking else None,
+    )
 
 
 def _connect_options(arguments: argparse.Namespace) -> ConnectOptions:
@@ -183,20 +218,41 @@ def _delete_reference(client: Client, arguments: argparse.Namespace) -> int:
 
 
 def _localize(client: Client, arguments: argparse.Namespace) -> int:
-    near = arguments.near
+    position_prior, heading_prior = _priors(arguments)
     answer = client.localize(
         arguments.photo,
         _read_camera(arguments.camera),
         arguments.scene,
         arguments.reference,
-        position_prior=PositionPrior(np.array(near[:3]), near[3]) if near else None,
+        position_prior=position_prior,
+        heading_prior=heading_prior,
         variant=arguments.variant,
         allow_coarse=arguments.allow_coarse,
         scale_strategy=arguments.scale_strategy,
         reference_count=arguments.count,
+        rerank_references=arguments.rerank,
     )
     _print(answer)
     return EXIT_REJECTED if isinstance(answer, Rejected) else 0
+
+
+def _retrieve(client: Client, arguments: argparse.Namespace) -> int:
+    position_prior, heading_prior = _priors(arguments)
+    return _print(
+        client.retrieve_references(
+            arguments.photo,
+            _read_camera(arguments.camera),
+            arguments.scene,
+            arguments.count,
+            position_prior=position_prior,
+            heading_prior=heading_prior,
+        )
+    )
+
+
+def _coverage(client: Client, arguments: argparse.Namespace) -> int:
+    pose, camera = _read_pose(arguments.pose), _read_camera(arguments.camera)
+    return _print(client.check_coverage(arguments.scene, pose, camera))
 
 
 def _read_camera(source: str) -> Camera:

@@ -2,59 +2,41 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import grpc
 
 from . import errors, names, wire
-from .geometry import Array, Camera, RigidTransform
+from .geometry import Camera, RigidTransform
 from .options import ConnectOptions
+from .requests import HeadingPrior, ImageSource, NewReference, PositionPrior, create_request, read_image, set_priors
 from .results import (
+    Coverage,
     LocalizationResult,
     Reference,
+    ReferenceAudit,
     Rejected,
+    RetrievedReference,
     Scene,
     answer_from_message,
+    audit_from_message,
+    coverage_from_message,
     reference_from_message,
+    retrieved_from_message,
     scene_from_message,
 )
-from .v1 import geometry_pb2
 from .v1 import localization_service_pb2 as localization_pb
 from .v1 import reference_service_pb2 as reference_pb
 from .v1.localization_service_pb2_grpc import LocalizationServiceStub
 from .v1.reference_service_pb2_grpc import ReferenceServiceStub
 
-ImageSource = bytes | str | os.PathLike[str]
-"""The bytes of a JPEG, PNG or WebP file, or its path. They are sent as they are."""
-
 # grpc.health.v1 as bytes, which spares robots a package: the request for the whole server is empty, the answer is
 # {status: SERVING}.
 _HEALTH_METHOD = "/grpc.health.v1.Health/Check"
 _SERVING = b"\x08\x01"
-
-
-@dataclass(frozen=True, eq=False)
-class NewReference:
-    """A reference to be stored: id within the scene, photograph, its camera and its pose (metric)."""
-
-    reference_id: str
-    image: ImageSource
-    camera: Camera
-    world_from_camera: RigidTransform
-
-
-@dataclass(frozen=True, eq=False)
-class PositionPrior:
-    """The camera is known to be within `radius_m` of `position_m` (3,), world frame."""
-
-    position_m: Array
-    radius_m: float
 
 
 class Client:
@@ -102,9 +84,11 @@ class Client:
         references: Sequence[str] = (),
         *,
         position_prior: PositionPrior | None = None,
+        heading_prior: HeadingPrior | None = None,
         variant: str = "",
         scale_strategy: str = "",
         reference_count: int = 0,
+        rerank_references: bool = False,
         allow_coarse: bool = False,
         capture_time: datetime | None = None,
         session_from_camera: RigidTransform | None = None,
@@ -118,9 +102,11 @@ class Client:
             scene: where to look.
             references: what to compare with, most similar first, at most 64; none: the server chooses.
             position_prior: what is known of the position; a pose outside is rejected.
+            heading_prior: what is known of the direction of view, likewise.
             variant: "best" (default), "full", "no_structure" or "coarse".
             scale_strategy: "two_stage" (default), "triangulation" or "trajectory".
-            reference_count: how many references the server chooses if none are named; 0 is its default.
+            reference_count: how many references the server chooses if it does; 0 is its default.
+            rerank_references: whether it chooses among those that are named, of which there may then be 1000.
             allow_coarse: whether a pose that could not be refined before the deadline is answered all the same, with
                 `LocalizationResult.pose_stage` "COARSE" and no covariance, instead of raising `DeadlineExceeded`.
             capture_time: when it was taken, with time zone; echoed.
@@ -132,19 +118,17 @@ class Client:
         request = localization_pb.LocalizeRequest(
             scene=scene,
             references=[_reference_name(scene, reference) for reference in references],
-            image=_read(image),
+            image=read_image(image),
             intrinsics=wire.camera_to_message(camera),
             options=localization_pb.LocalizeOptions(
                 variant=_enum_value(localization_pb.Variant, variant),
                 scale_strategy=_enum_value(localization_pb.ScaleStrategy, scale_strategy),
                 reference_count=reference_count,
                 allow_coarse=allow_coarse,
+                rerank_references=rerank_references,
             ),
         )
-        if position_prior is not None:
-            x, y, z = map(float, position_prior.position_m)
-            request.position_prior.position_m.CopyFrom(geometry_pb2.Vector3(x=x, y=y, z=z))
-            request.position_prior.radius_m = position_prior.radius_m
+        set_priors(request, position_prior, heading_prior)
         if capture_time is not None:
             request.capture_time.FromDatetime(capture_time)
         if session_from_camera is not None:
@@ -173,7 +157,7 @@ class Client:
 
     def add_reference(self, scene: str, reference: NewReference, *, timeout_s: float | None = None) -> Reference:
         """Stores a reference."""
-        request = _create_request(_scene_name(scene), reference)
+        request = create_request(_scene_name(scene), reference)
         return reference_from_message(self._call(self._references.CreateReference, request, timeout_s).reference)
 
     def add_references(
@@ -197,7 +181,7 @@ class Client:
         """
         name = _scene_name(scene)
         stored: list[Reference] = []
-        for requests in self._batches(_create_request(name, reference) for reference in references):
+        for requests in self._batches(create_request(name, reference) for reference in references):
             message = reference_pb.BatchCreateReferencesRequest(scene=name, requests=requests)
             response = self._call(
                 self._references.BatchCreateReferences, message, timeout_s or self.options.upload_timeout_s
@@ -225,6 +209,64 @@ class Client:
         """Deletes a reference."""
         request = reference_pb.DeleteReferenceRequest(name=_reference_name(_scene_name(scene), reference))
         self._call(self._references.DeleteReference, request, timeout_s)
+
+    def retrieve_references(
+        self,
+        image: ImageSource,
+        camera: Camera,
+        scene: str,
+        count: int = 0,
+        *,
+        position_prior: PositionPrior | None = None,
+        heading_prior: HeadingPrior | None = None,
+        timeout_s: float | None = None,
+    ) -> list[RetrievedReference]:
+        """The references that resemble a photograph most, as `localize` chooses them when it is given none.
+
+        Args:
+            image: the photograph.
+            camera: the camera that took it.
+            scene: where to look.
+            count: how many, at most 1000; 0 is the server's default.
+            position_prior: what is known of the position; only references near that are considered.
+            heading_prior: what is known of the direction of view, likewise.
+            timeout_s: deadline of the call.
+        """
+        request = reference_pb.RetrieveReferencesRequest(
+            scene=_scene_name(scene), image=read_image(image), intrinsics=wire.camera_to_message(camera), count=count
+        )
+        set_priors(request, position_prior, heading_prior)
+        response = self._call(self._references.RetrieveReferences, request, timeout_s)
+        return list(map(retrieved_from_message, response.references))
+
+    def audit_scene(
+        self, scene: str, references: Sequence[str] = (), *, page_size: int = 0, timeout_s: float | None = None
+    ) -> Iterator[ReferenceAudit]:
+        """What the neighbours say about references, or about all of a scene, by id, as it is found out.
+
+        Args:
+            scene: the scene.
+            references: which, at most 100; none: all.
+            page_size: references a call, each of which takes up to a second of computing; 0 is the server's default.
+            timeout_s: deadline of each call.
+        """
+        name = _scene_name(scene)
+        request = reference_pb.AuditSceneRequest(
+            scene=name, references=[_reference_name(name, it) for it in references], page_size=page_size
+        )
+        for page in self._pages(self._references.AuditScene, request, timeout_s):
+            yield from map(audit_from_message, page.audits)
+
+    def check_coverage(
+        self, scene: str, world_from_camera: RigidTransform, camera: Camera, *, timeout_s: float | None = None
+    ) -> Coverage:
+        """Whether a photograph taken there would be localized."""
+        request = reference_pb.CheckCoverageRequest(
+            scene=_scene_name(scene),
+            world_from_camera=wire.transform_to_message(world_from_camera),
+            intrinsics=wire.camera_to_message(camera),
+        )
+        return coverage_from_message(self._call(self._references.CheckCoverage, request, timeout_s))
 
     def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None) -> Any:
         """Every call: always with a deadline, and errors as ours."""
@@ -257,22 +299,6 @@ class Client:
             batch_bytes += size_bytes
         if batch:
             yield batch
-
-
-def _create_request(scene_name: str, reference: NewReference) -> reference_pb.CreateReferenceRequest:
-    return reference_pb.CreateReferenceRequest(
-        scene=scene_name,
-        reference_id=reference.reference_id,
-        reference=reference_pb.Reference(
-            image=_read(reference.image),
-            intrinsics=wire.camera_to_message(reference.camera),
-            world_from_camera=wire.transform_to_message(reference.world_from_camera),
-        ),
-    )
-
-
-def _read(image: ImageSource) -> bytes:
-    return image if isinstance(image, bytes) else Path(image).read_bytes()
 
 
 def _scene_name(scene: str) -> str:

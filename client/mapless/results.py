@@ -52,11 +52,15 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class ReferenceUse:
-    """What one reference contributed: matches with the photograph, and inliers of the pose."""
+    """What one reference contributed: matches with the photograph, and inliers of the pose.
+
+    `similarity` to the photograph, -1 to 1, where the server chose it; else 0.
+    """
 
     name: str
     match_count: int
     inlier_count: int
+    similarity: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,7 @@ class Diagnostics:
         stage_s: seconds by stage, in order.
         queue_s, total_s: seconds that the call waited and took, inside the server.
         processed_width_px, processed_height_px: size of the image as it was processed.
+        retrieval: what the references were chosen by; empty if they were used as they were given.
     """
 
     request_id: str
@@ -102,6 +107,7 @@ class Diagnostics:
     processed_width_px: int
     processed_height_px: int
     server_version: str
+    retrieval: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +165,64 @@ class Rejected:
     session_from_camera: RigidTransform | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class RetrievedReference:
+    """A reference that resembles a photograph: its name, how much it does (cosine, -1 to 1), and its pose."""
+
+    name: str
+    similarity: float
+    world_from_camera: RigidTransform
+
+
+@dataclass(frozen=True)
+class ReferenceAudit:
+    """What a reference's neighbours say about it.
+
+    Attributes:
+        name: "scenes/{scene}/references/{reference}".
+        verdict: the value of AuditVerdict without its prefix, "CONSISTENT" or "WRONG_POSE".
+        message: one sentence for a person, with the numbers that decided.
+        neighbour_count, match_count, inlier_count: what it was compared with, the matches, and those that agree.
+        reprojection_error_px: median of those under the stored pose, pixels of the processed image; 0 without matches.
+        position_offset_m, rotation_offset_deg: from the stored pose to what the neighbours say; 0 where unknown.
+        focal_ratio: their focal length over the stored one; 0 where unknown.
+        other: the reference that it was swapped with or is a duplicate of; else empty.
+    """
+
+    name: str
+    verdict: str
+    message: str
+    neighbour_count: int
+    match_count: int
+    inlier_count: int
+    reprojection_error_px: float
+    position_offset_m: float
+    rotation_offset_deg: float
+    focal_ratio: float
+    other: str
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Whether a photograph taken somewhere would be localized.
+
+    Attributes:
+        verdict: "LOCALIZABLE", "DOUBTFUL" or "NOT_LOCALIZABLE".
+        message: one sentence for a person, with the numbers that decided.
+        expected_match_count: 2D-3D matches that a photograph is expected to have.
+        image_share: share of the image in which there would be any, 0 to 1.
+        position_68_m: position error expected not to be exceeded in 68 % of cases; 0 where there is none to expect.
+        references: names of those that would serve, those that see most first.
+    """
+
+    verdict: str
+    message: str
+    expected_match_count: int
+    image_share: float
+    position_68_m: float
+    references: tuple[str, ...]
+
+
 def scene_from_message(message: reference_pb.Scene) -> Scene:
     """Scene of a message."""
     return Scene(
@@ -181,6 +245,41 @@ def reference_from_message(message: reference_pb.Reference) -> Reference:
         feature_count=message.feature_count,
         create_time=message.create_time.ToDatetime(timezone.utc),
         image=message.image or None,
+    )
+
+
+def retrieved_from_message(message: reference_pb.RetrievedReference) -> RetrievedReference:
+    """Retrieved reference of a message."""
+    pose = wire.transform_from_message(message.world_from_camera, "world_from_camera")
+    return RetrievedReference(message.name, message.similarity, pose)
+
+
+def audit_from_message(message: reference_pb.ReferenceAudit) -> ReferenceAudit:
+    """Audit of a message."""
+    return ReferenceAudit(
+        name=message.name,
+        verdict=_value_name(reference_pb.AuditVerdict, message.verdict),
+        message=message.message,
+        neighbour_count=message.neighbour_count,
+        match_count=message.match_count,
+        inlier_count=message.inlier_count,
+        reprojection_error_px=message.reprojection_error_px,
+        position_offset_m=message.position_offset_m,
+        rotation_offset_deg=message.rotation_offset_deg,
+        focal_ratio=message.focal_ratio,
+        other=message.other,
+    )
+
+
+def coverage_from_message(message: reference_pb.CheckCoverageResponse) -> Coverage:
+    """Coverage of a message."""
+    return Coverage(
+        verdict=_value_name(reference_pb.CoverageVerdict, message.verdict),
+        message=message.message,
+        expected_match_count=message.expected_match_count,
+        image_share=message.image_share,
+        position_68_m=message.position_68_m,
+        references=tuple(message.references),
     )
 
 
@@ -230,7 +329,9 @@ def _diagnostics_from_message(message: localization_pb.Diagnostics) -> Diagnosti
         features=message.features,
         variant=_value_name(localization_pb.Variant, message.variant),
         store_generation=message.store_generation,
-        references=tuple(ReferenceUse(use.name, use.match_count, use.inlier_count) for use in message.references),
+        references=tuple(
+            ReferenceUse(use.name, use.match_count, use.inlier_count, use.similarity) for use in message.references
+        ),
         scale=ScaleEstimate(
             scale.metres_per_unit, _value_name(localization_pb.ScaleStage, scale.stage), scale.deviation
         )
@@ -242,6 +343,7 @@ def _diagnostics_from_message(message: localization_pb.Diagnostics) -> Diagnosti
         processed_width_px=message.processed_width_px,
         processed_height_px=message.processed_height_px,
         server_version=message.server_version,
+        retrieval=message.retrieval,
     )
 
 

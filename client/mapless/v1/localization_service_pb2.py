@@ -27,47 +27,49 @@ from google.protobuf import timestamp_pb2 as google_dot_protobuf_dot_timestamp__
 from mapless.v1 import geometry_pb2 as mapless_dot_v1_dot_geometry__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n%mapless/v1/localization_service.proto\x12\nmapless.v1\x1a\x1egoogle/protobuf/duration.proto\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x19mapless/v1/geometry.proto\"\xc1\x02\n\x0fLocalizeRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x12\n\nreferences\x18\x02 \x03(\t\x12\r\n\x05image\x18\x03 \x01(\x0c\x12\x30\n\nintrinsics\x18\x04 \x01(\x0b\x32\x1c.mapless.v1.CameraIntrinsics\x12\x31\n\x0eposition_prior\x18\x05 \x01(\x0b\x32\x19.mapless.v1.PositionPrior\x12,\n\x07options\x18\x06 \x01(\x0b\x32\x1b.mapless.v1.LocalizeOptions\x12\x30\n\x0c\x63\x61pture_time\x18\x07 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x37\n\x13session_from_camera\x18\x08 \x01(\x0b\x32\x1a.mapless.v1.RigidTransform\"J\n\rPositionPrior\x12\'\n\nposition_m\x18\x01 \x01(\x0b\x32\x13.mapless.v1.Vector3\x12\x10\n\x08radius_m\x18\x02 \x01(\x01\"\x99\x01\n\x0fLocalizeOptions\x12$\n\x07variant\x18\x01 \x01(\x0e\x32\x13.mapless.v1.Variant\x12\x31\n\x0escale_strategy\x18\x02 \x01(\x0e\x32\x19.mapless.v1.ScaleStrategy\x12\x17\n\x0freference_count\x18\x03 \x01(\x05\x12\x14\n\x0c\x61llow_coarse\x18\x04 \x01(\x08\"\x94\x02\n\x10LocalizeResponse\x12\x30\n\x0clocalization\x18\x01 \x01(\x0b\x32\x18.mapless.v1.LocalizationH\x00\x12*\n\trejection\x18\x02 \x01(\x0b\x32\x15.mapless.v1.RejectionH\x00\x12,\n\x0b\x64iagnostics\x18\x03 \x01(\x0b\x32\x17.mapless.v1.Diagnostics\x12\x30\n\x0c\x63\x61pture_time\x18\x04 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x37\n\x13session_from_camera\x18\x05 \x01(\x0b\x32\x1a.mapless.v1.RigidTransformB\t\n\x07outcome\"\x92\x02\n\x0cLocalization\x12\x35\n\x11world_from_camera\x18\x01 \x01(\x0b\x32\x1a.mapless.v1.RigidTransform\x12.\n\ncovariance\x18\x02 \x01(\x0b\x32\x1a.mapless.v1.PoseCovariance\x12&\n\x08\x61\x63\x63uracy\x18\x03 \x01(\x0b\x32\x14.mapless.v1.Accuracy\x12)\n\npose_stage\x18\x04 \x01(\x0e\x32\x15.mapless.v1.PoseStage\x12\x14\n\x0cinlier_count\x18\x05 \x01(\x05\x12\x13\n\x0bmatch_count\x18\x06 \x01(\x05\x12\x1d\n\x15reprojection_error_px\x18\x07 \x01(\x01\"#\n\x0ePoseCovariance\x12\x11\n\trow_major\x18\x01 \x03(\x01\"~\n\x08\x41\x63\x63uracy\x12\x15\n\rposition_68_m\x18\x01 \x01(\x01\x12\x15\n\rposition_95_m\x18\x02 \x01(\x01\x12\x17\n\x0frotation_68_deg\x18\x03 \x01(\x01\x12\x17\n\x0frotation_95_deg\x18\x04 \x01(\x01\x12\x12\n\ncalibrated\x18\x05 \x01(\x08\"I\n\tRejection\x12+\n\x06reason\x18\x01 \x01(\x0e\x32\x1b.mapless.v1.RejectionReason\x12\x0f\n\x07message\x18\x02 \x01(\t\"\xd4\x03\n\x0b\x44iagnostics\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\x0f\n\x07\x62\x61\x63kend\x18\x02 \x01(\t\x12\x16\n\x0eweights_sha256\x18\x03 \x01(\t\x12\x10\n\x08\x66\x65\x61tures\x18\x04 \x01(\t\x12$\n\x07variant\x18\x05 \x01(\x0e\x32\x13.mapless.v1.Variant\x12\x18\n\x10store_generation\x18\x06 \x01(\x03\x12,\n\nreferences\x18\x07 \x03(\x0b\x32\x18.mapless.v1.ReferenceUse\x12(\n\x05scale\x18\x08 \x01(\x0b\x32\x19.mapless.v1.ScaleEstimate\x12\'\n\x06stages\x18\t \x03(\x0b\x32\x17.mapless.v1.StageTiming\x12\x31\n\x0equeue_duration\x18\n \x01(\x0b\x32\x19.google.protobuf.Duration\x12\x31\n\x0etotal_duration\x18\x0b \x01(\x0b\x32\x19.google.protobuf.Duration\x12\x1a\n\x12processed_width_px\x18\x0c \x01(\x05\x12\x1b\n\x13processed_height_px\x18\r \x01(\x05\x12\x16\n\x0eserver_version\x18\x0e \x01(\t\"G\n\x0cReferenceUse\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x13\n\x0bmatch_count\x18\x02 \x01(\x05\x12\x14\n\x0cinlier_count\x18\x03 \x01(\x05\"b\n\rScaleEstimate\x12\x17\n\x0fmetres_per_unit\x18\x01 \x01(\x01\x12%\n\x05stage\x18\x02 \x01(\x0e\x32\x16.mapless.v1.ScaleStage\x12\x11\n\tdeviation\x18\x03 \x01(\x01\"I\n\x0bStageTiming\x12\r\n\x05stage\x18\x01 \x01(\t\x12+\n\x08\x64uration\x18\x02 \x01(\x0b\x32\x19.google.protobuf.Duration*t\n\x07Variant\x12\x17\n\x13VARIANT_UNSPECIFIED\x10\x00\x12\x12\n\x0eVARIANT_COARSE\x10\x01\x12\x18\n\x14VARIANT_NO_STRUCTURE\x10\x02\x12\x10\n\x0cVARIANT_FULL\x10\x03\x12\x10\n\x0cVARIANT_BEST\x10\x04*\x8e\x01\n\rScaleStrategy\x12\x1e\n\x1aSCALE_STRATEGY_UNSPECIFIED\x10\x00\x12 \n\x1cSCALE_STRATEGY_TRIANGULATION\x10\x01\x12\x1d\n\x19SCALE_STRATEGY_TRAJECTORY\x10\x02\x12\x1c\n\x18SCALE_STRATEGY_TWO_STAGE\x10\x03*n\n\tPoseStage\x12\x1a\n\x16POSE_STAGE_UNSPECIFIED\x10\x00\x12\x16\n\x12POSE_STAGE_REFINED\x10\x01\x12\x16\n\x12POSE_STAGE_INITIAL\x10\x02\x12\x15\n\x11POSE_STAGE_COARSE\x10\x03*\xd7\x02\n\x0fRejectionReason\x12 \n\x1cREJECTION_REASON_UNSPECIFIED\x10\x00\x12)\n%REJECTION_REASON_NO_USABLE_REFERENCES\x10\x01\x12*\n&REJECTION_REASON_DEGENERATE_REFERENCES\x10\x02\x12 \n\x1cREJECTION_REASON_LOW_TEXTURE\x10\x03\x12 \n\x1cREJECTION_REASON_LOW_OVERLAP\x10\x04\x12%\n!REJECTION_REASON_SCALE_UNRELIABLE\x10\x05\x12$\n REJECTION_REASON_TOO_FEW_MATCHES\x10\x06\x12\x1f\n\x1bREJECTION_REASON_PNP_FAILED\x10\x07\x12\x19\n\x15REJECTION_REASON_GATE\x10\x08*d\n\nScaleStage\x12\x1b\n\x17SCALE_STAGE_UNSPECIFIED\x10\x00\x12\x1d\n\x19SCALE_STAGE_TRIANGULATION\x10\x01\x12\x1a\n\x16SCALE_STAGE_TRAJECTORY\x10\x02\x32\\\n\x13LocalizationService\x12\x45\n\x08Localize\x12\x1b.mapless.v1.LocalizeRequest\x1a\x1c.mapless.v1.LocalizeResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n%mapless/v1/localization_service.proto\x12\nmapless.v1\x1a\x1egoogle/protobuf/duration.proto\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x19mapless/v1/geometry.proto\"\xf2\x02\n\x0fLocalizeRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x12\n\nreferences\x18\x02 \x03(\t\x12\r\n\x05image\x18\x03 \x01(\x0c\x12\x30\n\nintrinsics\x18\x04 \x01(\x0b\x32\x1c.mapless.v1.CameraIntrinsics\x12\x31\n\x0eposition_prior\x18\x05 \x01(\x0b\x32\x19.mapless.v1.PositionPrior\x12,\n\x07options\x18\x06 \x01(\x0b\x32\x1b.mapless.v1.LocalizeOptions\x12\x30\n\x0c\x63\x61pture_time\x18\x07 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x37\n\x13session_from_camera\x18\x08 \x01(\x0b\x32\x1a.mapless.v1.RigidTransform\x12/\n\rheading_prior\x18\t \x01(\x0b\x32\x18.mapless.v1.HeadingPrior\"J\n\rPositionPrior\x12\'\n\nposition_m\x18\x01 \x01(\x0b\x32\x13.mapless.v1.Vector3\x12\x10\n\x08radius_m\x18\x02 \x01(\x01\"M\n\x0cHeadingPrior\x12&\n\tdirection\x18\x01 \x01(\x0b\x32\x13.mapless.v1.Vector3\x12\x15\n\rmax_angle_deg\x18\x02 \x01(\x01\"\xb4\x01\n\x0fLocalizeOptions\x12$\n\x07variant\x18\x01 \x01(\x0e\x32\x13.mapless.v1.Variant\x12\x31\n\x0escale_strategy\x18\x02 \x01(\x0e\x32\x19.mapless.v1.ScaleStrategy\x12\x17\n\x0freference_count\x18\x03 \x01(\x05\x12\x14\n\x0c\x61llow_coarse\x18\x04 \x01(\x08\x12\x19\n\x11rerank_references\x18\x05 \x01(\x08\"\x94\x02\n\x10LocalizeResponse\x12\x30\n\x0clocalization\x18\x01 \x01(\x0b\x32\x18.mapless.v1.LocalizationH\x00\x12*\n\trejection\x18\x02 \x01(\x0b\x32\x15.mapless.v1.RejectionH\x00\x12,\n\x0b\x64iagnostics\x18\x03 \x01(\x0b\x32\x17.mapless.v1.Diagnostics\x12\x30\n\x0c\x63\x61pture_time\x18\x04 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x37\n\x13session_from_camera\x18\x05 \x01(\x0b\x32\x1a.mapless.v1.RigidTransformB\t\n\x07outcome\"\x92\x02\n\x0cLocalization\x12\x35\n\x11world_from_camera\x18\x01 \x01(\x0b\x32\x1a.mapless.v1.RigidTransform\x12.\n\ncovariance\x18\x02 \x01(\x0b\x32\x1a.mapless.v1.PoseCovariance\x12&\n\x08\x61\x63\x63uracy\x18\x03 \x01(\x0b\x32\x14.mapless.v1.Accuracy\x12)\n\npose_stage\x18\x04 \x01(\x0e\x32\x15.mapless.v1.PoseStage\x12\x14\n\x0cinlier_count\x18\x05 \x01(\x05\x12\x13\n\x0bmatch_count\x18\x06 \x01(\x05\x12\x1d\n\x15reprojection_error_px\x18\x07 \x01(\x01\"#\n\x0ePoseCovariance\x12\x11\n\trow_major\x18\x01 \x03(\x01\"~\n\x08\x41\x63\x63uracy\x12\x15\n\rposition_68_m\x18\x01 \x01(\x01\x12\x15\n\rposition_95_m\x18\x02 \x01(\x01\x12\x17\n\x0frotation_68_deg\x18\x03 \x01(\x01\x12\x17\n\x0frotation_95_deg\x18\x04 \x01(\x01\x12\x12\n\ncalibrated\x18\x05 \x01(\x08\"I\n\tRejection\x12+\n\x06reason\x18\x01 \x01(\x0e\x32\x1b.mapless.v1.RejectionReason\x12\x0f\n\x07message\x18\x02 \x01(\t\"\xe7\x03\n\x0b\x44iagnostics\x12\x12\n\nrequest_id\x18\x01 \x01(\t\x12\x0f\n\x07\x62\x61\x63kend\x18\x02 \x01(\t\x12\x16\n\x0eweights_sha256\x18\x03 \x01(\t\x12\x10\n\x08\x66\x65\x61tures\x18\x04 \x01(\t\x12$\n\x07variant\x18\x05 \x01(\x0e\x32\x13.mapless.v1.Variant\x12\x18\n\x10store_generation\x18\x06 \x01(\x03\x12,\n\nreferences\x18\x07 \x03(\x0b\x32\x18.mapless.v1.ReferenceUse\x12(\n\x05scale\x18\x08 \x01(\x0b\x32\x19.mapless.v1.ScaleEstimate\x12\'\n\x06stages\x18\t \x03(\x0b\x32\x17.mapless.v1.StageTiming\x12\x31\n\x0equeue_duration\x18\n \x01(\x0b\x32\x19.google.protobuf.Duration\x12\x31\n\x0etotal_duration\x18\x0b \x01(\x0b\x32\x19.google.protobuf.Duration\x12\x1a\n\x12processed_width_px\x18\x0c \x01(\x05\x12\x1b\n\x13processed_height_px\x18\r \x01(\x05\x12\x16\n\x0eserver_version\x18\x0e \x01(\t\x12\x11\n\tretrieval\x18\x0f \x01(\t\"[\n\x0cReferenceUse\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x13\n\x0bmatch_count\x18\x02 \x01(\x05\x12\x14\n\x0cinlier_count\x18\x03 \x01(\x05\x12\x12\n\nsimilarity\x18\x04 \x01(\x01\"b\n\rScaleEstimate\x12\x17\n\x0fmetres_per_unit\x18\x01 \x01(\x01\x12%\n\x05stage\x18\x02 \x01(\x0e\x32\x16.mapless.v1.ScaleStage\x12\x11\n\tdeviation\x18\x03 \x01(\x01\"I\n\x0bStageTiming\x12\r\n\x05stage\x18\x01 \x01(\t\x12+\n\x08\x64uration\x18\x02 \x01(\x0b\x32\x19.google.protobuf.Duration*t\n\x07Variant\x12\x17\n\x13VARIANT_UNSPECIFIED\x10\x00\x12\x12\n\x0eVARIANT_COARSE\x10\x01\x12\x18\n\x14VARIANT_NO_STRUCTURE\x10\x02\x12\x10\n\x0cVARIANT_FULL\x10\x03\x12\x10\n\x0cVARIANT_BEST\x10\x04*\x8e\x01\n\rScaleStrategy\x12\x1e\n\x1aSCALE_STRATEGY_UNSPECIFIED\x10\x00\x12 \n\x1cSCALE_STRATEGY_TRIANGULATION\x10\x01\x12\x1d\n\x19SCALE_STRATEGY_TRAJECTORY\x10\x02\x12\x1c\n\x18SCALE_STRATEGY_TWO_STAGE\x10\x03*n\n\tPoseStage\x12\x1a\n\x16POSE_STAGE_UNSPECIFIED\x10\x00\x12\x16\n\x12POSE_STAGE_REFINED\x10\x01\x12\x16\n\x12POSE_STAGE_INITIAL\x10\x02\x12\x15\n\x11POSE_STAGE_COARSE\x10\x03*\xd7\x02\n\x0fRejectionReason\x12 \n\x1cREJECTION_REASON_UNSPECIFIED\x10\x00\x12)\n%REJECTION_REASON_NO_USABLE_REFERENCES\x10\x01\x12*\n&REJECTION_REASON_DEGENERATE_REFERENCES\x10\x02\x12 \n\x1cREJECTION_REASON_LOW_TEXTURE\x10\x03\x12 \n\x1cREJECTION_REASON_LOW_OVERLAP\x10\x04\x12%\n!REJECTION_REASON_SCALE_UNRELIABLE\x10\x05\x12$\n REJECTION_REASON_TOO_FEW_MATCHES\x10\x06\x12\x1f\n\x1bREJECTION_REASON_PNP_FAILED\x10\x07\x12\x19\n\x15REJECTION_REASON_GATE\x10\x08*d\n\nScaleStage\x12\x1b\n\x17SCALE_STAGE_UNSPECIFIED\x10\x00\x12\x1d\n\x19SCALE_STAGE_TRIANGULATION\x10\x01\x12\x1a\n\x16SCALE_STAGE_TRAJECTORY\x10\x02\x32\\\n\x13LocalizationService\x12\x45\n\x08Localize\x12\x1b.mapless.v1.LocalizeRequest\x1a\x1c.mapless.v1.LocalizeResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'mapless.v1.localization_service_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_VARIANT']._serialized_start=2216
-  _globals['_VARIANT']._serialized_end=2332
-  _globals['_SCALESTRATEGY']._serialized_start=2335
-  _globals['_SCALESTRATEGY']._serialized_end=2477
-  _globals['_POSESTAGE']._serialized_start=2479
-  _globals['_POSESTAGE']._serialized_end=2589
-  _globals['_REJECTIONREASON']._serialized_start=2592
-  _globals['_REJECTIONREASON']._serialized_end=2935
-  _globals['_SCALESTAGE']._serialized_start=2937
-  _globals['_SCALESTAGE']._serialized_end=3037
+  _globals['_VARIANT']._serialized_start=2410
+  _globals['_VARIANT']._serialized_end=2526
+  _globals['_SCALESTRATEGY']._serialized_start=2529
+  _globals['_SCALESTRATEGY']._serialized_end=2671
+  _globals['_POSESTAGE']._serialized_start=2673
+  _globals['_POSESTAGE']._serialized_end=2783
+  _globals['_REJECTIONREASON']._serialized_start=2786
+  _globals['_REJECTIONREASON']._serialized_end=3129
+  _globals['_SCALESTAGE']._serialized_start=3131
+  _globals['_SCALESTAGE']._serialized_end=3231
   _globals['_LOCALIZEREQUEST']._serialized_start=146
-  _globals['_LOCALIZEREQUEST']._serialized_end=467
-  _globals['_POSITIONPRIOR']._serialized_start=469
-  _globals['_POSITIONPRIOR']._serialized_end=543
-  _globals['_LOCALIZEOPTIONS']._serialized_start=546
-  _globals['_LOCALIZEOPTIONS']._serialized_end=699
-  _globals['_LOCALIZERESPONSE']._serialized_start=702
-  _globals['_LOCALIZERESPONSE']._serialized_end=978
-  _globals['_LOCALIZATION']._serialized_start=981
-  _globals['_LOCALIZATION']._serialized_end=1255
-  _globals['_POSECOVARIANCE']._serialized_start=1257
-  _globals['_POSECOVARIANCE']._serialized_end=1292
-  _globals['_ACCURACY']._serialized_start=1294
-  _globals['_ACCURACY']._serialized_end=1420
-  _globals['_REJECTION']._serialized_start=1422
-  _globals['_REJECTION']._serialized_end=1495
-  _globals['_DIAGNOSTICS']._serialized_start=1498
-  _globals['_DIAGNOSTICS']._serialized_end=1966
-  _globals['_REFERENCEUSE']._serialized_start=1968
-  _globals['_REFERENCEUSE']._serialized_end=2039
-  _globals['_SCALEESTIMATE']._serialized_start=2041
-  _globals['_SCALEESTIMATE']._serialized_end=2139
-  _globals['_STAGETIMING']._serialized_start=2141
-  _globals['_STAGETIMING']._serialized_end=2214
-  _globals['_LOCALIZATIONSERVICE']._serialized_start=3039
-  _globals['_LOCALIZATIONSERVICE']._serialized_end=3131
+  _globals['_LOCALIZEREQUEST']._serialized_end=516
+  _globals['_POSITIONPRIOR']._serialized_start=518
+  _globals['_POSITIONPRIOR']._serialized_end=592
+  _globals['_HEADINGPRIOR']._serialized_start=594
+  _globals['_HEADINGPRIOR']._serialized_end=671
+  _globals['_LOCALIZEOPTIONS']._serialized_start=674
+  _globals['_LOCALIZEOPTIONS']._serialized_end=854
+  _globals['_LOCALIZERESPONSE']._serialized_start=857
+  _globals['_LOCALIZERESPONSE']._serialized_end=1133
+  _globals['_LOCALIZATION']._serialized_start=1136
+  _globals['_LOCALIZATION']._serialized_end=1410
+  _globals['_POSECOVARIANCE']._serialized_start=1412
+  _globals['_POSECOVARIANCE']._serialized_end=1447
+  _globals['_ACCURACY']._serialized_start=1449
+  _globals['_ACCURACY']._serialized_end=1575
+  _globals['_REJECTION']._serialized_start=1577
+  _globals['_REJECTION']._serialized_end=1650
+  _globals['_DIAGNOSTICS']._serialized_start=1653
+  _globals['_DIAGNOSTICS']._serialized_end=2140
+  _globals['_REFERENCEUSE']._serialized_start=2142
+  _globals['_REFERENCEUSE']._serialized_end=2233
+  _globals['_SCALEESTIMATE']._serialized_start=2235
+  _globals['_SCALEESTIMATE']._serialized_end=2333
+  _globals['_STAGETIMING']._serialized_start=2335
+  _globals['_STAGETIMING']._serialized_end=2408
+  _globals['_LOCALIZATIONSERVICE']._serialized_start=3233
+  _globals['_LOCALIZATIONSERVICE']._serialized_end=3325
 # @@protoc_insertion_point(module_scope)

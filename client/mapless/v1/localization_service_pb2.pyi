@@ -75,7 +75,7 @@ SCALE_STAGE_TRIANGULATION: ScaleStage
 SCALE_STAGE_TRAJECTORY: ScaleStage
 
 class LocalizeRequest(_message.Message):
-    __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera")
+    __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
@@ -84,6 +84,7 @@ class LocalizeRequest(_message.Message):
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     CAPTURE_TIME_FIELD_NUMBER: _ClassVar[int]
     SESSION_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    HEADING_PRIOR_FIELD_NUMBER: _ClassVar[int]
     scene: str
     references: _containers.RepeatedScalarFieldContainer[str]
     image: bytes
@@ -92,7 +93,8 @@ class LocalizeRequest(_message.Message):
     options: LocalizeOptions
     capture_time: _timestamp_pb2.Timestamp
     session_from_camera: _geometry_pb2.RigidTransform
-    def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
+    heading_prior: HeadingPrior
+    def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ...) -> None: ...
 
 class PositionPrior(_message.Message):
     __slots__ = ("position_m", "radius_m")
@@ -102,17 +104,27 @@ class PositionPrior(_message.Message):
     radius_m: float
     def __init__(self, position_m: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., radius_m: _Optional[float] = ...) -> None: ...
 
+class HeadingPrior(_message.Message):
+    __slots__ = ("direction", "max_angle_deg")
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    MAX_ANGLE_DEG_FIELD_NUMBER: _ClassVar[int]
+    direction: _geometry_pb2.Vector3
+    max_angle_deg: float
+    def __init__(self, direction: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., max_angle_deg: _Optional[float] = ...) -> None: ...
+
 class LocalizeOptions(_message.Message):
-    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse")
+    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse", "rerank_references")
     VARIANT_FIELD_NUMBER: _ClassVar[int]
     SCALE_STRATEGY_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
     ALLOW_COARSE_FIELD_NUMBER: _ClassVar[int]
+    RERANK_REFERENCES_FIELD_NUMBER: _ClassVar[int]
     variant: Variant
     scale_strategy: ScaleStrategy
     reference_count: int
     allow_coarse: bool
-    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ...) -> None: ...
+    rerank_references: bool
+    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ..., rerank_references: bool = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
     __slots__ = ("localization", "rejection", "diagnostics", "capture_time", "session_from_camera")
@@ -175,7 +187,7 @@ class Rejection(_message.Message):
     def __init__(self, reason: _Optional[_Union[RejectionReason, str]] = ..., message: _Optional[str] = ...) -> None: ...
 
 class Diagnostics(_message.Message):
-    __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version")
+    __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval")
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     BACKEND_FIELD_NUMBER: _ClassVar[int]
     WEIGHTS_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -190,6 +202,7 @@ class Diagnostics(_message.Message):
     PROCESSED_WIDTH_PX_FIELD_NUMBER: _ClassVar[int]
     PROCESSED_HEIGHT_PX_FIELD_NUMBER: _ClassVar[int]
     SERVER_VERSION_FIELD_NUMBER: _ClassVar[int]
+    RETRIEVAL_FIELD_NUMBER: _ClassVar[int]
     request_id: str
     backend: str
     weights_sha256: str
@@ -204,17 +217,20 @@ class Diagnostics(_message.Message):
     processed_width_px: int
     processed_height_px: int
     server_version: str
-    def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ...) -> None: ...
+    retrieval: str
+    def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ...) -> None: ...
 
 class ReferenceUse(_message.Message):
-    __slots__ = ("name", "match_count", "inlier_count")
+    __slots__ = ("name", "match_count", "inlier_count", "similarity")
     NAME_FIELD_NUMBER: _ClassVar[int]
     MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
     INLIER_COUNT_FIELD_NUMBER: _ClassVar[int]
+    SIMILARITY_FIELD_NUMBER: _ClassVar[int]
     name: str
     match_count: int
     inlier_count: int
-    def __init__(self, name: _Optional[str] = ..., match_count: _Optional[int] = ..., inlier_count: _Optional[int] = ...) -> None: ...
+    similarity: float
+    def __init__(self, name: _Optional[str] = ..., match_count: _Optional[int] = ..., inlier_count: _Optional[int] = ..., similarity: _Optional[float] = ...) -> None: ...
 
 class ScaleEstimate(_message.Message):
     __slots__ = ("metres_per_unit", "stage", "deviation")

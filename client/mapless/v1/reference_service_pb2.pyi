@@ -1,11 +1,45 @@
 from google.protobuf import timestamp_pb2 as _timestamp_pb2
 from mapless.v1 import geometry_pb2 as _geometry_pb2
+from mapless.v1 import localization_service_pb2 as _localization_service_pb2
 from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from typing import ClassVar as _ClassVar, Iterable as _Iterable, Mapping as _Mapping, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
+
+class AuditVerdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    AUDIT_VERDICT_UNSPECIFIED: _ClassVar[AuditVerdict]
+    AUDIT_VERDICT_CONSISTENT: _ClassVar[AuditVerdict]
+    AUDIT_VERDICT_WRONG_POSE: _ClassVar[AuditVerdict]
+    AUDIT_VERDICT_WRONG_INTRINSICS: _ClassVar[AuditVerdict]
+    AUDIT_VERDICT_WRONG_POSE_AND_INTRINSICS: _ClassVar[AuditVerdict]
+    AUDIT_VERDICT_SWAPPED_IMAGE: _ClassVar[AuditVerdict]
+    AUDIT_VERDICT_DUPLICATE: _ClassVar[AuditVerdict]
+    AUDIT_VERDICT_SCENE_CHANGED: _ClassVar[AuditVerdict]
+    AUDIT_VERDICT_UNVERIFIABLE: _ClassVar[AuditVerdict]
+
+class CoverageVerdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    COVERAGE_VERDICT_UNSPECIFIED: _ClassVar[CoverageVerdict]
+    COVERAGE_VERDICT_LOCALIZABLE: _ClassVar[CoverageVerdict]
+    COVERAGE_VERDICT_DOUBTFUL: _ClassVar[CoverageVerdict]
+    COVERAGE_VERDICT_NOT_LOCALIZABLE: _ClassVar[CoverageVerdict]
+AUDIT_VERDICT_UNSPECIFIED: AuditVerdict
+AUDIT_VERDICT_CONSISTENT: AuditVerdict
+AUDIT_VERDICT_WRONG_POSE: AuditVerdict
+AUDIT_VERDICT_WRONG_INTRINSICS: AuditVerdict
+AUDIT_VERDICT_WRONG_POSE_AND_INTRINSICS: AuditVerdict
+AUDIT_VERDICT_SWAPPED_IMAGE: AuditVerdict
+AUDIT_VERDICT_DUPLICATE: AuditVerdict
+AUDIT_VERDICT_SCENE_CHANGED: AuditVerdict
+AUDIT_VERDICT_UNVERIFIABLE: AuditVerdict
+COVERAGE_VERDICT_UNSPECIFIED: CoverageVerdict
+COVERAGE_VERDICT_LOCALIZABLE: CoverageVerdict
+COVERAGE_VERDICT_DOUBTFUL: CoverageVerdict
+COVERAGE_VERDICT_NOT_LOCALIZABLE: CoverageVerdict
 
 class Scene(_message.Message):
     __slots__ = ("name", "generation", "reference_count", "create_time")
@@ -158,3 +192,115 @@ class DeleteReferenceRequest(_message.Message):
 class DeleteReferenceResponse(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
+
+class RetrieveReferencesRequest(_message.Message):
+    __slots__ = ("scene", "image", "intrinsics", "count", "position_prior", "heading_prior")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    POSITION_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    HEADING_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    image: bytes
+    intrinsics: _geometry_pb2.CameraIntrinsics
+    count: int
+    position_prior: _localization_service_pb2.PositionPrior
+    heading_prior: _localization_service_pb2.HeadingPrior
+    def __init__(self, scene: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., count: _Optional[int] = ..., position_prior: _Optional[_Union[_localization_service_pb2.PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[_localization_service_pb2.HeadingPrior, _Mapping]] = ...) -> None: ...
+
+class RetrieveReferencesResponse(_message.Message):
+    __slots__ = ("references", "descriptor", "store_generation")
+    REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    DESCRIPTOR_FIELD_NUMBER: _ClassVar[int]
+    STORE_GENERATION_FIELD_NUMBER: _ClassVar[int]
+    references: _containers.RepeatedCompositeFieldContainer[RetrievedReference]
+    descriptor: str
+    store_generation: int
+    def __init__(self, references: _Optional[_Iterable[_Union[RetrievedReference, _Mapping]]] = ..., descriptor: _Optional[str] = ..., store_generation: _Optional[int] = ...) -> None: ...
+
+class RetrievedReference(_message.Message):
+    __slots__ = ("name", "similarity", "world_from_camera")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    SIMILARITY_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    similarity: float
+    world_from_camera: _geometry_pb2.RigidTransform
+    def __init__(self, name: _Optional[str] = ..., similarity: _Optional[float] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
+
+class AuditSceneRequest(_message.Message):
+    __slots__ = ("scene", "references", "page_size", "page_token")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    PAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
+    PAGE_TOKEN_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    references: _containers.RepeatedScalarFieldContainer[str]
+    page_size: int
+    page_token: str
+    def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., page_size: _Optional[int] = ..., page_token: _Optional[str] = ...) -> None: ...
+
+class AuditSceneResponse(_message.Message):
+    __slots__ = ("audits", "next_page_token", "store_generation")
+    AUDITS_FIELD_NUMBER: _ClassVar[int]
+    NEXT_PAGE_TOKEN_FIELD_NUMBER: _ClassVar[int]
+    STORE_GENERATION_FIELD_NUMBER: _ClassVar[int]
+    audits: _containers.RepeatedCompositeFieldContainer[ReferenceAudit]
+    next_page_token: str
+    store_generation: int
+    def __init__(self, audits: _Optional[_Iterable[_Union[ReferenceAudit, _Mapping]]] = ..., next_page_token: _Optional[str] = ..., store_generation: _Optional[int] = ...) -> None: ...
+
+class ReferenceAudit(_message.Message):
+    __slots__ = ("name", "verdict", "message", "neighbour_count", "match_count", "inlier_count", "reprojection_error_px", "position_offset_m", "rotation_offset_deg", "focal_ratio", "other")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    VERDICT_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    NEIGHBOUR_COUNT_FIELD_NUMBER: _ClassVar[int]
+    MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
+    INLIER_COUNT_FIELD_NUMBER: _ClassVar[int]
+    REPROJECTION_ERROR_PX_FIELD_NUMBER: _ClassVar[int]
+    POSITION_OFFSET_M_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_OFFSET_DEG_FIELD_NUMBER: _ClassVar[int]
+    FOCAL_RATIO_FIELD_NUMBER: _ClassVar[int]
+    OTHER_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    verdict: AuditVerdict
+    message: str
+    neighbour_count: int
+    match_count: int
+    inlier_count: int
+    reprojection_error_px: float
+    position_offset_m: float
+    rotation_offset_deg: float
+    focal_ratio: float
+    other: str
+    def __init__(self, name: _Optional[str] = ..., verdict: _Optional[_Union[AuditVerdict, str]] = ..., message: _Optional[str] = ..., neighbour_count: _Optional[int] = ..., match_count: _Optional[int] = ..., inlier_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., position_offset_m: _Optional[float] = ..., rotation_offset_deg: _Optional[float] = ..., focal_ratio: _Optional[float] = ..., other: _Optional[str] = ...) -> None: ...
+
+class CheckCoverageRequest(_message.Message):
+    __slots__ = ("scene", "world_from_camera", "intrinsics")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    world_from_camera: _geometry_pb2.RigidTransform
+    intrinsics: _geometry_pb2.CameraIntrinsics
+    def __init__(self, scene: _Optional[str] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ...) -> None: ...
+
+class CheckCoverageResponse(_message.Message):
+    __slots__ = ("verdict", "message", "expected_match_count", "image_share", "position_68_m", "references", "store_generation")
+    VERDICT_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_SHARE_FIELD_NUMBER: _ClassVar[int]
+    POSITION_68_M_FIELD_NUMBER: _ClassVar[int]
+    REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    STORE_GENERATION_FIELD_NUMBER: _ClassVar[int]
+    verdict: CoverageVerdict
+    message: str
+    expected_match_count: int
+    image_share: float
+    position_68_m: float
+    references: _containers.RepeatedScalarFieldContainer[str]
+    store_generation: int
+    def __init__(self, verdict: _Optional[_Union[CoverageVerdict, str]] = ..., message: _Optional[str] = ..., expected_match_count: _Optional[int] = ..., image_share: _Optional[float] = ..., position_68_m: _Optional[float] = ..., references: _Optional[_Iterable[str]] = ..., store_generation: _Optional[int] = ...) -> None: ...

@@ -99,6 +99,21 @@ class ReferenceServiceStub(object):
                 request_serializer=mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceRequest.SerializeToString,
                 response_deserializer=mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceResponse.FromString,
                 _registered_method=True)
+        self.RetrieveReferences = channel.unary_unary(
+                '/mapless.v1.ReferenceService/RetrieveReferences',
+                request_serializer=mapless_dot_v1_dot_reference__service__pb2.RetrieveReferencesRequest.SerializeToString,
+                response_deserializer=mapless_dot_v1_dot_reference__service__pb2.RetrieveReferencesResponse.FromString,
+                _registered_method=True)
+        self.AuditScene = channel.unary_unary(
+                '/mapless.v1.ReferenceService/AuditScene',
+                request_serializer=mapless_dot_v1_dot_reference__service__pb2.AuditSceneRequest.SerializeToString,
+                response_deserializer=mapless_dot_v1_dot_reference__service__pb2.AuditSceneResponse.FromString,
+                _registered_method=True)
+        self.CheckCoverage = channel.unary_unary(
+                '/mapless.v1.ReferenceService/CheckCoverage',
+                request_serializer=mapless_dot_v1_dot_reference__service__pb2.CheckCoverageRequest.SerializeToString,
+                response_deserializer=mapless_dot_v1_dot_reference__service__pb2.CheckCoverageResponse.FromString,
+                _registered_method=True)
 
 
 class ReferenceServiceServicer(object):
@@ -188,6 +203,29 @@ class ReferenceServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def RetrieveReferences(self, request, context):
+        """Finds the references that resemble a photograph most, as Localize does when it is given none. Takes the role
+        localize. A scene without references is answered with an empty list.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def AuditScene(self, request, context):
+        """Examines references against their neighbours, page by page: wrong poses, wrong intrinsics, swapped images, duplicates,
+        things that have moved. Changes nothing; takes the role write, since it computes for long.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def CheckCoverage(self, request, context):
+        """Tells whether a photograph taken there would be localized, without one. Takes the role localize.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_ReferenceServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -235,6 +273,21 @@ def add_ReferenceServiceServicer_to_server(servicer, server):
                     servicer.DeleteReference,
                     request_deserializer=mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceRequest.FromString,
                     response_serializer=mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceResponse.SerializeToString,
+            ),
+            'RetrieveReferences': grpc.unary_unary_rpc_method_handler(
+                    servicer.RetrieveReferences,
+                    request_deserializer=mapless_dot_v1_dot_reference__service__pb2.RetrieveReferencesRequest.FromString,
+                    response_serializer=mapless_dot_v1_dot_reference__service__pb2.RetrieveReferencesResponse.SerializeToString,
+            ),
+            'AuditScene': grpc.unary_unary_rpc_method_handler(
+                    servicer.AuditScene,
+                    request_deserializer=mapless_dot_v1_dot_reference__service__pb2.AuditSceneRequest.FromString,
+                    response_serializer=mapless_dot_v1_dot_reference__service__pb2.AuditSceneResponse.SerializeToString,
+            ),
+            'CheckCoverage': grpc.unary_unary_rpc_method_handler(
+                    servicer.CheckCoverage,
+                    request_deserializer=mapless_dot_v1_dot_reference__service__pb2.CheckCoverageRequest.FromString,
+                    response_serializer=mapless_dot_v1_dot_reference__service__pb2.CheckCoverageResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -500,6 +553,87 @@ class ReferenceService(object):
             '/mapless.v1.ReferenceService/DeleteReference',
             mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceRequest.SerializeToString,
             mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def RetrieveReferences(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/mapless.v1.ReferenceService/RetrieveReferences',
+            mapless_dot_v1_dot_reference__service__pb2.RetrieveReferencesRequest.SerializeToString,
+            mapless_dot_v1_dot_reference__service__pb2.RetrieveReferencesResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def AuditScene(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/mapless.v1.ReferenceService/AuditScene',
+            mapless_dot_v1_dot_reference__service__pb2.AuditSceneRequest.SerializeToString,
+            mapless_dot_v1_dot_reference__service__pb2.AuditSceneResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def CheckCoverage(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/mapless.v1.ReferenceService/CheckCoverage',
+            mapless_dot_v1_dot_reference__service__pb2.CheckCoverageRequest.SerializeToString,
+            mapless_dot_v1_dot_reference__service__pb2.CheckCoverageResponse.FromString,
             options,
             channel_credentials,
             insecure,
