@@ -62,6 +62,23 @@ class StandInExtractor:
 
 
 @dataclass(frozen=True)
+class StandInDescriptor:
+    """Sees a photograph as four times four grey patches, so that the same photograph resembles itself and few others."""
+
+    name: str = "patches"
+    dimension: int = 16
+    extractor: None = None
+
+    def describe(self, view: View) -> NDArray[np.float32]:
+        assert view.photograph is not None
+        grey = view.photograph.read().mean(axis=2)
+        rows, columns = (np.linspace(0, side, 5).astype(int)[:-1] for side in grey.shape)
+        patches = np.add.reduceat(np.add.reduceat(grey, rows, axis=0), columns, axis=1).ravel()
+        patches -= patches.mean()
+        return (patches / (np.linalg.norm(patches) + 1e-9)).astype(np.float32)
+
+
+@dataclass(frozen=True)
 class StandInReconstructor:
     name: str = "geometric"
     weights_sha256: str = ""
@@ -190,20 +207,28 @@ def listening(settings: Settings, store: Store, make: MakeEngine) -> Iterator[tu
 
 
 @contextmanager
-def serving(data_dir: Path, features: Sequence[str] = ("stand-in",), **options: Any) -> Iterator[RunningServer]:
+def serving(
+    data_dir: Path,
+    features: Sequence[str] = ("stand-in",),
+    descriptor_name: str = "patches",
+    store: Store | None = None,
+    **options: Any,
+) -> Iterator[RunningServer]:
     """A server with the given settings until the block is left, or `stop` is called, which begins to drain it.
 
-    It has a tier for each of the `features`.
+    It has a tier for each of the `features`, and closes its store, which lies in the folder unless one is given.
     """
     defaults = {"workers": 2, "metrics": False, "warm_up": False}
     settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, **(defaults | options))
-    store = Store.open(data_dir)
+    store = store or Store.open(data_dir)
     method, extractors = StandInMethod(), [StandInExtractor(name) for name in features]
     method.gate.set()
 
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
         tiers = [Tier(extractor, Pipeline(cast(Any, StandInReconstructor()))) for extractor in extractors]
-        return Engine(store, tiers, engine_options(settings), metrics, quota, whole(method))
+        return Engine(
+            store, tiers, engine_options(settings), metrics, quota, whole(method), StandInDescriptor(descriptor_name)
+        )
 
     with listening(settings, store, make) as (running, stop):
         try:

@@ -13,6 +13,8 @@ from .method.coarse.make import make_reconstructor
 from .method.correspond import Matcher, make_matcher
 from .method.features import FEATURES, FeatureExtractor, make_extractor
 from .method.localize import Pipeline
+from .retrieval.descriptor import GlobalDescriptor
+from .retrieval.vlad import VladDescriptor
 from .settings import Settings, available_cores
 from .tiers import Tier
 from .weights import CATALOGUE, WeightsMissing, find_weights
@@ -27,6 +29,8 @@ references far apart, SIFT loses 16 at 0.1 s a photograph, ALIKED 3 at 1 to 3 s,
 only 53 need it. On a GPU the second is as quick as the first, and answers alone.
 """
 
+
+RETRIEVAL = ("auto", "vlad", "megaloc")
 
 WITH_WEIGHTS = frozenset(entry.name for entry in CATALOGUE)
 
@@ -64,6 +68,32 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
         Tier(extractor, Pipeline(reconstructor, _make_matcher(name, settings, device)))
         for name, extractor in extractors.items()
     )
+
+
+def make_descriptor(settings: Settings, extractor: FeatureExtractor) -> GlobalDescriptor:
+    """What references are chosen by; `extractor` is the first tier's.
+
+    `auto` is MegaLoc where there are a CUDA device and its weights: on a CPU it takes a second a photograph.
+
+    Raises:
+        ValueError: unknown kind of retrieval, or there is no such device.
+        WeightsError: weights are not there, or do not fit.
+        ImportError: a package that the network needs is not installed.
+    """
+    if settings.retrieval not in RETRIEVAL:
+        raise ValueError(f"unknown retrieval {settings.retrieval!r}; known: {', '.join(RETRIEVAL)}")
+    if settings.retrieval == "vlad":
+        return VladDescriptor.of(extractor)
+    if settings.retrieval == "auto" and device_for(settings) == "cpu":
+        return VladDescriptor.of(extractor)
+    try:
+        from .retrieval.megaloc import MegaLocDescriptor
+
+        return MegaLocDescriptor(find_weights("megaloc", settings.weights_dir), choose_device(settings.device))
+    except (ImportError, WeightsMissing):
+        if settings.retrieval != "auto":
+            raise
+    return VladDescriptor.of(extractor)
 
 
 def make_first_features(settings: Settings) -> tuple[str, FeatureExtractor]:

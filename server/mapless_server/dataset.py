@@ -2,24 +2,27 @@
 
 `cameras.json` holds ``frames``, a list of objects with ``image`` (path from the folder), ``width`` and ``height``,
 ``K`` (3x3, pixels, (0, 0) the centre of the top-left one), ``dist`` (OpenCV's k1 k2 p1 p2 [k3], or null) and
-``world_from_camera`` (4x4, camera axes x right, y down, z forward); and beside them ``metric`` (false: the unit of
-length is arbitrary) and ``source``.
+``world_from_camera`` (4x4, camera axes x right, y down, z forward), perhaps also ``split`` ("train" or "test") and
+``lens`` ("fisheye": dist is then OpenCV's fisheye k1 k2 k3 k4); and beside them ``metric`` (false: the unit of length
+is arbitrary), ``source`` and ``ground_truth``.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from mapless.geometry import Array, Camera, RadialTangential, RigidTransform
+from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential, RigidTransform
 
+FILE_NAME = "cameras.json"
 MAX_NAME_LENGTH = 128
+SPLITS = ("", "train", "test")
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +34,31 @@ class Frame:
         image_path: the file; its EXIF orientation is not to be applied.
         camera: with the distortion of the file's pixels.
         world_from_camera: metres, or the dataset's unit when it is not metric.
+        split: "train" for those a benchmark builds its references from, "test" for its queries, empty if unknown.
     """
 
     name: str
     image_path: Path
     camera: Camera
     world_from_camera: RigidTransform
+    split: str = ""
+
+    def __post_init__(self) -> None:
+        if self.split not in SPLITS:
+            raise ValueError(f"split must be one of {', '.join(map(repr, SPLITS))}, not {self.split!r}")
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A frame that a dataset names and that cannot be used.
+
+    Attributes:
+        frame: what its file calls it.
+        reason: one clause that names file and field.
+    """
+
+    frame: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -48,12 +70,20 @@ class Dataset:
         frames: in the order of the file.
         metric: whether lengths are metres.
         source: where the photographs come from; empty if the file does not say.
+        ground_truth: how the poses were found ("SfM (COLMAP)", "KinectFusion"); empty if the file does not say.
+        format: name of the layout it was read from.
+        refused: frames that are not among `frames`, and why.
+        notes: what a person should know of how it was read: a choice made for them, a unit that is not metres.
     """
 
     name: str
     frames: tuple[Frame, ...]
     metric: bool
     source: str
+    ground_truth: str = ""
+    format: str = "cameras"
+    refused: tuple[Refusal, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def read_folder(path: Path) -> Dataset:
@@ -62,54 +92,110 @@ def read_folder(path: Path) -> Dataset:
     Raises:
         ValueError: no `cameras.json`, or something in it is missing or malformed; the message names frame and field.
     """
-    file = path / "cameras.json"
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{file} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise ValueError(f"{file} is not JSON: {error}") from error
-    if not isinstance(content, dict) or not isinstance(content.get("frames"), list) or not content["frames"]:
-        raise ValueError(f"{file}: frames must be a list with at least one frame")
-    if not isinstance(content.get("metric", True), bool):
-        raise ValueError(f"{file}: metric must be true or false")
+    file = path / FILE_NAME
+    content = read_content(path)
     frames: list[Frame] = []
     taken: set[str] = set()
     for index, entry in enumerate(content["frames"]):
         try:
-            frame = _frame(path, entry, taken)
+            frame = read_frame(path, entry, taken)
         except ValueError as error:
-            label = entry.get("image", "?") if isinstance(entry, dict) else "?"
-            raise ValueError(f"{file}: frames[{index}] ({label}): {error}") from error
+            raise ValueError(f"{file}: {frame_label(index, entry)}: {error}") from error
         taken.add(frame.name)
         frames.append(frame)
-    name = path.resolve().name
-    return Dataset(name, tuple(frames), content.get("metric", True), str(content.get("source", "")))
+    return dataset_of(path, content, frames)
 
 
-def reference_id(image: str, taken: set[str]) -> str:
+def read_content(path: Path) -> dict[str, Any]:
+    """What `cameras.json` of a folder holds; its frames are a list that nobody has looked into.
+
+    Raises:
+        ValueError: the file cannot be read, is not JSON, or holds no frames; the message names it.
+    """
+    file = path / FILE_NAME
+    content = read_json(file)
+    if not isinstance(content, dict) or not isinstance(content.get("frames"), list) or not content["frames"]:
+        raise ValueError(f"{file}: frames must be a list with at least one frame")
+    if not isinstance(content.get("metric", True), bool):
+        raise ValueError(f"{file}: metric must be true or false")
+    return content
+
+
+def read_json(file: Path) -> Any:
+    """What a JSON file holds; ValueError, naming it, if it cannot be read or is none."""
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{file} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{file} is not JSON: {error}") from error
+
+
+def dataset_of(
+    path: Path, content: Mapping[str, Any], frames: Sequence[Frame], refused: Sequence[Refusal] = ()
+) -> Dataset:
+    """Frames and what `cameras.json` says of them all."""
+    return Dataset(
+        path.resolve().name,
+        tuple(frames),
+        content.get("metric", True),
+        str(content.get("source", "")),
+        str(content.get("ground_truth", "")),
+        refused=tuple(refused),
+    )
+
+
+def frame_label(index: int, entry: object) -> str:
+    """How messages call an entry of `frames`."""
+    return f"frames[{index}] ({entry.get('image', '?') if isinstance(entry, dict) else '?'})"
+
+
+def reference_id(image: str, taken: Container[str]) -> str:
     """The image path's stem as a legal reference id that is not `taken` yet."""
-    stem = re.sub(r"\.{2,}|[^A-Za-z0-9._-]", "_", Path(image).stem)
-    stem = re.sub(r"^[.-]|[.-]$", "_", stem[: MAX_NAME_LENGTH - 8])
+    return legal_id(PurePosixPath(image).stem, taken)
+
+
+def legal_id(stem: str, taken: Container[str]) -> str:
+    """A text as a legal reference id that is not `taken` yet."""
+    stem = re.sub(r"\.{2,}|[^A-Za-z0-9._-]", "_", stem) or "_"
+    stem = re.sub(r"^[.-]|[.-]$", "_", stem[:MAX_NAME_LENGTH])
     name, copy = stem, 2
     while name in taken:
-        name, copy = f"{stem}_{copy}", copy + 1
+        name, copy = f"{stem[: MAX_NAME_LENGTH - 8]}_{copy}", copy + 1
     return name
 
 
-def _frame(folder: Path, entry: object, taken: set[str]) -> Frame:
+def image_file(folder: Path, image: str) -> Path:
+    """The file of an image that a layout names.
+
+    Raises:
+        ValueError: the path leads out of the folder, or there is no such file.
+    """
+    if PurePosixPath(image).is_absolute() or ".." in PurePosixPath(image).parts:
+        raise ValueError(f"image: {image!r} leads out of {folder}")
+    file = folder / image
+    try:
+        found = file.is_file()
+    except OSError as error:  # a name that no file can have
+        raise ValueError(f"image: {image[:100]!r}: {error.strerror}") from error
+    if not found:
+        raise ValueError(f"image: there is no file {file}")
+    return file
+
+
+def read_frame(folder: Path, entry: object, taken: Container[str]) -> Frame:
+    """The frame of an entry of `frames`, with an id that is not `taken`; ValueError names the field that is wrong."""
     if not isinstance(entry, dict):
         raise ValueError("must be an object")
     image = entry.get("image")
     if not isinstance(image, str) or not image:
         raise ValueError("image must be a path")
-    if not (folder / image).is_file():
-        raise ValueError(f"image: there is no file {folder / image}")
+    file = image_file(folder, image)
     try:
         pose = RigidTransform.from_matrix(_numbers(entry, "world_from_camera", (4, 4)))
     except ValueError as error:
         raise ValueError(f"world_from_camera: {error}") from error
-    return Frame(reference_id(image, taken), folder / image, _camera(entry), pose)
+    return Frame(reference_id(image, taken), file, _camera(entry), pose, entry.get("split", ""))
 
 
 def _camera(entry: Mapping[str, Any]) -> Camera:
@@ -121,15 +207,25 @@ def _camera(entry: Mapping[str, Any]) -> Camera:
         raise ValueError("K: focal lengths must be above 0")
     if abs(k[0, 1]) > 1e-6 or abs(k[1, 0]) > 1e-6 or not np.allclose(k[2], [0, 0, 1]):
         raise ValueError("K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    distortion = None
-    if entry.get("dist") is not None:
-        coefficients = _numbers(entry, "dist", None)
-        if coefficients.shape not in ((4,), (5,)):
-            raise ValueError("dist must be null or have 4 or 5 coefficients (k1 k2 p1 p2 [k3])")
-        if coefficients.any():
-            distortion = RadialTangential(*coefficients.tolist())
+    distortion = _distortion(entry)
     focal_x, focal_y, principal_x, principal_y = k[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     return Camera(entry["width"], entry["height"], focal_x, focal_y, principal_x, principal_y, distortion)
+
+
+def _distortion(entry: Mapping[str, Any]) -> Distortion | None:
+    lens = entry.get("lens", "radial_tangential")
+    if lens not in ("radial_tangential", "fisheye"):
+        raise ValueError(f"lens must be radial_tangential or fisheye, is {lens!r}")
+    if entry.get("dist") is None:
+        return Fisheye() if lens == "fisheye" else None
+    coefficients = _numbers(entry, "dist", None)
+    if lens == "fisheye":
+        if coefficients.shape != (4,):
+            raise ValueError("dist of a fisheye lens must be null or have 4 coefficients (k1 k2 k3 k4)")
+        return Fisheye(*coefficients.tolist())
+    if coefficients.shape not in ((4,), (5,)):
+        raise ValueError("dist must be null or have 4 or 5 coefficients (k1 k2 p1 p2 [k3])")
+    return RadialTangential(*coefficients.tolist()) if coefficients.any() else None
 
 
 def _numbers(entry: Mapping[str, Any], field: str, shape: tuple[int, ...] | None) -> Array:

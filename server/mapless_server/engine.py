@@ -1,34 +1,44 @@
-"""What the service asks for, through the work queue: localizing a photograph, describing references."""
+"""What the services ask for, through the work queue: localizing a photograph, and whatever else takes computing."""
 
 from __future__ import annotations
 
 import asyncio
-from collections import deque
-from collections.abc import Awaitable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
+from .audit.verdict import ReferenceAudit
+from .auditing import SceneAudit
+from .choosing import ReferenceChooser
 from .decode import ImageLimits
+from .describing import Describer, Description
 from .errors import DeadlineExceeded, Overloaded, RequestError, Unavailable
 from .failures import failure_of
+from .items import Compute, Item, Items, Outcome, work_off
 from .library import ReferenceLibrary
-from .method.views import View
 from .query import Caller, Photo, Query, Result
 from .query_stages import COARSE, PREPARE, REFINE, Method, QueryStages, ReferenceSource, Work
 from .query_views import QueryViews
-from .scheduling.jobs import Done, Expired, Job, Next, Refused, Stage, Step, Verdict, Visit
+from .retrieval.chosen import Choice
+from .retrieval.descriptor import GlobalDescriptor
+from .retrieval.narrowing import Narrowing
+from .retrieval.vlad import VladDescriptor
+from .scene_indexes import SceneIndexes
+from .scheduling.jobs import Expired, Refused, Stage, Step, Visit
 from .scheduling.observer import Observer, Refusal
 from .scheduling.schedule import Quota
 from .scheduling.work_queue import Failure, Fatal, Lane, WorkQueue, WorkQueueOptions
 from .store import Store
+from .tenancy import SceneKey
 from .tiers import EscalationOptions, Tier
 from .turns import Turn
 
 HOST, DEVICE = "host", "device"
 """The lanes: threads for what the CPU does, and the one that has a network's device."""
 
-DESCRIBE = "describe"
+DESCRIBE, RETRIEVE, AUDIT, COVERAGE = "describe", "retrieve", "audit", "coverage"
+"""What is computed beside localizing, item by item."""
 
 
 @dataclass(frozen=True)
@@ -38,21 +48,21 @@ class EngineOptions:
     Attributes:
         workers: threads that compute on the CPU.
         max_batch: queries that a network reconstructs at a time.
-        max_candidates: references that are compared with a photograph when the request names none.
         image_limits: what is decoded.
+        index_cache_bytes: memory for what is held of scenes to choose references by.
         escalation: when stronger features are tried.
         queue: of the work queue.
     """
 
     workers: int = 2
     max_batch: int = 4
-    max_candidates: int = 200
     image_limits: ImageLimits = field(default_factory=ImageLimits)
+    index_cache_bytes: int = 1024 * 2**20
     escalation: EscalationOptions = field(default_factory=EscalationOptions)
     queue: WorkQueueOptions = field(default_factory=WorkQueueOptions)
 
     def __post_init__(self) -> None:
-        if self.workers < 1 or self.max_batch < 1 or self.max_candidates < 1:
+        if self.workers < 1 or self.max_batch < 1:
             raise ValueError(f"senseless options: {self}")
 
 
@@ -67,8 +77,18 @@ class Engine:
         observer: Observer | None = None,
         quota: Quota | None = None,
         method: Method | None = None,
+        descriptor: GlobalDescriptor | None = None,
     ) -> None:
         """The cheapest tier first; usually there is but one.
+
+        Args:
+            store: of the references.
+            tiers: features and what works on them, the cheapest first.
+            options: limits.
+            observer: hears what the queue does.
+            quota: what each tenant may use.
+            method: stands in for the method's parts in tests.
+            descriptor: what references are chosen by; None makes one of the first tier's features.
 
         Raises:
             ValueError: no tier, or two with the same extractor or matcher.
@@ -79,14 +99,19 @@ class Engine:
             raise ValueError("tiers must be one or more, each with an extractor and a matcher of its own")
         self.tiers = tuple(tiers)
         self.options = options
+        extractors = [tier.extractor for tier in self.tiers]
+        self._descriptor = descriptor = descriptor or VladDescriptor.of(extractors[0])
         self._library = ReferenceLibrary(store)
-        self._stages = QueryStages(self.tiers, options.max_candidates, options.escalation, method)
+        indexes = SceneIndexes(store, self._library, descriptor, extractors[0], options.index_cache_bytes)
+        self._describer = Describer(extractors, descriptor, options.image_limits)
+        self._chooser = ReferenceChooser(indexes, descriptor, extractors[0])
+        self._stages = QueryStages(self.tiers, self._chooser, options.escalation, method)
         # A backend that lives on correspondences computes on the CPU, one query at a time.
         on_cpu = all(tier.pipeline.reconstructor.uses_correspondences for tier in tiers)
         coarse = Stage(COARSE, HOST, REFINE) if on_cpu else Stage(COARSE, DEVICE, REFINE, options.max_batch)
         self.queue = WorkQueue(
             {
-                Stage(DESCRIBE, HOST): self._describe,
+                **{Stage(name, HOST): work_off for name in (DESCRIBE, RETRIEVE, AUDIT, COVERAGE)},
                 Stage(PREPARE, HOST, COARSE): self._stages.prepare,
                 coarse: self._stages.coarse,
                 Stage(REFINE, HOST): self._stages.refine,
@@ -117,7 +142,7 @@ class Engine:
             The answer, and the stages that the query went through.
 
         Raises:
-            RequestError: a bad image, unknown scene or reference, too many candidates, a full queue, a passed deadline.
+            RequestError: a bad image, unknown scene or reference, a full queue, a passed deadline.
         """
         views = QueryViews(query.photo, self.options.image_limits)
         work = Work(query, source or self._library, views, caller.deadline_s)
@@ -131,21 +156,58 @@ class Engine:
         with _as_request_errors():
             self.queue.check_room(Step(PREPARE, "", "", None))
 
-    async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[dict[str, View]]:
-        """What the extractors of all tiers find in photographs, in order, by the extractor's name; without the pixels.
-
-        They are described by as many jobs as there are threads, each one photograph after another, so that others have
-        their turn in between.
+    async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
+        """What is found in photographs, in order.
 
         Raises:
             RequestError: a bad image, a full queue, a passed deadline.
         """
-        task = _Descriptions(deque(enumerate(photos)), [{}] * len(photos))
-        jobs = min(self.options.workers, len(photos))
-        size_bytes = sum(len(photo.image) for photo in photos) // jobs
-        step = Step(DESCRIBE, DESCRIBE, DESCRIBE, task)
+        size_bytes = sum(len(photo.image) for photo in photos)
+        return await self._each(DESCRIBE, photos, self._describer.describe, caller, size_bytes)
+
+    async def retrieve(
+        self, scene_key: SceneKey, photo: Photo, count: int, narrowing: Narrowing, caller: Caller
+    ) -> Choice:
+        """The references of a scene that resemble a photograph most.
+
+        Raises:
+            RequestError: a bad image, an unknown scene, a full queue, a passed deadline.
+        """
+
+        def choose(photo: Photo, check: Callable[[], None]) -> Choice:
+            views = QueryViews(photo, self.options.image_limits)
+            return self._chooser.choose(scene_key, views, count, narrowing, (), Turn(check))
+
+        (choice,) = await self._each(RETRIEVE, [photo], choose, caller, len(photo.image))
+        return choice
+
+    async def audit(
+        self, scene_key: SceneKey, reference_ids: Sequence[str], caller: Caller
+    ) -> tuple[int, list[ReferenceAudit]]:
+        """The scene's generation, and what the neighbours of some of its references say about them, in order.
+
+        Raises:
+            RequestError: an unknown scene or reference, a full queue, a passed deadline.
+        """
+        audit = SceneAudit(self._library, self._chooser.indexes, self._descriptor, self.tiers[0], scene_key)
+        audits = await self._each(AUDIT, reference_ids, audit.audit, caller, 0, jobs=1)
+        return audit.generation, audits
+
+    async def _each(
+        self,
+        stage: str,
+        items: Sequence[Item],
+        compute: Compute[Item, Outcome],
+        caller: Caller,
+        size_bytes: int,
+        jobs: int | None = None,
+    ) -> list[Outcome]:
+        """Computes items by several jobs, or else as many as there are threads; others have their turn in between."""
+        work = Items(items, compute)
+        jobs = min(jobs or self.options.workers, len(items))
+        step = Step(stage, stage, stage, work)
         submissions = [
-            asyncio.ensure_future(self.queue.submit(caller.flow, step, caller.deadline_s, size_bytes))
+            asyncio.ensure_future(self.queue.submit(caller.flow, step, caller.deadline_s, size_bytes // jobs))
             for _ in range(jobs)
         ]
         with _as_request_errors():
@@ -158,24 +220,12 @@ class Engine:
             refusals = [it for it in outcomes if it is not None]
             if len(refusals) == jobs:  # else those that were admitted have done it all
                 raise refusals[0]
-        return task.described
+        return work.results
 
-    def _describe(self, jobs: Sequence[Job]) -> list[Verdict]:
-        """The next photograph of each; in the queue's threads."""
-        return [self._describe_next(job) for job in jobs]
-
-    def _describe_next(self, job: Job) -> Verdict:
-        task: _Descriptions = job.step.payload
-        try:
-            index, photo = task.remaining.popleft()
-        except IndexError:
-            return Done(None)
-        views, turn = QueryViews(photo, self.options.image_limits), Turn(job.check)
-        # A batch is held in memory until it is stored, so without its pixels.
-        task.described[index] = {
-            it.extractor.name: replace(views.view(it.extractor, turn), photograph=None) for it in self.tiers
-        }
-        return Next(job.step)
+    @property
+    def index_bytes(self) -> int:
+        """What the scenes that references are chosen from take in memory."""
+        return self._chooser.indexes.size_bytes
 
     async def close(self) -> None:
         """Ends what is being computed at its next step, and drops what waits."""
@@ -189,14 +239,6 @@ class Engine:
         shared = {id(tier.pipeline.reconstructor): tier.pipeline.reconstructor for tier in self.tiers}
         for reconstructor in shared.values():
             reconstructor.close()
-
-
-@dataclass(frozen=True, eq=False)
-class _Descriptions:
-    """Photographs to describe with their places in the list, shared by several jobs, and what was found."""
-
-    remaining: deque[tuple[int, Photo]]
-    described: list[dict[str, View]]
 
 
 async def _unless_refused(submission: Awaitable[Any]) -> Refused | None:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 
 from mapless.names import reference_name
 
+from .claims import Claims
 from .decode import ImageLimits, decode_image
 from .errors import AlreadyExists, DataLoss, InvalidArgument
 from .method.features import FeatureExtractor
 from .method.views import Photograph, PosedView
-from .store import DescribedReference, ReferencePose, ReferenceRecord, Store
+from .store import DescribedReference, ReferenceRecord, Store
 from .tenancy import SceneKey
 from .turns import Turn
 
@@ -40,11 +41,15 @@ class NotDescribedYet(Exception):
 
 
 class ReferenceLibrary:
-    """Loads references from the store; safe to use from several threads."""
+    """Loads references from the store; safe to use from several threads.
+
+    Attributes:
+        claims: what threads are describing, by the reference's key and the name of what describes it.
+    """
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._claims = _Claims()
+        self.claims = Claims()
         self._background = ThreadPoolExecutor(1, "describe")
         self._announced: set[tuple[str, str]] = set()
         self._announcing = threading.Lock()
@@ -54,10 +59,6 @@ class ReferenceLibrary:
         """Ends what is done in the background, after the reference that it is at."""
         self._closing.set()
         self._background.shutdown(wait=True, cancel_futures=True)
-
-    def list_poses(self, scene_key: SceneKey) -> Sequence[ReferencePose]:
-        """The poses of all references of a scene; NotFound if there is none such."""
-        return self._store.list_poses(scene_key)[1]
 
     def load(
         self,
@@ -116,13 +117,13 @@ class ReferenceLibrary:
         taken: list[ReferenceRecord] = []
         for record in records:
             check()
-            with self._claims.claimed((record.key, extractor.name)) as is_mine:
+            with self.claims.claimed((record.key, extractor.name)) as is_mine:
                 if is_mine:
                     self._describe(record, extractor)
                 else:
                     taken.append(record)
         for record in taken:
-            self._claims.wait((record.key, extractor.name), check)
+            self.claims.wait((record.key, extractor.name), check)
 
     def _describe(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
         # Another thread may have been done with it between our look and our claim.
@@ -152,32 +153,3 @@ class ReferenceLibrary:
 
 def _announce(records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:
     log.info("describing %d references of scene %s with %s", len(records), records[0].scene_key, extractor.name)
-
-
-class _Claims:
-    """Who is at what: a thing is claimed by one thread at a time."""
-
-    def __init__(self) -> None:
-        self._held: set[tuple[str, str]] = set()
-        self._changed = threading.Condition()
-
-    @contextmanager
-    def claimed(self, thing: tuple[str, str]) -> Iterator[bool]:
-        """Whether the thing is the caller's while the block runs; False if it is somebody else's."""
-        with self._changed:
-            is_mine = thing not in self._held
-            self._held.add(thing)
-        try:
-            yield is_mine
-        finally:
-            if is_mine:
-                with self._changed:
-                    self._held.remove(thing)
-                    self._changed.notify_all()
-
-    def wait(self, thing: tuple[str, str], check: Callable[[], None]) -> None:
-        """Returns when nobody holds the thing; lets through what `check` raises, which is called again and again."""
-        with self._changed:
-            while thing in self._held:
-                check()
-                self._changed.wait(_POLL_S)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from mapless.geometry import Array, Camera
+from mapless.geometry import Camera
 
 from .method.localize import LocalizeOptions
+from .retrieval.narrowing import Narrowing
 from .scheduling.fair import Flow
 from .tenancy import SceneKey
 from .tiers import Attempt
+
+DEFAULT_REFERENCE_COUNT = 10
+"""References that are chosen where the caller does not say how many."""
 
 
 @dataclass(frozen=True)
@@ -37,38 +39,33 @@ class Photo:
 
 
 @dataclass(frozen=True, eq=False)
-class PositionPrior:
-    """The camera is within `radius_m` of `position` (3,), world, metres."""
-
-    position: Array
-    radius_m: float
-
-    def distance_m(self, position: Array) -> float:
-        """How far from the sphere's surface a position lies; negative inside."""
-        return float(np.linalg.norm(position - self.position)) - self.radius_m
-
-
-@dataclass(frozen=True, eq=False)
 class Query:
     """A photograph to localize.
 
     Attributes:
         scene_key: where.
-        reference_ids: what to compare it with; none means that `reference_count` are to be chosen.
+        reference_ids: what to compare it with; none means that `reference_count` of the scene's are to be chosen.
         photo: the photograph.
-        prior: what is known of its position.
+        narrowing: what is known of where it was taken, which chooses among references and judges the pose.
         reference_count: see there.
         options: of the method.
         allow_coarse: whether the coarse pose is an answer where there is no time to refine it.
+        rerank: whether `reference_count` of the named references are to be chosen.
     """
 
     scene_key: SceneKey
     reference_ids: tuple[str, ...]
     photo: Photo
-    prior: PositionPrior | None
+    narrowing: Narrowing
     reference_count: int
     options: LocalizeOptions
     allow_coarse: bool = False
+    rerank: bool = False
+
+    @property
+    def chooses(self) -> bool:
+        """Whether the references are chosen here, by how much they resemble the photograph."""
+        return self.rerank or not self.reference_ids
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,21 +13,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
-from .errors import FailedPrecondition, NotFound, Unavailable
+from .choosing import ReferenceChooser
+from .errors import NotFound, Unavailable
 from .failures import failure_of
 from .library import NotDescribedYet
 from .method import localize as method
 from .method.features import FeatureExtractor
 from .method.localize import Answer, Coarse, Localization, Prepared
 from .method.rejection import Rejection, RejectionReason
-from .method.retrieve import choose_references
 from .method.views import PosedView, View
-from .query import PositionPrior, Query, Result
+from .query import Query, Result
 from .query_views import QueryViews
+from .retrieval.chosen import Choice
+from .retrieval.narrowing import Narrowing
 from .scheduling.jobs import Done, Fallback, Job, Next, Over, Step, Verdict
 from .scheduling.observer import Ending
 from .scheduling.work_queue import Failure
-from .store import ReferencePose
 from .tenancy import SceneKey
 from .tiers import Attempt, EscalationOptions, Tier, better_of, is_doubtful
 from .turns import Turn
@@ -37,9 +38,6 @@ log = logging.getLogger(__name__)
 P = TypeVar("P", Prepared, Coarse)
 
 PREPARE, COARSE, REFINE = "prepare", "coarse", "refine"
-
-PRIOR_MARGIN_M = 10.0
-"""References further from a prior's sphere than this are not considered: they see other things."""
 
 MAX_LISTINGS = 3
 """When a reference goes while it is used, the scene is listed again; more often than this it is being emptied."""
@@ -68,10 +66,6 @@ class ReferenceSource(Protocol):
         self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: FeatureExtractor, turn: Turn, waits: bool
     ) -> tuple[int, tuple[PosedView, ...]]:
         """The scene's generation and references of it, in the order asked for."""
-        ...
-
-    def list_poses(self, scene_key: SceneKey) -> Sequence[ReferencePose]:
-        """The poses of all references of a scene."""
         ...
 
 
@@ -108,7 +102,7 @@ class Work:
         """Queries of one kind take about as long."""
         ids = self.query.reference_ids
         count = next((count for count in _COUNTS if len(ids) <= count), _COUNTS[-1])
-        return f"tier {self.tier}, {f'up to {count}' if ids else 'chosen'}"
+        return f"tier {self.tier}, {'chosen' if self.query.chooses else f'up to {count}'}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,12 +114,14 @@ class Found:
         generation: of the scene when they were read.
         view: the photograph.
         seconds: where the time went.
+        choice: how they were chosen; None if they were used as they were named.
     """
 
     references: tuple[PosedView, ...]
     generation: int
     view: View
     seconds: dict[str, float]
+    choice: Choice | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,11 +137,15 @@ class QueryStages:
     """Computes the three stages; its methods run in the queue's threads."""
 
     def __init__(
-        self, tiers: Sequence[Tier], max_candidates: int, escalation: EscalationOptions, method: Method | None = None
+        self,
+        tiers: Sequence[Tier],
+        chooser: ReferenceChooser,
+        escalation: EscalationOptions,
+        method: Method | None = None,
     ) -> None:
         """The tiers, the cheapest first; see `EngineOptions`."""
         self._tiers = tiers
-        self._max_candidates = max_candidates
+        self._chooser = chooser
         self._escalation = escalation
         self._method = method or Method()
 
@@ -196,7 +196,8 @@ class QueryStages:
             # Once and for all: the queries to come find them described.
             job.unusual_s = turn.stage_seconds.get("describe", 0.0)
         if not found.references:
-            where = "the scene has no references" if work.query.prior is None else "no reference is near the prior"
+            unknown = work.query.narrowing.is_empty
+            where = "the scene has no references" if unknown else "no reference is where the prior says"
             return self._conclude(work, found, Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, where)))
         part = self._method.prepare(found.view, found.references, tier.pipeline, work.query.options, job.check)
         if isinstance(part, Answer):
@@ -206,35 +207,24 @@ class QueryStages:
     def _find(self, work: Work, tier: Tier, turn: Turn) -> Found:
         """The references that are named, or those that the photograph resembles most."""
         query = work.query
-        reference_ids = query.reference_ids or self._list_near(work)
+        choice: Choice | None = None
+        reference_ids: Sequence[str] = query.reference_ids
+        if query.chooses:
+            choice = self._chooser.choose(
+                query.scene_key,
+                work.views,
+                query.reference_count,
+                query.narrowing,
+                query.reference_ids,
+                turn,
+            )
+            reference_ids = [chosen.reference_id for chosen in choice.references]
         # References come first: a name that is wrong is found out before the photograph is described.
         # Only the first tier's references are waited for: there is an answer before the others'.
         generation, references = work.source.load(
             query.scene_key, reference_ids, tier.extractor, turn, waits=work.best is None
         )
-        view = work.views.view(tier.extractor, turn)
-        if not query.reference_ids and references:
-            with turn.stage("retrieval"):
-                ratio = tier.pipeline.matcher.options.query_ratio
-                chosen = choose_references(view, references, query.reference_count, ratio=ratio)
-            references = tuple(references[i] for i in chosen)
-        return Found(references, generation, view, turn.stage_seconds)
-
-    def _list_near(self, work: Work) -> list[str]:
-        """Ids of the references that come into question."""
-        prior = work.query.prior
-        near = [
-            pose.reference_id
-            for pose in work.source.list_poses(work.query.scene_key)
-            if prior is None or prior.distance_m(pose.world_from_camera.translation) <= PRIOR_MARGIN_M
-        ]
-        if len(near) > self._max_candidates:
-            raise FailedPrecondition(
-                f"{len(near)} references come into question, at most {self._max_candidates} are compared: name "
-                "the references to use, or give a position prior",
-                reason="TOO_MANY_CANDIDATES",
-            )
-        return near
+        return Found(references, generation, work.views.view(tier.extractor, turn), turn.stage_seconds, choice)
 
     def _after_coarse(self, underway: Underway[Prepared], part: Coarse | Answer | Exception) -> Verdict:
         if isinstance(part, Exception):
@@ -284,8 +274,9 @@ class QueryStages:
 
     def _attempt(self, work: Work, found: Found, answer: Answer) -> Attempt:
         _check_finite(answer)
-        answer = _gated(answer, work.query.prior)
-        return Attempt(self._tiers[work.tier], answer, found.references, found.generation, found.view.camera)
+        answer = _gated(answer, work.query.narrowing)
+        tier = self._tiers[work.tier]
+        return Attempt(tier, answer, found.references, found.generation, found.view.camera, found.choice)
 
     def _result(self, work: Work, best: Attempt, found: Found, answer: Answer) -> Result:
         prefix = "" if work.best is None else f"{self._tiers[work.tier].extractor.name}/"
@@ -312,12 +303,11 @@ def _check_finite(answer: Answer) -> None:
         raise ArithmeticError(f"the method's answer is not finite: {answer.outcome}, {answer.scale}")
 
 
-def _gated(answer: Answer, prior: PositionPrior | None) -> Answer:
-    """The answer, rejected if its pose contradicts the prior."""
-    if prior is None or not isinstance(answer.outcome, Localization):
+def _gated(answer: Answer, narrowing: Narrowing) -> Answer:
+    """The answer, rejected if its pose contradicts what is known of the camera."""
+    if not isinstance(answer.outcome, Localization):
         return answer
-    outside_m = prior.distance_m(answer.outcome.world_from_camera.translation)
-    if outside_m <= 0:
+    contradiction = narrowing.contradiction(answer.outcome.world_from_camera)
+    if not contradiction:
         return answer
-    message = f"the pose lies {outside_m:.2f} m outside the prior's radius of {prior.radius_m:g} m"
-    return replace(answer, outcome=Rejection(RejectionReason.GATE, message))
+    return replace(answer, outcome=Rejection(RejectionReason.GATE, contradiction))

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import base64
-import binascii
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -18,23 +16,25 @@ from mapless.wire import FieldError
 
 from .engine import Engine
 from .errors import AlreadyExists
+from .naming import reference_ids_from_names, reference_key_from_name, scene_key_from_name
+from .pages import Page, Record
 from .photos import photo_from_message
-from .query import Photo
+from .priors import narrowing_from_message
+from .query import DEFAULT_REFERENCE_COUNT, Photo
+from .reference_messages import audit_to_message, choice_to_message, reference_to_message, scene_to_message
 from .rpc import Call
-from .store import NewReference, ReferenceRecord, SceneRecord, Store
-from .tenancy import SceneKey, key_of
+from .store import NewReference, ReferenceRecord, Store
+from .tenancy import SceneKey, key_of, scene_id_of
 
-DEFAULT_PAGE_SIZE = 100
-MAX_PAGE_SIZE = 1000
 MAX_BATCH = 1000
+MAX_RETRIEVED = 1000
+DEFAULT_AUDITS, MAX_AUDITS = 10, 100
 STORE_THREADS = 4  # writers queue for one lock anyhow; these keep readers from waiting behind them
 
 T = TypeVar("T")
-Record = TypeVar("Record")
 M = TypeVar("M", pb.Scene, pb.Reference)
 Draft = tuple[str, Photo, RigidTransform]
 """Reference id, photograph and world_from_camera."""
-PageRequest = pb.ListScenesRequest | pb.ListReferencesRequest
 
 
 class ReferenceService(rpcs.ReferenceServiceServicer):
@@ -54,12 +54,14 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         """Implements ReferenceService.CreateScene."""
         scene_id = wire.checked_id(request.scene_id, "scene_id")
         scene = await self._stored(self._store.create_scene, key_of(call.principal.tenant, scene_id))
-        return pb.CreateSceneResponse(scene=_scene_to_message(scene))
+        return pb.CreateSceneResponse(scene=scene_to_message(scene))
 
     async def GetScene(self, request: pb.GetSceneRequest, call: Call) -> pb.GetSceneResponse:
         """Implements ReferenceService.GetScene."""
-        scene = await self._stored(self._store.get_scene, _scene_key(request.name, "name", call))
-        return pb.GetSceneResponse(scene=_scene_to_message(scene))
+        scene = await self._stored(
+            self._store.get_scene, scene_key_from_name(request.name, "name", call.principal.tenant)
+        )
+        return pb.GetSceneResponse(scene=scene_to_message(scene))
 
     async def ListScenes(self, request: pb.ListScenesRequest, call: Call) -> pb.ListScenesResponse:
         """Implements ReferenceService.ListScenes."""
@@ -67,28 +69,28 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         page = Page(request, tenant, "scenes")
         found = await self._stored(self._store.list_scenes, tenant, page.limit, page.after)
         scenes, token = page.cut(found, lambda scene: scene.scene_id)
-        return pb.ListScenesResponse(scenes=await _many(_scene_to_message, scenes), next_page_token=token)
+        return pb.ListScenesResponse(scenes=await _many(scene_to_message, scenes), next_page_token=token)
 
     async def DeleteScene(self, request: pb.DeleteSceneRequest, call: Call) -> pb.DeleteSceneResponse:
         """Implements ReferenceService.DeleteScene."""
-        await self._stored(self._store.delete_scene, _scene_key(request.name, "name", call))
+        await self._stored(self._store.delete_scene, scene_key_from_name(request.name, "name", call.principal.tenant))
         return pb.DeleteSceneResponse()
 
     async def CreateReference(self, request: pb.CreateReferenceRequest, call: Call) -> pb.CreateReferenceResponse:
         """Implements ReferenceService.CreateReference."""
-        scene_key = _scene_key(request.scene, "scene", call)
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
         draft = self._draft(request, "")
         try:
             (record,) = await self._add(scene_key, [draft], call)
         except AlreadyExists as error:
             raise AlreadyExists(str(error), field="reference_id") from error
-        return pb.CreateReferenceResponse(reference=_reference_to_message(record))
+        return pb.CreateReferenceResponse(reference=reference_to_message(record))
 
     async def BatchCreateReferences(
         self, request: pb.BatchCreateReferencesRequest, call: Call
     ) -> pb.BatchCreateReferencesResponse:
         """Implements ReferenceService.BatchCreateReferences."""
-        scene_key = _scene_key(request.scene, "scene", call)
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
         if not 1 <= len(request.requests) <= MAX_BATCH:
             raise FieldError("requests", f"must be 1 to {MAX_BATCH}, are {len(request.requests)}")
         seen: set[str] = set()
@@ -103,29 +105,67 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             lambda: [self._draft(item, f"requests[{i}]") for i, item in enumerate(request.requests)]
         )
         records = await self._add(scene_key, drafts, call)
-        return pb.BatchCreateReferencesResponse(references=await _many(_reference_to_message, records))
+        return pb.BatchCreateReferencesResponse(references=await _many(reference_to_message, records))
 
     async def GetReference(self, request: pb.GetReferenceRequest, call: Call) -> pb.GetReferenceResponse:
         """Implements ReferenceService.GetReference."""
-        key, reference_id = _reference_key(request.name, "name", call)
-        message = _reference_to_message(await self._stored(self._store.get_reference, key, reference_id))
+        key, reference_id = reference_key_from_name(request.name, "name", call.principal.tenant)
+        message = reference_to_message(await self._stored(self._store.get_reference, key, reference_id))
         if request.include_image:
             message.image = await self._stored(self._store.read_image, key, reference_id)
         return pb.GetReferenceResponse(reference=message)
 
     async def ListReferences(self, request: pb.ListReferencesRequest, call: Call) -> pb.ListReferencesResponse:
         """Implements ReferenceService.ListReferences."""
-        scene_key = _scene_key(request.scene, "scene", call)
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
         page = Page(request, call.principal.tenant, request.scene)
         found = await self._stored(self._store.list_references, scene_key, page.limit, page.after)
         references, token = page.cut(found, lambda reference: reference.reference_id)
-        messages = await _many(_reference_to_message, references)
+        messages = await _many(reference_to_message, references)
         return pb.ListReferencesResponse(references=messages, next_page_token=token)
 
     async def DeleteReference(self, request: pb.DeleteReferenceRequest, call: Call) -> pb.DeleteReferenceResponse:
         """Implements ReferenceService.DeleteReference."""
-        await self._stored(self._store.delete_reference, *_reference_key(request.name, "name", call))
+        await self._stored(
+            self._store.delete_reference, *reference_key_from_name(request.name, "name", call.principal.tenant)
+        )
         return pb.DeleteReferenceResponse()
+
+    async def RetrieveReferences(
+        self, request: pb.RetrieveReferencesRequest, call: Call
+    ) -> pb.RetrieveReferencesResponse:
+        """Implements ReferenceService.RetrieveReferences."""
+        engine = self._engine()
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        if not 0 <= request.count <= MAX_RETRIEVED:
+            raise FieldError("count", f"must be 0 to {MAX_RETRIEVED}, is {request.count}")
+        narrowing = narrowing_from_message(request)
+        photo = photo_from_message(request, "", engine.options.image_limits)
+        count = request.count or DEFAULT_REFERENCE_COUNT
+        choice = await engine.retrieve(scene_key, photo, count, narrowing, call.caller)
+        return choice_to_message(choice, scene_id_of(scene_key))
+
+    async def AuditScene(self, request: pb.AuditSceneRequest, call: Call) -> pb.AuditSceneResponse:
+        """Implements ReferenceService.AuditScene."""
+        engine = self._engine()
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        reference_ids, token = await self._audit_page(request, scene_key, call)
+        generation, audits = await engine.audit(scene_key, reference_ids, call.caller) if reference_ids else (0, [])
+        if not reference_ids:
+            generation = (await self._stored(self._store.get_scene, scene_key)).generation
+        messages = map(audit_to_message, audits)
+        return pb.AuditSceneResponse(audits=messages, next_page_token=token, store_generation=generation)
+
+    async def _audit_page(
+        self, request: pb.AuditSceneRequest, scene_key: SceneKey, call: Call
+    ) -> tuple[Sequence[str], str]:
+        """Ids of the references to audit, and the token of the next page."""
+        if request.references:
+            return reference_ids_from_names(request.references, scene_id_of(scene_key), MAX_AUDITS), ""
+        page = Page(request, call.principal.tenant, f"{request.scene} audit", DEFAULT_AUDITS, MAX_AUDITS)
+        found = await self._stored(self._store.list_references, scene_key, page.limit, page.after)
+        references, token = page.cut(found, lambda reference: reference.reference_id)
+        return [reference.reference_id for reference in references], token
 
     def _draft(self, request: pb.CreateReferenceRequest, path: str) -> Draft:
         """What a request asks to store, all checked but the pixels; FieldError or InvalidArgument names the field."""
@@ -147,8 +187,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         await self._stored(self._store.get_scene, scene_key)
         described = await self._engine().describe([photo for _, photo, _ in drafts], call.caller)
         references = [
-            NewReference(reference_id, photo.image, photo.camera, world_from_camera, views)
-            for (reference_id, photo, world_from_camera), views in zip(drafts, described, strict=True)
+            NewReference(reference_id, photo.image, photo.camera, world_from_camera, found.views, found.descriptors)
+            for (reference_id, photo, world_from_camera), found in zip(drafts, described, strict=True)
         ]
         return await self._stored(self._store.add_references, scene_key, references)
 
@@ -158,72 +198,6 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         return await asyncio.get_running_loop().run_in_executor(self._threads, operation, *arguments)
 
 
-class Page:
-    """One page of a list: how much to ask the store for, where to begin, where the next page begins.
-
-    A token is the tenant, the collection and the last id of the page before: opaque to callers, and good for its own
-    list only.
-
-    Raises:
-        FieldError: a negative page size, or a token that this list did not give.
-    """
-
-    def __init__(self, request: PageRequest, tenant: str, collection: str) -> None:
-        if request.page_size < 0:
-            raise FieldError("page_size", f"must not be negative, is {request.page_size}")
-        self._size = min(request.page_size or DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE)
-        self._list = f"{tenant}\n{collection}"
-        self.limit = self._size + 1  # one more tells whether there is a next page
-        self.after = self._read_token(request.page_token) if request.page_token else ""
-
-    def cut(self, records: Sequence[Record], id_of: Callable[[Record], str]) -> tuple[Sequence[Record], str]:
-        """The records of this page, and the token of the next one."""
-        if len(records) <= self._size:
-            return records, ""
-        token = f"{self._list}\n{id_of(records[self._size - 1])}"
-        return records[: self._size], base64.urlsafe_b64encode(token.encode()).decode()
-
-    def _read_token(self, token: str) -> str:
-        try:
-            its_list, _, after = base64.b64decode(token, b"-_", validate=True).decode().rpartition("\n")
-            if its_list == self._list:
-                return names.check_id(after)
-        except (binascii.Error, ValueError):
-            pass
-        raise FieldError("page_token", "is not one that this list gave")
-
-
-def _scene_key(name: str, field: str, call: Call) -> SceneKey:
-    """The key of the caller's scene of this name; FieldError if it is none."""
-    return key_of(call.principal.tenant, wire.scene_id_from_name(name, field))
-
-
-def _reference_key(name: str, field: str, call: Call) -> tuple[SceneKey, str]:
-    """The key of the caller's scene, and the reference's id within it; FieldError if the name is none."""
-    scene_id, reference_id = wire.reference_ids_from_name(name, field)
-    return key_of(call.principal.tenant, scene_id), reference_id
-
-
 async def _many(to_message: Callable[[Record], M], records: Sequence[Record]) -> list[M]:
     """The messages of a page; a thousand take tens of milliseconds, too long for the event loop."""
     return await asyncio.to_thread(lambda: [to_message(record) for record in records])
-
-
-def _scene_to_message(scene: SceneRecord) -> pb.Scene:
-    message = pb.Scene(
-        name=names.scene_name(scene.scene_id), generation=scene.generation, reference_count=scene.reference_count
-    )
-    message.create_time.FromDatetime(scene.create_time)
-    return message
-
-
-def _reference_to_message(reference: ReferenceRecord) -> pb.Reference:
-    message = pb.Reference(
-        name=names.reference_name(reference.scene_id, reference.reference_id),
-        intrinsics=wire.camera_to_message(reference.camera),
-        world_from_camera=wire.transform_to_message(reference.world_from_camera),
-        image_sha256=reference.image_sha256,
-        feature_count=reference.feature_count,
-    )
-    message.create_time.FromDatetime(reference.create_time)
-    return message

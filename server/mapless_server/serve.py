@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from . import __version__
-from .assembly import gpu_memory, make_tiers, what_is_missing
+from .assembly import gpu_memory, make_descriptor, make_tiers, what_is_missing
 from .decode import ImageLimits
 from .engine import Engine, EngineOptions
 from .grpc_server import AddressTaken, GrpcServer
@@ -70,7 +70,7 @@ def engine_options(settings: Settings) -> EngineOptions:
     return EngineOptions(
         workers=settings.workers,
         max_batch=settings.max_batch,
-        max_candidates=settings.retrieval_max_references,
+        index_cache_bytes=settings.retrieval_cache_mib * 2**20,
         image_limits=image_limits(settings),
         queue=WorkQueueOptions(
             ScheduleOptions(max_queued_s=settings.max_queued_s, max_bytes=settings.max_queued_mib * 2**20),
@@ -80,9 +80,12 @@ def engine_options(settings: Settings) -> EngineOptions:
 
 
 def open_store(settings: Settings) -> Store:
-    """The store in the settings' data folder; StartupError if it cannot be opened."""
+    """The store of the settings' database or data folder; StartupError if it cannot be opened."""
+    cache_bytes = settings.reference_cache_mib * 2**20
     try:
-        return Store.open(settings.data_dir, settings.reference_cache_mib * 2**20)
+        if settings.database_url is not None:
+            return Store.connect(settings.database_url.get_secret_value(), cache_bytes)
+        return Store.open(settings.data_dir, cache_bytes)
     except StoreError as error:
         raise StartupError(str(error)) from error
 
@@ -93,7 +96,9 @@ MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], Engine]
 def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
     """The engine that the settings ask for; StartupError if they name what is not known or not there."""
     try:
-        return Engine(store, make_tiers(settings), engine_options(settings), metrics, quota)
+        tiers = make_tiers(settings)
+        descriptor = make_descriptor(settings, tiers[0].extractor)
+        return Engine(store, tiers, engine_options(settings), metrics, quota, descriptor=descriptor)
     except (ImportError, WeightsMissing) as error:
         raise StartupError(what_is_missing(error)) from error
     except (ValueError, WeightsError) as error:
@@ -254,6 +259,7 @@ def _watch_engine(engine: Engine, metrics: Metrics) -> None:
     first = engine.tiers[0]
     reconstructor = first.pipeline.reconstructor
     metrics.built(__version__, reconstructor.name, first.extractor.name, reconstructor.weights_sha256)
+    metrics.watch_retrieval_index(lambda: engine.index_bytes)
     metrics.watch_gpu_memory(gpu_memory)
     cache = getattr(reconstructor, "cache", None)  # of tokens; only networks have one
     if cache is not None:

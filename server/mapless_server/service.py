@@ -8,7 +8,7 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Any, TypeVar
 
-from mapless import names, wire
+from mapless import wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
@@ -20,15 +20,19 @@ from .method.accuracy import accuracy_from_covariance
 from .method.localize import Localization, LocalizeOptions
 from .method.rejection import Rejection
 from .method.scale import MetricScale
+from .naming import reference_ids_from_names
 from .observability.metrics import LOCALIZED, Metrics
 from .photos import photo_from_message
-from .query import PositionPrior, Query, Result
+from .priors import narrowing_from_message
+from .query import DEFAULT_REFERENCE_COUNT, Query, Result
 from .rpc import Call
 from .scheduling.jobs import Visit
 from .tenancy import key_of
 
 MAX_REFERENCES = 64
-DEFAULT_REFERENCE_COUNT = 10
+MAX_CANDIDATES = 1000
+"""References that a request may name when the server is to choose among them."""
+
 
 E = TypeVar("E", bound=Enum)
 
@@ -105,12 +109,18 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             processed_width_px=attempt.processed.width_px,
             processed_height_px=attempt.processed.height_px,
             server_version=__version__,
+            retrieval=attempt.choice.descriptor if attempt.choice else "",
         )
         # Counts are missing when the stage that counts was not reached.
         match_counts = answer.reference_match_counts or (0,) * len(attempt.references)
         inlier_counts = answer.reference_inlier_counts or (0,) * len(attempt.references)
+        chosen = attempt.choice.references if attempt.choice else ()
+        similarities = {it.key: it.similarity for it in chosen}
         for reference, matches, inliers in zip(attempt.references, match_counts, inlier_counts, strict=True):
-            message.references.add(name=reference.name, match_count=matches, inlier_count=inliers)
+            similarity = similarities.get(reference.key, 0.0)
+            message.references.add(
+                name=reference.name, match_count=matches, inlier_count=inliers, similarity=similarity
+            )
         for stage, seconds in result.stage_seconds.items():
             message.stages.add(stage=stage).duration.FromNanoseconds(round(1e9 * seconds))
         message.queue_duration.FromNanoseconds(round(1e9 * (call.trail.queue_s or 0.0)))
@@ -126,39 +136,17 @@ def _query_from_message(request: pb.LocalizeRequest, tenant: str, limits: ImageL
     reference_count = request.options.reference_count
     if not 0 <= reference_count <= MAX_REFERENCES:
         raise FieldError("options.reference_count", f"must be 0 to {MAX_REFERENCES}, is {reference_count}")
+    most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
     return Query(
         scene_key=key_of(tenant, scene_id),
-        reference_ids=_reference_ids(request, scene_id),
+        reference_ids=reference_ids_from_names(request.references, scene_id, most),
         photo=photo_from_message(request, "", limits),
-        prior=_prior_from_message(request.position_prior) if request.HasField("position_prior") else None,
+        narrowing=narrowing_from_message(request),
         reference_count=reference_count or DEFAULT_REFERENCE_COUNT,
         options=_options_from_message(request.options),
         allow_coarse=request.options.allow_coarse,
+        rerank=request.options.rerank_references and bool(request.references),
     )
-
-
-def _reference_ids(request: pb.LocalizeRequest, scene_id: str) -> tuple[str, ...]:
-    if len(request.references) > MAX_REFERENCES:
-        raise FieldError("references", f"must be at most {MAX_REFERENCES}, are {len(request.references)}")
-    reference_ids: dict[str, None] = {}
-    for i, name in enumerate(request.references):
-        field = f"references[{i}]"
-        its_scene_id, reference_id = wire.reference_ids_from_name(name, field)
-        if its_scene_id != scene_id:
-            raise FieldError(field, f"{names.shown(name)} is a reference of another scene than {scene_id!r}")
-        if reference_id in reference_ids:
-            raise FieldError(field, f"{names.shown(name)} stands twice")
-        reference_ids[reference_id] = None
-    return tuple(reference_ids)
-
-
-def _prior_from_message(message: pb.PositionPrior) -> PositionPrior:
-    if not message.HasField("position_m"):
-        raise FieldError("position_prior.position_m", "is required")
-    position = wire.vector_from_message(message.position_m, "position_prior.position_m")
-    if not 0 < message.radius_m < float("inf"):
-        raise FieldError("position_prior.radius_m", f"must be finite and above 0, is {message.radius_m:g}")
-    return PositionPrior(position, message.radius_m)
 
 
 def _options_from_message(message: pb.LocalizeOptions) -> LocalizeOptions:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import (
     BaseSettings,
     EnvSettingsSource,
@@ -54,6 +54,10 @@ class Settings(BaseSettings):
     host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on; 0.0.0.0 for all.")
     port: int = Field(default=50051, ge=0, le=65535, description="Port to listen on; 0 for any free one.")
     data_dir: Path = Field(default=Path("mapless-data"), description="Folder of the store, on a local disk.")
+    database_url: SecretStr | None = Field(
+        default=None,
+        description="Of a PostgreSQL that several servers share, postgresql://user:password@host/name; else data_dir.",
+    )
     backend: str = Field(
         default="geometric",
         description="What does the coarse stage: geometric, pi3, pi3x (both non-commercial), or auto.",
@@ -92,8 +96,12 @@ class Settings(BaseSettings):
     max_message_mib: int = Field(default=32, ge=1, le=1024, description="Largest message, either way, MiB.")
     max_image_mib: int = Field(default=16, ge=1, description="Largest image file, MiB.")
     max_image_megapixels: float = Field(default=50.0, gt=0, le=268, description="Largest image, width times height.")
-    retrieval_max_references: int = Field(
-        default=200, ge=1, description="References compared with a photograph when the request names none."
+    retrieval: str = Field(
+        default="auto",
+        description="What references are chosen by: vlad (of the local features), megaloc, or auto.",
+    )
+    retrieval_cache_mib: int = Field(
+        default=1024, ge=1, description="Memory for the scenes whose references are chosen from, MiB."
     )
     reference_cache_mib: int = Field(default=512, ge=0, description="Memory for references' features, MiB.")
     warm_up: bool = Field(default=True, description="Whether a localization is tried before the first call is taken.")

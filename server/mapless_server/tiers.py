@@ -19,6 +19,7 @@ from .method.features import FeatureExtractor
 from .method.localize import Answer, Localization, Pipeline
 from .method.rejection import Rejection, RejectionReason
 from .method.views import PosedView
+from .retrieval.chosen import Choice
 
 UNMENDABLE = frozenset({RejectionReason.NO_USABLE_REFERENCES, RejectionReason.DEGENERATE_REFERENCES})
 """Rejections for what the references are, whatever is seen in them."""
@@ -77,6 +78,7 @@ class Attempt:
         references: those it used, in order.
         generation: of the scene when they were read.
         processed: the camera of the reduced image that features were found in.
+        choice: how the references were chosen; None if they were used as they were named.
     """
 
     tier: Tier
@@ -84,6 +86,7 @@ class Attempt:
     references: tuple[PosedView, ...]
     generation: int
     processed: Camera
+    choice: Choice | None = None
 
 
 def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:

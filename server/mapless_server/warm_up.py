@@ -23,8 +23,8 @@ from .method.features import FeatureExtractor
 from .method.localize import Localization, LocalizeOptions
 from .method.views import Photograph, PosedView
 from .query import Caller, Photo, Query
+from .retrieval.narrowing import Narrowing
 from .scheduling.fair import Flow
-from .store import ReferencePose
 from .tenancy import SceneKey
 from .turns import Turn
 
@@ -59,7 +59,7 @@ async def warm_up(engine: Engine) -> None:
         scene_key=SceneKey("warm-up"),
         reference_ids=tuple(f"r{i}" for i in range(len(_CENTRES_X_M))),
         photo=Photo(image, _CAMERA, "image"),
-        prior=None,
+        narrowing=Narrowing(),
         reference_count=len(_CENTRES_X_M),
         options=LocalizeOptions(),
     )
@@ -85,10 +85,6 @@ class _RenderedReferences:
             it.name: tuple(_posed_view(f"r{i}", _pose(x_m), it) for i, x_m in enumerate(_CENTRES_X_M))
             for it in extractors
         }
-
-    def list_poses(self, scene_key: SceneKey) -> Sequence[ReferencePose]:
-        """See ReferenceSource; nobody asks, since the query names its references."""
-        return ()
 
     def load(
         self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: FeatureExtractor, turn: Turn, waits: bool

@@ -15,10 +15,12 @@ from typing import Any
 
 import pytest
 import yaml  # type: ignore[import-untyped]
+from sqlalchemy import make_url
 
 from mapless.__main__ import _parser
 from mapless_server.security.binding import Verdict, advise
 from mapless_server.settings import PREFIX, Settings, load_settings
+from mapless_server.store.postgresql import CONNECTIONS_AT_MOST
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -28,12 +30,15 @@ else:
 ROOT = Path(__file__).parents[2]
 DOCKERFILE = ROOT / "docker" / "Dockerfile"
 DEPLOY = ROOT / "deploy"
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT = PYPROJECT["project"]
 TARGETS = ["cpu", "cuda"]
-PINNED = re.compile(r"[\w./-]+:v?\d+\.\d+\.\d+[\w.-]*(@sha256:[0-9a-f]{64})?")
+PINNED = re.compile(r"([\w./-]+:v?\d+\.\d+|postgres:\d+)\.\d+[\w.-]*(@sha256:[0-9a-f]{64})?")
+"""PostgreSQL's versions have two numbers since 10."""
 SERVICE_KEYS = {
     *("image", "build", "command", "environment", "ports", "volumes", "tmpfs", "depends_on", "healthcheck", "deploy"),
     *("read_only", "cap_drop", "security_opt", "restart", "cpus", "mem_limit", "pids_limit", "stop_grace_period"),
+    *("user", "shm_size"),
 }
 """Of the specification's keys, those in use: a misspelt one would be passed over in silence by some engines."""
 
@@ -66,8 +71,39 @@ def stages_of(instructions: list[Instruction]) -> dict[str, tuple[str, list[Inst
 
 INSTRUCTIONS = parse(DOCKERFILE.read_text())
 STAGES = stages_of(INSTRUCTIONS)
-COMPOSE: Json = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
-CUDA: Json = yaml.safe_load((DEPLOY / "compose.cuda.yaml").read_text())
+
+
+class Overriding(list[Any]):
+    """A sequence that takes the place of the one in the file below, where others are added to it."""
+
+
+class ComposeLoader(yaml.SafeLoader):
+    """YAML with Compose's tag."""
+
+
+ComposeLoader.add_constructor("!override", lambda loader, node: Overriding(loader.construct_sequence(node)))
+
+
+def compose_file(name: str) -> Json:
+    """One of the compose files, by itself."""
+    document: Json = yaml.load((DEPLOY / name).read_text(), ComposeLoader)
+    return document
+
+
+def merged(below: Any, above: Any) -> Any:
+    """Two files as Compose takes them together: keys and lists are joined, but commands and overrides."""
+    if isinstance(below, dict) and isinstance(above, dict):
+        joined = dict(below)
+        for key, value in above.items():
+            joined[key] = merged(below[key], value) if key in below and key != "command" else value
+        return joined
+    if isinstance(below, list) and isinstance(above, list) and not isinstance(above, Overriding):
+        return below + above
+    return above
+
+
+COMPOSE, CUDA, POSTGRES = map(compose_file, ("compose.yaml", "compose.cuda.yaml", "compose.postgres.yaml"))
+SHARED = merged(COMPOSE, POSTGRES)
 
 
 def chain(target: str) -> list[Instruction]:
@@ -78,6 +114,11 @@ def chain(target: str) -> list[Instruction]:
 
 def all_of(target: str, word: str) -> list[str]:
     return [rest for found, rest in chain(target) if found == word]
+
+
+def arguments_of(stage: str) -> list[tuple[str, str, str]]:
+    """Names and defaults of a stage's own arguments."""
+    return [rest.partition("=") for word, rest in STAGES[stage][1] if word == "ARG"]
 
 
 def environment_of(target: str) -> dict[str, str]:
@@ -102,7 +143,8 @@ def seconds(text: str) -> float:
 
 
 def services() -> Iterator[tuple[str, Json]]:
-    yield from COMPOSE["services"].items()
+    """What runs when all files but the GPU's are put together."""
+    yield from SHARED["services"].items()
 
 
 # The Dockerfile
@@ -177,8 +219,28 @@ def test_what_an_image_writes_to_is_a_volume(target: str) -> None:
     assert set(volumes) == {word for word in created.split() if word.startswith("/")}
 
 
+@pytest.mark.parametrize("target", TARGETS)
+def test_an_image_speaks_to_either_database(target: str) -> None:
+    (extras,) = [value for name, _, value in arguments_of(f"build-{target}") if name == "EXTRAS"]
+    assert {"server", "postgres"} <= set(extras.split(","))
+
+
+def test_what_is_no_code_is_packaged_too() -> None:
+    """Images have the wheel, not the repository: a file that is not named would be missing there, and only there."""
+    packages = PYPROJECT["tool"]["setuptools"]
+    for folder in packages["packages"]["find"]["where"]:
+        files = [path for path in (ROOT / folder).rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")]
+        named = {
+            path
+            for package, globs in packages["package-data"].items()
+            for glob in globs
+            for path in (ROOT / folder / package).glob(glob)
+        }
+        assert {path for path in files if not any(it.endswith(".egg-info") for it in path.parts)} <= named
+
+
 def test_versions_and_extras_are_the_projects() -> None:
-    arguments = [rest.partition("=") for word, rest in INSTRUCTIONS if word == "ARG"]
+    arguments = [argument for stage in STAGES for argument in arguments_of(stage)]
     assert [value for name, _, value in arguments if name == "VERSION"] == [PROJECT["version"]]
     for extras in [value for name, _, value in arguments if name == "EXTRAS"]:
         assert set(extras.split(",")) <= set(PROJECT["optional-dependencies"])
@@ -190,11 +252,12 @@ def test_versions_and_extras_are_the_projects() -> None:
 
 
 def test_compose_has_no_key_that_is_none() -> None:
-    for document in (COMPOSE, CUDA):
+    for document in (COMPOSE, CUDA, POSTGRES):
         assert {key for key in document if not key.startswith("x-")} <= {"name", "services", "volumes"}
         for service in document["services"].values():
             assert set(service) <= SERVICE_KEYS
     assert set(CUDA["services"]) <= set(COMPOSE["services"])
+    assert set(POSTGRES["services"]) - set(COMPOSE["services"]) == {"postgres"}
 
 
 def test_what_compose_refers_to_exists() -> None:
@@ -206,8 +269,9 @@ def test_what_compose_refers_to_exists() -> None:
                 assert (DEPLOY / source).is_dir()
             else:
                 used.add(source)
-        assert set(service.get("depends_on", ())) <= set(COMPOSE["services"])
-    assert used == set(COMPOSE["volumes"])
+        assert set(service.get("depends_on", ())) <= set(SHARED["services"])
+    assert used == set(SHARED["volumes"])
+    assert "postgres" not in COMPOSE["volumes"]
     (config,) = [word for word in COMPOSE["services"]["prometheus"]["command"] if word.startswith("--config.file=")]
     assert (DEPLOY / "prometheus" / Path(config).name).is_file()
     assert f"./prometheus:{Path(config.partition('=')[2]).parent}:ro" in COMPOSE["services"]["prometheus"]["volumes"]
@@ -235,20 +299,49 @@ def test_every_service_is_confined(name: str, service: Json) -> None:
         assert service["healthcheck"]["test"][0] == "CMD"
 
 
-@pytest.mark.parametrize("documents", [[COMPOSE], [COMPOSE, CUDA]], ids=TARGETS)
-def test_compose_runs_the_server_within_its_means(documents: list[Json], monkeypatch: pytest.MonkeyPatch) -> None:
-    service: Json = {}
-    environment = ours(environment_of("cpu"))
-    for document in documents:
-        service |= document["services"]["mapless"]
-        environment |= ours(document["services"]["mapless"]["environment"])
-    settings = settings_under(environment, monkeypatch)
+@pytest.mark.parametrize(
+    "document", [COMPOSE, merged(COMPOSE, CUDA), SHARED, merged(SHARED, CUDA)], ids=["cpu", "cuda", "shared", "both"]
+)
+def test_compose_runs_the_server_within_its_means(document: Json, monkeypatch: pytest.MonkeyPatch) -> None:
+    service = document["services"]["mapless"]
+    settings = settings_under(ours(environment_of("cpu")) | ours(service["environment"]), monkeypatch)
     assert settings.workers == service["cpus"]
-    assert service["ports"] == [f"127.0.0.1:{settings.port}:{settings.port}"]
+    (published,) = service["ports"]
+    address, first, last, port = re.fullmatch(r"(.*):(\d+)(?:-(\d+))?:(\d+)", published).groups()  # type: ignore[union-attr]
+    assert (address, int(first), int(port)) == ("127.0.0.1", settings.port, settings.port)
+    assert int(last or first) - int(first) + 1 == service.get("deploy", {}).get("replicas", 1)  # a port each
     assert verdict_on(settings) is Verdict.WARNING  # open, since only this machine reaches it
     assert seconds(service["stop_grace_period"]) > settings.drain_delay_s + settings.drain_grace_s
     mounted = {volume.split(":")[1] for volume in service["volumes"]} | set(service["tmpfs"])
     assert mounted == {*json.loads(all_of("cpu", "VOLUME")[-1]), "/tmp"}
+
+
+def test_a_store_of_its_own_has_one_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    service = COMPOSE["services"]["mapless"]
+    assert settings_under(ours(service["environment"]), monkeypatch).database_url is None
+    assert "replicas" not in service.get("deploy", {})
+
+
+def test_servers_of_compose_reach_the_database_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By name, port, user and password; it has room for all their connections, and nobody else is let in."""
+    server, database = SHARED["services"]["mapless"], SHARED["services"]["postgres"]
+    settings = settings_under(ours(server["environment"]), monkeypatch)
+    assert settings.database_url is not None
+    url = make_url(settings.database_url.get_secret_value())
+    made = database["environment"]
+    assert (url.host, url.port, url.drivername) == ("postgres", 5432, "postgresql")
+    assert (url.username, url.database) == (made["POSTGRES_USER"], made["POSTGRES_DB"])
+    assert made["POSTGRES_PASSWORD"] == url.password
+    assert re.fullmatch(r"\$\{POSTGRES_PASSWORD:\?[^}]+\}", url.password)  # from outside, or nothing starts
+    assert server["depends_on"]["postgres"] == {"condition": "service_healthy"}
+    assert database["ports"] == []
+    assert int(database["user"].split(":")[0]) > 0
+    options = dict(word.removeprefix("--").split("=") for word in database["command"] if word.startswith("--"))
+    reserved = 3  # for superusers, unless told otherwise
+    assert int(options["max_connections"]) >= server["deploy"]["replicas"] * CONNECTIONS_AT_MOST + reserved
+    assert not {"fsync", "full_page_writes", "synchronous_commit"} & set(options)
+    memory_mib = {"m": 1, "g": 1024}[database["mem_limit"][-1]] * int(database["mem_limit"][:-1])
+    assert int(options["shared_buffers"].removesuffix("MB")) <= memory_mib / 4
 
 
 def default(setting: str) -> Any:

@@ -5,6 +5,7 @@ Each file by itself, and what kustomize makes of them, where kubectl is there to
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
+from urllib.parse import urlsplit
 from urllib.request import urlopen
 
 import kubernetes_validate  # type: ignore[import-untyped]
@@ -38,9 +40,17 @@ KUBERNETES = ROOT / "deploy" / "kubernetes"
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
 OLDEST = "1.31"
 """The oldest Kubernetes that the manifests are checked against; the other one is the newest known."""
-BUILDS = ["base", "overlays/cpu", "overlays/cuda", "weights"]
-SERVERS = BUILDS[:3]
+BUILDS = ["base", "overlays/cpu", "overlays/shared", "overlays/cuda", "weights"]
+SERVERS = BUILDS[:4]
+ALONE = ["base", "overlays/cpu", "overlays/cuda"]
+"""Those with a store of their own."""
+WORKLOADS = ("StatefulSet", "Deployment")
 IN_IMAGE = {"MAPLESS_HOST": "0.0.0.0", "MAPLESS_METRICS_HOST": "0.0.0.0"}
+IN_SECRETS = {
+    ("mapless-database", "url"): "postgresql://mapless:secret@database.example:5432/mapless?sslmode=verify-full"
+    "&sslrootcert=/etc/mapless/database/ca.crt"
+}
+"""What an operator puts into the secrets that variables come from."""
 needs_kubectl = pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl, which has kustomize, is not here")
 
 Json = dict[str, Any]
@@ -72,13 +82,19 @@ def the(documents: tuple[Json, ...], kind: str) -> Json:
 
 def pods(documents: tuple[Json, ...]) -> Iterator[Json]:
     for document in documents:
-        if document["kind"] in ("StatefulSet", "Job"):
+        if document["kind"] in (*WORKLOADS, "Job"):
             yield document["spec"]["template"]
+
+
+def workload(documents: tuple[Json, ...]) -> Json:
+    """What runs the server."""
+    (found,) = [document for document in documents if document["kind"] in WORKLOADS]
+    return found
 
 
 def server(documents: tuple[Json, ...]) -> tuple[Json, Json]:
     """The server's pod and its one container."""
-    pod = the(documents, "StatefulSet")["spec"]["template"]
+    pod = workload(documents)["spec"]["template"]
     (container,) = pod["spec"]["containers"]
     return pod, container
 
@@ -88,11 +104,22 @@ def settings_of(container: Json, monkeypatch: pytest.MonkeyPatch) -> Settings:
     variables = dict(IN_IMAGE)
     for variable in container["env"]:
         assert variable["name"].startswith(PREFIX)
-        source = variable.get("valueFrom", {}).get("resourceFieldRef")
-        variables[variable["name"]] = str(limit(container, source)) if source else variable["value"]
+        variables[variable["name"]] = value_of(variable, container)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     return load_settings({}).settings
+
+
+def value_of(variable: Json, container: Json) -> str:
+    match variable.get("valueFrom"):
+        case None:
+            return str(variable["value"])
+        case {"resourceFieldRef": source}:
+            return str(limit(container, source))
+        case {"secretKeyRef": source}:
+            return IN_SECRETS[source["name"], source["key"]]
+        case other:
+            raise AssertionError(f"nobody knows {other}")
 
 
 def limit(container: Json, source: Json) -> int:
@@ -123,8 +150,9 @@ def test_every_resource_is_valid(folder: str, version: str) -> None:
 
 
 def test_no_secret_is_in_the_files() -> None:
-    kinds = {document["kind"] for path in KUBERNETES.rglob("*.yaml") for document in read(path)}
-    assert "StatefulSet" in kinds
+    documents = [document for path in KUBERNETES.rglob("*.yaml") for document in read(path)]
+    kinds = {document["kind"] for document in documents if isinstance(document, dict)}  # a list is a patch
+    assert set(WORKLOADS) <= kinds
     assert "Secret" not in kinds
 
 
@@ -184,12 +212,12 @@ def test_ports_are_the_settings(folder: str) -> None:
 def test_who_is_selected_is_there(folder: str) -> None:
     documents = built(KUBERNETES / folder)
     labels = server(documents)[0]["metadata"]["labels"].items()
-    for kind in ("StatefulSet", "PodDisruptionBudget"):
-        assert the(documents, kind)["spec"]["selector"]["matchLabels"].items() <= labels
+    for document in (workload(documents), the(documents, "PodDisruptionBudget")):
+        assert document["spec"]["selector"]["matchLabels"].items() <= labels
     assert the(documents, "NetworkPolicy")["spec"]["podSelector"]["matchLabels"].items() <= labels
     for service in of_kind(documents, "Service"):
         assert service["spec"]["selector"].items() <= labels
-    headless = the(documents, "StatefulSet")["spec"]["serviceName"]
+    headless = workload(documents)["spec"].get("serviceName", "mapless-headless")
     assert [s["metadata"]["name"] for s in of_kind(documents, "Service") if s["spec"].get("clusterIP") == "None"] == [
         headless
     ]
@@ -259,7 +287,8 @@ def test_pods_have_no_rights_and_write_to_volumes_alone(folder: str) -> None:
         assert {"cpu", "memory"} <= set(container["resources"]["requests"])
         assert "memory" in container["resources"]["limits"]
         writable = {mount["mountPath"] for mount in container["volumeMounts"] if not mount.get("readOnly")}
-        assert writable == ({"/weights", "/cache", "/tmp"} if folder == "weights" else {"/data", "/cache", "/tmp"})
+        kept = {"weights": {"/weights"}, "overlays/shared": set()}.get(folder, {"/data"})
+        assert writable == kept | {"/cache", "/tmp"}
 
 
 @needs_kubectl
@@ -269,8 +298,8 @@ def test_what_is_mounted_exists(folder: str) -> None:
     claims = {claim["metadata"]["name"] for claim in of_kind(built(KUBERNETES / "weights"), "PersistentVolumeClaim")}
     templates = {
         claim["metadata"]["name"]
-        for workload in of_kind(documents, "StatefulSet")
-        for claim in workload["spec"]["volumeClaimTemplates"]
+        for stateful_set in of_kind(documents, "StatefulSet")
+        for claim in stateful_set["spec"]["volumeClaimTemplates"]
     }
     for pod in pods(documents):
         volumes = {volume["name"]: volume for volume in pod["spec"]["volumes"]}
@@ -282,13 +311,14 @@ def test_what_is_mounted_exists(folder: str) -> None:
         secrets = [
             mount["mountPath"] for mount in container["volumeMounts"] if "secret" in volumes.get(mount["name"], {})
         ]
-        files = [v["value"] for v in container.get("env", ()) if v.get("value", "").startswith("/")]
+        values = [value_of(variable, container) for variable in container.get("env", ())]
+        files = [file for value in values for file in re.findall(r"(?:^|sslrootcert=)(/[^&]+)", value)]
         assert {str(Path(file).parent) for file in files} == set(secrets)
 
 
 @needs_kubectl
 def test_images_are_those_that_the_dockerfile_makes() -> None:
-    for folder, target in zip(BUILDS, ("cpu", "cpu", "cuda", "cuda"), strict=True):
+    for folder, target in zip(BUILDS, ("cpu", "cpu", "cpu", "cuda", "cuda"), strict=True):
         for pod in pods(built(KUBERNETES / folder)):
             assert [container["image"] for container in pod["spec"]["containers"]] == [f"mapless:{VERSION}-{target}"]
 
@@ -310,33 +340,91 @@ def test_the_job_fetches_weights_that_nobody_restricts() -> None:
     assert not any(catalogue[name].licence.restriction for name in names)
 
 
-# Scaling
+# Several servers, and scaling
 
 
-@needs_kubectl
-@pytest.mark.parametrize("folder", SERVERS)
-def test_scaling_joins_any_of_them(folder: str, tmp_path: Path) -> None:
-    """One server at first; with the component, as many as there is work for, and nobody else says how many."""
-    assert the(built(KUBERNETES / folder), "StatefulSet")["spec"]["replicas"] == 1
-    up = Path(*[".."] * (len(tmp_path.resolve().parts) - 1))
+def extended(folder: str, components: list[str], into: Path) -> Path:
+    """A kustomization of an operator's own: what is here, and components."""
+    up = Path(*[".."] * (len(into.resolve().parts) - 1))
     kustomization = {
         "apiVersion": "kustomize.config.k8s.io/v1beta1",
         "kind": "Kustomization",
         "resources": [str(up / (KUBERNETES / folder).relative_to("/"))],
-        "components": [str(up / (KUBERNETES / "components/autoscaling").relative_to("/"))],
+        "components": [str(up / (KUBERNETES / "components" / name).relative_to("/")) for name in components],
     }
-    (tmp_path / "kustomization.yaml").write_text(yaml.safe_dump(kustomization))
-    documents = built(tmp_path)
-    workload = the(documents, "StatefulSet")
+    (into / "kustomization.yaml").write_text(yaml.safe_dump(kustomization))
+    return into
+
+
+@needs_kubectl
+@pytest.mark.parametrize("folder", ALONE)
+def test_a_store_of_its_own_has_one_server(folder: str) -> None:
+    alone = the(built(KUBERNETES / folder), "StatefulSet")["spec"]
+    assert alone["replicas"] == 1
+    assert [claim["metadata"]["name"] for claim in alone["volumeClaimTemplates"]] == ["data"]
+
+
+@needs_kubectl
+@pytest.mark.parametrize("folder", ALONE)
+def test_any_of_them_can_share_a_database(folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing else changes than where the store is and what follows: volume, replicas, how they are replaced."""
+    before, after = built(KUBERNETES / folder), built(extended(folder, ["postgres"], tmp_path))
+    for document in after:
+        kubernetes_validate.validate(document, OLDEST, strict=True)
+    shared = the(after, "Deployment")["spec"]
+    assert not {"volumeClaimTemplates", "serviceName"} & set(shared)
+    assert shared["replicas"] == 2
+    assert shared["strategy"]["rollingUpdate"] == {"maxSurge": 1, "maxUnavailable": 0}
+    (_, own), (pod, container) = server(before), server(after)
+    startup = container["startupProbe"]
+    assert shared["progressDeadlineSeconds"] > startup["periodSeconds"] * startup["failureThreshold"]
+    was, settings = settings_of(own, monkeypatch), settings_of(container, monkeypatch)
+    assert was.database_url is None
+    assert settings.database_url is not None
+    assert settings.model_copy(update={"database_url": None}) == was
+    for key in (own | container).keys() - {"env", "volumeMounts"}:
+        assert container[key] == own[key], key
+    mounts = [{mount["mountPath"] for mount in it["volumeMounts"]} for it in (own, container)]
+    assert mounts[0] ^ mounts[1] == {"/data", "/etc/mapless/database"}
+    assert pod["spec"]["topologySpreadConstraints"][0]["labelSelector"]["matchLabels"].items() <= (
+        pod["metadata"]["labels"].items()
+    )
+
+
+@needs_kubectl
+def test_the_database_is_let_through_when_there_is_one() -> None:
+    def ports(folder: str) -> list[int]:
+        rules = the(built(KUBERNETES / folder), "NetworkPolicy")["spec"]["egress"]
+        return sorted({port["port"] for rule in rules for port in rule["ports"]})
+
+    (url,) = IN_SECRETS.values()
+    assert ports("overlays/cpu") == [53]
+    assert ports("overlays/shared") == [53, urlsplit(url).port]
+
+
+@needs_kubectl
+@pytest.mark.parametrize("folder", ALONE)
+def test_scaling_joins_any_of_them_that_shares_a_database(folder: str, tmp_path: Path) -> None:
+    """As many as there is work for, and nobody else says how many."""
+    documents = built(extended(folder, ["postgres", "autoscaling"], tmp_path))
+    scaled = the(documents, "Deployment")
     scaler = the(documents, "HorizontalPodAutoscaler")["spec"]
-    assert "replicas" not in workload["spec"]
+    assert "replicas" not in scaled["spec"]
     assert scaler["scaleTargetRef"] == {
-        "apiVersion": workload["apiVersion"],
-        "kind": workload["kind"],
-        "name": workload["metadata"]["name"],
+        "apiVersion": scaled["apiVersion"],
+        "kind": scaled["kind"],
+        "name": scaled["metadata"]["name"],
     }
     # With fewer than two, what may be disrupted is all there is.
     assert scaler["minReplicas"] > the(documents, "PodDisruptionBudget")["spec"]["maxUnavailable"]
+
+
+@needs_kubectl
+def test_servers_with_stores_of_their_own_cannot_be_scaled(tmp_path: Path) -> None:
+    command = ["kubectl", "kustomize", str(extended("overlays/cpu", ["autoscaling"], tmp_path))]
+    refused = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert refused.returncode != 0
+    assert "/kind failed" in refused.stderr
 
 
 def test_scaling_is_by_a_metric_that_the_adapter_gives() -> None:
@@ -344,8 +432,8 @@ def test_scaling_is_by_a_metric_that_the_adapter_gives() -> None:
     (metric,) = scaler["spec"]["metrics"]
     (rule,) = read(ROOT / "deploy/prometheus/adapter-rules.yaml")[0]["rules"]
     assert metric["pods"]["metric"]["name"] == rule["name"]["as"]
-    (workload,) = read(KUBERNETES / "base/statefulset.yaml")
-    (container,) = workload["spec"]["template"]["spec"]["containers"]
+    (base,) = read(KUBERNETES / "base/statefulset.yaml")
+    (container,) = base["spec"]["template"]["spec"]["containers"]
     # For each worker. A full queue is about half of what is admitted, for what is computed does not wait, and one
     # caller may not fill it; the target must be well below, or nothing would ever be scaled.
     per_worker_s = float(metric["pods"]["target"]["averageValue"]) / int(container["resources"]["limits"]["cpu"])

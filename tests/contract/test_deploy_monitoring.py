@@ -97,6 +97,7 @@ def everything_happened() -> Metrics:
     metrics.stored("read", 0.01)
     metrics.built("0.1.0", "geometric", "sift", "")
     metrics.watch_reference_cache(Counts)
+    metrics.watch_retrieval_index(lambda: 1)
     metrics.watch_token_cache(Counts)
     metrics.watch_gpu_memory(lambda: {"allocated": 1.0, "reserved": 1.0, "peak": 1.0})
     metrics.watch_certificate(lambda: 1.0)
@@ -274,8 +275,9 @@ def test_prometheus_asks_the_server_where_it_answers() -> None:
     (job,) = config["scrape_configs"]
     services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
     port = Settings.model_fields["metrics_port"].default
-    (target,) = job["static_configs"][0]["targets"]
-    assert target in {f"{name}:{port}" for name in services}
+    (asked,) = job["dns_sd_configs"]
+    assert set(asked["names"]) <= set(services)
+    assert (asked["type"], asked["port"]) == ("A", port)  # of a name with several containers, all are found
     assert all((DEPLOY / "prometheus" / name).is_file() for name in config["rule_files"])
     source = yaml.safe_load((DEPLOY / "grafana/provisioning/datasources/prometheus.yaml").read_text())["datasources"][0]
     assert source["jsonData"]["timeInterval"] == config["global"]["scrape_interval"]

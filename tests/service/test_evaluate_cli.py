@@ -11,37 +11,15 @@ import time
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
-from images import encode, textured
-from numpy.typing import NDArray
-from scenes import random_for
+from images import encode
 from typer.testing import CliRunner
+from wall import wall
 
-from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless.geometry import Camera
 from mapless_server.cli import app
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
-PIXELS_PER_METRE = 150.0
-BOARDS_M = ((5.0, 9.0, 7.0), (3.6, 1.6, 1.1))
-"""Depth, width and height of two upright boards, the far one behind everything."""
-
-
-def photograph(boards: list[NDArray[np.uint8]], world_from_camera: RigidTransform) -> NDArray[np.uint8]:
-    """Boards at z = depth, centred on the world's z axis, seen by CAMERA: each is one homography."""
-    camera_from_world = world_from_camera.inverse()
-    image = np.zeros((CAMERA.height_px, CAMERA.width_px, 3), np.uint8)
-    for board, (depth_m, width_m, height_m) in zip(boards, BOARDS_M, strict=True):
-        board_x, board_y = np.array([1, 0, 0]) / PIXELS_PER_METRE, np.array([0, 1, 0]) / PIXELS_PER_METRE
-        corner = np.array([-width_m / 2, -height_m / 2, depth_m])
-        on_board = np.stack([board_x, board_y, corner], axis=1)
-        in_camera = camera_from_world.rotation @ on_board
-        in_camera[:, 2] += camera_from_world.translation
-        cv2.warpPerspective(
-            board, CAMERA.matrix() @ in_camera, image.shape[1::-1], image, cv2.INTER_AREA, cv2.BORDER_TRANSPARENT
-        )
-    return image
 
 
 @pytest.fixture(scope="module")
@@ -49,16 +27,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine photographs, 0.35 m apart."""
     path = tmp_path_factory.mktemp("wall")
     (path / "images").mkdir()
-    random = random_for("wall")
-    boards = [
-        textured(round(width_m * PIXELS_PER_METRE), round(height_m * PIXELS_PER_METRE), seed=i)
-        for i, (_, width_m, height_m) in enumerate(BOARDS_M)
-    ]
     frames = []
-    for i in range(9):
-        rotation = rotation_from_vector(random.normal(0, 0.05, 3))
-        pose = RigidTransform(rotation, np.array([0.35 * (i - 4), random.normal(0, 0.1), random.normal(0, 0.1)]))
-        (path / "images" / f"{i}.png").write_bytes(encode(".png", photograph(boards, pose)))
+    for i, (image, pose) in enumerate(wall(CAMERA)):
+        (path / "images" / f"{i}.png").write_bytes(encode(".png", image))
         frames.append(
             {
                 "image": f"images/{i}.png",

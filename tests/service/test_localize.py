@@ -91,16 +91,16 @@ def test_without_references_the_server_chooses(client: Client, scene: str) -> No
 def test_references_that_go_while_the_server_chooses(
     server: RunningServer, client: Client, scene: str, monkeypatch: pytest.MonkeyPatch, deletions: int
 ) -> None:
-    listed = Store.list_poses
+    listed = Store.list_changes
     left = iter(range(deletions))
 
-    def list_then_delete(store: Store, scene_key: SceneKey) -> Any:
-        poses = listed(store, scene_key)
+    def list_then_delete(store: Store, scene_key: SceneKey, *arguments: Any) -> Any:
+        changes = listed(store, scene_key, *arguments)
         for i in itertools.islice(left, 1):
             store.delete_reference(scene_key, f"r{i}")
-        return poses
+        return changes
 
-    monkeypatch.setattr(Store, "list_poses", list_then_delete)
+    monkeypatch.setattr(Store, "list_changes", list_then_delete)
     with Client(server.address, ConnectOptions(max_attempts=1)) as impatient:
         if deletions < 3:
             uses = localized(impatient.localize(PHOTO, CAMERA, scene)).diagnostics.references
@@ -140,21 +140,6 @@ def test_a_prior_narrows_the_choice_to_its_radius_and_ten_metres(client: Client)
     nowhere = PositionPrior(np.array([1e6, 0, 0]), 3.0)
     assert rejected(client.localize(PHOTO, CAMERA, "street", position_prior=nowhere)).reason == "NO_USABLE_REFERENCES"
     client.delete_scene("street")
-
-
-def test_too_many_candidates_are_a_failed_precondition(tmp_path_factory: pytest.TempPathFactory) -> None:
-    with (
-        serving(tmp_path_factory.mktemp("data"), retrieval_max_references=2) as server,
-        Client(server.address) as client,
-    ):
-        client.create_scene("s")
-        client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(30.0 * i)) for i in range(3)])
-        with pytest.raises(FailedPrecondition) as caught:
-            client.localize(PHOTO, CAMERA, "s")
-        assert caught.value.reason == "TOO_MANY_CANDIDATES"
-        localized(client.localize(PHOTO, CAMERA, "s", ["r0", "r1", "r2"]))
-        near_r0 = PositionPrior(pose(0.0).translation, 5.0)
-        assert len(client.localize(PHOTO, CAMERA, "s", position_prior=near_r0).diagnostics.references) == 1
 
 
 @pytest.mark.parametrize(

@@ -204,13 +204,13 @@ def test_references_of_an_unknown_scene(client: Client) -> None:
 
 def test_a_page_is_made_off_the_event_loop(client: Client, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand messages take tens of milliseconds, in which nobody else would be answered."""
-    to_message, threads = reference_service._reference_to_message, set[str]()
+    to_message, threads = reference_service.reference_to_message, set[str]()
 
     def told(record: ReferenceRecord) -> pb.Reference:
         threads.add(threading.current_thread().name)
         return to_message(record)
 
-    monkeypatch.setattr(reference_service, "_reference_to_message", told)
+    monkeypatch.setattr(reference_service, "reference_to_message", told)
     assert [it.reference_id for it in client.list_references(scene)] == ["r0", "r1", "r2"]
     client.add_references(scene, [NewReference(f"new{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
     assert threads

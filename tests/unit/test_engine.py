@@ -14,19 +14,21 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from images import encode, textured
-from servers import CAMERA, PHOTO, StandInExtractor, StandInReconstructor, pose, whole
+from servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
 
 from mapless.geometry import RigidTransform
 from mapless_server.decode import ImageLimits, decode_image
+from mapless_server.describing import Description
 from mapless_server.engine import Engine, EngineOptions
 from mapless_server.errors import DeadlineExceeded, InvalidArgument, Unavailable
 from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import Features, PosedView, View
-from mapless_server.query import Caller, Photo, PositionPrior, Query, Result
+from mapless_server.query import Caller, Photo, Query, Result
 from mapless_server.query_stages import MAX_LISTINGS, Work
 from mapless_server.query_views import QueryViews
+from mapless_server.retrieval.narrowing import Narrowing, PositionPrior
 from mapless_server.scheduling.costs import Costs
 from mapless_server.scheduling.fair import Flow
 from mapless_server.scheduling.jobs import Job, Over
@@ -38,6 +40,7 @@ from mapless_server.tiers import EscalationOptions, Tier
 SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
 ESCALATION = EscalationOptions(doubtful_inliers=50, doubtful_radius_m=0.2)
 SCENE = SceneKey("s")
+DESCRIPTOR = StandInDescriptor()
 PIXELS = decode_image(PHOTO, ImageLimits())
 FEATURES = Features(np.zeros((1, 2), np.float32), np.full((1, 4), 0.5, np.float32), np.ones(1, np.float32))
 
@@ -82,10 +85,12 @@ class Setting:
             return reply(query, references, check) if callable(reply) else reply
 
         tiers = [Tier(extractor, pipelines[name]) for name, extractor in self.extractors.items()]
-        self.engine = Engine(self.store, tiers, EngineOptions(escalation=ESCALATION), method=whole(method))
+        self.engine = Engine(
+            self.store, tiers, EngineOptions(escalation=ESCALATION), None, None, whole(method), DESCRIPTOR
+        )
         self.loop = asyncio.new_event_loop()
 
-    def describe(self, photos: Sequence[Photo]) -> list[dict[str, View]]:
+    def describe(self, photos: Sequence[Photo]) -> list[Description]:
         return self.loop.run_until_complete(self.engine.describe(photos, caller()))
 
     def close(self) -> None:
@@ -93,7 +98,8 @@ class Setting:
         self.loop.close()
 
     def localize(self, deadline_s: float = 60.0, **changes: Any) -> Result:
-        values: dict[str, Any] = {"reference_ids": ("r0", "r1"), "prior": None, "reference_count": 2} | changes
+        named: dict[str, Any] = {"reference_ids": ("r0", "r1"), "narrowing": Narrowing(), "reference_count": 2}
+        values = named | changes
         query = Query(SCENE, photo=Photo(PHOTO, CAMERA, "image"), options=LocalizeOptions(), **values)
         result, _ = self.loop.run_until_complete(self.engine.localize(query, caller(deadline_s)))
         return result
@@ -105,12 +111,12 @@ def setting(tmp_path: Path) -> Iterator[Setting]:
         setting = Setting(store)
         store.create_scene(SCENE)
         photos = [Photo(encode(".png", textured(seed=i)), CAMERA, "image") for i in range(3)]
-        views = setting.describe(photos)
+        described = setting.describe(photos)
         store.add_references(
             SCENE,
             [
-                NewReference(f"r{i}", photo.image, CAMERA, pose(float(i)), its_views)
-                for i, (photo, its_views) in enumerate(zip(photos, views, strict=True))
+                NewReference(f"r{i}", photo.image, CAMERA, pose(float(i)), found.views, found.descriptors)
+                for i, (photo, found) in enumerate(zip(photos, described, strict=True))
             ],
         )
         for extractor in setting.extractors.values():
@@ -169,8 +175,8 @@ class TestTiers:
 
     def test_a_pose_outside_the_prior_is_doubtful_too(self, setting: Setting) -> None:
         setting.replies = {"cheap": localized(SURE_INLIERS, at=pose(3.0)), "strong": localized(SURE_INLIERS)}
-        prior = PositionPrior(pose(0.0).translation, 0.5)
-        result = setting.localize(prior=prior)
+        near = Narrowing(PositionPrior(pose(0.0).translation, 0.5))
+        result = setting.localize(narrowing=near)
         assert isinstance(result.attempt.answer.outcome, Localization)
         assert setting.asked == ["cheap", "strong"]
 
@@ -359,7 +365,7 @@ class TestDescribingReferences:
 
 def query_of(reference_ids: tuple[str, ...]) -> Query:
     photo = Photo(PHOTO, CAMERA, "image")
-    return Query(SCENE, reference_ids, photo, prior=None, reference_count=2, options=LocalizeOptions())
+    return Query(SCENE, reference_ids, photo, Narrowing(), reference_count=2, options=LocalizeOptions())
 
 
 def add_undescribed(setting: Setting, count: int) -> None:
@@ -374,8 +380,8 @@ class TestDescribe:
     def test_every_tier_once_and_without_pixels(self, setting: Setting) -> None:
         photos = [Photo(encode(".png", textured(seed=i)), CAMERA, "image") for i in range(5)]
         described = setting.describe(photos)
-        assert [list(views) for views in described] == [["cheap", "strong"]] * 5
-        assert all(view.photograph is None for views in described for view in views.values())
+        assert [list(found.views) for found in described] == [["cheap", "strong"]] * 5
+        assert all(view.photograph is None for found in described for view in found.views.values())
         assert [len(it.seen) for it in setting.extractors.values()] == [5, 5]
 
     def test_a_bad_image_names_its_field(self, setting: Setting) -> None:

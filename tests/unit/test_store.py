@@ -1,15 +1,11 @@
-"""The store keeps its promises: exact, atomic, ordered, checked."""
+"""The store keeps its promises on either database: exact, atomic, ordered, checked."""
 
 from __future__ import annotations
 
-import logging
 import math
-import os
-import sqlite3
 import struct
-import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -19,80 +15,56 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy.exc import IntegrityError
+from stores import (
+    DATABASES,
+    EXTRACTOR,
+    Folder,
+    Place,
+    assert_same_bits,
+    assert_same_view,
+    make_features,
+    make_reference,
+    place_on,
+    view_of,
+)
 
-from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
+from mapless.geometry import Distortion, Fisheye, RadialTangential, RigidTransform
 from mapless_server import errors
 from mapless_server.method.views import Features, View
 from mapless_server.principal import DEFAULT_TENANT
-from mapless_server.store import NewReference, Store, StoreError, codec, sqlite
+from mapless_server.store import NewReference, Store, codec
 from mapless_server.store.cache import LruCache
 from mapless_server.tenancy import SceneKey
 
-EXTRACTOR = "sift"
+DENIALS = {
+    "sqlite": (
+        "CREATE TRIGGER deny BEFORE INSERT ON features WHEN NEW.extractor = 'strong' "
+        "BEGIN SELECT RAISE(ABORT, 'denied'); END",
+        "DROP TRIGGER deny",
+    ),
+    "postgresql": (
+        "ALTER TABLE features ADD CONSTRAINT denied CHECK (extractor <> 'strong')",
+        "ALTER TABLE features DROP CONSTRAINT denied",
+    ),
+}
+"""Makes a transaction fail in its middle, and ends that."""
+
 OFFICE, HALL, SCENE, NOWHERE = map(SceneKey, ("office", "hall", "scene", "nowhere"))
 
 
-def make_reference(
-    reference_id: str, seed: int = 0, count: int = 20, distortion: Distortion | None = None
-) -> NewReference:
-    """A reference whose every number follows from the seed and uses all bits."""
-    random = np.random.default_rng(seed)
-    focal_x_px, focal_y_px, principal_x_px, principal_y_px = random.uniform(300, 900, 4).tolist()
-    camera = Camera(640, 480, focal_x_px, focal_y_px, principal_x_px, principal_y_px, distortion)
-    pose = RigidTransform(rotation_from_vector(random.normal(size=3)), random.normal(size=3) * 1e3)
-    image = random.bytes(5000)
-    view = View(camera.pinhole(), make_features(random, count))
-    return NewReference(reference_id, image, camera, pose, {EXTRACTOR: view})
-
-
-def view_of(new: NewReference) -> View:
-    return new.views[EXTRACTOR]
-
-
-def make_features(random: np.random.Generator, count: int) -> Features:
-    return Features(
-        random.uniform(0, 640, (count, 2)).astype(np.float32),
-        random.normal(size=(count, 128)).astype(np.float32),
-        random.uniform(1, 30, count).astype(np.float32),
-    )
-
-
-def assert_same_bits(actual: np.ndarray, expected: np.ndarray) -> None:
-    assert actual.dtype == expected.dtype
-    assert actual.shape == expected.shape
-    assert actual.tobytes() == expected.tobytes()
-
-
-def assert_same_view(actual: View, expected: View) -> None:
-    assert actual.camera == expected.camera
-    assert_same_bits(actual.features.keypoints, expected.features.keypoints)
-    assert_same_bits(actual.features.descriptors, expected.features.descriptors)
-    assert_same_bits(actual.features.sizes_px, expected.features.sizes_px)
-
-
-def execute(data_dir: Path, statement: str, *parameters: object) -> None:
-    """Reach into the database behind the store's back."""
-    connection = connect(data_dir)
-    with connection:
-        changed = connection.execute(statement, parameters).rowcount
-    connection.close()
-    assert changed != 0, "the tampering changed nothing"
-
-
-def connect(data_dir: Path) -> sqlite3.Connection:
-    """With the store's own library: another one in the same process would neither see nor keep its locks."""
-    connection: sqlite3.Connection = sqlite.choose_library().connect(data_dir / sqlite.DATABASE_FILE, timeout=0)
-    return connection
+@pytest.fixture(scope="session", params=DATABASES)
+def database(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
 
 
 @pytest.fixture
-def data_dir(tmp_path: Path) -> Path:
-    return tmp_path / "data"
+def place(database: str, tmp_path: Path) -> Place:
+    return place_on(database, lambda: tmp_path)
 
 
 @pytest.fixture
-def store(data_dir: Path) -> Iterator[Store]:
-    with Store.open(data_dir) as store:
+def store(place: Place) -> Iterator[Store]:
+    with place.open() as store:
         yield store
 
 
@@ -130,17 +102,15 @@ class TestScenes:
                 call()
             assert caught.value.field == "scene"
 
-    def test_deleted_scene_takes_its_references_along(self, store: Store, data_dir: Path) -> None:
+    def test_deleted_scene_takes_its_references_along(self, store: Store, place: Place) -> None:
         store.create_scene(OFFICE)
         store.create_scene(HALL)
         store.add_references(OFFICE, [make_reference("a")])
         store.add_references(HALL, [make_reference("a")])
         store.delete_scene(OFFICE)
         assert [scene.scene_id for scene in store.list_scenes(DEFAULT_TENANT, 10)] == ["hall"]
-        connection = connect(data_dir)
         for table in ("reference", "image", "features"):
-            assert connection.execute(f"SELECT count(*) FROM {table}").fetchone() == (1,), table
-        connection.close()
+            assert place.fetch(f"SELECT count(*) FROM {table}") == [(1,)], table
 
 
 class TestGenerations:
@@ -181,10 +151,10 @@ class TestGenerations:
                 call()
         assert store.get_scene(OFFICE).generation == generation
 
-    def test_a_new_life_repeats_no_generation(self, data_dir: Path) -> None:
+    def test_a_new_life_repeats_no_generation(self, place: Place) -> None:
         seen: list[int] = []
         for _ in range(3):
-            with Store.open(data_dir) as store:
+            with place.open() as store:
                 seen.append(store.create_scene(OFFICE).generation)
                 store.add_references(OFFICE, [make_reference("a")])
                 seen.append(store.get_scene(OFFICE).generation)
@@ -211,12 +181,12 @@ class TestReferences:
             Fisheye(0.1, 5e-324, -1 / 3, 1.7976931348623157e308),
         ],
     )
-    def test_comes_back_bit_for_bit_after_reopening(self, data_dir: Path, distortion: Distortion | None) -> None:
+    def test_comes_back_bit_for_bit_after_reopening(self, place: Place, distortion: Distortion | None) -> None:
         new = make_reference("a", seed=3, distortion=distortion)
-        with Store.open(data_dir) as store:
+        with place.open() as store:
             store.create_scene(OFFICE)
             (created,) = store.add_references(OFFICE, [new])
-        with Store.open(data_dir) as store:
+        with place.open() as store:
             read = store.get_reference(OFFICE, "a")
             image = store.read_image(OFFICE, "a")
             assert store.read_image_of(created.key) == image
@@ -311,7 +281,7 @@ class TestReferences:
             assert [it.reference_id for it in snapshot.undescribed] == ["b"]
 
     def test_features_of_all_extractors_are_stored_with_the_reference_or_not_at_all(
-        self, store: Store, data_dir: Path
+        self, store: Store, place: Place, database: str
     ) -> None:
         store.create_scene(OFFICE)
         good, other = make_reference("a", 1), make_reference("a", 2, count=7)
@@ -323,14 +293,11 @@ class TestReferences:
             with pytest.raises(ValueError, match=r"float32|no features"):
                 store.add_references(OFFICE, [bad])
         # Even a failure in the middle of the transaction leaves nothing.
-        execute(
-            data_dir,
-            "CREATE TRIGGER deny BEFORE INSERT ON features WHEN NEW.extractor = 'strong' "
-            "BEGIN SELECT RAISE(ABORT, 'denied'); END",
-        )
+        deny, permit = DENIALS[database]
+        place.execute(deny)
         with pytest.raises(IntegrityError, match="denied"):
             store.add_references(OFFICE, [both])
-        execute(data_dir, "DROP TRIGGER deny")
+        place.execute(permit)
         assert (store.get_scene(OFFICE).generation, store.list_references(OFFICE, 10)) == (1, [])
         (record,) = store.add_references(OFFICE, [both])
         assert (record.feature_count, store.get_scene(OFFICE).generation) == (20, 2)
@@ -362,8 +329,10 @@ class TestReferences:
         with pytest.raises(errors.AlreadyExists):
             store.add_references(OFFICE, [make_reference(it, count=1) for it in ["new", *ids]])
 
-    def test_ids_are_data_not_sql(self, store: Store) -> None:
-        nasty = ["'; DROP TABLE scene; --", "../../etc/passwd", '"', "%", "_", "\x00", "a b"]
+    def test_ids_are_data_not_sql(self, store: Store, database: str) -> None:
+        nasty = ["'; DROP TABLE scene; --", "../../etc/passwd", '"', "%", "_", "a b"]
+        if database == "sqlite":
+            nasty.append("\x00")  # no text to PostgreSQL
         for scene_key in map(SceneKey, nasty):
             store.create_scene(scene_key)
             store.add_references(scene_key, [make_reference(it, count=1) for it in nasty])
@@ -372,16 +341,16 @@ class TestReferences:
             assert store.read_image(scene_key, "%") == make_reference("%", count=1).image
 
 
-ids = st.text("ab_-.AZ09", min_size=1, max_size=3)
+IDS = st.text("ab_-.AZ09", min_size=1, max_size=3)
 
 
 class TestPages:
     @settings(max_examples=15, deadline=None)
-    @given(names=st.sets(ids, max_size=12), limit=st.integers(1, 5))
+    @given(names=st.sets(IDS, max_size=12), limit=st.integers(1, 5))
     def test_pages_are_a_partition_in_order(
-        self, tmp_path_factory: pytest.TempPathFactory, names: set[str], limit: int
+        self, database: str, tmp_path_factory: pytest.TempPathFactory, names: set[str], limit: int
     ) -> None:
-        with Store.open(tmp_path_factory.mktemp("pages")) as store:
+        with place_on(database, lambda: tmp_path_factory.mktemp("pages")).open() as store:
             store.create_scene(SCENE)
             for name in names:
                 store.create_scene(SceneKey("s" + name))
@@ -404,11 +373,11 @@ class TestPages:
 
 
 class TestMemory:
-    def test_repeated_load_reads_no_blob(self, store: Store, data_dir: Path) -> None:
+    def test_repeated_load_reads_no_blob(self, store: Store, place: Place) -> None:
         store.create_scene(OFFICE)
         store.add_references(OFFICE, [make_reference("a"), make_reference("b")])
         first = store.load_references(OFFICE, ["a", "b"], EXTRACTOR)
-        execute(data_dir, "UPDATE features SET data = x'00'")
+        place.execute("UPDATE features SET data = ?", b"\0")
         store.add_references(OFFICE, [make_reference("c")])
         again = store.load_references(OFFICE, ["b", "a", "c"], EXTRACTOR)
         assert again.references[0] is first.references[1]
@@ -517,26 +486,58 @@ class TestThreads:
         assert store.get_scene(OFFICE).generation == 2
 
 
+def zeros(place: Place, key: str, _: str) -> None:
+    place.execute("UPDATE features SET data = ? WHERE reference_key = ?", bytes(100), key)
+
+
+def nothing(place: Place, key: str, _: str) -> None:
+    place.execute("UPDATE features SET data = ? WHERE reference_key = ?", b"", key)
+
+
+def features_of_another(place: Place, key: str, other: str) -> None:
+    ((data,),) = place.fetch("SELECT data FROM features WHERE reference_key = ?", other)
+    place.execute("UPDATE features SET data = ? WHERE reference_key = ?", data, key)
+
+
+def features_and_checksum_of_another(place: Place, key: str, other: str) -> None:
+    ((data, sha256),) = place.fetch("SELECT data, sha256 FROM features WHERE reference_key = ?", other)
+    place.execute("UPDATE features SET data = ?, sha256 = ? WHERE reference_key = ?", data, sha256, key)
+
+
+def another_width(place: Place, key: str, _: str) -> None:
+    ((geometry,),) = place.fetch("SELECT geometry FROM reference WHERE key = ?", key)
+    place.execute("UPDATE reference SET geometry = ? WHERE key = ?", geometry.replace(b"640", b"641"), key)
+
+
+def no_geometry(place: Place, key: str, _: str) -> None:
+    place.execute("UPDATE reference SET geometry = ? WHERE key = ?", b"\xff", key)
+
+
+def text_for_bytes(place: Place, key: str, _: str) -> None:
+    if not isinstance(place, Folder):
+        pytest.skip("to PostgreSQL, text is not bytes")
+    place.execute("UPDATE reference SET geometry = CAST(geometry AS TEXT) WHERE key = ?", key)
+
+
+DAMAGES = (
+    zeros,
+    nothing,
+    features_of_another,
+    features_and_checksum_of_another,
+    another_width,
+    no_geometry,
+    text_for_bytes,
+)
+
+
 class TestDamage:
-    @pytest.mark.parametrize(
-        "damage",
-        [
-            "UPDATE features SET data = zeroblob(100) WHERE reference_key = ?",
-            "UPDATE features SET data = x'' WHERE reference_key = ?",
-            "UPDATE features SET data = (SELECT data FROM features WHERE reference_key != ?1) WHERE reference_key = ?1",
-            "UPDATE features SET (data, sha256) = (SELECT data, sha256 FROM features WHERE reference_key != ?1) "
-            "WHERE reference_key = ?1",
-            "UPDATE reference SET geometry = CAST(replace(geometry, '640', '641') AS BLOB) WHERE key = ?",
-            "UPDATE reference SET geometry = CAST(geometry AS TEXT) WHERE key = ?",
-            "UPDATE reference SET geometry = x'ff' WHERE key = ?",
-        ],
-    )
+    @pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: str(damage.__name__))
     def test_one_damaged_reference_is_named_and_the_other_served(
-        self, store: Store, data_dir: Path, damage: str
+        self, store: Store, place: Place, damage: Callable[[Place, str, str], None]
     ) -> None:
         store.create_scene(OFFICE)
-        bad, _ = store.add_references(OFFICE, [make_reference("bad", 1), make_reference("good", 2)])
-        execute(data_dir, damage, bad.key)
+        bad, good_record = store.add_references(OFFICE, [make_reference("bad", 1), make_reference("good", 2)])
+        damage(place, bad.key, good_record.key)
         for ids in (["bad"], ["good", "bad"], None):
             with pytest.raises(errors.DataLoss, match="'bad'"):
                 store.load_references(OFFICE, ids, EXTRACTOR)
@@ -546,10 +547,10 @@ class TestDamage:
         store.delete_reference(OFFICE, "bad")
         assert len(store.load_references(OFFICE, None, EXTRACTOR).references) == 1
 
-    def test_damaged_image_is_not_handed_out(self, store: Store, data_dir: Path) -> None:
+    def test_damaged_image_is_not_handed_out(self, store: Store, place: Place) -> None:
         store.create_scene(OFFICE)
         bad, _ = store.add_references(OFFICE, [make_reference("bad"), make_reference("good")])
-        execute(data_dir, "UPDATE image SET data = zeroblob(5000) WHERE reference_key = ?", bad.key)
+        place.execute("UPDATE image SET data = ? WHERE reference_key = ?", bytes(5000), bad.key)
         with pytest.raises(errors.DataLoss, match="'bad'"):
             store.read_image(OFFICE, "bad")
         with pytest.raises(errors.DataLoss, match="'bad'"):
@@ -571,172 +572,3 @@ class TestDamage:
         struct.pack_into("<B", blob, 0, codec.VIEW_FORMAT_VERSION + 1)
         with pytest.raises(codec.Damaged, match="format 2"):
             codec.decode_view("owner", bytes(blob), codec.sha256_for("owner", bytes(blob)))
-
-
-class TestFaults:
-    def test_a_full_disk_is_said_and_harms_nothing(self, store: Store) -> None:
-        store.create_scene(OFFICE)
-        store.add_references(OFFICE, [make_reference("a")])
-        before = store.get_scene(OFFICE)
-        with store._database.read() as connection:
-            pages = connection.exec_driver_sql("PRAGMA page_count").scalar()
-            unlimited = connection.exec_driver_sql("PRAGMA max_page_count").scalar()
-            connection.exec_driver_sql(f"PRAGMA max_page_count={pages}")
-        with pytest.raises(errors.Overloaded) as caught:
-            store.add_references(OFFICE, [make_reference(it, count=200) for it in "bcd"])
-        assert caught.value.reason == "STORE_FULL"
-        assert store.get_scene(OFFICE) == before
-        with store._database.read() as connection:
-            connection.exec_driver_sql(f"PRAGMA max_page_count={unlimited}")
-        store.add_references(OFFICE, [make_reference(it, count=200) for it in "bcd"])
-        assert store.get_scene(OFFICE).reference_count == 4
-
-    def test_a_lock_held_by_another_tool_asks_for_a_retry(
-        self, data_dir: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(sqlite, "BUSY_TIMEOUT_MS", 10)
-        with Store.open(data_dir) as store:
-            other = connect(data_dir)
-            other.execute("BEGIN IMMEDIATE")
-            with pytest.raises(errors.Unavailable) as caught:
-                store.create_scene(OFFICE)
-            assert caught.value.retry_after_s is not None
-            assert store.list_scenes(DEFAULT_TENANT, 10) == []
-            other.rollback()
-            other.close()
-            assert store.create_scene(OFFICE).generation == 1
-
-
-class TestOpening:
-    @pytest.mark.parametrize(
-        ("version", "affected"),
-        [
-            ((3, 6, 23), False),
-            ((3, 7, 0), True),
-            ((3, 40, 1), True),
-            ((3, 44, 5), True),
-            ((3, 44, 6), False),
-            ((3, 45, 0), True),
-            ((3, 50, 6), True),
-            ((3, 50, 7), False),
-            ((3, 51, 0), True),
-            ((3, 51, 2), True),
-            ((3, 51, 3), False),
-            ((3, 53, 4), False),
-        ],
-    )
-    def test_versions_with_the_wal_reset_bug(self, version: tuple[int, int, int], affected: bool) -> None:
-        assert sqlite.has_wal_reset_bug(version) is affected
-
-    def settings_in_use(self, store: Store) -> dict[str, object]:
-        names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "trusted_schema", "cell_size_check")
-        with store._database.read() as connection:
-            return {name: connection.exec_driver_sql(f"PRAGMA {name}").scalar() for name in (*names, "mmap_size")}
-
-    def test_settings_of_every_connection(self, store: Store) -> None:
-        expected = {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1, "busy_timeout": 5000}
-        expected |= {"trusted_schema": 0, "cell_size_check": 1, "mmap_size": 0}
-        with ThreadPoolExecutor(3) as pool:
-            barrier = threading.Barrier(3, timeout=10)
-
-            def look(_: int) -> dict[str, object]:
-                with store._database.read():
-                    barrier.wait()
-                    return self.settings_in_use(store)
-
-            assert list(pool.map(look, range(3))) == [expected] * 3
-
-    def test_transactions_really_begin(self, store: Store, data_dir: Path) -> None:
-        with store._database.write() as writer:
-            assert writer.connection.driver_connection.in_transaction  # type: ignore[union-attr]
-            # A second write transaction, past our own queue, must be refused by SQLite itself.
-            other = connect(data_dir)
-            with pytest.raises(sqlite.choose_library().OperationalError, match="locked"):
-                other.execute("BEGIN IMMEDIATE")
-            other.close()
-        with store._database.read() as reader:
-            assert reader.connection.driver_connection.in_transaction  # type: ignore[union-attr]
-
-    def test_affected_library_runs_in_safe_mode(
-        self, data_dir: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        with Store.open(data_dir) as store:
-            store.create_scene(OFFICE)
-            assert self.settings_in_use(store)["journal_mode"] == "wal"
-        with monkeypatch.context() as patch, caplog.at_level(logging.WARNING):
-            for library in (sqlite3.dbapi2, pytest.importorskip("pysqlite3.dbapi2")):
-                patch.setattr(library, "sqlite_version_info", (3, 51, 2))
-            with Store.open(data_dir) as store:
-                in_use = self.settings_in_use(store)
-                assert (in_use["journal_mode"], in_use["synchronous"]) == ("delete", 3)
-                with ThreadPoolExecutor(4) as pool:
-                    list(pool.map(lambda it: store.add_references(OFFICE, [make_reference(it)]), "abcd"))
-                    list(pool.map(lambda it: store.delete_reference(OFFICE, it), "bcd"))
-        assert "WAL-reset" in caplog.text
-        with Store.open(data_dir) as store:
-            assert self.settings_in_use(store)["journal_mode"] == "wal"
-            assert store.get_scene(OFFICE).reference_count == 1
-
-    def test_works_without_the_packaged_library(self, data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setitem(sys.modules, "pysqlite3", None)
-        monkeypatch.setitem(sys.modules, "pysqlite3.dbapi2", None)
-        with Store.open(data_dir) as store:
-            store.create_scene(OFFICE)
-            store.add_references(OFFICE, [make_reference("a")])
-            assert store.load_references(OFFICE, None, EXTRACTOR).generation == 2
-
-    def test_second_server_is_refused_until_the_first_has_gone(self, data_dir: Path) -> None:
-        with Store.open(data_dir) as store:
-            store.create_scene(OFFICE)
-            with pytest.raises(StoreError, match=f"in use by another server .process {os.getpid()}."):
-                Store.open(data_dir)
-            assert store.get_scene(OFFICE).generation == 1
-        with Store.open(data_dir) as store:
-            assert store.get_scene(OFFICE).generation == 1
-
-    def test_refused_opening_leaves_no_lock(self, data_dir: Path) -> None:
-        data_dir.mkdir()
-        database = data_dir / sqlite.DATABASE_FILE
-        database.write_bytes(b"not a database " * 1000)
-        for _ in range(2):
-            with pytest.raises(StoreError, match="not a database"):
-                Store.open(data_dir)
-        database.unlink()
-        Store.open(data_dir).close()
-
-    def test_schema_from_the_future_is_refused(self, data_dir: Path) -> None:
-        Store.open(data_dir).close()
-        execute(data_dir, "UPDATE store_version SET schema_version = 2")
-        with pytest.raises(StoreError, match="version 2"):
-            Store.open(data_dir)
-
-    def test_database_of_another_program_is_refused(self, data_dir: Path) -> None:
-        data_dir.mkdir()
-        execute(data_dir, "CREATE TABLE scene (name TEXT)")
-        with pytest.raises(StoreError, match="another program"):
-            Store.open(data_dir)
-
-    def test_truncated_database_is_refused_or_reported(self, data_dir: Path) -> None:
-        with Store.open(data_dir) as store:
-            store.create_scene(OFFICE)
-            store.add_references(OFFICE, [make_reference(str(index)) for index in range(20)])
-        os.truncate(data_dir / sqlite.DATABASE_FILE, 8192)
-        with pytest.raises((StoreError, errors.DataLoss)), Store.open(data_dir) as store:
-            store.load_references(OFFICE, None, EXTRACTOR)
-
-    def test_unusable_folders_are_one_sentence(self, tmp_path: Path) -> None:
-        file = tmp_path / "file"
-        file.touch()
-        folder_for_file = tmp_path / "folder"
-        (folder_for_file / sqlite.DATABASE_FILE).mkdir(parents=True)
-        for data_dir in (file, file / "below", folder_for_file):
-            with pytest.raises(StoreError) as caught:
-                Store.open(data_dir)
-            assert str(data_dir) in str(caught.value)
-            assert "\n" not in str(caught.value)
-
-    @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-    def test_unwritable_folder_is_refused(self, tmp_path: Path) -> None:
-        tmp_path.chmod(0o500)
-        with pytest.raises(StoreError, match="Permission denied"):
-            Store.open(tmp_path)

@@ -22,6 +22,7 @@ from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.decode import ImageLimits
+from mapless_server.describing import Description
 from mapless_server.errors import NotFound, RequestError
 from mapless_server.method.views import Features, View
 from mapless_server.principal import DEFAULT_TENANT, Principal
@@ -69,9 +70,9 @@ class StandInEngine:
 
     options: Any = field(default_factory=lambda: SimpleNamespace(image_limits=ImageLimits()))
 
-    async def describe(self, photos: Sequence[Any], *_: Any, **__: Any) -> list[dict[str, View]]:
+    async def describe(self, photos: Sequence[Any], *_: Any, **__: Any) -> list[Description]:
         features = Features(np.zeros((1, 2), np.float32), np.ones((1, 4), np.float32), np.ones(1, np.float32))
-        return [{"stand-in": View(photo.camera.pinhole(), features)} for photo in photos]
+        return [Description({"stand-in": View(photo.camera.pinhole(), features)}, {}) for photo in photos]
 
 
 @dataclass

@@ -32,6 +32,8 @@ class QueryResult:
         latency_ms: of the call, as the client sees it.
         stage_ms: inside the server, by stage.
         backend, features: what computed it.
+        best_reference: name of the one with the most inliers; empty for a rejection.
+        pose: the answered one, world from camera: x y z and the quaternion x y z w; None for a rejection.
     """
 
     name: str
@@ -48,6 +50,8 @@ class QueryResult:
     stage_ms: Mapping[str, float]
     backend: str
     features: str
+    best_reference: str = ""
+    pose: tuple[float, ...] | None = None
 
     @property
     def localized(self) -> bool:

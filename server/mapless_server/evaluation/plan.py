@@ -163,11 +163,30 @@ def make_plan(
         UsageError: too few frames, or an image is missing, damaged or of another size than its camera.
     """
     split = split_frames(len(dataset.frames), options)
-    used = sorted({*split.references, *split.queries})
-    check_images((dataset.frames[i] for i in used), limits)
+    references, queries = (tuple(dataset.frames[i] for i in part) for part in (split.references, split.queries))
+    check_images(dict.fromkeys((*references, *queries)), limits)
+    return Plan(
+        dataset, references, rank_by_matches(queries, references, options.k, extractor, ratio, limits, progress)
+    )
 
-    def view_of(index: int) -> View:
-        frame = dataset.frames[index]
+
+def rank_by_matches(
+    queries: Sequence[Frame],
+    references: Sequence[Frame],
+    k: int,
+    extractor: FeatureExtractor,
+    ratio: float,
+    limits: ImageLimits,
+    progress: Progress,
+) -> tuple[PlannedQuery, ...]:
+    """The queries, each with those k references, itself excepted, that share the most feature matches with it.
+
+    Raises:
+        UsageError: an image is damaged.
+    """
+    used = tuple(dict.fromkeys((*references, *queries)))
+
+    def view_of(frame: Frame) -> View:
         try:
             return extractor.extract(decode_image(frame.image_path.read_bytes(), limits), frame.camera)
         except InvalidArgument as error:
@@ -175,18 +194,13 @@ def make_plan(
 
     views = dict(zip(used, _map(view_of, used, "features", progress), strict=True))
 
-    def planned(query: int) -> PlannedQuery:
-        candidates = [i for i in split.references if i != query]
-        frames = [dataset.frames[i] for i in candidates]
-        posed = [
-            PosedView(frame.name, frame.name, views[i], frame.world_from_camera)
-            for i, frame in zip(candidates, frames, strict=True)
-        ]
-        chosen = choose_references(views[query], posed, options.k, ratio=ratio)
-        return PlannedQuery(dataset.frames[query], tuple(frames[i] for i in chosen))
+    def planned(query: Frame) -> PlannedQuery:
+        candidates = [frame for frame in references if frame is not query]
+        posed = [PosedView(frame.name, frame.name, views[frame], frame.world_from_camera) for frame in candidates]
+        chosen = choose_references(views[query], posed, k, ratio=ratio)
+        return PlannedQuery(query, tuple(candidates[i] for i in chosen))
 
-    queries = _map(planned, split.queries, "choosing references", progress)
-    return Plan(dataset, tuple(dataset.frames[i] for i in split.references), tuple(queries))
+    return tuple(_map(planned, queries, "choosing references", progress))
 
 
 def _spread(first: int, last: int, count: int) -> tuple[int, ...]:
@@ -194,7 +208,7 @@ def _spread(first: int, last: int, count: int) -> tuple[int, ...]:
     return tuple(dict.fromkeys(np.round(np.linspace(first, last, count)).astype(int).tolist()))
 
 
-def _map(function: Callable[[int], T], items: Sequence[int], step: str, progress: Progress) -> list[T]:
+def _map(function: Callable[[Frame], T], items: Sequence[Frame], step: str, progress: Progress) -> list[T]:
     results: list[T] = []
     with ThreadPoolExecutor(available_cores()) as pool:
         progress(step, 0, len(items))

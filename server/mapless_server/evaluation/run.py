@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from mapless import Client, ConnectOptions, LocalizationResult, NewReference
+from mapless import Client, ConnectOptions, LocalizationResult, NewReference, Rejected, RigidTransform
+from mapless.names import parse_reference_name
 
 from ..assembly import make_first_features
 from ..child import child_server
-from ..dataset import Dataset
+from ..dataset import Dataset, Frame
 from ..method.correspond import OPTIONS
+from ..method.features import FeatureExtractor
 from ..serve import image_limits
 from ..settings import Settings
 from ..weights import WeightsError
@@ -68,21 +71,39 @@ def plan_for(dataset: Dataset, options: EvaluationOptions, settings: Settings, p
     Raises:
         UsageError: as `make_plan`, or the settings ask for features that are not there.
     """
+    extractor, ratio = first_features(settings)
+    return make_plan(dataset, options, extractor, ratio, image_limits(settings), progress)
+
+
+def first_features(settings: Settings) -> tuple[FeatureExtractor, float]:
+    """The first features that a server of these settings has, and their ratio of a match with the query.
+
+    Raises:
+        UsageError: the settings ask for features that are not there.
+    """
     try:
         features, extractor = make_first_features(settings)
     except (ValueError, ImportError, WeightsError) as error:
         raise UsageError(str(error)) from error
-    ratio = OPTIONS[features].query_ratio
-    return make_plan(dataset, options, extractor, ratio, image_limits(settings), progress)
+    return extractor, OPTIONS[features].query_ratio
 
 
 def upload(client: Client, plan: Plan, progress: Progress) -> None:
     """Creates the scene and stores the plan's references in it."""
-    client.create_scene(SCENE)
-    new = (NewReference(f.name, f.image_path, f.camera, f.world_from_camera) for f in plan.references)
-    total = len(plan.references)
+    store_references(client, SCENE, plan.references, progress)
+
+
+def store_references(client: Client, scene: str, references: Sequence[Frame], progress: Progress) -> None:
+    """Creates a scene with these references.
+
+    Raises:
+        MaplessError: a call failed.
+    """
+    client.create_scene(scene)
+    new = (NewReference(f.name, f.image_path, f.camera, f.world_from_camera) for f in references)
+    total = len(references)
     progress("storing references", 0, total)
-    client.add_references(SCENE, new, on_progress=lambda done: progress("storing references", done, total))
+    client.add_references(scene, new, on_progress=lambda done: progress("storing references", done, total))
 
 
 def localize_queries(
@@ -90,9 +111,10 @@ def localize_queries(
 ) -> tuple[QueryResult, ...]:
     """Localizes the plan's queries, one after the other."""
     results: list[QueryResult] = []
+    poses = {frame.name: frame for frame in plan.references}
     progress("localizing", 0, len(plan.queries))
     for query in plan.queries:
-        results.append(_localize(client, query, options))
+        results.append(localize_query(client, SCENE, query, options, poses))
         progress("localizing", len(results), len(plan.queries))
     return tuple(results)
 
@@ -103,26 +125,59 @@ def evaluation_of(plan: Plan, options: EvaluationOptions, results: tuple[QueryRe
     return Evaluation(plan.dataset, options, len(plan.references), radius, results)
 
 
-def _localize(client: Client, query: PlannedQuery, options: EvaluationOptions) -> QueryResult:
+def localize_query(
+    client: Client, scene: str, query: PlannedQuery, options: EvaluationOptions, references: Mapping[str, Frame]
+) -> QueryResult:
+    """Localizes one query.
+
+    Args:
+        client: of the server.
+        scene: id of the scene.
+        query: with its references; none: the server chooses k.
+        options: variant, scale strategy and k.
+        references: those of the scene, by name.
+
+    Raises:
+        MaplessError: the call failed.
+    """
     frame = query.frame
-    names = tuple(reference.name for reference in query.references)
     image = frame.image_path.read_bytes()
     start_s = time.perf_counter()
     answer = client.localize(
-        image, frame.camera, SCENE, names, variant=options.variant, scale_strategy=options.scale_strategy
+        image,
+        frame.camera,
+        scene,
+        [reference.name for reference in query.references],
+        variant=options.variant,
+        scale_strategy=options.scale_strategy,
+        reference_count=0 if query.references else options.k,
     )
     latency_ms = 1000 * (time.perf_counter() - start_s)
-    centres = np.array([reference.world_from_camera.translation for reference in query.references])
-    distances = np.linalg.norm(centres - frame.world_from_camera.translation, axis=1)
+    return _result(frame, answer, query.references, latency_ms, references)
+
+
+def _result(
+    frame: Frame,
+    answer: LocalizationResult | Rejected,
+    given: Sequence[Frame],
+    latency_ms: float,
+    references: Mapping[str, Frame],
+) -> QueryResult:
+    diagnostics = answer.diagnostics
+    uses = {parse_reference_name(use.name)[1]: use for use in diagnostics.references}
+    used = list(given) or [references[name] for name in uses]
+    distances = [
+        float(np.linalg.norm(it.world_from_camera.translation - frame.world_from_camera.translation)) for it in used
+    ]
     found = answer if isinstance(answer, LocalizationResult) else None
     errors = pose_error(frame.world_from_camera, found.world_from_camera) if found else (math.inf, math.inf)
-    diagnostics = answer.diagnostics
+    best = max(uses, key=lambda name: uses[name].inlier_count, default="") if found else ""
     return QueryResult(
         name=frame.name,
-        references=names,
+        references=tuple(it.name for it in used),
         translation_error=errors[0],
         rotation_error_deg=errors[1],
-        reference_distance=float(np.median(distances)),
+        reference_distance=float(np.median(distances)) if distances else math.inf,
         position_68=found.accuracy.position_68_m if found and found.accuracy else None,
         inlier_count=found.inlier_count if found else 0,
         match_count=found.match_count if found else 0,
@@ -132,4 +187,11 @@ def _localize(client: Client, query: PlannedQuery, options: EvaluationOptions) -
         stage_ms={stage: 1000 * seconds for stage, seconds in diagnostics.stage_s.items()},
         backend=diagnostics.backend,
         features=diagnostics.features,
+        best_reference=best,
+        pose=_numbers(found.world_from_camera) if found else None,
     )
+
+
+def _numbers(pose: RigidTransform) -> tuple[float, ...]:
+    q = pose.quaternion()
+    return (*pose.translation.tolist(), q.x, q.y, q.z, q.w)

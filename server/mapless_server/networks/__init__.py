@@ -14,4 +14,9 @@ the header of weights' files.
     pi3.py, pi3x.py
     checkpoint.py  weights from a file, all of them and nothing else
     runner.py      a network on a device
+
+Beside them one that describes a whole image by one vector, of the same blocks:
+
+    megaloc.py     MegaLoc (Berton and Masone 2025): DINOv2, SALAD, a linear layer
+    salad.py       tokens to one vector by optimal transport
 """

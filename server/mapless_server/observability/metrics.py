@@ -23,7 +23,7 @@ from ..method.rejection import RejectionReason
 from ..scheduling.observer import Ending, Observer, Refusal
 from .scraped import CacheCounts, Scraped, TokenCacheCounts
 
-STAGES = ("prepare", "coarse", "refine", "describe")
+STAGES = ("prepare", "coarse", "refine", "describe", "retrieve", "audit", "coverage")
 """Stages of the queue."""
 
 LOCALIZED = "localized"
@@ -245,6 +245,10 @@ class Metrics(Observer):
     def watch_reference_cache(self, read: Callable[[], CacheCounts]) -> None:
         """Asks, at every scrape, how the cache of references' features does."""
         self._scraped.reference_cache = read
+
+    def watch_retrieval_index(self, read: Callable[[], int]) -> None:
+        """Asks, at every scrape, what the scenes in memory take, bytes."""
+        self._scraped.retrieval_index = read
 
     def watch_token_cache(self, read: Callable[[], TokenCacheCounts]) -> None:
         """Asks, at every scrape, how the cache of references' tokens does."""

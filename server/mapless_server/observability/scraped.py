@@ -65,6 +65,7 @@ class Scraped(Collector):
 
     def __init__(self) -> None:
         self.reference_cache: Callable[[], CacheCounts] | None = None
+        self.retrieval_index: Callable[[], int] | None = None
         self.token_cache: Callable[[], TokenCacheCounts] | None = None
         self.gpu_memory: Callable[[], Mapping[str, float]] | None = None
         self.certificate_expiry: Callable[[], float | None] | None = None
@@ -75,7 +76,13 @@ class Scraped(Collector):
 
     def collect(self) -> Iterable[Metric]:
         """Implements Collector."""
-        for family in (self._reference_cache, self._token_cache, self._gpu_memory, self._certificate):
+        for family in (
+            self._reference_cache,
+            self._retrieval_index,
+            self._token_cache,
+            self._gpu_memory,
+            self._certificate,
+        ):
             metrics: dict[str, Metric] = {}
             try:
                 family(metrics)
@@ -94,6 +101,11 @@ class Scraped(Collector):
             misses.add_metric([], counts.misses)
             evictions.add_metric([], counts.evictions)
             size.add_metric([], counts.used_bytes)
+
+    def _retrieval_index(self, metrics: dict[str, Metric]) -> None:
+        size = _gauge(metrics, "mapless_retrieval_index_bytes", "Size of the scenes held to choose references by.")
+        if self.retrieval_index is not None:
+            size.add_metric([], self.retrieval_index())
 
     def _token_cache(self, metrics: dict[str, Metric]) -> None:
         hits = _counter(metrics, "mapless_token_cache_hits", "Tokens found, by where.", ["tier"])

@@ -7,6 +7,8 @@ Geometry is JSON text: Python writes the shortest decimal that reads back as the
     header       JSON (camera, count, dimension), padded with spaces so that the arrays are aligned
     arrays       keypoints (N, 2), sizes (N,), descriptors (N, D), float32
 
+A global descriptor is its numbers as float16, and nothing else: similarities of unit vectors change by less than 0.001.
+
 Everything is little-endian.
 """
 
@@ -15,10 +17,12 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform
 from mapless_server.method.views import Features, View
@@ -27,6 +31,7 @@ VIEW_FORMAT_VERSION = 1
 _PREFIX = struct.Struct("<B3xI")
 _ALIGNMENT_BYTES = 16
 _FLOAT32 = np.dtype("<f4")
+_FLOAT16 = np.dtype("<f2")
 
 _DISTORTION_TYPES: dict[str, type[RadialTangential] | type[Fisheye]] = {
     "radial_tangential": RadialTangential,
@@ -61,7 +66,7 @@ def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, Rigid
     Raises:
         Damaged: the checksum does not match.
     """
-    _check(owner, data, sha256, "camera and pose")
+    check(owner, data, sha256, "camera and pose")
     content = json.loads(data)
     pose = content["world_from_camera"]
     rotation, translation = np.array(pose["rotation"], float), np.array(pose["translation"], float)
@@ -93,7 +98,7 @@ def decode_view(owner: str, blob: bytes, sha256: str) -> View:
     Raises:
         Damaged: the checksum does not match, or the format is unknown.
     """
-    _check(owner, blob, sha256, "features")
+    check(owner, blob, sha256, "features")
     version, header_length = _PREFIX.unpack_from(blob)
     if version != VIEW_FORMAT_VERSION:
         raise Damaged(f"features (format {version} is unknown)")
@@ -106,7 +111,44 @@ def decode_view(owner: str, blob: bytes, sha256: str) -> View:
     return View(_camera_from_dict(header["camera"]), features)
 
 
-def _check(owner: str, data: object, sha256: str, what: str) -> None:
+def decode_poses(geometries: Sequence[bytes]) -> list[RigidTransform]:
+    """The poses alone of many cameras and poses, whose checksums must have been checked; read-only arrays."""
+    poses = [json.loads(geometry)["world_from_camera"] for geometry in geometries]
+    rotations = np.array([pose["rotation"] for pose in poses], float)
+    translations = np.array([pose["translation"] for pose in poses], float)
+    rotations.setflags(write=False)
+    translations.setflags(write=False)
+    return list(map(RigidTransform, rotations, translations))
+
+
+def encode_descriptor(vector: NDArray[np.float32]) -> bytes:
+    """A global descriptor, rounded to float16.
+
+    Raises:
+        ValueError: it is not a vector, is empty, or a number is not finite as float16.
+    """
+    if vector.ndim != 1 or not len(vector):
+        raise ValueError(f"a global descriptor must be a vector, has shape {vector.shape}")
+    with np.errstate(over="ignore"):
+        rounded = vector.astype(_FLOAT16)
+    if not np.isfinite(rounded).all():
+        raise ValueError("a global descriptor's number is not finite, or too large for float16")
+    return rounded.tobytes()
+
+
+def decode_descriptors(blobs: Sequence[bytes]) -> list[NDArray[np.float32]]:
+    """Many global descriptors, whose checksums must have been checked; read-only arrays."""
+    if len(set(map(len, blobs))) > 1:  # the same name means the same length, unless somebody gave it to two things
+        return [decode_descriptors([blob])[0] for blob in blobs]
+    if not blobs:
+        return np.empty((0, 0), np.float32)
+    vectors = np.frombuffer(b"".join(blobs), _FLOAT16).reshape(len(blobs), -1).astype(np.float32)
+    vectors.setflags(write=False)
+    return [*vectors]
+
+
+def check(owner: str, data: object, sha256: str, what: str) -> None:
+    """Raises Damaged if these are not the bytes that were stored for this owner."""
     # One flipped bit can make SQLite take a blob for text, so the type is as little to be trusted as the content.
     if not isinstance(data, bytes) or sha256_for(owner, data) != sha256:
         raise Damaged(what)

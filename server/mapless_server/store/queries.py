@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, func, select, update
+from sqlalchemy import Connection, Row, Select, Table, select, update
+from sqlalchemy.dialects import postgresql, sqlite
 
 from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.principal import DEFAULT_TENANT
-from mapless_server.store.tables import features, image, reference, scene, scene_generation
+from mapless_server.store.tables import features, global_descriptor, image, reference, scene, scene_generation
 from mapless_server.tenancy import KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
 
 _IDS_PER_STATEMENT = 500
@@ -17,10 +18,9 @@ _IDS_PER_STATEMENT = 500
 
 
 def select_scenes() -> Select[Any]:
-    """Columns of ``scene``, ``generation`` and ``reference_count``."""
-    count = select(func.count()).where(reference.c.scene_id == scene.c.scene_id).scalar_subquery()
+    """Columns of ``scene`` and ``generation``."""
     return (
-        select(scene, scene_generation.c.generation, count.label("reference_count"))
+        select(scene, scene_generation.c.generation)
         .select_from(scene)
         .join(scene_generation, scene_generation.c.scene_id == scene.c.scene_id)
     )
@@ -54,21 +54,38 @@ def read_generation(connection: Connection, scene_key: SceneKey) -> int:
     return generation
 
 
-def raise_generation(connection: Connection, scene_key: SceneKey) -> bool:
-    """Count a change; False if no scene of this id ever existed."""
-    generation = scene_generation.c.generation
-    change = update(scene_generation).where(scene_generation.c.scene_id == scene_key).values(generation=generation + 1)
-    return connection.execute(change).rowcount == 1
+def read_generations(connection: Connection) -> dict[str, int]:
+    """Generations by scene key, of all scenes that ever existed."""
+    column = scene_generation.c
+    return {row.scene_id: row.generation for row in connection.execute(select(column.scene_id, column.generation))}
 
 
-def begin_change(connection: Connection, scene_key: SceneKey) -> None:
-    """Count a change of a scene that must exist. Raises NotFound.
+def raise_generation(connection: Connection, scene_key: SceneKey) -> int:
+    """Count a change of a scene, which need not exist; the new generation.
 
-    The counter is raised before anything is looked at: its row is the lock that orders the changes of a scene where the
+    This comes before anything is looked at: the counter's row is the lock that orders the changes of a scene where the
     database lets several writers in.
     """
-    raise_generation(connection, scene_key)
-    read_generation(connection, scene_key)
+    column = scene_generation.c
+    first = _upsert(connection, scene_generation).values(scene_id=scene_key, generation=1)
+    change = first.on_conflict_do_update(index_elements=[column.scene_id], set_={"generation": column.generation + 1})
+    connection.execute(change)
+    generation: int = connection.execute(select(column.generation).where(column.scene_id == scene_key)).scalar_one()
+    return generation
+
+
+def begin_change(connection: Connection, scene_key: SceneKey, added_count: int = 0) -> int:
+    """Count a change of a scene that must exist, and the references that it adds. Raises NotFound.
+
+    Returns:
+        The new generation.
+    """
+    generation = raise_generation(connection, scene_key)
+    count = scene.c.reference_count + added_count
+    change = update(scene).where(scene.c.scene_id == scene_key).values(reference_count=count)
+    if connection.execute(change).rowcount != 1:
+        raise _scene_not_found(scene_key)
+    return generation
 
 
 def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
@@ -133,12 +150,24 @@ def features_by_key(connection: Connection, keys: Sequence[str], extractor: str)
     }
 
 
-def find_id(connection: Connection, key: str) -> str:
-    """Id of the reference with this key. Raises NotFound if it was deleted."""
-    reference_id: str | None = connection.scalar(select(reference.c.reference_id).where(reference.c.key == key))
-    if reference_id is None:
-        raise _reference_deleted()
-    return reference_id
+def hold_reference(connection: Connection, key: str) -> Row[Any]:
+    """Columns ``scene_id`` and ``reference_id`` of a reference, which nobody deletes before the transaction is over.
+
+    Raises NotFound if it was deleted.
+    """
+    statement: Select[Any] = select(reference.c.scene_id, reference.c.reference_id).where(reference.c.key == key)
+    row = connection.execute(statement.with_for_update(read=True, key_share=True)).one_or_none()
+    if row is None:
+        raise reference_deleted()
+    return row
+
+
+def find_scene_key(connection: Connection, key: str) -> SceneKey:
+    """Scene of the reference with this key. Raises NotFound if it was deleted."""
+    scene_key: str | None = connection.scalar(select(reference.c.scene_id).where(reference.c.key == key))
+    if scene_key is None:
+        raise reference_deleted()
+    return SceneKey(scene_key)
 
 
 def find_image(connection: Connection, key: str) -> Row[Any]:
@@ -150,7 +179,7 @@ def find_image(connection: Connection, key: str) -> Row[Any]:
     )
     row = connection.execute(statement).one_or_none()
     if row is None:
-        raise _reference_deleted()
+        raise reference_deleted()
     return row
 
 
@@ -161,12 +190,30 @@ def has_features(connection: Connection, key: str, extractor: str) -> bool:
     return connection.scalar(statement) is not None
 
 
+def has_descriptor(connection: Connection, key: str, name: str) -> bool:
+    """Whether there is a global descriptor of this name."""
+    column = global_descriptor.c
+    return connection.scalar(select(column.name).where(column.reference_key == key, column.name == name)) is not None
+
+
+def insert_new(connection: Connection, table: Table, row: Mapping[str, Any]) -> bool:
+    """Insert a row unless one with its primary key is there already; whether it was inserted."""
+    addition = _upsert(connection, table).values(row).on_conflict_do_nothing()
+    return connection.execute(addition, execution_options={"preserve_rowcount": True}).rowcount == 1
+
+
+def _upsert(connection: Connection, table: Table) -> Any:
+    """An insertion that may say what happens on conflict: both databases can, each by a class of its own."""
+    return postgresql.insert(table) if connection.dialect.name == "postgresql" else sqlite.insert(table)
+
+
 def reference_not_found(scene_key: SceneKey, reference_id: str, field: str) -> NotFound:
     """The answer for a reference that does not exist."""
     return NotFound(f"there is no reference {reference_id!r} in scene {scene_id_of(scene_key)!r}", field=field)
 
 
-def _reference_deleted() -> NotFound:
+def reference_deleted() -> NotFound:
+    """The answer to a key that is nobody's any more."""
     return NotFound("a reference was deleted while it was used")
 
 

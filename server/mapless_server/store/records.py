@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.method.views import View
@@ -19,7 +22,8 @@ class SceneRecord:
         scene_key: unique among the scenes that exist.
         generation: raised by every change of the scene or its references. A scene that is deleted and created again
             counts on, so (scene_key, generation) never means two different contents. Features of one more extractor
-            are no change: they follow from the image and the extractor's name, and answers are named after both.
+            are no change: they follow from the image and the extractor's name, and answers are named after both. One
+            more global descriptor is: which references are found depends on which of them have it.
         reference_count: number of references.
         create_time: UTC.
     """
@@ -46,6 +50,7 @@ class NewReference:
         world_from_camera: its pose, metric.
         views: by the name of the extractor, "sift-2048-1024px-0.02": processed camera and features, float32 arrays. At
             least one; the first one's features are those that are counted.
+        descriptors: global descriptors by name, (D,) each; kept as float16.
     """
 
     reference_id: str
@@ -53,6 +58,7 @@ class NewReference:
     camera: Camera
     world_from_camera: RigidTransform
     views: Mapping[str, View]
+    descriptors: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,3 +121,39 @@ class SceneSnapshot:
     generation: int
     references: tuple[DescribedReference, ...]
     undescribed: tuple[ReferenceRecord, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class IndexedReference:
+    """What choosing among references needs to know of one.
+
+    Attributes:
+        reference_id: unique within the scene.
+        key: identifies this very reference for good.
+        world_from_camera: its pose, metric; read-only arrays.
+        descriptor: the global descriptor of the name asked for, (D,), read-only, as float16 keeps it; None where there
+            is none.
+    """
+
+    reference_id: str
+    key: str
+    world_from_camera: RigidTransform
+    descriptor: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneChanges:
+    """What became of a scene since a generation, read at one moment.
+
+    Attributes:
+        generation: of the scene at that moment; the one to ask with next time.
+        added: references to put in, by id. One that is known already has got a descriptor since and takes the place of
+            what was known.
+        removed: keys of references that are gone; they may never have been known.
+        is_whole: what was known before is void, and `added` is the whole scene.
+    """
+
+    generation: int
+    added: tuple[IndexedReference, ...]
+    removed: frozenset[str]
+    is_whole: bool

@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import uuid
+from collections.abc import Sequence
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import Row
 
 from mapless_server.errors import DataLoss
 from mapless_server.method.views import View
 from mapless_server.store import codec
-from mapless_server.store.records import DescribedReference, NewReference, ReferenceRecord, SceneRecord
+from mapless_server.store.records import (
+    DescribedReference,
+    IndexedReference,
+    NewReference,
+    ReferenceRecord,
+    SceneRecord,
+)
 from mapless_server.tenancy import SceneKey
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
@@ -47,7 +56,7 @@ def new_record(scene_key: SceneKey, new: NewReference, create_time: datetime) ->
 
 
 def reference_row(record: ReferenceRecord) -> dict[str, Any]:
-    """For the table ``reference``. Raises ValueError if a number is not finite."""
+    """For the table ``reference``, but for the generation. Raises ValueError if a number is not finite."""
     geometry = codec.encode_geometry(record.camera, record.world_from_camera)
     return {
         "key": record.key,
@@ -86,15 +95,57 @@ def features_row(key: str, extractor: str, view: View) -> dict[str, Any]:
         "reference_key": key,
         "extractor": extractor,
         "data": data,
-        "sha256": codec.sha256_for(f"{key}/{extractor}", data),
+        "sha256": codec.sha256_for(features_owner(key, extractor), data),
     }
+
+
+def descriptor_row(key: str, name: str, vector: NDArray[np.float32]) -> dict[str, Any]:
+    """For the table ``global_descriptor``. Raises ValueError if it is no vector or a number not finite."""
+    data = codec.encode_descriptor(vector)
+    return {
+        "reference_key": key,
+        "name": name,
+        "data": data,
+        "sha256": codec.sha256_for(descriptor_owner(key, name), data),
+    }
+
+
+def features_owner(key: str, extractor: str) -> str:
+    """Whom the bytes of features belong to."""
+    return f"{key}/{extractor}"
+
+
+def descriptor_owner(key: str, name: str) -> str:
+    """Whom the bytes of a global descriptor belong to; nothing else of a reference has a number sign in its name."""
+    return f"{key}#{name}"
+
+
+def indexed_references(found: Sequence[Row[Any]], descriptor_name: str) -> list[IndexedReference]:
+    """From rows as ``changes.py`` selects them, all at once for speed. Raises DataLoss if one is damaged."""
+    for row in found:
+        _check_indexed(row, descriptor_name)
+    poses = codec.decode_poses([row.geometry for row in found])
+    vectors = iter(codec.decode_descriptors([row.data for row in found if row.sha256 is not None]))
+    return [
+        IndexedReference(row.reference_id, row.key, pose, None if row.sha256 is None else next(vectors))
+        for row, pose in zip(found, poses, strict=True)
+    ]
+
+
+def _check_indexed(row: Row[Any], descriptor_name: str) -> None:
+    try:
+        codec.check(row.key, row.geometry, row.geometry_sha256, "camera and pose")
+        if row.sha256 is not None:
+            codec.check(descriptor_owner(row.key, descriptor_name), row.data, row.sha256, "global descriptor")
+    except codec.Damaged as error:
+        raise data_loss(row.reference_id, str(error)) from error
 
 
 def described_reference(row: Row[Any]) -> DescribedReference:
     """From a row of ``queries.features_by_key``. Raises DataLoss if it is damaged."""
     record = reference_record(row)
     try:
-        view = codec.decode_view(f"{row.key}/{row.extractor}", row.data, row.sha256)
+        view = codec.decode_view(features_owner(row.key, row.extractor), row.data, row.sha256)
     except codec.Damaged as error:
         raise data_loss(row.reference_id, str(error)) from error
     return DescribedReference(record, view)

@@ -15,12 +15,15 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from urllib.parse import quote
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event
 from sqlalchemy.exc import DBAPIError
 
-from mapless_server.errors import DataLoss, Overloaded, Unavailable
-from mapless_server.store.tables import create_or_check_schema
+from mapless_server.errors import DataLoss, Overloaded, RequestError, Unavailable
+from mapless_server.store.database import StoreError
+from mapless_server.store.migrations import migrate, read_version
+from mapless_server.store.tables import SCHEMA_VERSION
 
 logger = logging.getLogger(__name__)
 
@@ -29,11 +32,8 @@ LOCK_FILE = "mapless.lock"
 BUSY_TIMEOUT_MS = 5000
 """How long a connection waits for another's lock. Our writers queue before SQLite does; this is for tools beside us."""
 
+_URI_PREFIX = "file:"
 _BEGIN_OPTION = "sqlite_begin_statement"
-
-
-class StoreError(Exception):
-    """The store cannot be opened; the message is one sentence for the operator."""
 
 
 def has_wal_reset_bug(version: tuple[int, int, int]) -> bool:
@@ -48,7 +48,10 @@ def has_wal_reset_bug(version: tuple[int, int, int]) -> bool:
 class SqliteDatabase:
     """The database file of one data folder, locked against other servers; safe for many threads."""
 
-    def __init__(self, engine: Engine, folder_lock: int) -> None:
+    is_shared = False
+
+    def __init__(self, engine: Engine, folder_lock: int | None) -> None:
+        self.name = str(engine.url.database).removeprefix(_URI_PREFIX)
         self._engine = engine
         # BEGIN IMMEDIATE takes the write lock at once. A transaction that reads first and then wants to write would be
         # refused without waiting when another has written in between.
@@ -69,33 +72,85 @@ class SqliteDatabase:
             folder_lock = _lock_folder(folder)
         except OSError as error:
             raise StoreError(f"data folder {folder} cannot be used: {error.strerror}") from error
-        path = folder / DATABASE_FILE
-        database = SqliteDatabase(_create_engine(path), folder_lock)
-        try:
-            with database._writing_engine.begin() as connection:
-                create_or_check_schema(connection)
-        except DBAPIError as error:
-            database.close()
-            raise StoreError(f"database {path} cannot be opened: {error.orig}") from error
-        except ValueError as error:
-            database.close()
-            raise StoreError(f"database {path} cannot be used: {error}") from error
-        except BaseException:
-            database.close()
-            raise
+        return SqliteDatabase._opened(folder / DATABASE_FILE, folder_lock)
+
+    @staticmethod
+    def open_scratch(path: Path, version: int = SCHEMA_VERSION) -> SqliteDatabase:
+        """A file that is worth nothing before it is finished, so that nothing is waited for; of a schema's version.
+
+        Raises:
+            StoreError: as `open`.
+        """
+        return SqliteDatabase._opened(path, None, version, is_scratch=True)
+
+    @staticmethod
+    def look_at(path: Path) -> SqliteDatabase:
+        """Read a database as it is, whatever its schema: that of a server that is running, or a backup.
+
+        Raises:
+            StoreError: there is no such file, or it holds something else than our store.
+        """
+        if not path.is_file():
+            raise StoreError(f"there is no database {path}")
+        database = SqliteDatabase(create_sqlite_engine(path, only_reads=True), None)
+        with database._faults_at_opening(), database.read() as connection:
+            if read_version(connection) is None:
+                raise ValueError("it is empty")
+        return database
+
+    @staticmethod
+    def _opened(
+        path: Path, folder_lock: int | None, version: int = SCHEMA_VERSION, is_scratch: bool = False
+    ) -> SqliteDatabase:
+        database = SqliteDatabase(create_sqlite_engine(path, is_scratch=is_scratch), folder_lock)
+        with database._faults_at_opening():
+            database._migrate(version)
         return database
 
     @contextmanager
+    def _faults_at_opening(self) -> Iterator[None]:
+        try:
+            yield
+        except DBAPIError as error:
+            self.close()
+            raise StoreError(f"database {self.name} cannot be opened: {error.orig}") from error
+        except RequestError as error:
+            self.close()
+            raise StoreError(f"database {self.name} cannot be opened: {error}") from error
+        except ValueError as error:
+            self.close()
+            raise StoreError(f"database {self.name} cannot be used: {error}") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _migrate(self, version: int) -> None:
+        with self._writing_engine.connect() as connection:
+            # Where SQLite cannot alter a table it is given a new one, and deleting the old must not delete what refers
+            # to it. This can be said outside of a transaction only.
+            _execute(connection, "PRAGMA foreign_keys=OFF")
+            try:
+                with connection.begin():
+                    found = migrate(connection, version)
+                    if found not in (None, version) and connection.exec_driver_sql("PRAGMA foreign_key_check").first():
+                        raise ValueError("a part of it refers to what is not there")
+            finally:
+                _execute(connection, "PRAGMA foreign_keys=ON")
+
+    @contextmanager
     def read(self) -> Iterator[Connection]:
-        """A transaction that sees one moment of the database throughout."""
+        """Implements Database."""
         with _database_faults_translated(), self._engine.begin() as connection:
             yield connection
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
-        """A transaction that is on the disk, whole, when the block is left, or not at all if it raises."""
+        """Implements Database."""
         with _database_faults_translated(), self._write_lock, self._writing_engine.begin() as connection:
             yield connection
+
+    def take_your_time(self, connection: Connection) -> None:
+        """Implements Database."""
 
     def close(self) -> None:
         """Close all connections and let other servers in; nothing may be reading or writing."""
@@ -122,7 +177,21 @@ def _lock_folder(folder: Path) -> int:
     return lock
 
 
-def _create_engine(path: Path) -> Engine:
+def _execute(connection: Connection, statement: str) -> None:
+    """Outside of any transaction."""
+    driver_connection = connection.connection.driver_connection
+    assert driver_connection is not None
+    driver_connection.execute(statement)
+
+
+def create_sqlite_engine(path: Path, only_reads: bool = False, is_scratch: bool = False) -> Engine:
+    """Connections to a file, each set as a store that must not lose anything needs it.
+
+    Args:
+        path: the file, created if missing.
+        only_reads: the file must be there, and is left as it is.
+        is_scratch: the file may be lost.
+    """
     library = choose_library()
     safe_mode = has_wal_reset_bug(library.sqlite_version_info)
     if safe_mode:
@@ -132,8 +201,14 @@ def _create_engine(path: Path) -> Engine:
         )
     # WAL with FULL, and a rollback journal with EXTRA, keep every acknowledged commit through a power failure.
     journal_mode, synchronous = ("delete", "EXTRA") if safe_mode else ("wal", "FULL")
+    if is_scratch:
+        journal_mode, synchronous = "off", "OFF"
+    url = URL.create("sqlite", database=str(path))
+    if only_reads:
+        # As a URI, a file that is missing is not created. It may be written all the same: readers share WAL's index.
+        url = URL.create("sqlite", database=f"{_URI_PREFIX}{quote(str(path))}", query={"mode": "rw", "uri": "true"})
     engine = create_engine(
-        URL.create("sqlite", database=str(path)),
+        url,
         module=library,
         max_overflow=-1,  # each worker thread holds one connection at most, so the threads are the bound
         hide_parameters=True,  # an error's text must not carry image bytes into the log
@@ -152,8 +227,10 @@ def _create_engine(path: Path) -> Engine:
             "mmap_size=0",
         ):
             cursor.execute(f"PRAGMA {setting}")
+        if only_reads:
+            cursor.execute("PRAGMA query_only=ON")
+            return
         (mode_in_use,) = cursor.execute(f"PRAGMA journal_mode={journal_mode}").fetchone()
-        cursor.close()
         if mode_in_use != journal_mode:
             raise StoreError(f"database {path} refuses journal mode {journal_mode}; is it on a local disk?")
 

@@ -1,24 +1,23 @@
-"""The schema: five tables and a version number, in types that SQLite and PostgreSQL share."""
+"""The schema as it is now, in types that SQLite and PostgreSQL share; migrations/ has how it came about."""
 
 from __future__ import annotations
 
 from sqlalchemy import (
     BigInteger,
     Column,
-    Connection,
     ForeignKey,
+    Index,
     Integer,
     LargeBinary,
     MetaData,
+    PrimaryKeyConstraint,
     String,
     Table,
     UniqueConstraint,
-    insert,
-    inspect,
-    select,
+    text,
 )
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 metadata = MetaData()
 
@@ -28,6 +27,7 @@ _Id = String(128).with_variant(String(128, collation="C"), "postgresql")
 _SceneKey = String(257).with_variant(String(257, collation="C"), "postgresql")
 _Key = String(32)
 _Sha256 = String(64)
+_NONE_YET = text("0")
 
 store_version = Table(
     "store_version",
@@ -35,11 +35,23 @@ store_version = Table(
     Column("schema_version", Integer, primary_key=True, autoincrement=False),
 )
 
+# Alembic's own, as it makes it: which of its steps were run.
+alembic_version = Table(
+    "alembic_version",
+    metadata,
+    Column("version_num", String(32), nullable=False),
+    PrimaryKeyConstraint("version_num", name="alembic_version_pkc"),
+)
+
 scene = Table(
     "scene",
     metadata,
     Column("scene_id", _SceneKey, primary_key=True),
     Column("create_time_us", BigInteger, nullable=False),
+    # Counted by every change: counting rows takes as long as there are rows.
+    Column("reference_count", BigInteger, nullable=False, server_default=_NONE_YET),
+    # Changes are known since this generation: who knows the scene as of an earlier one reads it as a whole.
+    Column("first_generation", BigInteger, nullable=False, server_default=_NONE_YET),
 )
 
 # Outlives the scene, so that a scene created again under the same id does not repeat generations of its former life.
@@ -61,7 +73,19 @@ reference = Table(
     Column("image_sha256", _Sha256, nullable=False),
     Column("feature_count", Integer, nullable=False),
     Column("create_time_us", BigInteger, nullable=False),
+    # Of the scene when this reference was added, or got its latest global descriptor.
+    Column("generation", BigInteger, nullable=False, server_default=_NONE_YET),
     UniqueConstraint("scene_id", "reference_id"),
+    Index("reference_by_generation", "scene_id", "generation"),
+)
+
+# References that were deleted, as long as their scene exists.
+removed_reference = Table(
+    "removed_reference",
+    metadata,
+    Column("scene_id", _SceneKey, ForeignKey("scene.scene_id", ondelete="CASCADE"), primary_key=True),
+    Column("generation", BigInteger, primary_key=True, autoincrement=False),
+    Column("reference_key", _Key, primary_key=True),
 )
 
 # Images and features stand apart from `reference`, so that listing references does not drag their bytes along.
@@ -81,20 +105,11 @@ features = Table(
     Column("sha256", _Sha256, nullable=False),
 )
 
-
-def create_or_check_schema(connection: Connection) -> None:
-    """Create the tables in an empty database; check that any other holds a store that this program understands.
-
-    Raises:
-        ValueError: the database holds something else, or a store of a newer program.
-    """
-    names = inspect(connection).get_table_names()
-    if not names:
-        metadata.create_all(connection)
-        connection.execute(insert(store_version).values(schema_version=SCHEMA_VERSION))
-        return
-    found = connection.scalar(select(store_version.c.schema_version)) if store_version.name in names else None
-    if found is None:
-        raise ValueError("it is a database of another program")
-    if found != SCHEMA_VERSION:
-        raise ValueError(f"its schema has version {found}, this program knows version {SCHEMA_VERSION}")
+global_descriptor = Table(
+    "global_descriptor",
+    metadata,
+    Column("reference_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
+    Column("name", String(128), primary_key=True),
+    Column("data", LargeBinary, nullable=False),  # see codec.py
+    Column("sha256", _Sha256, nullable=False),
+)

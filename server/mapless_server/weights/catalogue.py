@@ -74,7 +74,7 @@ class Weights:
     Attributes:
         name: what a person calls it.
         file_name: in the weights folder.
-        purpose: what it is for: backend, features or matching.
+        purpose: what it is for: backend, features, matching or retrieval.
         licence: its terms.
         source: where `fetch` gets it.
         size_bytes, sha256: of the official file as it lies in the folder; None where not known, and then not checked.
@@ -99,8 +99,8 @@ _MAGIC_LEAP = Licence(
     "research only",
 )
 
-# Sizes and digests of Pi3 and Pi3X are those that several independent users published of the official files. The
-# sizes are also, to the byte, what a file of exactly our networks' tensors in float32 has. Those of the converted
+# Sizes and digests of Pi3, Pi3X and MegaLoc are those that several independent users published of the official files.
+# The sizes are also, to the byte, what a file of exactly our networks' tensors in float32 has. Those of the converted
 # files were computed here, from originals with the digests of their authors' repositories and releases.
 CATALOGUE = (
     Weights(
@@ -182,6 +182,16 @@ CATALOGUE = (
         "matching",
         _MAGIC_LEAP,
         HubFile("ETH-CVG/lightglue_superpoint"),
+    ),
+    Weights(
+        "megaloc",
+        "megaloc.safetensors",
+        "retrieval",
+        Licence("MIT", "https://github.com/gmberton/MegaLoc/blob/main/LICENSE"),
+        HubFile("gberton/MegaLoc", "7cb9f7970d366fdf059963d04d372e503e8e9df9"),
+        914_577_436,
+        "d4f9f2bcb60018f91eb6a8e061ed054fd55654e10c2569cf13841ea986ffb4f8",
+        "mapless_server.networks.megaloc:MegaLoc",
     ),
 )
 

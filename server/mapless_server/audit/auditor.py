@@ -1,0 +1,182 @@
+"""Examines references against their neighbours, and finds out who is at fault.
+
+A first look judges a reference from the neighbours that share the most matches with it, which are robust against a few
+wrong ones among them. Where it finds a fault there are three suspicions to clear before anybody is blamed:
+
+* the neighbours are at fault. Those whose own first look finds a fault are left out of a second look; a fault that goes
+  away with them was theirs.
+* all poses there are noisy. An offset must stand out from the neighbours' own.
+* the photographs of two references are swapped, which shows when each fits the other's pose.
+
+Where the neighbours by pose do not see what the photograph shows, others are asked that look like it.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from mapless.geometry import RigidTransform
+
+from .change import Change, changed_region
+from .duplicates import Likeness, likeness
+from .look import Look, look_at, pose_difference
+from .neighbourhood import PairMatches
+from .options import AuditOptions
+from .report import describe
+from .resection import Freedom
+from .surroundings import Surroundings
+from .verdict import ReferenceAudit, Verdict
+
+
+def audit_references(
+    names: Sequence[str],
+    surroundings: Surroundings,
+    options: AuditOptions | None = None,
+    pairs: PairMatches | None = None,
+    check: Callable[[], None] = lambda: None,
+) -> list[ReferenceAudit]:
+    """Audits references of a scene, in the order named; the verdicts do not depend on who else is named.
+
+    Args:
+        names: references of the surroundings.
+        surroundings: all references of the scene.
+        options: see there.
+        pairs: remembers matches between calls; with the ratio of the features.
+        check: called before each look, and lets what it raises through.
+    """
+    auditor = Auditor(surroundings, options or AuditOptions(), pairs or PairMatches(), check)
+    return [auditor.audit(name) for name in names]
+
+
+class Auditor:
+    """Audits references; remembers looks, since neighbours are asked again and again. Of one thread."""
+
+    def __init__(
+        self,
+        surroundings: Surroundings,
+        options: AuditOptions,
+        pairs: PairMatches,
+        check: Callable[[], None] = lambda: None,
+        remembered_looks: int = 300,
+    ) -> None:
+        self._around, self._options, self._pairs, self._check = surroundings, options, pairs, check
+        self._remembered_looks = remembered_looks
+        self._looks: OrderedDict[str, tuple[Look, tuple[str, Likeness]]] = OrderedDict()
+
+    def audit(self, name: str) -> ReferenceAudit:
+        """The verdict on one reference."""
+        look, twin = self._first_look(name)
+        is_wide = False
+        if not look.is_usable:
+            look, twin = self._wide_look(name, twin)
+            is_wide = True
+        verdict, blamed = self._judge(look), ""
+        if verdict.is_alarm:
+            look, verdict, blamed = self._without_suspects(look, verdict, is_wide)
+        if verdict in (Verdict.WRONG_POSE, Verdict.WRONG_POSE_AND_FOCAL):
+            partner = self._swapped_with(look)
+            if partner:
+                return describe(look, Verdict.SWAPPED, other=partner)
+        if verdict.is_alarm:
+            return describe(look, verdict, other=twin[0] if twin[1] is Likeness.SAME_PHOTOGRAPH else "")
+        change = self._change(name, look, verdict)
+        if change is not None and change.is_alarm:
+            return describe(look, Verdict.CHANGED, change=change)
+        if verdict is Verdict.UNVERIFIABLE:
+            return describe(look, verdict, other=blamed)
+        if twin[0]:
+            return describe(look, Verdict.DUPLICATE, other=twin[0], same=twin[1] is Likeness.SAME_PHOTOGRAPH, change=change)
+        return describe(look, Verdict.CONSISTENT, change=change)
+
+    def _first_look(self, name: str) -> tuple[Look, tuple[str, Likeness]]:
+        """From the neighbours by pose, and the reference most like it among them; remembered."""
+        if name not in self._looks:
+            self._looks[name] = self._look(name, self._around.near(name, self._options.candidate_count))
+            while len(self._looks) > self._remembered_looks:
+                self._looks.popitem(last=False)
+        self._looks.move_to_end(name)
+        return self._looks[name]
+
+    def _wide_look(self, name: str, twin: tuple[str, Likeness]) -> tuple[Look, tuple[str, Likeness]]:
+        """From those that look like it."""
+        look, wide_twin = self._look(name, self._around.alike(name, self._options.wide_count))
+        return look, max(twin, wide_twin, key=lambda t: t[1].value)
+
+    def _look(self, name: str, candidates: Sequence[str]) -> tuple[Look, tuple[str, Likeness]]:
+        """From the candidates that share the most matches.
+
+        Copies of the same photograph bear no witness: what is wrong with one is wrong with the other.
+        """
+        self._check()
+        subject, twin = self._around.view(name), ("", Likeness.DIFFERENT)
+        counts: dict[str, int] = {}
+        for other in self._around.views(candidates):
+            matches = self._pairs.match(subject, other)
+            alike = likeness(subject, other, matches, self._options)
+            twin = max(twin, (other.name, alike), key=lambda t: t[1].value)
+            if alike is not Likeness.SAME_PHOTOGRAPH:
+                counts[other.name] = len(matches)
+        chosen = sorted(counts, key=lambda n: -counts[n])[: self._options.neighbour_count]
+        return look_at(subject, self._around.views(chosen), self._pairs, self._options), twin
+
+    def _judge(self, look: Look) -> Verdict:
+        """The verdict on a look, with the allowance for noise that its neighbours need where they agree on it."""
+        verdict = look.verdict()
+        if not verdict.is_alarm:
+            return verdict
+        looks = [self._first_look(reference.name)[0] for reference in look.neighbourhood.references]
+        usable = [other for other in looks if other.is_usable]
+        if not usable:
+            return verdict
+        noise_m = float(np.median([other.offset_m for other in usable]))
+        noise_deg = float(np.median([other.turn_deg for other in usable]))
+        return look.verdict(noise_m, noise_deg)
+
+    def _without_suspects(self, look: Look, verdict: Verdict, is_wide: bool) -> tuple[Look, Verdict, str]:
+        """The look and verdict that are left when faulty neighbours are left out, and one of them if that undid it all."""
+        names = [reference.name for reference in look.neighbourhood.references]
+        suspects = [name for name in names if self._first_look(name)[0].verdict().is_alarm]
+        if not suspects:
+            return look, verdict, ""
+        rest = [name for name in names if name not in suspects]
+        if not is_wide:
+            spare = [n for n in self._around.near(look.subject.name, 2 * self._options.candidate_count) if n not in names]
+            rest += [n for n in spare if not self._first_look(n)[0].verdict().is_alarm]
+        second, _ = self._look(look.subject.name, rest)
+        if second.is_usable:
+            return second, self._judge(second), ""
+        worse = max(suspects, key=lambda n: self._first_look(n)[0].excess(Freedom.NOTHING))
+        if self._first_look(worse)[0].excess(Freedom.NOTHING) < look.excess(Freedom.NOTHING):
+            return look, verdict, ""
+        return second, Verdict.UNVERIFIABLE, worse
+
+    def _swapped_with(self, look: Look) -> str:
+        """The reference at whose pose the photograph was taken, if that one's was taken here; empty if there is none."""
+        found, given = look.world_from_camera, look.subject.world_from_camera
+        for name in self._around.near_pose(found, 4, look.subject.name):
+            if not self._is_near(found, self._around.pose(name), look):
+                continue
+            other, _ = self._first_look(name)
+            if not other.is_usable:
+                other, _ = self._wide_look(name, ("", Likeness.DIFFERENT))
+            if other.is_usable and self._is_near(other.world_from_camera, given, other):
+                return name
+        return ""
+
+    def _is_near(self, found: RigidTransform, given: RigidTransform, look: Look) -> bool:
+        """Whether a given pose is what a look found, as far as it can tell."""
+        apart_m, apart_deg = pose_difference(found, given)
+        sigma = self._options.significance_sigma
+        largest_sigma_m = look.largest_sigma_m
+        return apart_m <= max(self._options.position_tolerance_m, sigma * largest_sigma_m) and apart_deg <= max(
+            self._options.rotation_tolerance_deg, sigma * look.sigma_deg
+        )
+
+    def _change(self, name: str, look: Look, verdict: Verdict) -> Change | None:
+        """What of the image does not show what the neighbours show; None where that cannot be said."""
+        if verdict is Verdict.UNVERIFIABLE:
+            look, _ = self._first_look(name)
+        return changed_region(look)

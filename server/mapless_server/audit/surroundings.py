@@ -1,0 +1,128 @@
+"""The references around one: near by pose, or similar by looks. Poses of the whole scene fit in memory, features do not.
+
+A reference is judged from its neighbours and, if these are in doubt, from theirs; so a scene of any size is audited
+page by page, and references are loaded as they are needed.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from mapless.geometry import Array, RigidTransform
+
+from ..method.views import PosedView
+
+HEADING_DEG = 30.0
+"""A turn by so much costs two photographs as much in common as a step to the last of the nearest references."""
+
+Similar = Callable[[str, int], Sequence[str]]
+"""Names of at most so many references that look like the one named, the most similar first."""
+
+
+@dataclass(frozen=True)
+class PosedName:
+    """A reference without its features.
+
+    Attributes:
+        name: unique in the scene.
+        world_from_camera: its given pose, metric.
+    """
+
+    name: str
+    world_from_camera: RigidTransform
+
+
+class Surroundings:
+    """The references of a scene, found by pose or by looks."""
+
+    def __init__(
+        self,
+        poses: Sequence[PosedName],
+        load: Callable[[Sequence[str]], Sequence[PosedView]],
+        similar: Similar | None = None,
+        remembered_views: int = 500,
+    ) -> None:
+        """Takes all poses of a scene and how to load references of it.
+
+        Args:
+            poses: of all references.
+            load: the references of these names, in order.
+            similar: how to find similar ones; None looks at the nearest by position instead.
+            remembered_views: loaded references that are kept, about 1.2 MB each.
+        """
+        self.poses = tuple(poses)
+        self._load, self._similar = load, similar
+        self._remembered_views = remembered_views
+        self._views: OrderedDict[str, PosedView] = OrderedDict()
+        self._index = {pose.name: i for i, pose in enumerate(self.poses)}
+
+    def view(self, name: str) -> PosedView:
+        """The reference of this name."""
+        return self.views([name])[0]
+
+    def views(self, names: Sequence[str]) -> tuple[PosedView, ...]:
+        """The references of these names."""
+        missing = [name for name in names if name not in self._views]
+        found = {name: self._views[name] for name in names if name in self._views}
+        if missing:
+            found |= dict(zip(missing, self._load(missing), strict=True))
+        for name in names:
+            self._views[name] = found[name]
+            self._views.move_to_end(name)
+        while len(self._views) > self._remembered_views:
+            self._views.popitem(last=False)
+        return tuple(found[name] for name in names)
+
+    def near(self, name: str, count: int) -> list[str]:
+        """Names of the references nearest to one by position and heading, the nearest first."""
+        return self.near_pose(self.poses[self._index[name]].world_from_camera, count, name)
+
+    def near_pose(self, world_from_camera: RigidTransform, count: int, but: str = "") -> list[str]:
+        """Names of the references nearest to a pose by position and heading, the nearest first."""
+        distance, index = self._nearest(world_from_camera, 4 * count + 1)
+        others = np.array([self.poses[i].name != but for i in index])
+        distance, index = distance[others], index[others]
+        if not len(index):
+            return []
+        cosine = self._headings[index] @ world_from_camera.rotation[:, 2]
+        turn_deg = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+        reach_m = max(float(distance[min(count, len(distance)) - 1]), 1e-9)
+        order = np.argsort(distance / reach_m + turn_deg / HEADING_DEG, kind="stable")
+        return [self.poses[i].name for i in index[order[:count]]]
+
+    def alike(self, name: str, count: int) -> list[str]:
+        """Names of references that may show the same as one, wherever they are said to stand."""
+        if self._similar is not None:
+            return [other for other in self._similar(name, count + 1) if other != name][:count]
+        _, index = self._nearest(self.poses[self._index[name]].world_from_camera, count + 1)
+        return [self.poses[i].name for i in index if self.poses[i].name != name][:count]
+
+    def pose(self, name: str) -> RigidTransform:
+        """The given pose of a reference."""
+        return self.poses[self._index[name]].world_from_camera
+
+    def _nearest(self, world_from_camera: RigidTransform, count: int) -> tuple[Array, NDArray[np.intp]]:
+        distance, index = self._tree.query(world_from_camera.translation, k=min(count, len(self.poses)))
+        return np.atleast_1d(distance), np.atleast_1d(index)
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(np.stack([pose.world_from_camera.translation for pose in self.poses]))
+
+    @cached_property
+    def _headings(self) -> Array:
+        return np.stack([pose.world_from_camera.rotation[:, 2] for pose in self.poses])
+
+
+def surroundings_of(references: Sequence[PosedView]) -> Surroundings:
+    """Of references that are all in memory."""
+    by_name = {reference.name: reference for reference in references}
+    poses = [PosedName(r.name, r.world_from_camera) for r in references]
+    return Surroundings(poses, lambda names: [by_name[name] for name in names], remembered_views=len(references))

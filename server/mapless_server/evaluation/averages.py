@@ -1,0 +1,116 @@
+"""Runs by benchmark, and their figures averaged over scenes: the mean of the scenes' medians, as in the paper."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from .benchmarks import BENCHMARKS, Benchmark
+from .metrics import RECALL_BARS, Summary, summarize
+from .protocol import Method
+from .suite import Run, Suite
+
+Key = tuple[str, int, Method]
+"""Scene, setting and method."""
+
+
+@dataclass(frozen=True)
+class Average:
+    """Figures of one method in one setting over scenes.
+
+    Attributes:
+        scenes: which.
+        complete: whether they are all that the paper averages over; always, where there is no paper.
+        median_translation_m, median_rotation_deg: mean of the scenes' medians; infinite if one is.
+        recall: mean of the scenes' shares within `RECALL_BARS`.
+        localized, queries: of all scenes together.
+        latency_p50_ms, latency_p95_ms: mean of the scenes'.
+    """
+
+    scenes: tuple[str, ...]
+    complete: bool
+    median_translation_m: float
+    median_rotation_deg: float
+    recall: dict[str, float]
+    localized: int
+    queries: int
+    latency_p50_ms: float
+    latency_p95_ms: float
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Runs on scenes of one layout.
+
+    Attributes:
+        benchmark: None for folders with cameras.json.
+        scenes: those that were to be measured, in order.
+        settings, methods: the same.
+        runs: by scene, setting and method; what could not be measured is not there.
+        summaries: the same.
+    """
+
+    layout: str
+    benchmark: Benchmark | None
+    scenes: tuple[str, ...]
+    settings: tuple[int, ...]
+    methods: tuple[Method, ...]
+    runs: dict[Key, Run]
+    summaries: dict[Key, Summary] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "summaries", {key: summarize(run.results) for key, run in self.runs.items()})
+
+    @property
+    def title(self) -> str:
+        """Name of the benchmark, or what it is else."""
+        return self.benchmark.title if self.benchmark else "Own photographs"
+
+    def average(self, setting: int, method: Method) -> Average | None:
+        """Over those measured scenes that the paper averages over, else over all; None if nothing was measured."""
+        measured = tuple(scene for scene in self.scenes if (scene, setting, method) in self.summaries)
+        papers = tuple(self.benchmark.scenes) if self.benchmark else ()
+        scenes = tuple(scene for scene in measured if scene in papers) or measured
+        if not scenes:
+            return None
+        summaries = [self.summaries[scene, setting, method] for scene in scenes]
+        return Average(
+            scenes=scenes,
+            complete=set(scenes) == set(papers or self.scenes),
+            median_translation_m=_mean([s.median_translation for s in summaries]),
+            median_rotation_deg=_mean([s.median_rotation_deg for s in summaries]),
+            recall={name: _mean([s.recall[name] for s in summaries]) for name in RECALL_BARS},
+            localized=sum(s.localized_count for s in summaries),
+            queries=sum(s.query_count for s in summaries),
+            latency_p50_ms=_mean([s.latency_p50_ms for s in summaries]),
+            latency_p95_ms=_mean([s.latency_p95_ms for s in summaries]),
+        )
+
+
+def groups_of(suite: Suite) -> tuple[Group, ...]:
+    """The runs of each benchmark together."""
+    groups = []
+    for layout in dict.fromkeys(scene.place.layout for scene in suite.scenes):
+        scenes = [scene for scene in suite.scenes if scene.place.layout == layout]
+        settings = dict.fromkeys(split.setting for scene in scenes for split in scene.splits)
+        runs = {
+            (run.scene.place.name, run.split.setting, run.method): run
+            for run in suite.runs
+            if run.scene.place.layout == layout
+        }
+        groups.append(
+            Group(
+                layout,
+                BENCHMARKS.get(layout),
+                tuple(scene.place.name for scene in scenes),
+                tuple(settings),
+                suite.options.methods(),
+                runs,
+            )
+        )
+    return tuple(groups)
+
+
+def _mean(values: Sequence[float]) -> float:
+    return math.fsum(values) / len(values) if all(map(math.isfinite, values)) else math.inf

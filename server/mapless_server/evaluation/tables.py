@@ -1,0 +1,211 @@
+"""The paper's tables, with our figures beside its own; the same tables for the terminal and for the page."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from .averages import Average, Group
+from .metrics import Summary
+from .paper import DENSE, Median, PaperMethod
+from .protocol import Method, setting_name
+from .report import format_stages
+
+OURS, PAPERS, RIVAL = "ours", "paper", "rival"
+NOTHING = "\N{EN DASH}"
+"""Not measured, or not in the paper."""
+FAILED = "failed"
+"""A median that is infinite: half of the queries, or more, were not localized."""
+
+METRIC_ALREADY = (
+    "The backend geometric triangulates from the references' own poses: its reconstruction is metric already, and the "
+    "strategies agree. They differ with pi3 and pi3x."
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line: its cells, and whose figures they are."""
+
+    cells: tuple[str, ...]
+    whose: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table for people.
+
+    Attributes:
+        head: of the columns; the first names the lines.
+        notes: what has to be known to read it.
+        wide: whether it is too wide for a terminal.
+    """
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...] = ()
+    wide: bool = False
+
+
+def tables_of(group: Group) -> tuple[Table, ...]:
+    """All tables of a benchmark that have something in them."""
+    tables = [_dense(group)] if DENSE in group.settings else []
+    tables += [_by_setting(group), _recall(group), _by_scene(group)]
+    if len({method.scale for method in group.methods}) > 1:
+        tables.append(_scales(group))
+    return tuple(table for table in (*tables, _timing(group)) if table.rows)
+
+
+def format_median(translation_cm: float, rotation_deg: float) -> str:
+    """As the paper prints it, with a digit more: "0.62/0.214"."""
+    if math.isinf(translation_cm) or math.isinf(rotation_deg):
+        return FAILED
+    return (
+        f"{translation_cm:.2f}/{rotation_deg:.3f}"
+        if translation_cm < 100
+        else f"{translation_cm:.0f}/{rotation_deg:.2f}"
+    )
+
+
+def _dense(group: Group) -> Table:
+    paper = group.benchmark.paper if group.benchmark else None
+    names = group.benchmark.scenes if group.benchmark else {}
+    scenes = tuple(dict.fromkeys((*names, *group.scenes)))
+    rows = [
+        Row(
+            (
+                _ours(m),
+                *(_median(group.summaries.get((s, DENSE, m))) for s in scenes),
+                _average(group.average(DENSE, m)),
+            ),
+            OURS,
+        )
+        for m in group.methods
+    ]
+    for method in reversed(paper.methods if paper else ()):
+        cells = (*(_papers(method.scenes.get(scene)) for scene in scenes), _papers(method.average.get(DENSE)))
+        rows.append(Row((_theirs(method), *cells), PAPERS if method.variant else RIVAL))
+    head = ("method", *(names.get(scene, scene) for scene in scenes), "average")
+    notes = [f'Of the paper: its table "{paper.dense_table}".'] if paper else []
+    return Table("Dense: median error, cm/°", head, tuple(rows), (*notes, *_average_notes(group)))
+
+
+def _by_setting(group: Group) -> Table:
+    paper = group.benchmark.paper if group.benchmark else None
+    rows = [
+        Row((_ours(m), *(_average(group.average(setting, m)) for setting in group.settings)), OURS)
+        for m in group.methods
+    ]
+    for method in reversed(paper.methods if paper else ()):
+        if any(setting in method.average for setting in group.settings if setting != DENSE):
+            cells = (_papers(method.average[s], FAILED) if s in method.average else NOTHING for s in group.settings)
+            rows.append(Row((_theirs(method), *cells), PAPERS if method.variant else RIVAL))
+    notes = [f'Of the paper: its table "{paper.sparse_table}"; failed: in at least one scene.'] if paper else []
+    return Table(
+        "By number of references: mean over scenes of the median error, cm/°",
+        ("method", *map(setting_name, group.settings)),
+        tuple(rows),
+        (*notes, *_average_notes(group)),
+    )
+
+
+def _recall(group: Group) -> Table:
+    rows = []
+    for setting in group.settings:
+        for method in group.methods:
+            average = group.average(setting, method)
+            if average is not None:
+                shares = (f"{100 * share:.1f}" for share in average.recall.values())
+                localized = f"{average.localized} of {average.queries}"
+                rows.append(Row((f"{_ours(method)}, {setting_name(setting)}", *shares, localized), OURS))
+    for paper in reversed(group.benchmark.paper.methods if group.benchmark else ()):
+        if paper.recall_percent:
+            shares = (f"{paper.recall_percent[bar]:g}" if bar in paper.recall_percent else NOTHING for bar in _BARS)
+            rows.append(Row((f"{_theirs(paper)}, dense", *shares, NOTHING), PAPERS if paper.variant else RIVAL))
+    head = ("method", *(bar.replace("_", ", ").replace("deg", "°").replace("cm", " cm") for bar in _BARS), "localized")
+    return Table("Share of queries within, %", head, tuple(rows), _average_notes(group))
+
+
+_BARS = ("1cm_1deg", "5cm_5deg", "25cm_2deg")
+
+
+def _by_scene(group: Group) -> Table:
+    rows = [
+        Row((f"{scene}, {m.label}", *(_median(group.summaries.get((scene, s, m))) for s in group.settings)), OURS)
+        for scene in group.scenes
+        for m in group.methods
+    ]
+    head = ("scene", *map(setting_name, group.settings))
+    return Table("Every scene: median error, cm/°", head, tuple(rows))
+
+
+def _scales(group: Group) -> Table:
+    """The ablation: one variant, every strategy."""
+    last = group.methods[-1].variant
+    backends = {result.backend for run in group.runs.values() for result in run.results}
+    methods = [method for method in group.methods if method.variant == last]
+    rows = [
+        Row((method.scale, *(_average(group.average(setting, method)) for setting in group.settings)), OURS)
+        for method in methods
+    ]
+    return Table(
+        f"Ablation of the scale, variant {last}: mean over scenes of the median error, cm/°",
+        ("scale", *map(setting_name, group.settings)),
+        tuple(rows),
+        (*([METRIC_ALREADY] if backends == {"geometric"} else []), *_average_notes(group)),
+    )
+
+
+def _timing(group: Group) -> Table:
+    rows = []
+    for (scene, setting, method), summary in group.summaries.items():
+        cells = (
+            f"{scene}, {setting_name(setting)}, {method.label}",
+            f"{summary.latency_p50_ms:.0f}",
+            f"{summary.latency_p95_ms:.0f}",
+            f"{summary.latency_first_ms:.0f}",
+            format_stages(summary.stage_share),
+            NOTHING if summary.claim_held is None else f"{100 * summary.claim_held:.0f}",
+            ", ".join(f"{count} {reason}" for reason, count in summary.rejections.items()) or "none",
+        )
+        rows.append(Row(cells, OURS))
+    head = ("run", "p50 ms", "p95 ms", "first ms", "time by stage", "claimed 68 % radius held, %", "rejected")
+    return Table("Time of a call, the server's own claims, and rejections", head, tuple(rows), wide=True)
+
+
+def _average_notes(group: Group) -> tuple[str, ...]:
+    averages = [group.average(setting, method) for setting in group.settings for method in group.methods]
+    partial = {average.scenes for average in averages if average is not None and not average.complete}
+    if group.benchmark is None or not partial:
+        return ()
+    scenes = max(partial, key=len)
+    of_paper = sum(scene in group.benchmark.scenes for scene in scenes)
+    return (
+        f"Our averages are over {', '.join(scenes)}, {of_paper} of the paper's {len(group.benchmark.scenes)} scenes: "
+        "not comparable with its averages.",
+    )
+
+
+def _ours(method: Method) -> str:
+    return f"mapless {method.label}"
+
+
+def _theirs(method: PaperMethod) -> str:
+    return f"{method.name} (paper)"
+
+
+def _median(summary: Summary | None) -> str:
+    if summary is None:
+        return NOTHING
+    return format_median(100 * summary.median_translation, summary.median_rotation_deg)
+
+
+def _average(average: Average | None) -> str:
+    if average is None:
+        return NOTHING
+    return format_median(100 * average.median_translation_m, average.median_rotation_deg)
+
+
+def _papers(median: Median | None, absent: str = NOTHING) -> str:
+    return absent if median is None else f"{median[0]:g}/{median[1]:g}"

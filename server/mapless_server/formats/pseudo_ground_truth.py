@@ -1,0 +1,103 @@
+"""SfM pseudo ground truth of 7-Scenes and 12-Scenes (Brachmann et al. 2021), in the two forms in which it goes round.
+
+Text files, one a split (`redkitchen_train.txt`, `apt1_kitchen_test.txt`): lines of the image's path, qw qx qy qz tx ty
+tz of camera_from_world, and the focal length. The principal point is the image's centre, as COLMAP's models of these
+have it.
+
+COLMAP models, as hloc has them: `7scenes_sfm_triangulated/<scene>/triangulated`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapless.geometry import Camera, Quaternion, RigidTransform
+
+from .collecting import from_corner, numbers, read_text
+from .colmap.model import Model, find_model, read_model
+from .options import Intrinsics
+
+GROUND_TRUTH = "SfM pseudo ground truth (COLMAP)"
+
+
+@dataclass(frozen=True, eq=False)
+class PosesBySplit:
+    """Poses by image path; one of the two is empty.
+
+    Attributes:
+        source: the file or folder, for messages.
+        lines: words of the text files' lines.
+        model: a COLMAP model, its images by name.
+    """
+
+    source: Path
+    lines: Mapping[str, tuple[str, ...]]
+    model: Model | None
+
+    def camera_and_pose(
+        self, image: str, size: tuple[int, int], intrinsics: Intrinsics | None
+    ) -> tuple[Camera, RigidTransform]:
+        """Of an image of this size; intrinsics if given stand for those found. ValueError if the image has no pose."""
+        if self.model is not None:
+            camera, pose = self.model.camera_and_pose(image)
+            if (camera.width_px, camera.height_px) != size:
+                camera = camera.resized(*size)
+        else:
+            camera, pose = self._from_line(image, size)
+        return (intrinsics.camera(*size) if intrinsics else camera), pose
+
+    def _from_line(self, image: str, size: tuple[int, int]) -> tuple[Camera, RigidTransform]:
+        if image not in self.lines:
+            raise ValueError(f"ground truth: {self.source} has no pose of {image}")
+        w, x, y, z, *translation, focal_px = numbers(self.lines[image], 8, "ground truth")
+        try:
+            rotation = Quaternion(float(x), float(y), float(z), float(w)).matrix()
+        except ValueError as error:
+            raise ValueError(f"ground truth: {error}") from error
+        camera_from_world = RigidTransform(rotation, numbers([str(t) for t in translation], 3, "ground truth"))
+        camera = Camera(*size, float(focal_px), float(focal_px), size[0] / 2, size[1] / 2)
+        return from_corner(camera), camera_from_world.inverse()
+
+
+def find_ground_truth(path: Path, scene: str) -> PosesBySplit:
+    """The poses of a scene.
+
+    Args:
+        path: a text file; a folder with the scene's text files, at any of the depths of the original repository; a
+            COLMAP model; or a folder with one of the scene.
+        scene: "redkitchen", or "apt1_kitchen".
+
+    Raises:
+        ValueError: there are none, or a file is malformed.
+    """
+    if path.is_file():
+        return PosesBySplit(path, _read_lines([path]), None)
+    for folder in (path / scene / "triangulated", path / "triangulated", path / scene, path):
+        if find_model(folder) is not None:
+            return PosesBySplit(folder, {}, read_model(folder))
+    names = [f"{scene}{end}.txt" for end in ("_train", "_test", "")] + [f"pgt_7scenes_{scene}.txt"]
+    for folder in (path, path / "7scenes", path / "12scenes", path / "sfm" / "7scenes", path / "sfm" / "12scenes"):
+        files = [folder / name for name in names if (folder / name).is_file()]
+        if files:
+            return PosesBySplit(folder, _read_lines(files), None)
+    raise ValueError(f"{path} holds no ground truth of {scene}: neither {names[0]} nor a COLMAP model")
+
+
+def _read_lines(files: list[Path]) -> dict[str, tuple[str, ...]]:
+    lines: dict[str, tuple[str, ...]] = {}
+    for file in files:
+        for number, line in enumerate(read_text(file).splitlines(), 1):
+            words = line.split()
+            if not words:
+                continue
+            if len(words) != 9:
+                raise ValueError(
+                    f"{file}:{number}: expected a path, qw qx qy qz tx ty tz and a focal length, found {len(words)} "
+                    "words"
+                )
+            if words[0] in lines:
+                raise ValueError(f"{file}:{number}: {words[0]} stands twice")
+            lines[words[0]] = tuple(words[1:])
+    return lines

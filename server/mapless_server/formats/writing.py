@@ -1,0 +1,68 @@
+"""A scene's references as a folder of files: images, and what says their cameras and poses."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mapless.geometry import Fisheye
+
+from ..dataset import FILE_NAME
+from .colmap.writing import PosedImage, model_texts
+
+IMAGES = "images"
+
+
+def image_name(reference_id: str, image: bytes) -> str:
+    """File name of a reference's image: its id, and the ending of what it is."""
+    if image.startswith(b"\x89PNG"):
+        return f"{reference_id}.png"
+    return f"{reference_id}.webp" if image.startswith(b"RIFF") else f"{reference_id}.jpg"
+
+
+def write_file(file: Path, content: bytes) -> None:
+    """Writes a file that is there whole or not at all."""
+    unfinished = file.with_name(f".{file.name}.unfinished")
+    try:
+        with unfinished.open("wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        unfinished.replace(file)
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        raise
+
+
+def cameras_files(images: Sequence[PosedImage], source: str) -> dict[str, str]:
+    """Contents of `cameras.json` by its path; images lie in the folder IMAGES."""
+    content = {"source": source, "metric": True, "units": "metre", "frames": [_entry(image) for image in images]}
+    return {FILE_NAME: json.dumps(content, indent=1, allow_nan=False) + "\n"}
+
+
+def colmap_files(images: Sequence[PosedImage], source: str) -> dict[str, str]:
+    """Contents of a COLMAP text model's files by their paths; images lie in the folder IMAGES."""
+    return {f"sparse/0/{name}": f"# {source}\n{text}" for name, text in model_texts(images).items()}
+
+
+LAYOUTS: Mapping[str, Callable[[Sequence[PosedImage], str], dict[str, str]]] = {
+    "cameras": cameras_files,
+    "colmap": colmap_files,
+}
+"""Layouts that are written, by name."""
+
+
+def _entry(image: PosedImage) -> dict[str, Any]:
+    camera, lens = image.camera, image.camera.distortion
+    entry: dict[str, Any] = {
+        "image": f"{IMAGES}/{image.name}",
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "K": camera.matrix().tolist(),
+        "dist": None if lens is None else list(vars(lens).values()),
+        "world_from_camera": image.world_from_camera.matrix().tolist(),
+    }
+    return entry | {"lens": "fisheye"} if isinstance(lens, Fisheye) else entry

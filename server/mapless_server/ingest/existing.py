@@ -1,0 +1,96 @@
+"""What a scene holds already, and whether a frame is among it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from dataclasses import astuple, dataclass, fields
+
+import numpy as np
+
+from mapless import Reference
+from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
+
+SAME_POSITION_M = 1e-6
+SAME_ROTATION_DEG = 1e-5
+"""Poses travel as quaternions: what was stored is what was sent, but for rounding."""
+
+_SAME_SHARE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """What identifies a reference."""
+
+    reference_id: str
+    image_sha256: str
+    camera: Camera
+    world_from_camera: RigidTransform
+
+
+class KnownReferences:
+    """References of a scene by id and by image, and those that this import is about to add; for several threads."""
+
+    def __init__(self, references: Iterable[Reference]) -> None:
+        self._lock = threading.Lock()
+        self._by_id: dict[str, Stored] = {}
+        self._by_image: dict[str, Stored] = {}
+        for reference in references:
+            self._remember(stored_of(reference))
+
+    def claim(self, new: Stored) -> Stored | None:
+        """What there is already under this id, or else with this image; if there is nothing, the new one is there now.
+
+        An image is enough to be the same photograph: a second id for it would be the same reference twice.
+        """
+        with self._lock:
+            known = self._by_id.get(new.reference_id) or self._by_image.get(new.image_sha256)
+            if known is None:
+                self._remember(new)
+            return known
+
+    def forget(self, stored: Stored) -> None:
+        """It was not added after all."""
+        with self._lock:
+            for index, key in ((self._by_id, stored.reference_id), (self._by_image, stored.image_sha256)):
+                if index.get(key) is stored:
+                    del index[key]
+
+    def _remember(self, stored: Stored) -> None:
+        self._by_id[stored.reference_id] = stored
+        self._by_image.setdefault(stored.image_sha256, stored)
+
+
+def stored_of(reference: Reference) -> Stored:
+    """Of what the server answers."""
+    return Stored(reference.reference_id, reference.image_sha256, reference.camera, reference.world_from_camera)
+
+
+def difference(there: Stored, new: Stored) -> str:
+    """In what two differ, their ids aside; empty if they are the same."""
+    if there.image_sha256 != new.image_sha256:
+        return "its image differs"
+    return _camera_difference(there.camera, new.camera) or _pose_difference(
+        there.world_from_camera, new.world_from_camera
+    )
+
+
+def _camera_difference(there: Camera, new: Camera) -> str:
+    for field in fields(Camera):
+        a, b = getattr(there, field.name), getattr(new, field.name)
+        if field.name == "distortion":
+            same = type(a) is type(b) and (a is None or np.allclose(astuple(a), astuple(b), rtol=_SAME_SHARE, atol=0))
+        else:
+            same = abs(a - b) <= _SAME_SHARE * max(abs(a), abs(b), 1.0)
+        if not same:
+            return f"its camera's {field.name} is {a}, not {b}"
+    return ""
+
+
+def _pose_difference(there: RigidTransform, new: RigidTransform) -> str:
+    apart_m = float(np.linalg.norm(there.translation - new.translation))
+    turned_deg = rotation_angle_deg(there.rotation.T @ new.rotation)
+    scale = max(1.0, float(np.abs(new.translation).max()))
+    if apart_m <= SAME_POSITION_M * scale and turned_deg <= SAME_ROTATION_DEG:
+        return ""
+    return f"its pose is {apart_m:.6g} m and {turned_deg:.6g} degrees away"

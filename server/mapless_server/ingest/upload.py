@@ -1,0 +1,314 @@
+"""Storing references through a server: several messages in flight, each whole or not at all.
+
+As many messages are read ahead as there are threads, and no more. What the server refuses is taken out of its message,
+and the rest is sent again; when it is busy or away it is waited for. A message whose answer was lost may have been
+stored all the same, so an id that is taken is looked at before it is called a duplicate.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from mapless import (
+    AlreadyExists,
+    Client,
+    DeadlineExceeded,
+    Internal,
+    InvalidArgument,
+    MaplessError,
+    NewReference,
+    NotFound,
+    ResourceExhausted,
+    Unavailable,
+)
+
+from ..dataset import Frame, Refusal
+from ..decode import image_size
+from ..errors import InvalidArgument as BadImage
+from ..formats.collecting import ANY_SIZE
+from .existing import KnownReferences, Stored, difference, stored_of
+from .report import ImportReport
+
+BATCH_COUNT = 8
+"""References a message: progress shows, and little is sent again when one is refused."""
+
+BATCH_BYTES = 6 * 2**20
+"""Of images a message; large ones take the server long to receive, which its other callers feel."""
+
+STORE_FULL = "STORE_FULL"
+
+_REQUEST = re.compile(r"requests\[(\d+)\]")
+
+
+@dataclass(frozen=True)
+class UploadOptions:
+    """Options of storing.
+
+    Attributes:
+        parallel: messages in flight. The server describes their photographs side by side; more only wait.
+        busy_patience_s: how long a server may say that it is too busy before the import gives up.
+        away_patience_s: how long it may be unreachable; a restart takes seconds.
+    """
+
+    parallel: int = 3
+    busy_patience_s: float = 600.0
+    away_patience_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.parallel <= 64 and self.busy_patience_s > 0 and self.away_patience_s > 0):
+            raise ValueError("parallel must be 1 to 64 and times above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class _Item:
+    """A frame that is ready to be sent."""
+
+    frame: Frame
+    image: bytes
+    stored: Stored
+
+    def reference(self) -> NewReference:
+        return NewReference(self.frame.name, self.image, self.frame.camera, self.frame.world_from_camera)
+
+
+class _Stopped(Exception):
+    """The import ends; the report says why."""
+
+
+class Uploader:
+    """Stores frames and writes into a report what became of them."""
+
+    def __init__(
+        self,
+        client: Client,
+        known: KnownReferences,
+        report: ImportReport,
+        options: UploadOptions,
+        progress: Callable[[str, int, int], None],
+    ) -> None:
+        self._client = client
+        self._known = known
+        self._report = report
+        self._options = options
+        self._progress = progress
+        self._stop = threading.Event()
+        self._lock = threading.Lock()
+        self._done = 0
+
+    def run(self) -> None:
+        """Stores the report's chosen frames. An interruption stops it soon, and goes through."""
+        batches = _batches(self._report.chosen)
+        total = len(self._report.chosen)
+        self._progress("storing references", 0, total)
+        start_s = time.monotonic()
+        threads = ThreadPoolExecutor(self._options.parallel, "import")
+        try:
+            workers = [threads.submit(self._work, batches) for _ in range(self._options.parallel)]
+            for worker in workers:
+                worker.result()
+        except BaseException:
+            self._stop.set()
+            self._client.close()  # ends the calls in flight
+            raise
+        finally:
+            threads.shutdown(wait=True)
+            self._report.seconds = time.monotonic() - start_s
+
+    def _work(self, batches: Iterator[Sequence[Frame]]) -> None:
+        try:
+            while not self._stop.is_set():
+                with self._lock:
+                    batch = next(batches, None)
+                if batch is None:
+                    return
+                items = [item for frame in batch if (item := self._load(frame)) is not None]
+                self._send(items)
+                with self._lock:
+                    self._done += len(batch)
+                    self._progress("storing references", self._done, len(self._report.chosen))
+        except _Stopped:
+            pass
+        except BaseException:
+            self._stop.set()
+            raise
+
+    def _load(self, frame: Frame) -> _Item | None:
+        """The frame with its image's bytes; None if it is not to be sent, which the report then says."""
+        try:
+            item = _read(frame)
+        except ValueError as error:
+            self._refuse(frame, str(error))
+            return None
+        there = self._known.claim(item.stored)
+        if there is None:
+            return item
+        self._duplicate(frame, there, item.stored)
+        return None
+
+    def _send(self, items: Sequence[_Item]) -> None:
+        """Stores items, in one message if it is taken."""
+        waiting = _Waiting(self._options, self._stop)
+        left = list(items)
+        while left:
+            if self._stop.is_set():
+                raise _Stopped
+            try:
+                self._client.add_references(self._report.scene, [item.reference() for item in left])
+            except AlreadyExists as error:
+                left = self._reconcile(left, waiting, error)
+            except InvalidArgument as error:
+                left = self._without_guilty(left, error)
+            except ResourceExhausted as error:
+                if error.reason == STORE_FULL:
+                    self._end(f"the store is full: {error.message}")
+                if error.retry_after_s is None:
+                    left = self._halves(left, error)
+                elif not waiting.for_busy(error.retry_after_s):
+                    self._end(f"the server stays too busy: {error.message}")
+            except (Unavailable, DeadlineExceeded) as error:
+                waiting.lost_an_answer = True
+                if not waiting.for_return():
+                    self._end(f"the server cannot be reached: {error.message}")
+            except Internal as error:
+                left = self._halves(left, error)
+            except MaplessError as error:
+                self._end(str(error))
+            else:
+                self._add(left)
+                return
+
+    def _reconcile(self, items: Sequence[_Item], waiting: _Waiting, error: AlreadyExists) -> list[_Item]:
+        """Items that are not there yet, after an id was taken."""
+        left = []
+        for item in items:
+            try:
+                there = stored_of(self._client.get_reference(self._report.scene, item.frame.name))
+            except NotFound:
+                left.append(item)
+                continue
+            except MaplessError as failure:
+                self._end(str(failure))
+            if waiting.lost_an_answer and not difference(there, item.stored):
+                self._add([item])
+            else:
+                self._duplicate(item.frame, there, item.stored)
+        if len(left) == len(items):  # it was there, and is not any longer: somebody else is at work
+            if waiting.for_return():
+                return left
+            self._end(str(error))
+        return left
+
+    def _without_guilty(self, items: Sequence[_Item], error: InvalidArgument) -> list[_Item]:
+        """Items without the one that the server names; those it does not name it are sent one by one."""
+        named = _REQUEST.match(error.field or "")
+        if named and int(named[1]) < len(items):
+            return self._without(items, int(named[1]), error)
+        return self._halves(items, error)
+
+    def _halves(self, items: Sequence[_Item], error: MaplessError) -> list[_Item]:
+        """Nothing: what was refused together is sent in parts, and what is refused alone is refused."""
+        if len(items) == 1:
+            return self._without(items, 0, error)
+        middle = len(items) // 2
+        self._send(items[:middle])
+        self._send(items[middle:])
+        return []
+
+    def _without(self, items: Sequence[_Item], index: int, error: MaplessError) -> list[_Item]:
+        field = _REQUEST.sub("", error.field or "").lstrip(".")
+        request = f" (request {error.request_id})" if isinstance(error, Internal) else ""
+        self._refuse(items[index].frame, f"{f'{field}: ' if field else ''}{error.message}{request}")
+        self._known.forget(items[index].stored)
+        return [*items[:index], *items[index + 1 :]]
+
+    def _duplicate(self, frame: Frame, there: Stored, new: Stored) -> None:
+        what = difference(there, new)
+        here = "" if there.reference_id == frame.name else f"the same image as {there.reference_id}"
+        if not what:
+            with self._lock:
+                self._report.skipped.append(Refusal(frame.name, here or "already there"))
+        else:
+            self._refuse(frame, f"is there already{f' as {there.reference_id}' if here else ''}, but {what}")
+
+    def _refuse(self, frame: Frame, reason: str) -> None:
+        with self._lock:
+            self._report.refused.append(Refusal(frame.name, reason))
+
+    def _add(self, items: Sequence[_Item]) -> None:
+        with self._lock:
+            self._report.added += [item.frame.name for item in items]
+
+    def _end(self, reason: str) -> None:
+        """Ends the import; whoever stops first says why."""
+        with self._lock:
+            if not self._stop.is_set():
+                self._report.stopped = reason
+            self._stop.set()
+        raise _Stopped
+
+
+def _read(frame: Frame) -> _Item:
+    """A frame with its image's bytes; ValueError if they cannot be what its camera took."""
+    file, camera = frame.image_path, frame.camera
+    try:
+        image = file.read_bytes()
+        width, height = image_size(image, ANY_SIZE)
+    except OSError as error:
+        raise ValueError(f"{file} cannot be read: {error.strerror}") from error
+    except BadImage as error:
+        raise ValueError(f"{file}: {error}") from error
+    if (width, height) != (camera.width_px, camera.height_px):
+        raise ValueError(f"{file} has {width}x{height} pixels, its camera {camera.width_px}x{camera.height_px}")
+    stored = Stored(frame.name, hashlib.sha256(image).hexdigest(), camera, frame.world_from_camera)
+    return _Item(frame, image, stored)
+
+
+class _Waiting:
+    """Waiting for the server on behalf of one message."""
+
+    def __init__(self, options: UploadOptions, stop: threading.Event) -> None:
+        self.lost_an_answer = False
+        self._options = options
+        self._stop = stop
+        self._start_s = time.monotonic()
+        self._away_s = 0.0
+
+    def for_busy(self, retry_after_s: float) -> bool:
+        """Waits as the server asks; False when that has been going on for too long."""
+        if time.monotonic() - self._start_s > self._options.busy_patience_s:
+            return False
+        self._stop.wait(min(max(retry_after_s, 0.05), 30.0))
+        return True
+
+    def for_return(self) -> bool:
+        """Waits a little longer each time; False when it has been long enough."""
+        if self._away_s >= self._options.away_patience_s:
+            return False
+        pause_s = min(max(0.5, self._away_s / 2), 5.0)
+        self._stop.wait(pause_s)
+        self._away_s += pause_s
+        return True
+
+
+def _batches(frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
+    """Frames in their order, as many together as one message shall have; their files are not read."""
+    batch: list[Frame] = []
+    batch_bytes = 0
+    for frame in frames:
+        try:
+            size_bytes = frame.image_path.stat().st_size
+        except OSError:  # whoever reads it says so
+            size_bytes = 0
+        if batch and (len(batch) == BATCH_COUNT or batch_bytes + size_bytes > BATCH_BYTES):
+            yield batch
+            batch, batch_bytes = [], 0
+        batch.append(frame)
+        batch_bytes += size_bytes
+    if batch:
+        yield batch

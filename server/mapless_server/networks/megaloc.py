@@ -1,0 +1,185 @@
+"""MegaLoc (Berton and Masone 2025): one vector for a whole image, the nearer the likelier the same place.
+
+A DINOv2 ViT-B/14 without registers (Oquab et al. 2023), SALAD on top, and a linear layer that mixes the parts. Written
+from the papers and a description of the published model; modules are named as the entries of its checkpoint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from .blocks import BLOCK_EPS, Block, LayerNorm, Linear
+from .encoder import POSITION_SIDE, PatchEmbedding
+from .network import IMAGE_MEAN, IMAGE_STD, patch_grid
+from .salad import Salad
+
+POSITION_OFFSET = 0.1
+"""DINOv2 resizes its learned positions by the factor (cells + 0.1) / 37, once a guard against rounding. Weights were
+trained so: on 23 x 23 patches the last samples lie a sixth of a cell elsewhere than without."""
+
+REDUCTION_SEED = 2025
+"""Of the signed sums; another one makes descriptors that cannot be compared."""
+
+
+@dataclass(frozen=True)
+class MegaLocSizes:
+    """Sizes of the network; the defaults are those of the published one.
+
+    Attributes:
+        width, heads, depth: of the transformer.
+        hidden: channels within SALAD's perceptrons.
+        clusters, cluster_width, token_width: see Salad.
+        length: of the descriptor.
+    """
+
+    width: int = 768
+    heads: int = 12
+    depth: int = 12
+    hidden: int = 512
+    clusters: int = 64
+    cluster_width: int = 256
+    token_width: int = 256
+    length: int = 8448
+
+
+class Backbone(nn.Module):
+    """Normalized images to tokens: DINOv2 without registers."""
+
+    def __init__(self, width: int, heads: int, depth: int) -> None:
+        super().__init__()
+        self.cls_token = nn.Parameter(torch.empty(1, 1, width))
+        self.pos_embed = nn.Parameter(torch.empty(1, 1 + POSITION_SIDE**2, width))
+        self.patch_embed = PatchEmbedding(3, width)
+        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
+        self.norm = LayerNorm(width, eps=BLOCK_EPS)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Images (B, 3, H, W), sides multiples of 14, to tokens (B, 1 + P, C) float32; the class token comes first."""
+        patches = self.patch_embed(images)
+        of_class = self.cls_token.expand(len(images), -1, -1)
+        x = torch.cat([of_class, patches.to(of_class.dtype)], dim=1) + self.positions(patch_grid(images))
+        for block in self.blocks:
+            x = block(x)
+        tokens: Tensor = self.norm(x)
+        return tokens
+
+    def positions(self, grid: tuple[int, int]) -> Tensor:
+        """Position embeddings (1, 1 + P, C) of the class token and of a grid (rows, columns) of patches.
+
+        The learned grid is resized bicubically without antialiasing, see POSITION_OFFSET.
+        """
+        if grid == (POSITION_SIDE, POSITION_SIDE):
+            return self.pos_embed
+        of_class, of_patches = self.pos_embed.split([1, POSITION_SIDE**2], dim=1)
+        learned = of_patches.transpose(1, 2).unflatten(2, (POSITION_SIDE, POSITION_SIDE))
+        factors = [(cells + POSITION_OFFSET) / POSITION_SIDE for cells in grid]
+        resized = F.interpolate(learned, scale_factor=factors, mode="bicubic", align_corners=False)
+        return torch.cat([of_class, resized.flatten(2).transpose(1, 2)], dim=1)
+
+
+class Mixing(nn.Module):
+    """SALAD and the linear layer behind it."""
+
+    def __init__(self, sizes: MegaLocSizes) -> None:
+        super().__init__()
+        self.agg = Salad(sizes.width, sizes.hidden, sizes.clusters, sizes.cluster_width, sizes.token_width)
+        self.linear = nn.Linear(self.agg.length, sizes.length)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Tokens (B, 1 + P, C), the class token first, to (B, length)."""
+        mixed: Tensor = self.linear(self.agg(tokens[:, 1:], tokens[:, 0]))
+        return mixed
+
+
+class MegaLoc(nn.Module):
+    """Images to descriptors."""
+
+    image_mean: Tensor
+    image_std: Tensor
+
+    def __init__(self, sizes: MegaLocSizes | None = None) -> None:
+        sizes = sizes or MegaLocSizes()
+        super().__init__()
+        # No checkpoint holds the two constants, so they are there even in a network that is made without memory.
+        for name, values in (("image_mean", IMAGE_MEAN), ("image_std", IMAGE_STD)):
+            self.register_buffer(name, torch.tensor(values, device="cpu").view(1, 3, 1, 1), persistent=False)
+        self.backbone = Backbone(sizes.width, sizes.heads, sizes.depth)
+        self.aggregator = Mixing(sizes)
+
+    @property
+    def length(self) -> int:
+        """Of the descriptors."""
+        return self.aggregator.linear.out_features
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Images (B, 3, H, W) in [0, 1], sides multiples of 14, to descriptors (B, length) float32 of unit length.
+
+        Raises:
+            ValueError: sides that are not, or no more patches than SALAD has clusters.
+        """
+        tokens = self.backbone((images - self.image_mean) / self.image_std)
+        descriptors: Tensor = F.normalize(self.aggregator(tokens), dim=1)
+        return descriptors
+
+    def set_compute_type(self, dtype: torch.dtype) -> None:
+        """Casts what computes in low precision: the transformer's linear layers and the patch embedding.
+
+        The rest, what adds up residuals and all of SALAD, stays float32: it costs a hundredth, and its logarithms and
+        sums over patches are where rounding would show.
+        """
+        for module in self.backbone.modules():
+            if isinstance(module, (Linear, PatchEmbedding)):
+                module.to(dtype)
+
+    @torch.no_grad()
+    def reduce(self, length: int) -> None:
+        """Shortens all descriptors to come; the similarity of two stays the same but for an error around zero.
+
+        Each new number is a sum of `signed_groups` of old ones, divided by the root of their count: a random projection
+        with orthonormal rows. It is built into the linear layer, which shrinks as the descriptors do.
+
+        Raises:
+            ValueError: the length is no divisor of the present one.
+        """
+        if length == self.length:
+            return
+        if length < 1 or self.length % length:
+            raise ValueError(f"descriptors of {self.length} numbers cannot be reduced to {length}, which is no divisor")
+        whole = self.aggregator.linear
+        order, signs = (part.view(length, -1).to(whole.weight.device) for part in signed_groups(self.length))
+        with torch.device("meta"):
+            reduced = nn.Linear(whole.in_features, length)
+        state = {name: _signed_sums(tensor, order, signs) for name, tensor in whole.state_dict().items()}
+        reduced.load_state_dict(state, assign=True)
+        self.aggregator.linear = reduced.requires_grad_(whole.weight.requires_grad)
+
+
+def signed_groups(count: int) -> tuple[Tensor, Tensor]:
+    """A random order (count,) int64 of numbers, consecutive ones of which make a group, and a sign (count,) for each.
+
+    From the raw stream of a generator, which NumPy promises to keep as it is; it does not promise that of its
+    distributions.
+    """
+    raw = np.random.PCG64(REDUCTION_SEED).random_raw(2 * count)
+    order = np.argsort(raw[:count], kind="stable")
+    signs = 1.0 - 2.0 * (raw[count:] >> np.uint64(63)).astype(np.float32)
+    return torch.from_numpy(order), torch.from_numpy(signs)
+
+
+def _signed_sums(rows: Tensor, order: Tensor, signs: Tensor) -> Tensor:
+    """Sums (D, ...) of G each of ``rows`` (D * G, ...), in the order and with the signs (D, G), over the root of G.
+
+    One summand at a time, in memory that is there: all of them together are as large as the rest of the network.
+    """
+    shape = (-1, *[1] * (rows.dim() - 1))
+    total = rows.new_zeros(len(order), *rows.shape[1:])
+    summand = torch.empty_like(total)
+    for places, sign in zip(order.T, signs.T, strict=True):
+        torch.index_select(rows, 0, places, out=summand)
+        total.addcmul_(summand, sign.reshape(shape))
+    return total.div_(order.shape[1] ** 0.5)

@@ -1,0 +1,87 @@
+"""SALAD (Izquierdo and Civera 2024): what an image's tokens say together, by optimal transport to learned clusters.
+
+Every patch has mass one to give: to clusters, or to a dustbin where what tells nothing of a place ends (sky, people).
+Every cluster takes mass one, the dustbin the rest. What a cluster is given, features weighted by mass, is one part of
+the descriptor; the class token's features are another.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F  # noqa: N812  its usual name
+from torch import Tensor, nn
+
+ROUNDS = 3
+"""Of the Sinkhorn iteration; what the published weights were trained with, so not to be tuned."""
+_SAME = nn.Identity
+"""Where training drops features: the published entries' numbers count it."""
+
+
+class PointLinear(nn.Conv2d):
+    """A linear layer for tokens whose weights are stored as those of a 1 x 1 convolution."""
+
+    def __init__(self, width: int, width_out: int) -> None:
+        super().__init__(width, width_out, 1)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """(..., in) to (..., out)."""
+        return F.linear(tokens, self.weight.flatten(1), self.bias)
+
+
+class Salad(nn.Module):
+    """Patch tokens and the class token to one vector of unit length, float32 throughout.
+
+    Args:
+        width: channels of a token.
+        hidden: between the two layers of each of the three perceptrons.
+        clusters: how many.
+        cluster_width: channels of what a cluster is given.
+        token_width: channels of the class token's part.
+    """
+
+    def __init__(self, width: int, hidden: int, clusters: int, cluster_width: int, token_width: int) -> None:
+        super().__init__()
+        self.token_features = nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, token_width))
+        self.cluster_features = _of_patches(width, hidden, cluster_width)
+        self.score = _of_patches(width, hidden, clusters)
+        self.dust_bin = nn.Parameter(torch.empty(()))
+        self.length = token_width + clusters * cluster_width
+
+    def forward(self, patches: Tensor, of_class: Tensor) -> Tensor:
+        """Patch tokens (B, P, C) and class tokens (B, C) to (B, length); more patches than clusters."""
+        masses = transport(self.score(patches).transpose(1, 2), self.dust_bin)
+        given = self.cluster_features(patches).transpose(1, 2) @ masses.transpose(1, 2)  # (B, cluster_width, clusters)
+        parts = F.normalize(self.token_features(of_class), dim=1), F.normalize(given, dim=1).flatten(1)
+        return F.normalize(torch.cat(parts, dim=1), dim=1)
+
+
+def transport(scores: Tensor, dustbin_score: Tensor) -> Tensor:
+    """Masses (B, M, N) that each of N patches gives to each of M clusters; what it gives to the dustbin is left out.
+
+    Sinkhorn's iteration in logarithms: clusters and dustbin scale to what they may take, then patches to what they
+    have. Patches come last, so each has given exactly one in all; the clusters' sums are one only in the limit.
+
+    Args:
+        scores: (B, M, N), the higher the better they go together.
+        dustbin_score: (), of the dustbin with any patch.
+
+    Raises:
+        ValueError: no more patches than clusters; nothing would be left for the dustbin.
+    """
+    batch, clusters, patches = scores.shape
+    if patches <= clusters:
+        raise ValueError(f"{patches} patches are too few for {clusters} clusters: show a larger image")
+    scores = torch.cat([scores, dustbin_score.expand(batch, 1, patches)], dim=1)
+    log_taken = scores.new_zeros(clusters + 1)
+    log_taken[-1] = math.log(patches - clusters)
+    of_patches = scores.new_zeros(batch, 1, patches)
+    for _ in range(ROUNDS):
+        of_clusters = log_taken[:, None] - torch.logsumexp(scores + of_patches, dim=2, keepdim=True)
+        of_patches = -torch.logsumexp(scores + of_clusters, dim=1, keepdim=True)
+    return torch.exp(scores + of_clusters + of_patches)[:, :-1]
+
+
+def _of_patches(width: int, hidden: int, width_out: int) -> nn.Sequential:
+    return nn.Sequential(PointLinear(width, hidden), _SAME(), nn.ReLU(), PointLinear(hidden, width_out))

@@ -1,0 +1,157 @@
+"""The order of references for a photograph: by similarity, thinned to a baseline, narrowed by what is known beforehand.
+
+Two references at one place that look the same way see the same and triangulate nothing, so after the first of them the
+second counts for less. It is not left out: in a dense sequence the strictly spread ones see so little of the query that
+they cost a third of the accuracy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mapless.geometry import Array, RigidTransform
+
+from .descriptor import Vector
+from .index import Entries, Rows
+from .narrowing import Narrowing
+
+
+@dataclass(frozen=True)
+class RankOptions:
+    """Options of the ranking.
+
+    Attributes:
+        apart_m: references closer together than this triangulate nothing (the paper's baseline),
+        apart_deg: if their optical axes are closer than this too: one that looks elsewhere sees other things.
+        nearby_weight: what is left of a reference's lead over the scene's typical similarity when one nearby is chosen
+            already. 1 does not thin, 0 spreads at any price.
+        pool: so many times the references that are wanted are looked at, the most similar ones. Those behind them are
+            never chosen instead of one that is nearby.
+        smallest_pool: but at least so many.
+    """
+
+    apart_m: float = 0.3
+    apart_deg: float = 30.0
+    nearby_weight: float = 0.5
+    pool: int = 10
+    smallest_pool: int = 200
+
+    def __post_init__(self) -> None:
+        is_sensible = self.apart_m >= 0 and 0 <= self.apart_deg <= 180 and 0 <= self.nearby_weight <= 1
+        if not (is_sensible and self.pool >= 1 and self.smallest_pool >= 1):
+            raise ValueError(f"senseless options: {self}")
+
+
+@dataclass(frozen=True, eq=False)
+class RankedReference:
+    """A reference and how much it resembles the photograph.
+
+    Attributes:
+        reference_id: unique in its scene.
+        key: identifies this very reference for good.
+        similarity: cosine of the descriptors, -1 to 1; NaN where the reference or the photograph has none.
+        world_from_camera: its pose, metric.
+    """
+
+    reference_id: str
+    key: str
+    similarity: float
+    world_from_camera: RigidTransform
+
+
+def rank_references(
+    entries: Entries,
+    vector: Vector | None,
+    count: int,
+    narrowing: Narrowing | None = None,
+    among: Collection[str] | None = None,
+    options: RankOptions | None = None,
+) -> list[RankedReference]:
+    """At most `count` references in the order of choice; fewer where fewer come into question.
+
+    References without a descriptor come last; these, and all where the photograph has none, are ordered by how near
+    they are to the position prior, or as they were stored.
+
+    Args:
+        entries: of the scene.
+        vector: the photograph's descriptor, (D,); None if it has none.
+        count: how many.
+        narrowing: which references come into question.
+        among: ids of those to choose from; None for all. Unknown ones are passed over.
+        options: see there.
+    """
+    options, narrowing = options or RankOptions(), narrowing or Narrowing()
+    rows = entries.rows(among)
+    rows = rows[narrowing.keeps(entries.centres(rows), entries.axes(rows))]
+    if not len(rows) or count < 1:
+        return []
+    similarity = np.full(len(rows), np.nan, np.float32) if vector is None else entries.similarities(vector, rows)
+    score = _scores(similarity, entries.centres(rows), narrowing)
+    known = similarity[np.isfinite(similarity)]
+    typical = float(np.median(known)) if len(known) else math.inf
+    pool = _best(score, max(options.pool * count, options.smallest_pool))
+    rows, similarity, score = rows[pool], similarity[pool], score[pool]
+    order = spread(score, entries.centres(rows), entries.axes(rows), count, typical, options)
+    return [_ranked(entries, int(rows[i]), float(similarity[i])) for i in order]
+
+
+def spread(
+    scores: ArrayLike, centres: ArrayLike, axes: ArrayLike, count: int, typical: float, options: RankOptions
+) -> list[int]:
+    """Takes the best score again and again, where one near a chosen one has less of a lead; ties go to the first.
+
+    Args:
+        scores: (N,) finite, or -inf.
+        centres: (N, 3) camera centres, metres.
+        axes: (N, 3) optical axes, unit length.
+        count: how many to choose.
+        typical: score that is no lead: those below it lose nothing.
+        options: see there.
+
+    Returns:
+        Indices in the order of choice, as many as there are, but not more than `count`.
+    """
+    score, centre, axis = np.asarray(scores, float), np.asarray(centres, float), np.asarray(axes, float)
+    lead = np.maximum(score - typical, 0.0)
+    lowered = score - (1 - options.nearby_weight) * lead
+    same_way = math.cos(math.radians(options.apart_deg))
+    left = np.ones(len(score), bool)
+    current = score.copy()
+    chosen: list[int] = []
+    for _ in range(min(count, len(score))):
+        candidates = np.flatnonzero(left)
+        best = int(candidates[np.argmax(current[candidates])])
+        chosen.append(best)
+        left[best] = False
+        nearby = np.linalg.norm(centre - centre[best], axis=1) < options.apart_m
+        current = np.where(nearby & (axis @ axis[best] >= same_way), lowered, current)
+    return chosen
+
+
+def _scores(similarity: NDArray[np.float32], centres: Array, narrowing: Narrowing) -> Array:
+    """Similarities (N,), and for those that are unknown something lower: the less, the further from the prior."""
+    far = np.zeros(len(centres))
+    if narrowing.position is not None:
+        far = np.linalg.norm(centres - narrowing.position.position, axis=1)
+    return np.where(np.isfinite(similarity), similarity, -2.0 - far)
+
+
+def _best(score: Array, count: int) -> Rows:
+    """Indices of the `count` best scores, the best first; ties in order."""
+    if count >= len(score):
+        return np.argsort(-score, kind="stable")
+    # Partitioning keeps any of those that tie with the last one: take the first of them.
+    smallest = np.partition(score, len(score) - count)[len(score) - count]
+    better, ties = np.flatnonzero(score > smallest), np.flatnonzero(score == smallest)
+    best = np.sort(np.concatenate([better, ties[: count - len(better)]]))
+    return np.asarray(best[np.argsort(-score[best], kind="stable")])
+
+
+def _ranked(entries: Entries, row: int, similarity: float) -> RankedReference:
+    reference_id, key, world_from_camera = entries.reference(row)
+    return RankedReference(reference_id, key, similarity, world_from_camera)

@@ -1,0 +1,214 @@
+"""Copies of a store: to a file while it is served, and from a file into an empty store, of either database.
+
+A backup is one SQLite file, from whichever database, so that it is also the way from one to the other. It shows one
+moment. It has its name only once every row of it was read again and found to be as it was stored.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from sqlalchemy import Connection, MetaData, Table, delete, func, insert, select, update
+from sqlalchemy.exc import DBAPIError
+
+from mapless_server.errors import RequestError
+from mapless_server.store import queries
+from mapless_server.store.database import Database, StoreError
+from mapless_server.store.migrations import read_version
+from mapless_server.store.sqlite import SqliteDatabase, choose_library
+from mapless_server.store.tables import (
+    SCHEMA_VERSION,
+    alembic_version,
+    removed_reference,
+    scene,
+    scene_generation,
+    store_version,
+)
+from mapless_server.store.verify import (
+    BLOBS_AT_A_TIME,
+    Progress,
+    Verification,
+    ignore_progress,
+    verify,
+)
+
+GENERATIONS_SKIPPED = 1_000_000
+"""A restored scene counts on past what it may have come to after the backup, so that no generation means two things."""
+
+_BYTES_AT_A_TIME = 8 * 2**20
+_ROWS_AT_A_TIME = 1000
+_PAGES_AT_A_TIME = 1000
+_NOT_RESTORED = (store_version, alembic_version, scene_generation, removed_reference)
+"""What the store has of its own, and tombstones, of which nobody asks who reads the scene as a whole."""
+
+
+def back_up(database: Database, path: Path, on_progress: Progress = ignore_progress) -> Verification:
+    """Copy a store to a file, as of one moment; servers may go on reading and writing it.
+
+    What is damaged in the store itself is damaged in its copy, too, and named by what is returned.
+
+    Raises:
+        StoreError: the file exists or cannot be written, or differs from the store.
+    """
+    if path.exists():
+        raise StoreError(f"{path} exists already")
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
+    try:
+        with _faults_said(f"backup {path} cannot be made"):
+            with database.read() as source:
+                database.take_your_time(source)
+                if source.dialect.name == "sqlite":
+                    _copy_pages(source, unfinished, on_progress)
+                else:
+                    _copy_rows_to_file(source, unfinished, on_progress)
+                found = _verify_copy(source, unfinished, on_progress)
+            _sync(unfinished)
+            unfinished.rename(path)
+            _sync(path.parent)
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return found
+
+
+def restore(path: Path, database: Database, on_progress: Progress = ignore_progress) -> Verification:
+    """Copy a backup into a store without scenes: all of it, or nothing.
+
+    Raises:
+        StoreError: the backup is damaged, of a newer program or no backup; the store has scenes or cannot be written.
+    """
+    with _faults_said(f"backup {path} cannot be restored"), closing(SqliteDatabase.look_at(path)) as backup:
+        with backup.read() as source:
+            found = verify(source, on_progress)
+        if found.faults:
+            raise StoreError(f"backup {path} is damaged ({len(found.faults)} faults), first: {found.faults[0]}")
+        with (
+            _in_this_schema(backup, path, found.version) as current,
+            current.read() as source,
+            database.write() as target,
+        ):
+            database.take_your_time(target)
+            if target.scalar(select(func.count()).select_from(scene)):
+                raise StoreError(f"database {database.name} has scenes; a backup needs an empty store")
+            _copy_rows(source, target, {it.name for it in _NOT_RESTORED}, on_progress)
+            _skip_generations(source, target)
+            written = verify(target, on_progress)
+            if written.faults or not found.counts.items() <= written.counts.items():
+                raise StoreError(f"database {database.name} does not keep what is written to it")
+    return written
+
+
+def _copy_pages(source: Connection, path: Path, on_progress: Progress) -> None:
+    """By SQLite's own means; in a transaction that has begun to read, the copy does not see what others write."""
+    raw = source.connection.driver_connection
+    assert raw is not None
+
+    def tell(_status: int, remaining: int, total: int) -> None:
+        on_progress("copying pages", total - remaining, total)
+
+    with closing(choose_library().connect(path)) as target:
+        raw.backup(target, pages=_PAGES_AT_A_TIME, progress=tell)
+        target.execute("PRAGMA journal_mode=DELETE")  # one file, which can be read where nothing can be written
+
+
+def _copy_rows_to_file(source: Connection, path: Path, on_progress: Progress) -> None:
+    version = read_version(source)
+    assert version is not None
+    with closing(SqliteDatabase.open_scratch(path, version)) as database, database.write() as target:
+        _copy_rows(source, target, {store_version.name, alembic_version.name}, on_progress)
+
+
+def _copy_rows(source: Connection, target: Connection, left_out: set[str], on_progress: Progress) -> None:
+    """All rows of the tables that both have."""
+    schema = MetaData()
+    schema.reflect(target, only=lambda name, _: name not in left_out)
+    for table in schema.sorted_tables:
+        total, done = source.scalar(select(func.count()).select_from(table)) or 0, 0
+        for rows in _portions(source, table):
+            target.execute(insert(table), rows)
+            done += len(rows)
+            on_progress(f"copying {table.name}", done, total)
+
+
+def _portions(source: Connection, table: Table) -> Iterator[list[dict[str, Any]]]:
+    """Rows, some megabytes at a time."""
+    portion: list[dict[str, Any]] = []
+    size_bytes = 0
+    for row in source.execution_options(yield_per=BLOBS_AT_A_TIME).execute(select(table)).mappings():
+        portion.append(dict(row))
+        size_bytes += sum(len(value) for value in row.values() if isinstance(value, bytes))
+        if size_bytes >= _BYTES_AT_A_TIME or len(portion) == _ROWS_AT_A_TIME:
+            yield portion
+            portion, size_bytes = [], 0
+    if portion:
+        yield portion
+
+
+def _skip_generations(source: Connection, target: Connection) -> None:
+    """Scenes count on past both lives; whoever knows one as of either reads it as a whole."""
+    column = scene_generation.c
+    former, saved = queries.read_generations(target), queries.read_generations(source)
+    target.execute(delete(scene_generation).where(column.scene_id.in_(saved.keys() & former.keys())))
+    if saved:
+        raised = {key: max(saved[key], former.get(key, 0)) + GENERATIONS_SKIPPED for key in saved}
+        target.execute(insert(scene_generation), [{"scene_id": key, "generation": it} for key, it in raised.items()])
+    latest = select(column.generation).where(column.scene_id == scene.c.scene_id).scalar_subquery()
+    target.execute(update(scene).values(first_generation=latest))
+
+
+def _verify_copy(source: Connection, path: Path, on_progress: Progress) -> Verification:
+    """What is found in a copy; StoreError if that is not what is in the store."""
+    with closing(SqliteDatabase.look_at(path)) as database, database.read() as copy:
+        found = verify(copy, on_progress)
+        if _count_rows(copy) != _count_rows(source):
+            raise StoreError("the copy lacks rows of the store")
+    # Rare, so it may take as long again: was it damaged before, or by us?
+    if found.faults and verify(source, on_progress).faults != found.faults:
+        raise StoreError(f"the copy is damaged: {found.faults[0]}")
+    return found
+
+
+def _count_rows(connection: Connection) -> dict[str, int]:
+    schema = MetaData()
+    schema.reflect(connection)
+    return {
+        table.name: connection.execute(select(func.count()).select_from(table)).scalar_one()
+        for table in schema.sorted_tables
+    }
+
+
+@contextmanager
+def _in_this_schema(backup: SqliteDatabase, path: Path, version: int) -> Iterator[Database]:
+    """The backup itself, or, if it is of an older program, a copy that is brought up to date."""
+    if version == SCHEMA_VERSION:
+        yield backup
+        return
+    with TemporaryDirectory(prefix="mapless-restore-") as folder:
+        copy = Path(folder) / path.name
+        shutil.copyfile(path, copy)
+        with closing(SqliteDatabase.open_scratch(copy)) as database:
+            yield database
+
+
+@contextmanager
+def _faults_said(what: str) -> Iterator[None]:
+    try:
+        yield
+    except StoreError:
+        raise
+    except (DBAPIError, RequestError, OSError, ValueError, choose_library().Error) as error:
+        cause = str(error.orig if isinstance(error, DBAPIError) else error).partition("\n")[0]
+        raise StoreError(f"{what}: {cause}") from error
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

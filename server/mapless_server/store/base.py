@@ -1,0 +1,57 @@
+"""What reading and changing the store share: the database, and what is remembered of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from sqlalchemy import Connection
+
+from mapless_server.store.cache import LruCache
+from mapless_server.store.database import Database
+from mapless_server.store.observed import StoreObserver, Unobserved
+from mapless_server.store.records import DescribedReference, ReferencePose
+
+POSE_CACHE_BYTES = 32 * 2**20
+NAME_CACHE_BYTES = 16 * 2**20
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """What a scene's reference ids meant while the store was in a state.
+
+    Attributes:
+        state: the store's, see `BaseStore`.
+        generation: the scene's.
+        keys: of the references, in the order of their ids.
+    """
+
+    state: object
+    generation: int
+    keys: tuple[str, ...]
+
+
+class BaseStore:
+    """A database and what is remembered of it."""
+
+    def __init__(self, database: Database, described: LruCache[DescribedReference]) -> None:
+        self._database = database
+        self.observer: StoreObserver = Unobserved()
+        # By (key, extractor): references never change and keys are never reused, so no entry is ever stale.
+        self._described = described
+        # By (scene_key, generation), which are never reused either.
+        self._poses: LruCache[tuple[ReferencePose, ...]] = LruCache(POSE_CACHE_BYTES)
+        # What names meant, by scene and names. Where this process alone writes, it holds as long as nothing was written
+        # since, and the database is not asked at all; where others write, as long as the generation is the same.
+        self._resolved: LruCache[Resolved] = LruCache(NAME_CACHE_BYTES)
+        self._state = object()
+
+    @contextmanager
+    def _changing(self) -> Iterator[Connection]:
+        """A transaction that writes; what is remembered of before is void when it is over, however it ends."""
+        try:
+            with self._database.write() as connection:
+                yield connection
+        finally:
+            self._state = object()

@@ -1,0 +1,54 @@
+"""What became of a scene since a generation: how whoever has it in memory keeps up without reading it again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import Connection, Select, and_, select
+
+from mapless_server.store import queries, rows
+from mapless_server.store.records import IndexedReference, SceneChanges
+from mapless_server.store.tables import global_descriptor, reference, removed_reference
+from mapless_server.tenancy import SceneKey
+
+_ROWS_AT_A_TIME = 2000
+"""A few megabytes, so that a scene that is read whole is not in memory twice."""
+
+
+def read_changes(
+    connection: Connection, scene_key: SceneKey, since_generation: int | None, descriptor_name: str
+) -> SceneChanges:
+    """See ``Store.list_changes``; in the caller's transaction, which must see one moment."""
+    row = queries.find_scene(connection, scene_key)
+    generation: int = row.generation
+    # A generation yet to come is one of a database that a backup has taken the place of since.
+    if since_generation is None or not row.first_generation <= since_generation <= generation:
+        return SceneChanges(generation, _read(connection, scene_key, -1, descriptor_name), frozenset(), True)
+    if since_generation == generation:
+        return SceneChanges(generation, (), frozenset(), False)
+    removed = removed_reference.c
+    gone = select(removed.reference_key).where(removed.scene_id == scene_key, removed.generation > since_generation)
+    return SceneChanges(
+        generation,
+        _read(connection, scene_key, since_generation, descriptor_name),
+        frozenset(connection.scalars(gone)),
+        False,
+    )
+
+
+def _read(
+    connection: Connection, scene_key: SceneKey, after_generation: int, descriptor_name: str
+) -> tuple[IndexedReference, ...]:
+    statement = _select_indexed(descriptor_name).where(
+        reference.c.scene_id == scene_key, reference.c.generation > after_generation
+    )
+    result = connection.execution_options(yield_per=_ROWS_AT_A_TIME).execute(statement)
+    found = [it for portion in result.partitions() for it in rows.indexed_references(portion, descriptor_name)]
+    return tuple(sorted(found, key=lambda it: it.reference_id))
+
+
+def _select_indexed(descriptor_name: str) -> Select[Any]:
+    column, descriptor = reference.c, global_descriptor.c
+    return select(
+        column.reference_id, column.key, column.geometry, column.geometry_sha256, descriptor.data, descriptor.sha256
+    ).outerjoin(global_descriptor, and_(descriptor.reference_key == column.key, descriptor.name == descriptor_name))

@@ -1,0 +1,148 @@
+"""The half of the store that changes it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime, timezone
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import delete, insert, select, update
+
+from mapless_server.errors import AlreadyExists
+from mapless_server.method.views import View
+from mapless_server.store import queries, rows, tables
+from mapless_server.store.base import BaseStore
+from mapless_server.store.observed import observed
+from mapless_server.store.records import NewReference, ReferenceRecord, SceneRecord
+from mapless_server.tenancy import SceneKey, scene_id_of
+
+
+class ChangingStore(BaseStore):
+    """Each method is one transaction: all of it happens or nothing."""
+
+    @observed
+    def create_scene(self, scene_key: SceneKey) -> SceneRecord:
+        """Create an empty scene.
+
+        Raises:
+            AlreadyExists: the id is taken.
+        """
+        now, scene = _now(), tables.scene
+        with self._changing() as connection:
+            generation = queries.raise_generation(connection, scene_key)
+            if connection.scalar(select(scene.c.scene_id).where(scene.c.scene_id == scene_key)) is not None:
+                raise AlreadyExists(f"scene {scene_id_of(scene_key)!r} exists already", field="scene_id")
+            row = {"scene_id": scene_key, "create_time_us": rows.time_us(now), "first_generation": generation}
+            connection.execute(insert(scene).values(row))
+            return rows.scene_record(queries.find_scene(connection, scene_key))
+
+    @observed
+    def delete_scene(self, scene_key: SceneKey) -> None:
+        """Delete a scene and all its references.
+
+        Raises:
+            NotFound: there is no such scene.
+        """
+        with self._changing() as connection:
+            queries.begin_change(connection, scene_key)
+            connection.execute(delete(tables.scene).where(tables.scene.c.scene_id == scene_key))
+
+    @observed
+    def add_references(self, scene_key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
+        """Add references, all or none, each with all its features and descriptors; one change of the scene.
+
+        Returns:
+            The new references in the order given.
+
+        Raises:
+            NotFound: there is no such scene.
+            AlreadyExists: an id is taken or stands twice; the field is "requests[i].reference_id".
+            ValueError: features are not float32, a number of a camera, pose or descriptor is not finite, no reference
+                is given, or one without any features.
+        """
+        if not references:
+            raise ValueError("no reference to add")
+        now = _now()
+        # Encoding takes milliseconds a reference, so it is done before the others who want to write have to wait.
+        records = [rows.new_record(scene_key, new, now) for new in references]
+        reference_rows = [rows.reference_row(record) for record in records]
+        image_rows, features_rows, descriptor_rows = [], [], []
+        for record, new in zip(records, references, strict=True):
+            image_rows.append({"reference_key": record.key, "data": new.image})
+            features_rows += [rows.features_row(record.key, *described) for described in new.views.items()]
+            descriptor_rows += [rows.descriptor_row(record.key, *named) for named in new.descriptors.items()]
+        with self._changing() as connection:
+            generation = queries.begin_change(connection, scene_key, len(records))
+            queries.refuse_taken_ids(connection, scene_key, [new.reference_id for new in references])
+            connection.execute(insert(tables.reference), [row | {"generation": generation} for row in reference_rows])
+            connection.execute(insert(tables.image), image_rows)
+            connection.execute(insert(tables.features), features_rows)
+            if descriptor_rows:
+                connection.execute(insert(tables.global_descriptor), descriptor_rows)
+        return records
+
+    @observed
+    def add_features(self, key: str, extractor: str, view: View) -> None:
+        """Store what another extractor found in a reference's image; no change of the scene, see SceneRecord.
+
+        Args:
+            key: of the reference. An id would not do: by now it may be that of another image.
+            extractor: whose features.
+            view: processed camera and features.
+
+        Raises:
+            NotFound: the reference was deleted.
+            AlreadyExists: the reference has features of this extractor.
+            ValueError: features are not float32, or a number of the camera is not finite.
+        """
+        row = rows.features_row(key, extractor, view)
+        with self._changing() as connection:
+            reference_id = queries.hold_reference(connection, key).reference_id
+            if not queries.insert_new(connection, tables.features, row):
+                raise AlreadyExists(f"reference {reference_id!r} has features of {extractor!r} already")
+
+    @observed
+    def add_descriptor(self, key: str, name: str, vector: NDArray[np.float32]) -> None:
+        """Store a global descriptor that a reference lacks; a change of its scene. One that is there already stays.
+
+        Whoever has the scene in memory hears of it as of a reference that was added, see `list_changes`.
+
+        Args:
+            key: of the reference.
+            name: of the global descriptor.
+            vector: (D,), finite.
+
+        Raises:
+            NotFound: the reference was deleted.
+            ValueError: it is no vector, or a number is not finite as float16.
+        """
+        row = rows.descriptor_row(key, name, vector)
+        reference = tables.reference
+        with self._database.read() as connection:
+            scene_key = queries.find_scene_key(connection, key)
+            if queries.has_descriptor(connection, key, name):
+                return
+        with self._changing() as connection:
+            generation = queries.begin_change(connection, scene_key)
+            queries.hold_reference(connection, key)
+            if queries.insert_new(connection, tables.global_descriptor, row):
+                connection.execute(update(reference).where(reference.c.key == key).values(generation=generation))
+
+    @observed
+    def delete_reference(self, scene_key: SceneKey, reference_id: str) -> None:
+        """Delete a reference with its image and features; works on a damaged one, too.
+
+        Raises:
+            NotFound: there is no such scene or reference.
+        """
+        with self._changing() as connection:
+            generation = queries.begin_change(connection, scene_key, -1)
+            key = queries.find_key(connection, scene_key, reference_id)
+            connection.execute(delete(tables.reference).where(tables.reference.c.key == key))
+            tombstone = {"scene_id": scene_key, "generation": generation, "reference_key": key}
+            connection.execute(insert(tables.removed_reference).values(tombstone))
+
+
+def _now() -> datetime:
+    return datetime.now(timezone.utc)

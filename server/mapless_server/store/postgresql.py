@@ -1,0 +1,217 @@
+"""Everything that is particular to PostgreSQL: how it is reached, how long it is waited for, what its faults mean.
+
+Reading is REPEATABLE READ and read-only, so that a call sees one moment. Writing is READ COMMITTED: everything that
+changes a scene first locks the row of its generation (see `queries.begin_change`), so that what SERIALIZABLE would find
+out at the end, and have us try again, cannot come up.
+
+A commit is acknowledged when it is on the disk. A commit whose acknowledgement is lost on the way is reported as
+Unavailable, though it may have happened: who tries again then meets AlreadyExists, or NotFound when deleting. When the
+database goes away, calls fail and its connections are thrown away; when it is back, the next call gets a new one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from sqlalchemy import URL, Connection, Engine, create_engine, make_url
+from sqlalchemy.exc import ArgumentError, DBAPIError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
+
+from mapless_server.errors import DataLoss, Overloaded, RequestError, Unavailable
+from mapless_server.store.database import StoreError
+from mapless_server.store.migrations import migrate, read_version
+from mapless_server.store.tables import SCHEMA_VERSION
+
+DRIVER = "postgresql+psycopg"
+CONNECTIONS_KEPT = 4
+CONNECTIONS_AT_MOST = 16
+"""Of one server: PostgreSQL lets 100 in unless told otherwise, which is six servers."""
+CONNECTION_WAIT_S = 5.0
+"""For one of our own connections that is in use: less than callers wait."""
+RETRY_AFTER_S = 1.0
+
+_CONNECT_OPTIONS: dict[str, Any] = {
+    "application_name": "mapless-server",
+    "connect_timeout": 5,
+    # A host that vanishes says nothing: it is given up after 10 + 3 * 5 s in silence, or 15 s after it was spoken to.
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 15_000,
+}
+_SESSION_OPTIONS = {
+    # "on", or a stricter one of the URL's own, keeps every acknowledged commit through a power failure.
+    "synchronous_commit": "on",
+    "statement_timeout": "60s",
+    "lock_timeout": "5s",
+    # A server that hangs in the middle of a change must not keep the scene's lock from the others.
+    "idle_in_transaction_session_timeout": "60s",
+}
+_MIGRATION_LOCK = 0x6D61706C657373
+"""Any number that other programs on the same database do not use: "mapless"."""
+_UNLIMITED = ("statement_timeout", "lock_timeout", "idle_in_transaction_session_timeout")
+
+# By the class of their SQLSTATE or by all of it: https://www.postgresql.org/docs/current/errcodes-appendix.html
+_FULL = ("53100",)
+_DAMAGED = ("XX001", "XX002")
+_BUSY = ("40001", "40P01", "55P03", "57014")
+_AWAY = ("08", "25006", "25P03", "53", "57P")
+
+
+class PostgresqlDatabase:
+    """One database of a PostgreSQL, shared with other servers; safe for many threads."""
+
+    is_shared = True
+
+    def __init__(self, engine: Engine, name: str) -> None:
+        self.name = name
+        self._writing_engine = engine
+        self._engine = engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
+
+    @staticmethod
+    def open(database_url: str) -> PostgresqlDatabase:
+        """Connect, and bring an empty or older database to the schema of this program.
+
+        Args:
+            database_url: "postgresql://user:password@host:5432/database"; libpq's options may follow after "?".
+
+        Raises:
+            StoreError: the URL is wrong, the database is not there, or it holds something else than our store.
+        """
+        return PostgresqlDatabase._opened(database_url, migrates=True)
+
+    @staticmethod
+    def look_at(database_url: str) -> PostgresqlDatabase:
+        """Connect to a store as it is, whatever its schema.
+
+        Raises:
+            StoreError: as `open`, or the database is empty.
+        """
+        return PostgresqlDatabase._opened(database_url, migrates=False)
+
+    @staticmethod
+    def _opened(database_url: str, migrates: bool) -> PostgresqlDatabase:
+        url = _parse(database_url)
+        database = PostgresqlDatabase(_create_engine(url), f"{url.host or 'local'}:{url.port or 5432}/{url.database}")
+        try:
+            database._prepare(migrates)
+        except (DBAPIError, RequestError, ValueError) as error:
+            database.close()
+            cause = error.orig if isinstance(error, DBAPIError) else error.__cause__ or error
+            raise StoreError(f"database {database.name} cannot be used: {_first_line(cause)}") from None
+        except BaseException:
+            database.close()
+            raise
+        return database
+
+    @contextmanager
+    def read(self) -> Iterator[Connection]:
+        """Implements Database."""
+        with _faults_translated(), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def write(self) -> Iterator[Connection]:
+        """Implements Database."""
+        with _faults_translated(), self._writing_engine.begin() as connection:
+            yield connection
+
+    def take_your_time(self, connection: Connection) -> None:
+        """Implements Database."""
+        for setting in _UNLIMITED:
+            connection.exec_driver_sql(f"SET LOCAL {setting} = 0")
+
+    def close(self) -> None:
+        """Implements Database."""
+        self._writing_engine.dispose()
+
+    def _prepare(self, migrates: bool) -> None:
+        with self.read() as connection:
+            encoding = connection.exec_driver_sql("SHOW server_encoding").scalar()
+            if encoding != "UTF8":
+                raise ValueError(f"its encoding is {encoding}, must be UTF8")
+            found = read_version(connection)
+            if found is None and not migrates:
+                raise ValueError("it is empty")
+            if found == SCHEMA_VERSION or not migrates:
+                return
+        with self.write() as connection:
+            self.take_your_time(connection)
+            # Of several servers that start at once, one migrates, and the others find it done.
+            connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_MIGRATION_LOCK})")
+            migrate(connection)
+
+
+def _parse(database_url: str) -> URL:
+    try:
+        url = make_url(database_url)
+    except (ArgumentError, ValueError):
+        url = None
+    # The text is never repeated: what is wrong with it may be that its password is taken for something else.
+    if url is None or url.drivername not in ("postgresql", "postgres", DRIVER) or not url.database:
+        raise StoreError("database_url must be like postgresql://user:password@host:5432/database")
+    return url.set(drivername=DRIVER)
+
+
+def _create_engine(url: URL) -> Engine:
+    try:
+        import psycopg
+        from psycopg.pq import Format
+    except ImportError:
+        raise StoreError("PostgreSQL needs psycopg: pip install 'mapless[postgres]'") from None
+
+    def binary_cursor(*args: Any, **kwargs: Any) -> psycopg.Cursor[Any]:
+        # As text, bytes would come as hexadecimal digits: twice as many, and to be read one by one.
+        cursor: psycopg.Cursor[Any] = psycopg.Cursor(*args, **kwargs)
+        cursor.format = Format.BINARY
+        return cursor
+
+    options = {name: value for name, value in _CONNECT_OPTIONS.items() if name not in url.query}
+    session = [f"-c {name}={value}" for name, value in _SESSION_OPTIONS.items()]
+    given = url.query.get("options", ())
+    options["options"] = " ".join([*session, *([given] if isinstance(given, str) else given)])
+    return create_engine(
+        url.difference_update_query(["options"]),
+        connect_args=options | {"cursor_factory": binary_cursor},
+        pool_size=CONNECTIONS_KEPT,
+        max_overflow=CONNECTIONS_AT_MOST - CONNECTIONS_KEPT,
+        pool_timeout=CONNECTION_WAIT_S,
+        pool_pre_ping=True,
+        isolation_level="READ COMMITTED",
+        hide_parameters=True,  # an error's text must not carry image bytes into the log
+    )
+
+
+@contextmanager
+def _faults_translated() -> Iterator[None]:
+    """Turn the faults of the database that a caller can act on into answers; the rest is INTERNAL."""
+    try:
+        yield
+    except PoolTimeoutError as error:
+        raise Unavailable("the store is busy", reason="STORE_UNAVAILABLE", retry_after_s=RETRY_AFTER_S) from error
+    except DBAPIError as error:
+        answer = _answer_to(error)
+        if answer is None:
+            raise
+        raise answer from error.orig
+
+
+def _answer_to(error: DBAPIError) -> RequestError | None:
+    state: str = getattr(error.orig, "sqlstate", None) or ""
+    if state.startswith(_FULL):
+        return Overloaded("the store's disk is full", reason="STORE_FULL")
+    if state.startswith(_DAMAGED):
+        return DataLoss("the store is damaged")
+    if state.startswith(_BUSY):
+        return Unavailable("the store is busy", reason="STORE_UNAVAILABLE", retry_after_s=RETRY_AFTER_S)
+    # The library's own faults have no state: it cannot connect, or the connection broke.
+    is_away = error.connection_invalidated or type(error.orig).__name__ == "OperationalError"
+    if state.startswith(_AWAY) or (not state and is_away):
+        return Unavailable("the store is not there", reason="STORE_UNAVAILABLE", retry_after_s=RETRY_AFTER_S)
+    return None
+
+
+def _first_line(error: object) -> str:
+    return str(error).partition("\n")[0].strip()

@@ -1,0 +1,208 @@
+"""The half of the store that reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy import select
+
+from mapless_server.store import queries, rows, tables
+from mapless_server.store.base import BaseStore, Resolved
+from mapless_server.store.changes import read_changes
+from mapless_server.store.observed import observed
+from mapless_server.store.records import (
+    DescribedReference,
+    ReferencePose,
+    ReferenceRecord,
+    SceneChanges,
+    SceneRecord,
+    SceneSnapshot,
+)
+from mapless_server.tenancy import SceneKey
+
+NAME_BYTES = 300
+"""About the size of a reference's id and key in memory."""
+POSE_BYTES = 700
+"""About the size of a ReferencePose in memory, arrays and strings included."""
+
+
+class ReadingStore(BaseStore):
+    """Each method sees one moment of the database."""
+
+    @observed
+    def get_scene(self, scene_key: SceneKey) -> SceneRecord:
+        """A scene.
+
+        Raises:
+            NotFound: there is no such scene.
+        """
+        with self._database.read() as connection:
+            return rows.scene_record(queries.find_scene(connection, scene_key))
+
+    @observed
+    def list_scenes(self, tenant: str, limit: int, after: str = "") -> list[SceneRecord]:
+        """At most ``limit`` scenes of a tenant, by id, of those whose id is greater than ``after``."""
+        page = queries.select_scenes_of(tenant, after).limit(limit)
+        with self._database.read() as connection:
+            return [rows.scene_record(row) for row in connection.execute(page)]
+
+    @observed
+    def has_features(self, key: str, extractor: str) -> bool:
+        """Whether a reference has features of this extractor; False if it was deleted."""
+        with self._database.read() as connection:
+            return queries.has_features(connection, key, extractor)
+
+    @observed
+    def get_reference(self, scene_key: SceneKey, reference_id: str) -> ReferenceRecord:
+        """A reference without its image.
+
+        Raises:
+            NotFound: there is no such scene or reference.
+            DataLoss: its camera and pose are damaged.
+        """
+        with self._database.read() as connection:
+            key = queries.find_key(connection, scene_key, reference_id)
+            row = connection.execute(select(tables.reference).where(tables.reference.c.key == key)).one()
+        return rows.reference_record(row)
+
+    @observed
+    def read_image(self, scene_key: SceneKey, reference_id: str) -> bytes:
+        """The image's bytes as they came.
+
+        Raises:
+            NotFound: there is no such scene or reference.
+            DataLoss: the bytes are damaged.
+        """
+        with self._database.read() as connection:
+            row = queries.find_image(connection, queries.find_key(connection, scene_key, reference_id))
+        return rows.image(row)
+
+    @observed
+    def read_image_of(self, key: str) -> bytes:
+        """The image's bytes as they came, by the reference's key: the very image that a snapshot spoke of.
+
+        Raises:
+            NotFound: the reference was deleted.
+            DataLoss: the bytes are damaged.
+        """
+        with self._database.read() as connection:
+            row = queries.find_image(connection, key)
+        return rows.image(row)
+
+    @observed
+    def list_references(self, scene_key: SceneKey, limit: int, after: str = "") -> list[ReferenceRecord]:
+        """At most ``limit`` references of a scene, by id, of those whose id is greater than ``after``.
+
+        Raises:
+            NotFound: there is no such scene.
+            DataLoss: camera and pose of one of them are damaged.
+        """
+        column = tables.reference.c
+        page = select(tables.reference).where(column.scene_id == scene_key, column.reference_id > after)
+        with self._database.read() as connection:
+            queries.read_generation(connection, scene_key)
+            found = connection.execute(page.order_by(column.reference_id).limit(limit)).all()
+        return [rows.reference_record(row) for row in found]
+
+    @observed
+    def list_poses(self, scene_key: SceneKey) -> tuple[int, tuple[ReferencePose, ...]]:
+        """The scene's generation and the poses of all its references, by id; from memory when nothing has changed.
+
+        Raises:
+            NotFound: there is no such scene.
+            DataLoss: camera and pose of a reference are damaged.
+        """
+        column = tables.reference.c
+        with self._database.read() as connection:
+            generation = queries.read_generation(connection, scene_key)
+            poses = self._poses.get((scene_key, generation))
+            if poses is not None:
+                return generation, poses
+            statement = select(tables.reference).where(column.scene_id == scene_key).order_by(column.reference_id)
+            found = connection.execute(statement).all()
+        records = [rows.reference_record(row) for row in found]
+        poses = tuple(ReferencePose(it.reference_id, it.key, it.world_from_camera) for it in records)
+        self._poses.put((scene_key, generation), poses, POSE_BYTES * len(poses))
+        return generation, poses
+
+    @observed
+    def load_references(
+        self, scene_key: SceneKey, reference_ids: Sequence[str] | None, extractor: str
+    ) -> SceneSnapshot:
+        """References with their features, which of them have none, and the generation, all read at one moment.
+
+        References that were loaded before come from memory.
+
+        Args:
+            scene_key: the scene.
+            reference_ids: which references, in the order wanted; None for all, by id.
+            extractor: whose features.
+
+        Raises:
+            NotFound: there is no such scene (field "scene") or reference (field "references[i]").
+            DataLoss: features, camera or pose of one of them are damaged.
+        """
+        state = self._state
+        names = None if reference_ids is None else tuple(reference_ids)
+        resolved = None if names is None else self._resolved.get((scene_key, names))
+        remembered: dict[str, DescribedReference | None] = {}  # each is asked for once: hits and misses are counted
+        if resolved is not None and resolved.state is state and not self._database.is_shared:
+            remembered, snapshot = self._recall(resolved, extractor)
+            if snapshot is not None:
+                return snapshot
+        with self._database.read() as connection:
+            generation = queries.read_generation(connection, scene_key)
+            if resolved is not None and resolved.generation == generation and self._database.is_shared:
+                remembered, snapshot = self._recall(resolved, extractor)
+                if snapshot is not None:
+                    return snapshot
+            if reference_ids is None:
+                keys = queries.list_keys(connection, scene_key)
+                reference_ids = list(keys)
+            else:
+                keys = queries.find_keys(connection, scene_key, reference_ids)
+            for index, reference_id in enumerate(reference_ids):
+                if reference_id not in keys:
+                    raise queries.reference_not_found(scene_key, reference_id, field=f"references[{index}]")
+            wanted = [keys[reference_id] for reference_id in reference_ids]
+            remembered |= {key: self._described.get((key, extractor)) for key in wanted if key not in remembered}
+            described = {key: it for key, it in remembered.items() if it is not None}
+            found = queries.features_by_key(connection, [key for key in wanted if key not in described], extractor)
+            lacking = [key for key in wanted if key not in described and key not in found]
+            undescribed = queries.rows_by_key(connection, lacking)
+        if names is not None:
+            size_bytes = NAME_BYTES * (1 + len(names))
+            self._resolved.put((scene_key, names), Resolved(state, generation, tuple(wanted)), size_bytes)
+        for key, row in found.items():
+            described[key] = rows.described_reference(row)
+            self._described.put((key, extractor), described[key], len(row.data) + POSE_BYTES)
+        return SceneSnapshot(
+            generation,
+            tuple(described[key] for key in wanted if key in described),
+            tuple(rows.reference_record(undescribed[key]) for key in lacking),
+        )
+
+    @observed
+    def list_changes(self, scene_key: SceneKey, since_generation: int | None, descriptor_name: str) -> SceneChanges:
+        """What became of a scene since a generation, read at one moment.
+
+        Args:
+            scene_key: the scene.
+            since_generation: the one that the caller knows; None for the whole scene.
+            descriptor_name: whose global descriptors.
+
+        Raises:
+            NotFound: there is no such scene.
+            DataLoss: camera and pose, or the descriptor, of one of them are damaged.
+        """
+        with self._database.read() as connection:
+            return read_changes(connection, scene_key, since_generation, descriptor_name)
+
+    def _recall(
+        self, resolved: Resolved, extractor: str
+    ) -> tuple[dict[str, DescribedReference | None], SceneSnapshot | None]:
+        """What is remembered of references, by key, and all of it as a snapshot if it is all."""
+        remembered = {key: self._described.get((key, extractor)) for key in resolved.keys}
+        in_memory = tuple(it for it in map(remembered.get, resolved.keys) if it is not None)
+        is_all = len(in_memory) == len(resolved.keys)
+        return remembered, SceneSnapshot(resolved.generation, in_memory) if is_all else None

@@ -1,0 +1,178 @@
+"""A real PostgreSQL for tests, from the system's package: started once a test run, and ended with it however it ends.
+
+Each test gets a schema of its own, which costs milliseconds where a database costs a tenth of a second.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import os
+import pwd
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from functools import cache
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+
+USER = "mapless"
+START_LIMIT_S = 30.0
+_UNPRIVILEGED = ("postgres", "nobody")
+_PR_SET_PDEATHSIG = 1
+_SETTINGS = {
+    "listen_addresses": "127.0.0.1",
+    "unix_socket_directories": "",
+    "max_connections": "60",
+    "shared_buffers": "32MB",
+    "wal_level": "minimal",
+    "max_wal_senders": "0",
+}
+
+
+def programs() -> Path | None:
+    """Folder of initdb, postgres and the like; None where the package is not installed."""
+    on_path = shutil.which("initdb")
+    found = [Path(on_path)] if on_path else sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
+    return found[-1].parent if found else None
+
+
+class Cluster:
+    """A running PostgreSQL.
+
+    Args:
+        survives_power_failure: whether it waits for the disk. Processes may be killed without: what they have written
+            is the kernel's.
+    """
+
+    def __init__(self, survives_power_failure: bool = False) -> None:
+        folder = programs()
+        assert folder is not None
+        self._programs = folder
+        # Root may not run it. Its files are then another user's, who must be able to reach them.
+        users = [it for it in _UNPRIVILEGED if _has_user(it)] if os.geteuid() == 0 else []
+        self._user = pwd.getpwnam(users[0]) if users else None
+        self._folder = Path(tempfile.mkdtemp(prefix="mapless-postgres-"))
+        if self._user is not None:
+            os.chown(self._folder, self._user.pw_uid, self._user.pw_gid)
+        self.port = _free_port()
+        self._numbers = count()
+        self._settings = _SETTINGS | {"port": str(self.port), "fsync": "on" if survives_power_failure else "off"}
+        self._server: subprocess.Popen[bytes] | None = None
+        try:
+            self._run("initdb", "--auth=trust", f"--username={USER}", "--encoding=UTF8", "--locale=C", "--no-sync")
+            self.start()
+        except BaseException:
+            self.remove()
+            raise
+
+    @property
+    def process_id(self) -> int:
+        """Of the server's first process."""
+        assert self._server is not None
+        return self._server.pid
+
+    def fresh_url(self) -> str:
+        """URL of an empty schema."""
+        schema = f"test_{os.getpid()}_{next(self._numbers)}"
+        with self.connect() as connection:
+            connection.execute(f"CREATE SCHEMA {schema}")
+        return f"postgresql://{USER}@127.0.0.1:{self.port}/postgres?options=-csearch_path%3D{schema}"
+
+    def connect(self) -> psycopg.Connection[tuple[object, ...]]:
+        """Past everything of ours; commits by itself."""
+        return psycopg.connect(f"postgresql://{USER}@127.0.0.1:{self.port}/postgres", autocommit=True)
+
+    def start(self) -> None:
+        """Start it and wait until it lets somebody in, after it has recovered from whatever ended it."""
+        settings = [f"--{name}={value}" for name, value in self._settings.items()]
+        with (self._folder / "log").open("ab") as log:
+            self._server = subprocess.Popen(
+                [self._programs / "postgres", "-D", self._data, *settings],
+                stdout=log,
+                stderr=log,
+                cwd=self._folder,
+                preexec_fn=_end_with_parent,
+                **self._as_user(),
+            )
+        give_up = time.monotonic() + START_LIMIT_S
+        while not self._lets_in():
+            if self._server.poll() is not None or time.monotonic() > give_up:
+                raise RuntimeError((self._folder / "log").read_text()[-2000:])
+            time.sleep(0.02)
+
+    def stop(self, how: signal.Signals = signal.SIGQUIT) -> None:
+        """End it: at once and without tidying up (SIGQUIT, what "immediate" means), or dropping callers (SIGINT)."""
+        if self._server is not None:
+            self._server.send_signal(how)
+            self._server.wait(START_LIMIT_S)
+            self._server = None
+
+    def remove(self) -> None:
+        """End it and delete its files."""
+        self.stop()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    @property
+    def _data(self) -> Path:
+        return self._folder / "data"
+
+    def _lets_in(self) -> bool:
+        try:
+            self.connect().close()
+        except psycopg.OperationalError:
+            return False
+        return True
+
+    def _run(self, program: str, *arguments: str) -> None:
+        command = [str(self._programs / program), "-D", str(self._data), *arguments]
+        subprocess.run(command, check=True, capture_output=True, cwd=self._folder, timeout=60, **self._as_user())
+
+    def _as_user(self) -> dict[str, Any]:
+        if self._user is None:
+            return {}
+        return {"user": self._user.pw_uid, "group": self._user.pw_gid, "extra_groups": []}
+
+
+@cache
+def shared_cluster() -> Cluster:
+    """The one that most tests use; skips the test where there is no PostgreSQL."""
+    require()
+    cluster = Cluster()
+    atexit.register(cluster.remove)
+    return cluster
+
+
+def require() -> None:
+    """Skips the test where there is no PostgreSQL."""
+    if programs() is None:
+        pytest.skip("needs PostgreSQL: Debian's package `postgresql`")
+    if os.geteuid() == 0 and not any(map(_has_user, _UNPRIVILEGED)):
+        pytest.skip("PostgreSQL does not run as root, and there is nobody else")
+
+
+def _end_with_parent() -> None:
+    """In the new process: it is told to end when its parent does, even by SIGKILL."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGQUIT)
+
+
+def _has_user(name: str) -> bool:
+    try:
+        pwd.getpwnam(name)
+    except KeyError:
+        return False
+    return True
+
+
+def _free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port: int = listener.getsockname()[1]
+        return port

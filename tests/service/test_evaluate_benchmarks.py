@@ -1,0 +1,201 @@
+"""`mapless-server evaluate` on the benchmarks' layouts, written here with photographs of a rendered wall."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from click.testing import Result
+from images import encode
+from typer.testing import CliRunner
+from wall import Shot, wall
+
+from mapless.geometry import Camera
+from mapless_server.evaluation.cli import evaluate_command
+
+app = typer.Typer()
+app.command()(evaluate_command)
+
+KINECT = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
+"""What the reader of 7-Scenes takes, since the layout has no intrinsics."""
+CENTRED = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [*map(str, arguments)])
+
+
+def refusal(*arguments: object) -> str:
+    """What is said of arguments that are wrong: one line, exit code 2, and nothing measured."""
+    done = run(*arguments)
+    assert done.exit_code == 2, done.output
+    assert done.stdout == ""
+    (line,) = (line for line in done.stderr.strip().splitlines() if not line.startswith("reading scenes"))
+    return line
+
+
+def write_pose(file: Path, shot: Shot) -> None:
+    np.savetxt(file, shot[1].matrix())
+
+
+def write_7scenes(scene: Path) -> Path:
+    """Even photographs are seq-01, for training; odd ones seq-02, for tests."""
+    for i, shot in enumerate(wall(KINECT)):
+        sequence = scene / f"seq-0{i % 2 + 1}"
+        sequence.mkdir(parents=True, exist_ok=True)
+        (sequence / f"frame-{i // 2:06d}.color.png").write_bytes(encode(".png", shot[0]))
+        write_pose(sequence / f"frame-{i // 2:06d}.pose.txt", shot)
+    (scene / "TrainSplit.txt").write_text("sequence1\n")
+    (scene / "TestSplit.txt").write_text("sequence2\n")
+    return scene
+
+
+def write_12scenes(room: Path) -> Path:
+    """The first three photographs are the queries' sequence."""
+    (room / "data").mkdir(parents=True)
+    for i, shot in enumerate(wall(CENTRED)):
+        (room / "data" / f"frame-{i:06d}.color.jpg").write_bytes(encode(".jpg", shot[0]))
+        write_pose(room / "data" / f"frame-{i:06d}.pose.txt", shot)
+    (room / "split.txt").write_text(
+        "sequence0 [frames=3]  [start=0 ; end=2]\nsequence1 [frames=6]  [start=3 ; end=8]\n"
+    )
+    k = np.eye(4)
+    k[:3, :3] = CENTRED.matrix()
+    (room / "info.txt").write_text(
+        "m_colorWidth = 640\nm_colorHeight = 480\n"
+        f"m_calibrationColorIntrinsic = {' '.join(str(value) for value in k.ravel())}\n"
+    )
+    return room
+
+
+def write_cambridge(scene: Path) -> Path:
+    """Even photographs are references, odd ones queries."""
+    (scene / "seq1").mkdir(parents=True)
+    lines: dict[str, list[str]] = {"train": [], "test": []}
+    cameras = []
+    for i, (image, pose) in enumerate(wall(CENTRED)):
+        (scene / "seq1" / f"frame{i:05d}.png").write_bytes(encode(".png", image))
+        q, centre = pose.inverse().quaternion(), " ".join(map(str, pose.translation))
+        lines["test" if i % 2 else "train"].append(f"seq1/frame{i:05d}.png {centre} {q.w} {q.x} {q.y} {q.z}")
+        cameras.append(f"seq1/frame{i:05d}.jpg\t500 {q.w} {q.x} {q.y} {q.z} {centre} 0 0")
+    for split, its in lines.items():
+        (scene / f"dataset_{split}.txt").write_text("\n".join(["Visual Landmark Dataset V1", "head", "", *its]) + "\n")
+    (scene / "reconstruction.nvm").write_text("\n".join(["NVM_V3", "", str(len(cameras)), *cameras, "", "0"]))
+    return scene
+
+
+@pytest.fixture(scope="module")
+def chess(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_7scenes(tmp_path_factory.mktemp("7scenes") / "chess")
+
+
+def test_measures_every_layout_and_goes_on_where_it_ended(chess: Path, tmp_path: Path) -> None:
+    """One photograph is torn behind its header: its scene fails, the others do not, and mended it alone is measured."""
+    folder, output = tmp_path / "data", tmp_path / "out"
+    shutil.copytree(chess, folder / "chess")
+    write_12scenes(folder / "apt1" / "kitchen")
+    torn = write_cambridge(folder / "ShopFacade") / "seq1" / "frame00004.png"
+    whole = torn.read_bytes()
+    torn.write_bytes(whole[: len(whole) // 2])
+    arguments = (folder, "--sparse", "3", "--max-queries", 2, "--worst", 1, "--output", output)
+
+    done = run(*arguments)
+    assert done.exit_code == 1, done.output
+    assert "ShopFacade is not complete" in done.stdout
+    content = json.loads((output / "evaluation.json").read_text())
+    assert [failure["scene"] for failure in content["failures"]] == ["ShopFacade"]
+    measured = {file: file.stat().st_mtime_ns for file in (output / "runs").iterdir()}
+    assert len([file for file in measured if not file.name.startswith("ShopFacade")]) == 4
+
+    torn.write_bytes(whole)
+    done = run(*arguments)
+    assert done.exit_code == 0, done.output
+    assert "chess, dense: storing" not in done.stderr
+    assert "ShopFacade, dense: storing" in done.stderr
+    assert all(
+        file.stat().st_mtime_ns == time for file, time in measured.items() if not file.name.startswith("ShopFacade")
+    )
+
+    content = json.loads((output / "evaluation.json").read_text())
+    assert content["failures"] == []
+    assert [(r["scene"], r["setting"]) for r in content["runs"]] == [
+        (scene, setting) for scene in ("apt1/kitchen", "chess", "ShopFacade") for setting in ("dense", "N=3")
+    ]
+    for figures in content["runs"]:
+        assert figures["localized"] == figures["queries"] == 2
+        assert figures["median_translation_cm"] < 3, figures["scene"]
+        assert figures["references"] == (
+            3 if figures["setting"] == "N=3" else {"apt1/kitchen": 6}.get(figures["scene"], 5)
+        )
+    assert {scene["scene"]: scene["ground_truth"] for scene in content["scenes"]} == {
+        "apt1/kitchen": "VoxelHashing (original)",
+        "chess": "KinectFusion (original)",
+        "ShopFacade": "SfM (VisualSFM, original)",
+    }
+    page = (output / "report.html").read_text()
+    assert page.count("data:image/jpeg") == 3 * 2
+    assert "chess: 2 of 4 queries, evenly spread" in page
+    assert "Cambridge Landmarks. Dense: median error, cm/°" in " ".join(done.stdout.split())
+
+
+def test_takes_the_references_of_a_pairs_file(chess: Path, tmp_path: Path) -> None:
+    pairs = tmp_path / "pairs.txt"
+    wanted = ["seq-01/frame-000002.color.png", "seq-01/frame-000000.color.png", "seq-01/frame-000001.color.png"]
+    queries = [f"seq-02/frame-{i:06d}.color.png" for i in range(4)]
+    pairs.write_text("".join(f"{query} {reference}\n" for query in queries for reference in wanted))
+    done = run(
+        chess, "--protocol", "dense", "--pairs", pairs, "--max-queries", 1, "--worst", 0, "--output", tmp_path / "out"
+    )
+    assert done.exit_code == 0, done.output
+    with (tmp_path / "out" / "queries.csv").open(newline="") as stream:
+        (query,) = csv.DictReader(stream)
+    assert query["references"].split() == [f"seq-01_frame-{i:06d}" for i in (2, 0, 1)]
+    assert "chosen by: the pairs of" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--layout", "cambridge"), "has the layout 7scenes"),
+        (("--layout", "8scenes"), "layout must be one of"),
+        (("--protocol", "thick"), "protocol must be one of dense, sparse"),
+        (("--sparse", "5,many"), "whole numbers"),
+        (("--sparse", "-5"), "at least 2 references"),
+        (("--sparse", "50"), "5 training frames, 50 references are wanted"),
+        (("--variants", "best,bset"), "'bset'"),
+        (("--max-queries", "-1"), "max-queries must be at least 1"),
+        (("--stride", "0"), "stride"),
+        (("--worst", "-1"), "worst must be 0 or more"),
+        (("--choose", "luck"), "'luck'"),
+        (("--pairs", "/nowhere/pairs.txt"), "no file /nowhere/pairs.txt"),
+        (("--output", "/proc/nowhere"), "/proc/nowhere cannot be written"),
+        (("--references", "10"), "--references: flags like it are for a folder with cameras.json"),
+    ],
+)
+def test_wrong_arguments_are_one_line(chess: Path, tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
+    defaults = {"--sparse": "3", "--output": str(tmp_path)}
+    given = dict(zip(arguments[::2], arguments[1::2], strict=True))
+    assert words in refusal(chess, *(part for flag in (defaults | given).items() for part in flag))
+
+
+def test_a_broken_scene_is_refused_before_anything_is_measured(chess: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "data" / "fire"
+    shutil.copytree(chess, broken)
+    shutil.copytree(chess, tmp_path / "data" / "chess")
+    arguments = (tmp_path / "data", "--sparse", "3", "--output", tmp_path / "out")
+    (broken / "TestSplit.txt").unlink()
+    assert "fire has no frame of the test split" in refusal(*arguments)
+    (broken / "TestSplit.txt").write_text("sequence3\n")
+    assert "seq-03" in refusal(*arguments)
+    (broken / "TestSplit.txt").write_text("sequence2\n")
+    (broken / "seq-02" / "frame-000001.color.png").write_bytes(b"")
+    assert "fire: 1 of 9 frames cannot be used, the first, seq-02/frame-000001" in refusal(*arguments)
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("seq-02/frame-000000.color.png seq-01/frame-000099.color.png\n")
+    assert "has no image 'seq-01/frame-000099.color.png'" in refusal(chess, *arguments[1:], "--pairs", pairs)
+    assert not any((tmp_path / "out" / "runs").iterdir())

@@ -1,0 +1,169 @@
+"""The server finds references by what they look like: by themselves, for Localize, and among those that are named."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from images import encode, textured
+from servers import CAMERA, RunningServer, pose, serving
+
+from mapless import (
+    Camera,
+    Client,
+    HeadingPrior,
+    InvalidArgument,
+    LocalizationResult,
+    NewReference,
+    NotFound,
+    PositionPrior,
+    Rejected,
+)
+
+COUNT = 12
+PHOTOS = [encode(".png", textured(seed=i)) for i in range(COUNT)]
+SPACING_M = 5.0
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
+    with serving(tmp_path_factory.mktemp("data")) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def client(server: RunningServer) -> Iterator[Client]:
+    with Client(server.address) as client:
+        client.create_scene("hall")
+        client.add_references(
+            "hall", [NewReference(f"r{i:02}", PHOTOS[i], CAMERA, pose(SPACING_M * i)) for i in range(COUNT)]
+        )
+        yield client
+
+
+def ids(names: list[str]) -> list[str]:
+    return [name.rpartition("/")[2] for name in names]
+
+
+@pytest.mark.parametrize("i", [0, 5, 11])
+def test_a_photograph_resembles_itself_most(client: Client, i: int) -> None:
+    found = client.retrieve_references(PHOTOS[i], CAMERA, "hall", 3)
+    assert len(found) == 3
+    assert found[0].name == f"scenes/hall/references/r{i:02}"
+    assert found[0].similarity == pytest.approx(1, abs=1e-3)
+    assert all(other.similarity < 0.99 for other in found[1:])
+    np.testing.assert_allclose(found[0].world_from_camera.matrix(), pose(SPACING_M * i).matrix(), atol=1e-9)
+
+
+def test_ten_unless_asked_otherwise_and_no_more_than_there_are(client: Client) -> None:
+    assert len(client.retrieve_references(PHOTOS[0], CAMERA, "hall")) == 10
+    every = client.retrieve_references(PHOTOS[0], CAMERA, "hall", 1000)
+    assert sorted(ids([it.name for it in every])) == [f"r{i:02}" for i in range(COUNT)]
+
+
+def test_localize_uses_what_retrieval_finds(client: Client) -> None:
+    found = client.retrieve_references(PHOTOS[7], CAMERA, "hall", 4)
+    answer = client.localize(PHOTOS[7], CAMERA, "hall", reference_count=4)
+    assert isinstance(answer, LocalizationResult)
+    uses = answer.diagnostics.references
+    assert [use.name for use in uses] == [it.name for it in found]
+    assert [use.similarity for use in uses] == [it.similarity for it in found]
+    assert answer.diagnostics.retrieval == "patches"
+
+
+def test_named_references_are_used_as_they_come_unless_reranking_is_asked_for(client: Client) -> None:
+    names = [f"r{i:02}" for i in range(COUNT)]
+    plain = client.localize(PHOTOS[9], CAMERA, "hall", names, reference_count=3)
+    assert ids([use.name for use in plain.diagnostics.references]) == names
+    assert plain.diagnostics.retrieval == ""
+    ranked = client.localize(PHOTOS[9], CAMERA, "hall", names[:10], reference_count=3, rerank_references=True)
+    uses = ids([use.name for use in ranked.diagnostics.references])
+    assert len(uses) == 3
+    assert uses[0] == "r09"
+    assert set(uses) <= set(names[:10])
+
+
+def test_a_name_that_is_wrong_is_found_out_when_reranking_too(client: Client) -> None:
+    with pytest.raises(NotFound) as caught:
+        client.localize(PHOTOS[0], CAMERA, "hall", ["r00", "nobody"], rerank_references=True)
+    assert caught.value.field == "references[1]"
+
+
+def test_a_position_prior_narrows_to_its_radius_and_ten_metres(client: Client) -> None:
+    prior = PositionPrior(pose(0.0).translation, 1.0)
+    found = client.retrieve_references(PHOTOS[9], CAMERA, "hall", 1000, position_prior=prior)
+    assert sorted(ids([it.name for it in found])) == ["r00", "r01", "r02"]
+
+
+def test_a_heading_prior_narrows_to_its_angle_and_sixty_degrees(client: Client) -> None:
+    axis = pose(0.0).rotation[:, 2]
+    near = client.retrieve_references(PHOTOS[0], CAMERA, "hall", 1000, heading_prior=HeadingPrior(3 * axis, 1.0))
+    expected = [i for i in range(COUNT) if axis @ pose(SPACING_M * i).rotation[:, 2] >= np.cos(np.radians(61))]
+    assert sorted(ids([it.name for it in near])) == [f"r{i:02}" for i in expected]
+    assert 0 < len(expected) < COUNT
+
+
+def test_a_pose_that_looks_elsewhere_than_the_heading_prior_is_rejected(client: Client) -> None:
+    axis = pose(0.0).rotation[:, 2]
+    ahead, behind = HeadingPrior(axis, 5.0), HeadingPrior(-axis, 5.0)
+    assert isinstance(client.localize(PHOTOS[0], CAMERA, "hall", ["r00"], heading_prior=ahead), LocalizationResult)
+    answer = client.localize(PHOTOS[0], CAMERA, "hall", ["r00"], heading_prior=behind)
+    assert isinstance(answer, Rejected)
+    assert answer.reason == "GATE"
+    assert "175.0 degrees outside" in answer.message
+
+
+def test_what_is_added_and_deleted_is_found_and_not_found_at_once(client: Client) -> None:
+    photo = encode(".png", textured(seed=99))
+    client.add_reference("hall", NewReference("late", photo, CAMERA, pose(-50.0)))
+    assert ids([client.retrieve_references(photo, CAMERA, "hall", 1)[0].name]) == ["late"]
+    client.delete_reference("hall", "late")
+    every = client.retrieve_references(photo, CAMERA, "hall", 1000)
+    assert "late" not in ids([it.name for it in every])
+    assert len(every) == COUNT
+
+
+def test_an_empty_scene_has_nothing_to_find(client: Client) -> None:
+    client.create_scene("empty")
+    assert client.retrieve_references(PHOTOS[0], CAMERA, "empty") == []
+
+
+def test_a_store_without_descriptors_is_described_by_the_first_call(tmp_path: Path) -> None:
+    """One that was filled before there was retrieval."""
+    with serving(tmp_path) as server, Client(server.address) as client:
+        client.create_scene("s")
+        client.add_references("s", [NewReference(f"r{i}", PHOTOS[i], CAMERA, pose(float(i))) for i in range(3)])
+    with serving(tmp_path, descriptor_name="others") as server, Client(server.address) as client:
+        first, second = (client.localize(PHOTOS[2], CAMERA, "s", reference_count=1) for _ in range(2))
+        for answer in (first, second):
+            assert ids([use.name for use in answer.diagnostics.references]) == ["r2"]
+            assert answer.diagnostics.retrieval == "others"
+        assert ["describe" in it.diagnostics.stage_s for it in (first, second)] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"count": -1}, "count"),
+        ({"count": 1001}, "count"),
+        ({"position_prior": PositionPrior(np.zeros(3), 0.0)}, "position_prior.radius_m"),
+        ({"heading_prior": HeadingPrior(np.zeros(3), 10.0)}, "heading_prior.direction"),
+        ({"heading_prior": HeadingPrior(np.array([0, 0, np.nan]), 10.0)}, "heading_prior.direction.z"),
+        ({"heading_prior": HeadingPrior(np.array([0, 0, 1.0]), 181.0)}, "heading_prior.max_angle_deg"),
+        ({"camera": Camera(97, 64, 80.0, 81.0, 47.5, 31.5)}, "intrinsics.width_px"),
+        ({"image": b"no image"}, "image"),
+    ],
+)
+def test_bad_requests_name_their_field(client: Client, changes: dict[str, object], field: str) -> None:
+    request = {"image": PHOTOS[0], "camera": CAMERA, "scene": "hall"} | changes
+    with pytest.raises(InvalidArgument) as caught:
+        client.retrieve_references(**request)  # type: ignore[arg-type]
+    assert caught.value.field == field
+
+
+def test_an_unknown_scene_is_not_found(client: Client) -> None:
+    with pytest.raises(NotFound) as caught:
+        client.retrieve_references(PHOTOS[0], CAMERA, "nowhere")
+    assert caught.value.field == "scene"

@@ -1,0 +1,110 @@
+"""Several servers on one PostgreSQL are one service: what is done through one is seen through the others at once."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from images import encode, textured
+from postgres import Cluster, require, shared_cluster
+from servers import CAMERA, PHOTO, pose, serving
+
+from mapless import Client, ConnectOptions, LocalizationResult, NewReference, NotFound, Unavailable
+from mapless_server.store import Store, StoreError
+
+PHOTOS = [encode(".png", textured(seed=i)) for i in range(3)]
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> Iterator[tuple[Client, Client]]:
+    """Clients of two servers that share a database."""
+    url = shared_cluster().fresh_url()
+    with (
+        serving(tmp_path / "first", store=Store.connect(url)) as first,
+        serving(tmp_path / "second", store=Store.connect(url)) as second,
+        Client(first.address) as one,
+        Client(second.address) as other,
+    ):
+        yield one, other
+
+
+def used(client: Client, references: tuple[str, ...] = (), photo: bytes = PHOTO) -> list[str]:
+    answer = client.localize(photo, CAMERA, "s", references)
+    assert isinstance(answer, LocalizationResult)
+    return [use.name.rpartition("/")[2] for use in answer.diagnostics.references]
+
+
+def test_what_is_added_through_one_is_used_through_the_other(two: tuple[Client, Client]) -> None:
+    one, other = two
+    one.create_scene("s")
+    for i, photo in enumerate(PHOTOS):
+        one.add_reference("s", NewReference(f"r{i}", photo, CAMERA, pose(i)))
+        # By name, by choice, by retrieval and in the list, each with its own memory of what was there before.
+        assert used(other, (f"r{i}",)) == [f"r{i}"]
+        assert used(other, photo=photo)[0] == f"r{i}"
+        assert other.retrieve_references(photo, CAMERA, "s", 1)[0].similarity == pytest.approx(1, abs=1e-3)
+        assert [it.reference_id for it in other.list_references("s")] == [f"r{j}" for j in range(i + 1)]
+        assert other.get_scene("s").generation == one.get_scene("s").generation == i + 2
+
+
+def test_what_is_deleted_through_one_is_gone_for_the_other(two: tuple[Client, Client]) -> None:
+    one, other = two
+    one.create_scene("s")
+    one.add_references("s", [NewReference(f"r{i}", photo, CAMERA, pose(i)) for i, photo in enumerate(PHOTOS)])
+    assert set(used(other)) == {"r0", "r1", "r2"}
+    assert used(other, ("r1", "r0")) == ["r1", "r0"]
+    one.delete_reference("s", "r1")
+    assert set(used(other)) == {"r0", "r2"}
+    with pytest.raises(NotFound) as caught:
+        used(other, ("r1", "r0"))
+    assert caught.value.field == "references[0]"
+    # Another photograph under the old name is another reference.
+    other.add_reference("s", NewReference("r1", PHOTOS[2], CAMERA, pose(7.0)))
+    assert one.get_reference("s", "r1", include_image=True).image == PHOTOS[2]
+    assert used(one, ("r1",)) == ["r1"]
+    one.delete_scene("s")
+    with pytest.raises(NotFound):
+        used(other)
+    other.create_scene("s")
+    assert one.get_scene("s").reference_count == 0
+
+
+@pytest.mark.timeout(120)
+def test_a_database_that_goes_and_comes_back_costs_errors_and_no_restart(tmp_path: Path) -> None:
+    require()
+    database = Cluster(survives_power_failure=True)
+    try:
+        url = database.fresh_url()
+        with (
+            serving(tmp_path, store=Store.connect(url)) as server,
+            Client(server.address, ConnectOptions(max_attempts=1, timeout_s=20)) as client,
+        ):
+            client.create_scene("s")
+            client.add_references(
+                "s", [NewReference(f"r{i}", photo, CAMERA, pose(i)) for i, photo in enumerate(PHOTOS)]
+            )
+            before = client.get_scene("s")
+            for how in (signal.SIGQUIT, signal.SIGINT):
+                database.stop(how)
+                for call in (lambda: client.get_scene("s"), lambda: used(client), lambda: used(client, ("r0",))):
+                    with pytest.raises(Unavailable) as caught:
+                        call()
+                    assert caught.value.retry_after_s is not None
+                database.start()
+                assert client.get_scene("s") == before
+                assert set(used(client)) == {"r0", "r1", "r2"}
+            client.add_reference("s", NewReference("late", PHOTO, CAMERA, pose(9.0)))
+            assert used(client, ("late",)) == ["late"]
+    finally:
+        database.remove()
+
+
+def test_a_server_without_its_database_does_not_start_and_says_why() -> None:
+    require()
+    database = Cluster()
+    url = database.fresh_url()
+    database.remove()
+    with pytest.raises(StoreError, match=r"database 127\.0\.0\.1:\d+/postgres cannot be used: .*refused"):
+        Store.connect(url)

@@ -1,0 +1,143 @@
+"""Where a store can be, for tests that hold on every database, and references that follow from a seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import postgres
+import psycopg
+
+from mapless.geometry import Camera, Distortion, RigidTransform, rotation_from_vector
+from mapless_server.method.views import Features, View
+from mapless_server.store import NewReference, Store, sqlite
+from mapless_server.store.store import DEFAULT_CACHE_BYTES
+
+EXTRACTOR = "sift"
+DATABASES = ("sqlite", "postgresql")
+
+
+class Place(Protocol):
+    """A database that stores are opened on, and that can be reached into behind their backs."""
+
+    def open(self, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
+        """A store on it."""
+        ...
+
+    def fetch(self, statement: str, *parameters: object) -> list[tuple[Any, ...]]:
+        """Rows of a statement with question marks for its parameters."""
+        ...
+
+    def execute(self, statement: str, *parameters: object) -> None:
+        """Run and commit a statement, which must change something."""
+        ...
+
+
+@dataclass(frozen=True)
+class Folder:
+    """A data folder with SQLite."""
+
+    data_dir: Path
+
+    def open(self, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
+        """Implements Place."""
+        return Store.open(self.data_dir, cache_bytes)
+
+    def fetch(self, statement: str, *parameters: object) -> list[tuple[Any, ...]]:
+        """Implements Place."""
+        with closing(self.connect()) as connection:
+            return list(connection.execute(statement, parameters).fetchall())
+
+    def execute(self, statement: str, *parameters: object) -> None:
+        """Implements Place."""
+        with closing(self.connect()) as connection, connection:
+            assert connection.execute(statement, parameters).rowcount != 0, "nothing was changed"
+
+    def connect(self) -> Any:
+        """With the store's own library: another one in the same process would neither see nor keep its locks."""
+        return sqlite.choose_library().connect(self.data_dir / sqlite.DATABASE_FILE, timeout=0)
+
+
+@dataclass(frozen=True)
+class Shared:
+    """A schema of a PostgreSQL."""
+
+    url: str
+
+    def open(self, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
+        """Implements Place."""
+        return Store.connect(self.url, cache_bytes)
+
+    def fetch(self, statement: str, *parameters: object) -> list[tuple[Any, ...]]:
+        """Implements Place."""
+        with psycopg.connect(self.url) as connection:
+            return connection.execute(_in_psycopg(statement), parameters).fetchall()
+
+    def execute(self, statement: str, *parameters: object) -> None:
+        """Implements Place."""
+        with psycopg.connect(self.url) as connection:
+            assert connection.execute(_in_psycopg(statement), parameters).rowcount != 0, "nothing was changed"
+
+
+def place_on(database: str, new_folder: Callable[[], Path]) -> Place:
+    """An empty place; skips the test where there is no such database."""
+    if database == "sqlite":
+        return Folder(new_folder() / "data")
+    return Shared(postgres.shared_cluster().fresh_url())
+
+
+def make_reference(
+    reference_id: str, seed: int = 0, count: int = 20, distortion: Distortion | None = None, dimension: int = 0
+) -> NewReference:
+    """A reference whose every number follows from the seed and uses all bits; 0 dimensions are no descriptor."""
+    random = np.random.default_rng(seed)
+    focal_x_px, focal_y_px, principal_x_px, principal_y_px = random.uniform(300, 900, 4).tolist()
+    camera = Camera(640, 480, focal_x_px, focal_y_px, principal_x_px, principal_y_px, distortion)
+    pose = RigidTransform(rotation_from_vector(random.normal(size=3)), random.normal(size=3) * 1e3)
+    image = random.bytes(5000)
+    view = View(camera.pinhole(), make_features(random, count))
+    descriptors = {"vlad": make_descriptor(random, dimension)} if dimension else {}
+    return NewReference(reference_id, image, camera, pose, {EXTRACTOR: view}, descriptors)
+
+
+def make_features(random: np.random.Generator, count: int) -> Features:
+    """So many features."""
+    return Features(
+        random.uniform(0, 640, (count, 2)).astype(np.float32),
+        random.normal(size=(count, 128)).astype(np.float32),
+        random.uniform(1, 30, count).astype(np.float32),
+    )
+
+
+def make_descriptor(random: np.random.Generator, dimension: int) -> np.ndarray:
+    """A unit vector."""
+    vector = random.normal(size=dimension).astype(np.float32)
+    return vector / np.linalg.norm(vector)
+
+
+def view_of(new: NewReference) -> View:
+    """What the one extractor found."""
+    return new.views[EXTRACTOR]
+
+
+def assert_same_bits(actual: np.ndarray, expected: np.ndarray) -> None:
+    """Type, shape and every bit."""
+    assert actual.dtype == expected.dtype
+    assert actual.shape == expected.shape
+    assert actual.tobytes() == expected.tobytes()
+
+
+def assert_same_view(actual: View, expected: View) -> None:
+    """Camera and features."""
+    assert actual.camera == expected.camera
+    assert_same_bits(actual.features.keypoints, expected.features.keypoints)
+    assert_same_bits(actual.features.descriptors, expected.features.descriptors)
+    assert_same_bits(actual.features.sizes_px, expected.features.sizes_px)
+
+
+def _in_psycopg(statement: str) -> Any:
+    return statement.replace("%", "%%").replace("?", "%s")
