@@ -103,7 +103,7 @@ class Cluster:
                 **self._as_user(),
             )
         give_up = time.monotonic() + START_LIMIT_S
-        while not self._lets_in():
+        while not self.lets_in():
             if self._server.poll() is not None or time.monotonic() > give_up:
                 raise RuntimeError((self._folder / "log").read_text()[-2000:])
             time.sleep(0.02)
@@ -124,7 +124,8 @@ class Cluster:
     def _data(self) -> Path:
         return self._folder / "data"
 
-    def _lets_in(self) -> bool:
+    def lets_in(self) -> bool:
+        """Whether it is there and has recovered."""
         try:
             self.connect().close()
         except psycopg.OperationalError:

@@ -63,7 +63,7 @@ class StandInExtractor:
 
 @dataclass(frozen=True)
 class StandInDescriptor:
-    """Sees a photograph as four times four grey patches, so that the same photograph resembles itself and few others."""
+    """Sees four times four grey patches: the same photograph resembles itself, and few others do."""
 
     name: str = "patches"
     dimension: int = 16

@@ -1,4 +1,4 @@
-"""Photographs of two upright boards, one behind the other: a place that is rendered in milliseconds and localizes well."""
+"""Photographs of two upright boards, one behind the other: rendered in milliseconds, and they localize well."""
 
 from __future__ import annotations
 

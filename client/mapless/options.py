@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import dataclass, field
+from typing import Any
 
 import grpc
 
@@ -97,6 +98,8 @@ class ConnectOptions:
             # A message that does not fit into this buffer, 256 KiB unless set, is not retried: no photograph would be.
             ("grpc.per_rpc_retry_buffer_size", max_message_bytes),
         ]
+        # Of several servers behind one name each gets its share, and one that goes away is left out.
+        config: dict[str, Any] = {"loadBalancingConfig": [{"round_robin": {}}]}
         if self.max_attempts > 1:
             policy = {
                 "maxAttempts": self.max_attempts,
@@ -105,6 +108,6 @@ class ConnectOptions:
                 "backoffMultiplier": 2,
                 "retryableStatusCodes": ["UNAVAILABLE"],
             }
-            config = {"methodConfig": [{"name": [{}], "retryPolicy": policy}]}
-            options.append(("grpc.service_config", json.dumps(config)))
+            config["methodConfig"] = [{"name": [{}], "retryPolicy": policy}]
+        options.append(("grpc.service_config", json.dumps(config)))
         return options

@@ -73,7 +73,7 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
 def make_descriptor(settings: Settings, extractor: FeatureExtractor) -> GlobalDescriptor:
     """What references are chosen by; `extractor` is the first tier's.
 
-    `auto` is MegaLoc where there are a CUDA device and its weights: on a CPU it takes a second a photograph.
+    `auto` is MegaLoc where networks run on a CUDA device and its weights are present: on a CPU it takes seconds.
 
     Raises:
         ValueError: unknown kind of retrieval, or there is no such device.

@@ -14,9 +14,11 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from . import __version__
+from .ingest.command import export_command, import_command
 from .load.command import load_app
 from .security.command import token_app
 from .settings import ConfigError, Settings, load_settings
+from .store.command import store_app
 
 app = typer.Typer(
     help="Visual localization without a map, as a gRPC service.",
@@ -31,6 +33,9 @@ weights_app = typer.Typer(
 app.add_typer(weights_app, name="weights")
 app.add_typer(token_app, name="token")
 app.add_typer(load_app, name="load")
+app.add_typer(store_app, name="store")
+app.command("import")(import_command)
+app.command("export")(export_command)
 
 
 def _help(setting: str) -> str:
@@ -58,7 +63,6 @@ def serve_command(
     host: Annotated[str | None, typer.Option(help=_help("host"))] = None,
     port: Annotated[int | None, typer.Option(help=_help("port"))] = None,
     data_dir: Annotated[Path | None, typer.Option(help=_help("data_dir"))] = None,
-    database_url: Annotated[str | None, typer.Option(help=_help("database_url"))] = None,
     backend: Annotated[str | None, typer.Option(help=_help("backend"))] = None,
     features: Annotated[str | None, typer.Option(help=_help("features"))] = None,
     device: Annotated[str | None, typer.Option(help=_help("device"))] = None,
@@ -95,7 +99,10 @@ def serve_command(
     log_level: Annotated[str | None, typer.Option(help=_help("log_level"))] = None,
     log_format: Annotated[str | None, typer.Option(help=_help("log_format"))] = None,
 ) -> None:
-    """Serve until SIGTERM. Every flag is also a setting of the file and of the environment, as MAPLESS_<FLAG>."""
+    """Serve until SIGTERM. Every flag is also a setting of the file and of the environment, as MAPLESS_<FLAG>.
+
+    `database_url` is a setting of these alone: everybody on the machine can read a command line.
+    """
     from .observability.logs import configure_logging
 
     flags: dict[str, Any] = {name: value for name, value in locals().items() if name in Settings.model_fields}

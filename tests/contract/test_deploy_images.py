@@ -77,7 +77,7 @@ class Overriding(list[Any]):
     """A sequence that takes the place of the one in the file below, where others are added to it."""
 
 
-class ComposeLoader(yaml.SafeLoader):
+class ComposeLoader(yaml.SafeLoader):  # type: ignore[misc]
     """YAML with Compose's tag."""
 
 
@@ -332,7 +332,8 @@ def test_servers_of_compose_reach_the_database_that_is_there(monkeypatch: pytest
     assert (url.host, url.port, url.drivername) == ("postgres", 5432, "postgresql")
     assert (url.username, url.database) == (made["POSTGRES_USER"], made["POSTGRES_DB"])
     assert made["POSTGRES_PASSWORD"] == url.password
-    assert re.fullmatch(r"\$\{POSTGRES_PASSWORD:\?[^}]+\}", url.password)  # from outside, or nothing starts
+    assert re.fullmatch(r"\$\{POSTGRES_PASSWORD:\?[^}]+\}", str(url.password))  # from outside, or nothing starts
+    assert ".env" in (ROOT / ".gitignore").read_text().splitlines()
     assert server["depends_on"]["postgres"] == {"condition": "service_healthy"}
     assert database["ports"] == []
     assert int(database["user"].split(":")[0]) > 0

@@ -34,11 +34,18 @@ from mapless_server.weights.install import add
 
 OPTIONS = MegaLocOptions(dimension=24, batch=3)
 
-PUBLISHED = (
-    *(0.0531425, 0.1005863, -0.0246275, 0.0733341, 0.0108711, -0.0649925, 0.0162236, 0.0524118),
-    *(0.0270171, 0.1099585, 0.1004871, 0.0901774, -0.0266725, -0.2352324, 0.0142348, 0.0602001),
-)
-"""Every twelfth number of two descriptors by the published code with the weights of `small_megaloc`."""
+PUBLISHED = {
+    (140, 196): (
+        *(0.0531425, 0.1005863, -0.0246275, 0.0733341, 0.0108711, -0.0649925, 0.0162236, 0.0524118),
+        *(0.0270171, 0.1099585, 0.1004871, 0.0901774, -0.0266725, -0.2352324, 0.0142348, 0.0602001),
+    ),
+    (42, 56): (
+        *(-0.0485626, 0.2263825, 0.0342704, 0.1724895, -0.0843703, -0.2031881, 0.0520563, 0.0262572),
+        *(-0.1206225, 0.2054542, 0.1436262, 0.1271045, -0.1195485, -0.1476702, -0.0006776, 0.0127103),
+    ),
+}
+"""By height and width of images, every twelfth number of two descriptors, by the published code with the weights of
+`small_megaloc`. With twelve patches for eight clusters every patch has its say."""
 
 
 @pytest.fixture(scope="module")
@@ -60,10 +67,11 @@ def some_views(count: int, reads: list[str] | None = None) -> list[View]:
 # ---- the network
 
 
-def test_a_small_network_answers_as_the_published_code() -> None:
-    descriptors = ruled_megaloc()(torch.from_numpy(images("megaloc", (2, 3, 140, 196))))
+@pytest.mark.parametrize("size", PUBLISHED)
+def test_a_small_network_answers_as_the_published_code(size: tuple[int, int]) -> None:
+    descriptors = ruled_megaloc()(torch.from_numpy(images("megaloc", (2, 3, *size))))
     assert descriptors.shape == (2, 96)
-    np.testing.assert_allclose(descriptors[:, ::12].flatten(), PUBLISHED, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(descriptors[:, ::12].flatten(), PUBLISHED[size], rtol=0, atol=1e-6)
 
 
 def test_the_official_file_has_the_size_of_exactly_our_networks_tensors() -> None:

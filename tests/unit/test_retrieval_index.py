@@ -119,15 +119,15 @@ def test_any_changes_leave_what_they_leave_in_a_dictionary(
 def test_many_adds_and_removals_in_blocks() -> None:
     """Enough for the arrays to grow several times and to be compacted."""
     index, slow = SceneIndex(DIMENSION), SlowIndex()
-    for generation in range(20):
+    for generation in range(10):
         added = tuple(reference(100 * generation + i) for i in range(100))
         removed = frozenset(list(slow.by_key)[:90])
         for target in (index, slow):
             target.apply(change(generation, added, removed))
         assert_same(index, slow)
-    assert len(index.entries()) == 2000 - 19 * 90
+    assert len(index.entries()) == 1000 - 9 * 90
     for target in (index, slow):
-        target.apply(change(20, removed=frozenset(list(slow.by_key)[:-5])))
+        target.apply(change(10, removed=frozenset(list(slow.by_key)[:-5])))
     assert_same(index, slow)
 
 

@@ -127,7 +127,8 @@ class TestThinning:
         options = RankOptions(apart_m=0.3, nearby_weight=0.5)
         for elsewhere, expected in ((0.55, [0, 2, 1]), (0.45, [0, 1, 2])):
             axes = np.tile(AHEAD, (3, 1))
-            assert spread([0.9, 0.8, elsewhere], [[0, 0, 0], [0.2, 0, 0], [5, 0, 0]], axes, 3, 0.2, options) == expected
+            centres = np.array([[0.0, 0, 0], [0.2, 0, 0], [5, 0, 0]])
+            assert spread([0.9, 0.8, elsewhere], centres, axes, 3, 0.2, options) == expected
 
     def test_one_that_looks_elsewhere_is_no_neighbour(self) -> None:
         options = RankOptions(apart_deg=30.0, nearby_weight=0.0)
@@ -136,7 +137,7 @@ class TestThinning:
         assert spread([0.9, 0.8, 0.7], centres, turned, 2, 0.0, options) == [0, 2]
 
     def test_what_is_below_typical_is_not_raised(self) -> None:
-        centres, axes = [[0, 0, 0], [0.1, 0, 0], [5, 0, 0]], np.tile(AHEAD, (3, 1))
+        centres, axes = np.array([[0.0, 0, 0], [0.1, 0, 0], [5, 0, 0]]), np.tile(AHEAD, (3, 1))
         assert spread([0.9, 0.1, 0.2], centres, axes, 3, 0.5, RankOptions(nearby_weight=0.0)) == [0, 2, 1]
 
     def test_neighbours_are_thinned_in_the_ranking_too(self) -> None:
@@ -208,7 +209,7 @@ def test_a_removed_reference_is_never_ranked() -> None:
 def test_senseless_options_are_refused() -> None:
     for options in ({"apart_m": -1.0}, {"apart_deg": 181.0}, {"nearby_weight": 1.5}, {"nearby_weight": math.nan}):
         with pytest.raises(ValueError, match="senseless"):
-            RankOptions(**options)  # type: ignore[arg-type]
+            RankOptions(**options)
     for size in ({"pool": 0}, {"smallest_pool": 0}):
         with pytest.raises(ValueError, match="senseless"):
-            RankOptions(**size)  # type: ignore[arg-type]
+            RankOptions(**size)

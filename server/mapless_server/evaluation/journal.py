@@ -48,7 +48,8 @@ class Journal:
                 break
             self.results[result.name] = result
             whole += len(line) + 1
-        os.truncate(self.path, min(whole, len(content)))
+        if whole < len(content):
+            os.truncate(self.path, whole)
 
     def add(self, result: QueryResult) -> None:
         """Writes a result; it is on its way to the disk when this returns, and survives the program."""

@@ -115,8 +115,8 @@ def _scenes(
             dataset = read_dataset(place.path, place.layout, ReadOptions(ground_truth=ground_truth))
         if not dataset.metric:
             raise UsageError(f"{place.name}: its unit of length is arbitrary, the paper's figures are centimetres")
-        splits = tuple(split_scene(dataset, setting, options) for setting in options.settings(place))
         _check_images(place, dataset, settings, partial)
+        splits = tuple(split_scene(dataset, setting, options) for setting in options.settings(place))
         its = None
         if pairs is not None:
             its = read_pairs(pairs_file(pairs, place.name, len(places)), dataset, place.path)

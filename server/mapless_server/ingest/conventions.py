@@ -68,7 +68,7 @@ CONVENTIONS: Mapping[str, Correction] = {
 }
 """Corrections by what a person is told."""
 
-FOCAL_SCALES = np.geomspace(0.2, 5.0, 65)
+FOCAL_SCALES = np.geomspace(0.2, 5.0, 33)
 """Wrong image sizes are usually wrong by a factor of up to four."""
 
 

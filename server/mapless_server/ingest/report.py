@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from ..dataset import Dataset, Frame, Refusal
 from .verdict import Verdict
 
 SHOWN = 20
+ALREADY_THERE = "already there"
 
 
 @dataclass
@@ -95,9 +95,10 @@ def print_report(report: ImportReport, console: Console) -> None:
     """The report, at most SHOWN reasons of a kind."""
     _print_reasons("refused", report.refused, console)
     if report.is_dry:
-        console.print(f"{len(report.chosen)} references could be imported, {len(report.refused)} are refused")
+        counts = f"{len(report.chosen)} references could be imported, {len(report.refused)} are refused"
+        console.print(counts, markup=False, highlight=False)
         return
-    _print_reasons("skipped as duplicates", report.skipped, console)
+    _print_reasons("skipped as duplicates", [it for it in report.skipped if it.reason != ALREADY_THERE], console)
     rate = f" ({len(report.added) / report.seconds:.1f} a second)" if report.added and report.seconds > 0 else ""
     counts = [f"{len(report.added)} added{rate}", f"{len(report.skipped)} skipped as duplicates"]
     counts.append(f"{len(report.refused)} refused")
@@ -159,16 +160,7 @@ def _number(value: float) -> float | None:
 def _print_reasons(title: str, items: Sequence[Refusal], console: Console) -> None:
     if not items:
         return
-    table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2, 0, 0))
-    table.add_column(overflow="fold")
-    table.add_column(overflow="fold")
-    for item in items[:SHOWN]:
-        table.add_row(_plain(item.frame), _plain(item.reason))
-    console.print(table)
+    lines = [f"{title}:", *(f"  {item.frame}: {item.reason}" for item in items[:SHOWN])]
+    console.print("\n".join(lines), markup=False, highlight=False)
     if len(items) > SHOWN:
         console.print(f"... and {len(items) - SHOWN} more; --report writes them all")
-
-
-def _plain(text: str) -> str:
-    """Text in which brackets are no markup."""
-    return text.replace("[", r"\[")

@@ -33,7 +33,7 @@ from ..decode import image_size
 from ..errors import InvalidArgument as BadImage
 from ..formats.collecting import ANY_SIZE
 from .existing import KnownReferences, Stored, difference, stored_of
-from .report import ImportReport
+from .report import ALREADY_THERE, ImportReport
 
 BATCH_COUNT = 8
 """References a message: progress shows, and little is sent again when one is refused."""
@@ -232,7 +232,7 @@ class Uploader:
         here = "" if there.reference_id == frame.name else f"the same image as {there.reference_id}"
         if not what:
             with self._lock:
-                self._report.skipped.append(Refusal(frame.name, here or "already there"))
+                self._report.skipped.append(Refusal(frame.name, here or ALREADY_THERE))
         else:
             self._refuse(frame, f"is there already{f' as {there.reference_id}' if here else ''}, but {what}")
 

@@ -27,6 +27,7 @@ _WRONG_SHARE = 0.4  # more bad pairs than one photograph in five could make
 _GUILTY_SHARE = 0.6
 _GUILTY_PAIRS = 2
 _REFINEMENTS = 3
+_ENOUGH_MATCHES = 64  # for a median that tells hypotheses apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +125,7 @@ def errors_of(views: Views, matched: Sequence[MatchedPair]) -> list[PairError]:
 
 def explain(views: Views, matched: Sequence[MatchedPair], given_px: float) -> tuple[str, float]:
     """The mistake that, corrected, makes the poses fit best, and the median error then; empty if none does."""
+    matched = [MatchedPair(item.pair, item.matches[:: 1 + len(item.matches) // _ENOUGH_MATCHES]) for item in matched]
     candidates = [
         (name, *_summary_with(views, matched, lambda view, c=correction: corrected(view, c)))  # type: ignore[misc]
         for name, correction in CONVENTIONS.items()

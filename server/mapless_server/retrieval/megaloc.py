@@ -45,11 +45,11 @@ class MegaLocOptions:
 
     Attributes:
         dimension: of the vectors, a divisor of 8448, which is the network's own; see the module about 1056.
-        batch: photographs described in one go by `describe_many`; at 16 a large GPU is busy, and their pixels and
-            tokens take less than 0.3 GB.
+        batch: photographs described in one go by `describe_many`; 16 are 8,480 tokens, enough to fill a device, and
+            take about 0.3 GB beside the weights by calculation.
         dtype: what the transformer computes in; None is bfloat16 on a CUDA device that has flash attention, else
             float32. Not part of the name, so that servers with and without a GPU can share references: it changes
-            similarities by a thousandth of what they differ by among photographs of one scene.
+            similarities by a thousandth of what they differ by among photographs of one scene (random weights).
     """
 
     dimension: int = 1056

@@ -87,12 +87,13 @@ def rank_references(
     """
     options, narrowing = options or RankOptions(), narrowing or Narrowing()
     rows = entries.rows(among)
-    rows = rows[narrowing.keeps(entries.centres(rows), entries.axes(rows))]
+    if not narrowing.is_empty:
+        rows = rows[narrowing.keeps(entries.centres(rows), entries.axes(rows))]
     if not len(rows) or count < 1:
         return []
     similarity = np.full(len(rows), np.nan, np.float32) if vector is None else entries.similarities(vector, rows)
-    score = _scores(similarity, entries.centres(rows), narrowing)
-    known = similarity[np.isfinite(similarity)]
+    score = _scores(similarity, entries, rows, narrowing)
+    known = similarity[~np.isnan(similarity)]
     typical = float(np.median(known)) if len(known) else math.inf
     pool = _best(score, max(options.pool * count, options.smallest_pool))
     rows, similarity, score = rows[pool], similarity[pool], score[pool]
@@ -133,12 +134,15 @@ def spread(
     return chosen
 
 
-def _scores(similarity: NDArray[np.float32], centres: Array, narrowing: Narrowing) -> Array:
+def _scores(similarity: NDArray[np.float32], entries: Entries, rows: Rows, narrowing: Narrowing) -> Array:
     """Similarities (N,), and for those that are unknown something lower: the less, the further from the prior."""
-    far = np.zeros(len(centres))
-    if narrowing.position is not None:
-        far = np.linalg.norm(centres - narrowing.position.position, axis=1)
-    return np.where(np.isfinite(similarity), similarity, -2.0 - far)
+    scores = similarity.astype(np.float64)
+    unknown = np.flatnonzero(np.isnan(similarity))
+    scores[unknown] = -2.0
+    if narrowing.position is not None and len(unknown):
+        centres = entries.centres(rows[unknown])
+        scores[unknown] -= np.linalg.norm(centres - narrowing.position.position, axis=1)
+    return scores
 
 
 def _best(score: Array, count: int) -> Rows:

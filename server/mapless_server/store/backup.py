@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -95,7 +95,7 @@ def restore(path: Path, database: Database, on_progress: Progress = ignore_progr
             database.take_your_time(target)
             if target.scalar(select(func.count()).select_from(scene)):
                 raise StoreError(f"database {database.name} has scenes; a backup needs an empty store")
-            _copy_rows(source, target, {it.name for it in _NOT_RESTORED}, on_progress)
+            _copy_rows(source, target, _tables_of(source, _NOT_RESTORED), on_progress)
             _skip_generations(source, target)
             written = verify(target, on_progress)
             if written.faults or not found.counts.items() <= written.counts.items():
@@ -120,19 +120,23 @@ def _copy_rows_to_file(source: Connection, path: Path, on_progress: Progress) ->
     version = read_version(source)
     assert version is not None
     with closing(SqliteDatabase.open_scratch(path, version)) as database, database.write() as target:
-        _copy_rows(source, target, {store_version.name, alembic_version.name}, on_progress)
+        _copy_rows(source, target, _tables_of(target, (store_version, alembic_version)), on_progress)
 
 
-def _copy_rows(source: Connection, target: Connection, left_out: set[str], on_progress: Progress) -> None:
-    """All rows of the tables that both have."""
-    schema = MetaData()
-    schema.reflect(target, only=lambda name, _: name not in left_out)
-    for table in schema.sorted_tables:
-        total, done = source.scalar(select(func.count()).select_from(table)) or 0, 0
+def _copy_rows(source: Connection, target: Connection, tables: list[Table], on_progress: Progress) -> None:
+    for table in tables:
+        total, done = source.execute(select(func.count()).select_from(table)).scalar_one(), 0
         for rows in _portions(source, table):
             target.execute(insert(table), rows)
             done += len(rows)
             on_progress(f"copying {table.name}", done, total)
+
+
+def _tables_of(copy: Connection, left_out: Sequence[Table] = ()) -> list[Table]:
+    """The tables of a file as they are, of whatever schema; in the order in which they are to be filled."""
+    schema = MetaData()
+    schema.reflect(copy, only=lambda name, _: name not in {it.name for it in left_out})
+    return schema.sorted_tables
 
 
 def _portions(source: Connection, table: Table) -> Iterator[list[dict[str, Any]]]:
@@ -165,21 +169,13 @@ def _verify_copy(source: Connection, path: Path, on_progress: Progress) -> Verif
     """What is found in a copy; StoreError if that is not what is in the store."""
     with closing(SqliteDatabase.look_at(path)) as database, database.read() as copy:
         found = verify(copy, on_progress)
-        if _count_rows(copy) != _count_rows(source):
+        counts = [select(func.count()).select_from(table) for table in _tables_of(copy)]
+        if any(copy.scalar(count) != source.scalar(count) for count in counts):
             raise StoreError("the copy lacks rows of the store")
     # Rare, so it may take as long again: was it damaged before, or by us?
     if found.faults and verify(source, on_progress).faults != found.faults:
         raise StoreError(f"the copy is damaged: {found.faults[0]}")
     return found
-
-
-def _count_rows(connection: Connection) -> dict[str, int]:
-    schema = MetaData()
-    schema.reflect(connection)
-    return {
-        table.name: connection.execute(select(func.count()).select_from(table)).scalar_one()
-        for table in schema.sorted_tables
-    }
 
 
 @contextmanager

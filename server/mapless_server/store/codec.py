@@ -113,7 +113,8 @@ def decode_view(owner: str, blob: bytes, sha256: str) -> View:
 
 def decode_poses(geometries: Sequence[bytes]) -> list[RigidTransform]:
     """The poses alone of many cameras and poses, whose checksums must have been checked; read-only arrays."""
-    poses = [json.loads(geometry)["world_from_camera"] for geometry in geometries]
+    # As one array it takes one call, not one each.
+    poses = [it["world_from_camera"] for it in json.loads(b"[" + b",".join(geometries) + b"]")]
     rotations = np.array([pose["rotation"] for pose in poses], float)
     translations = np.array([pose["translation"] for pose in poses], float)
     rotations.setflags(write=False)
@@ -138,10 +139,10 @@ def encode_descriptor(vector: NDArray[np.float32]) -> bytes:
 
 def decode_descriptors(blobs: Sequence[bytes]) -> list[NDArray[np.float32]]:
     """Many global descriptors, whose checksums must have been checked; read-only arrays."""
+    if not blobs:
+        return []
     if len(set(map(len, blobs))) > 1:  # the same name means the same length, unless somebody gave it to two things
         return [decode_descriptors([blob])[0] for blob in blobs]
-    if not blobs:
-        return np.empty((0, 0), np.float32)
     vectors = np.frombuffer(b"".join(blobs), _FLOAT16).reshape(len(blobs), -1).astype(np.float32)
     vectors.setflags(write=False)
     return [*vectors]

@@ -35,6 +35,7 @@ RETRY_AFTER_S = 1.0
 _CONNECT_OPTIONS: dict[str, Any] = {
     "application_name": "mapless-server",
     "connect_timeout": 5,
+    "client_encoding": "utf8",
     # A host that vanishes says nothing: it is given up after 10 + 3 * 5 s in silence, or 15 s after it was spoken to.
     "keepalives_idle": 10,
     "keepalives_interval": 5,
@@ -155,7 +156,7 @@ def _parse(database_url: str) -> URL:
     return url.set(drivername=DRIVER)
 
 
-def _create_engine(url: URL) -> Engine:
+def _create_engine(url: URL, cursors_are_binary: bool = True) -> Engine:
     try:
         import psycopg
         from psycopg.pq import Format
@@ -165,7 +166,7 @@ def _create_engine(url: URL) -> Engine:
     def binary_cursor(*args: Any, **kwargs: Any) -> psycopg.Cursor[Any]:
         # As text, bytes would come as hexadecimal digits: twice as many, and to be read one by one.
         cursor: psycopg.Cursor[Any] = psycopg.Cursor(*args, **kwargs)
-        cursor.format = Format.BINARY
+        cursor.format = Format.BINARY if cursors_are_binary else Format.TEXT
         return cursor
 
     options = {name: value for name, value in _CONNECT_OPTIONS.items() if name not in url.query}

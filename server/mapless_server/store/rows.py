@@ -33,10 +33,14 @@ def time_us(time: datetime) -> int:
     return (time - _EPOCH) // _MICROSECOND
 
 
+def time_of(time_us: int) -> datetime:
+    """The inverse."""
+    return _EPOCH + time_us * _MICROSECOND
+
+
 def scene_record(row: Row[Any]) -> SceneRecord:
     """From a row of ``queries.select_scenes``."""
-    create_time = _EPOCH + row.create_time_us * _MICROSECOND
-    return SceneRecord(SceneKey(row.scene_id), row.generation, row.reference_count, create_time)
+    return SceneRecord(SceneKey(row.scene_id), row.generation, row.reference_count, time_of(row.create_time_us))
 
 
 def new_record(scene_key: SceneKey, new: NewReference, create_time: datetime) -> ReferenceRecord:
@@ -84,7 +88,7 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
         world_from_camera=world_from_camera,
         image_sha256=row.image_sha256,
         feature_count=row.feature_count,
-        create_time=_EPOCH + row.create_time_us * _MICROSECOND,
+        create_time=time_of(row.create_time_us),
     )
 
 

@@ -1,0 +1,82 @@
+"""Folders of photographs in the layouts of others, hand-built from one planted truth.
+
+The planted cameras stand on a circle and look at its middle; nothing of theirs is round, so that a sign, an order of
+axes or half a pixel that is wrong shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from images import encode, textured
+
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless_server.dataset import Dataset, Frame
+
+CAMERA = Camera(96, 64, 80.0, 81.0, 47.25, 30.75)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a layout is built from, and what must come back."""
+
+    poses: tuple[RigidTransform, ...]
+    camera: Camera = CAMERA
+
+
+def truth(count: int = 4, camera: Camera = CAMERA) -> Truth:
+    """Poses that differ in everything."""
+    poses = tuple(
+        RigidTransform(rotation_from_vector([0.2 + 0.1 * i, -0.7 * i, 0.15]), np.array([1.5 * i, -0.25, 2.0 - 0.3 * i]))
+        for i in range(count)
+    )
+    return Truth(poses, camera)
+
+
+def write_image(file: Path, seed: int = 0, width: int = 96, height: int = 64) -> None:
+    """A small photograph that no other has the pixels of."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(encode(file.suffix, textured(width, height, seed=seed)))
+
+
+def opengl(pose: RigidTransform) -> np.ndarray:
+    """The 4x4 of a pose with OpenGL's camera axes."""
+    return pose.matrix() @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def assert_same_camera(camera: Camera, expected: Camera, px: float = 1e-9) -> None:
+    """Sizes exactly, intrinsics to `px`."""
+    assert (camera.width_px, camera.height_px) == (expected.width_px, expected.height_px)
+    np.testing.assert_allclose(camera.matrix(), expected.matrix(), atol=px)
+    assert type(camera.distortion) is type(expected.distortion)
+    if camera.distortion is not None and expected.distortion is not None:
+        np.testing.assert_allclose(
+            list(vars(camera.distortion).values()), list(vars(expected.distortion).values()), atol=1e-12
+        )
+
+
+def assert_same_pose(pose: RigidTransform, expected: RigidTransform, tolerance: float = 1e-9) -> None:
+    """Equal to rounding, or to the digits that a layout writes."""
+    np.testing.assert_allclose(pose.matrix(), expected.matrix(), atol=tolerance)
+
+
+def assert_reads(dataset: Dataset, planted: Truth, tolerance: float = 1e-9) -> None:
+    """The dataset is the planted truth, in order, and nothing was refused."""
+    assert dataset.refused == ()
+    assert len(dataset.frames) == len(planted.poses)
+    for frame, pose in zip(dataset.frames, planted.poses, strict=True):
+        assert_same_pose(frame.world_from_camera, pose, tolerance)
+        assert_same_camera(frame.camera, planted.camera)
+        assert frame.image_path.is_file()
+
+
+def reasons(dataset: Dataset) -> dict[str, str]:
+    """Why frames were refused."""
+    return {refusal.frame: refusal.reason for refusal in dataset.refused}
+
+
+def by_name(dataset: Dataset) -> dict[str, Frame]:
+    """Frames by their ids."""
+    return {frame.name: frame for frame in dataset.frames}

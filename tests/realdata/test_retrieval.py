@@ -1,0 +1,67 @@
+"""Retrieval on real photographs: among the ten that are chosen, one sees the same place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from mapless_server.dataset import Dataset, Frame
+from mapless_server.decode import ImageLimits, decode_image
+from mapless_server.evaluation.metrics import pose_error
+from mapless_server.evaluation.plan import EvaluationOptions, split_frames
+from mapless_server.method.features import SiftExtractor
+from mapless_server.retrieval.descriptor import Vector
+from mapless_server.retrieval.index import SceneIndex
+from mapless_server.retrieval.ranking import RankedReference, RankOptions, rank_references
+from mapless_server.retrieval.vlad import VladDescriptor
+from mapless_server.store.records import IndexedReference, SceneChanges
+
+pytestmark = pytest.mark.realdata
+
+Photographs = Callable[[str], Dataset]
+EXTRACTOR = SiftExtractor()
+DESCRIPTOR = VladDescriptor.of(EXTRACTOR)
+
+
+def describe(frame: Frame) -> Vector:
+    image = decode_image(frame.image_path.read_bytes(), ImageLimits())
+    return DESCRIPTOR.describe(EXTRACTOR.extract(image, frame.camera))
+
+
+def index_of(frames: list[Frame]) -> SceneIndex:
+    index = SceneIndex(DESCRIPTOR.dimension)
+    added = tuple(IndexedReference(it.name, it.name, it.world_from_camera, describe(it)) for it in frames)
+    index.apply(SceneChanges(1, added, frozenset(), True))
+    return index
+
+
+def sees_the_same(frame: Frame, found: list[RankedReference]) -> bool:
+    errors = np.array([pose_error(frame.world_from_camera, it.world_from_camera) for it in found])
+    return bool((errors <= (0.5, 30.0)).all(axis=1).any())
+
+
+def test_kitchen_queries_find_a_reference_within_half_a_metre_and_30_degrees(photographs: Photographs) -> None:
+    """100 references spread over the sequence, 100 other frames: 95 % of them, thinned or not."""
+    frames = photographs("7scenes-redkitchen-seq01-first600").frames
+    split = split_frames(len(frames), EvaluationOptions(reference_count=100, query_count=125))
+    assert len(split.references) == 100
+    assert len(split.queries) >= 100
+    entries = index_of([frames[i] for i in split.references]).entries()
+    queries = [(frames[i], describe(frames[i])) for i in split.queries]
+    for options in (RankOptions(), RankOptions(nearby_weight=1.0)):
+        found = [rank_references(entries, vector, 10, options=options) for _, vector in queries]
+        shares = np.mean([sees_the_same(frame, it) for (frame, _), it in zip(queries, found, strict=True)])
+        assert shares >= 0.95
+
+
+def test_photographs_of_several_places_find_their_own_place(photographs: Photographs) -> None:
+    """In one index of three places, the most similar other photograph is of the same place."""
+    folders = ("fountain-P11", "herz-jesus-P8", "tum-fr3-office")
+    vectors = {(folder, it.name): describe(it) for folder in folders for it in photographs(folder).frames}
+    places, matrix = [folder for folder, _ in vectors], np.array(list(vectors.values()))
+    similarity = matrix @ matrix.T
+    np.testing.assert_allclose(np.diag(similarity), 1.0, atol=1e-5)
+    np.fill_diagonal(similarity, -1.0)
+    assert [places[i] for i in similarity.argmax(axis=1)] == places

@@ -1,0 +1,90 @@
+"""`mapless-server export`: what is written reads back, and images are bit by bit what was stored."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import typer
+from images import encode, textured
+from layouts import CAMERA, assert_same_camera, assert_same_pose, by_name, truth
+from servers import RunningServer
+from typer.testing import CliRunner, Result
+
+from mapless import Client, NewReference
+from mapless.geometry import Fisheye, RadialTangential
+from mapless_server.formats import read_dataset
+from mapless_server.ingest.command import export_command, import_command
+
+app = typer.Typer()
+app.command("import")(import_command)
+app.command("export")(export_command)
+
+LENSES = (None, RadialTangential(0.1, -0.2, 0.01, 0.02, 0.3), Fisheye(0.1, 0.2, 0.3, 0.4))
+ENDINGS = (".png", ".jpg", ".webp")
+
+
+def run(server: RunningServer, *arguments: object) -> Result:
+    return CliRunner().invoke(app, [*map(str, arguments), "--address", server.address])
+
+
+@pytest.fixture
+def filled(client: Client) -> Iterator[tuple[str, list[NewReference]]]:
+    """A scene of three references: each another lens, another kind of file, ids with what ids may have."""
+    scene = f"export-{time.monotonic_ns()}"
+    references = [
+        NewReference(f"r.{i}-_A", encode(ending, textured(seed=i)), replace(CAMERA, distortion=lens), truth().poses[i])
+        for i, (lens, ending) in enumerate(zip(LENSES, ENDINGS, strict=True))
+    ]
+    client.create_scene(scene)
+    client.add_references(scene, references)
+    yield scene, references
+    client.delete_scene(scene)
+
+
+@pytest.mark.parametrize("layout", ["cameras", "colmap"])
+def test_an_export_imports_as_the_same_scene(
+    server: RunningServer, client: Client, filled: tuple[str, list[NewReference]], layout: str, tmp_path: Path
+) -> None:
+    scene, references = filled
+    done = run(server, "export", scene, tmp_path / "out", "--format", layout)
+    assert done.exit_code == 0, done.output
+    frames = by_name(read_dataset(tmp_path / "out"))
+    for reference, ending in zip(references, ENDINGS, strict=True):
+        frame = frames[reference.reference_id]
+        assert frame.image_path.name == reference.reference_id + ending
+        assert frame.image_path.read_bytes() == reference.image
+        assert_same_camera(frame.camera, reference.camera, px=1e-12)
+        assert_same_pose(frame.world_from_camera, reference.world_from_camera, 1e-12)
+    # Its own importer agrees: there is nothing to add to the scene that it came from.
+    again = run(server, "import", tmp_path / "out", scene, "--skip-check")
+    assert again.exit_code == 0, again.output
+    assert "0 added, 3 skipped as duplicates, 0 refused" in again.stdout
+
+
+def test_a_folder_with_something_in_it_is_not_written_to(
+    server: RunningServer, filled: tuple[str, list[NewReference]], tmp_path: Path
+) -> None:
+    (tmp_path / "mine").write_text("precious")
+    done = run(server, "export", filled[0], tmp_path)
+    assert done.exit_code == 2
+    assert "is not empty" in done.stderr
+    assert [file.name for file in tmp_path.iterdir()] == ["mine"]
+
+
+def test_scenes_that_are_not_there_or_empty_and_layouts_that_are_not_written(
+    server: RunningServer, client: Client, tmp_path: Path
+) -> None:
+    done = run(server, "export", "no-such-scene", tmp_path / "a")
+    assert done.exit_code == 1
+    assert "no-such-scene" in done.stderr
+    scene = f"empty-{time.monotonic_ns()}"
+    client.create_scene(scene)
+    done = run(server, "export", scene, tmp_path / "b")
+    assert (done.exit_code, "has no references" in done.stderr) == (2, True)
+    done = run(server, "export", scene, tmp_path / "c", "--format", "7scenes")
+    assert (done.exit_code, "cameras or colmap" in done.stderr) == (2, True)
+    assert list(tmp_path.iterdir()) == []

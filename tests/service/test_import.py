@@ -1,0 +1,230 @@
+"""`mapless-server import` against a real server, and of a folder to a store of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from images import encode
+from layouts import CAMERA, assert_same_camera, assert_same_pose, truth, write_image
+from servers import RunningServer
+from typer.testing import CliRunner, Result
+from wall import wall
+
+from mapless import Client
+from mapless.geometry import Camera
+from mapless_server.formats.colmap.writing import PosedImage
+from mapless_server.formats.writing import LAYOUTS
+from mapless_server.ingest.command import export_command, import_command
+
+PROGRAM = (
+    "import typer; from mapless_server.ingest.command import import_command, export_command; app = typer.Typer();"
+    "app.command('import')(import_command); app.command('export')(export_command); app()"
+)
+app = typer.Typer()
+app.command("import")(import_command)
+app.command("export")(export_command)
+
+COUNT = 12
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Twelve photographs, the first eight for references."""
+    path = tmp_path / "photographs"
+    images = []
+    for i, pose in enumerate(truth(COUNT).poses):
+        write_image(path / "images" / f"p{i:02d}.png", seed=i)
+        images.append(PosedImage(f"p{i:02d}.png", CAMERA, pose))
+    content = json.loads(LAYOUTS["cameras"](images, "a test")["cameras.json"])
+    for i, frame in enumerate(content["frames"]):
+        frame["split"] = "train" if i < 8 else "test"
+    (path / "cameras.json").write_text(json.dumps(content))
+    return path
+
+
+@pytest.fixture
+def scene(client: Client) -> str:
+    """An id that no scene has."""
+    return f"import-{time.monotonic_ns()}"
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [*map(str, arguments)])
+
+
+def run_import(server: RunningServer, folder: Path, scene: str, *more: object) -> Result:
+    return run("import", folder, scene, "--address", server.address, *more)
+
+
+def stored(client: Client, scene: str) -> list[str]:
+    return [reference.reference_id for reference in client.list_references(scene)]
+
+
+def test_a_folder_becomes_a_scene_and_a_second_run_changes_nothing(
+    server: RunningServer, client: Client, scene: str, folder: Path, tmp_path: Path
+) -> None:
+    done = run_import(server, folder, scene, "--report", tmp_path / "report.json")
+    assert done.exit_code == 0, done.output
+    assert f"scene {scene}: 12 added" in done.stdout
+    assert "layout cameras" in done.stderr
+    planted = truth(COUNT)
+    for i, reference in enumerate(client.list_references(scene)):
+        assert reference.reference_id == f"p{i:02d}"
+        assert_same_pose(reference.world_from_camera, planted.poses[i])
+        assert_same_camera(reference.camera, CAMERA)
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["format"], len(report["added"]), report["stopped"]) == ("cameras", 12, "")
+    generation = client.get_scene(scene).generation
+    again = run_import(server, folder, scene)
+    assert again.exit_code == 0
+    assert "0 added, 12 skipped as duplicates, 0 refused" in again.stdout
+    assert client.get_scene(scene).generation == generation
+
+
+def test_a_part_of_a_folder_with_a_prefix(server: RunningServer, client: Client, scene: str, folder: Path) -> None:
+    assert run_import(server, folder, scene, "--split", "train", "--stride", 3, "--id-prefix", "east-").exit_code == 0
+    assert stored(client, scene) == ["east-p00", "east-p03", "east-p06"]
+    assert run_import(server, folder, scene, "--split", "test", "--max", 2).exit_code == 0
+    assert stored(client, scene) == ["east-p00", "east-p03", "east-p06", "p08", "p10"]
+
+
+def test_single_frames_are_refused_by_name_and_the_rest_is_in(
+    server: RunningServer, client: Client, scene: str, folder: Path
+) -> None:
+    """By the reader, before sending, and by the server: a photograph that ends in the middle."""
+    file = folder / "cameras.json"
+    content = json.loads(file.read_text())
+    content["frames"][1]["world_from_camera"][2][2] *= -1
+    content["frames"][2]["width"] = 640
+    file.write_text(json.dumps(content))
+    (folder / "images" / "p03.png").unlink()
+    cut = folder / "images" / "p04.png"
+    cut.write_bytes(cut.read_bytes()[:300])
+    done = run_import(server, folder, scene, "--skip-check")
+    assert done.exit_code == 1
+    assert "8 added" in done.stdout
+    assert "4 refused" in done.stdout
+    for part in ("frames[1]", "world_from_camera", "96x64 pixels, its camera 640x64", "there is no file", "decoded"):
+        assert part in done.stdout, part
+    assert stored(client, scene) == ["p00", *(f"p{i:02d}" for i in range(5, 12))]
+
+
+def test_a_pose_that_changed_is_refused_not_overwritten(
+    server: RunningServer, client: Client, scene: str, folder: Path
+) -> None:
+    assert run_import(server, folder, scene).exit_code == 0
+    file = folder / "cameras.json"
+    content = json.loads(file.read_text())
+    content["frames"][5]["world_from_camera"][0][3] += 0.25
+    file.write_text(json.dumps(content))
+    done = run_import(server, folder, scene)
+    assert done.exit_code == 1
+    assert "p05" in done.stdout
+    assert "its pose is 0.25 m" in done.stdout
+
+
+def test_a_dry_run_needs_no_server_and_stores_nothing(folder: Path, tmp_path: Path) -> None:
+    done = run("import", folder, "nowhere", "--dry-run", "--report", tmp_path / "report.json")
+    assert done.exit_code == 0
+    assert "12 references could be imported, 0 are refused" in done.stdout
+    assert json.loads((tmp_path / "report.json").read_text())["dry_run"] is True
+
+
+def write_wall(folder: Path) -> Path:
+    """Photographs of a wall."""
+    camera = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
+    frames: list[dict[str, Any]] = []
+    (folder / "images").mkdir(parents=True)
+    for i, (image, pose) in enumerate(wall(camera)):
+        (folder / "images" / f"{i}.png").write_bytes(encode(".png", image))
+        frames.append({"image": f"images/{i}.png", "width": 480, "height": 360, "K": camera.matrix().tolist()})
+        frames[-1]["world_from_camera"] = pose.matrix().tolist()
+    (folder / "cameras.json").write_text(json.dumps({"frames": frames}))
+    return folder
+
+
+def test_the_epipolar_error_of_rendered_photographs_is_printed(tmp_path: Path) -> None:
+    done = run("import", write_wall(tmp_path / "wall"), "nowhere", "--dry-run")
+    assert done.exit_code == 0, done.output
+    assert "epipolar error of matched points under the given poses: median 0." in done.stderr
+    assert "warning" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--format", "bundler"), "not 'bundler'"),
+        (("--split", "holdout"), "split must be train or test"),
+        (("--stride", 0), "stride and max"),
+        (("--intrinsics", "1,2,3"), "intrinsics must be fx,fy,cx,cy"),
+        (("--id-prefix", "../"), "an id is"),
+        (("--parallel", 0), "parallel must be"),
+        (("--report", "no/such/folder/report.json"), "cannot be written"),
+        (("--token-file", "none"), "cannot be read"),
+    ],
+)
+def test_arguments_that_are_wrong_are_named_in_one_line(
+    server: RunningServer, folder: Path, arguments: tuple[object, ...], message: str
+) -> None:
+    done = run_import(server, folder, "refused", "--skip-check", *arguments)
+    assert done.exit_code == 2
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("mapless-server:")]
+    assert message in line
+
+
+def test_a_server_that_is_not_there_is_named(folder: Path) -> None:
+    done = run("import", folder, "nowhere", "--skip-check", "--address", "127.0.0.1:1")
+    assert done.exit_code == 1
+    assert "12 not reached" in done.stdout
+    assert "stopped:" in done.stdout
+
+
+def test_a_folder_without_a_layout_is_named(tmp_path: Path) -> None:
+    done = run("import", tmp_path, "nowhere", "--dry-run")
+    assert done.exit_code == 2
+    assert "no layout that is known" in done.stderr
+    assert run("import", tmp_path, "not an id", "--dry-run").exit_code == 2
+
+
+@pytest.mark.slow
+def test_terminated_in_the_middle_the_next_run_goes_on(tmp_path: Path) -> None:
+    """Without an address: a server of its own on the settings' store, which goes with the command."""
+    folder = tmp_path / "many"
+    count = 120
+    images = []
+    for i, pose in enumerate(truth(count).poses):
+        write_image(folder / "images" / f"p{i:03d}.png", i, 320, 240)
+        images.append(PosedImage(f"p{i:03d}.png", Camera(320, 240, 300.0, 300.0, 159.5, 119.5), pose))
+    (folder / "cameras.json").write_text(LAYOUTS["cameras"](images, "a test")["cameras.json"])
+    environment = os.environ | {"MAPLESS_DATA_DIR": str(tmp_path / "store"), "MAPLESS_WARM_UP": "false"}
+    report = tmp_path / "report.json"
+    arguments = [sys.executable, "-c", PROGRAM, "import", str(folder), "place", "--skip-check", "--report", str(report)]
+    process = subprocess.Popen(arguments, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stderr is not None
+        while "storing references" not in process.stderr.readline():
+            assert process.poll() is None
+        time.sleep(0.7)
+        process.send_signal(signal.SIGTERM)
+        output, _ = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.communicate()
+    assert process.returncode == 128 + signal.SIGTERM
+    assert "goes on from there" in output
+    added = len(json.loads(report.read_text())["added"])
+    again = subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert again.returncode == 0, again.stdout + again.stderr
+    content = json.loads(report.read_text())
+    # A message whose answer was cut off may be stored, so more can be there than the first run counts.
+    assert added <= len(content["skipped"]) < count
+    assert len(content["skipped"]) + len(content["added"]) == count

@@ -1,0 +1,294 @@
+"""A server, or the database itself, killed at any moment loses nothing acknowledged and leaves nothing half-written.
+
+Run as a program, this file is the nursery: for each line it reads it forks a victim, which changes a store as fast as
+it can and prints a line for each change before it is made (``try``), when it is acknowledged (``done``), and where its
+fate is unknown because the database went away (``lost``). Victims are forked since Python takes long to start.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import postgres
+import pytest
+from stores import DATABASES, Folder, Place, Shared
+
+from mapless.geometry import Camera, RigidTransform
+from mapless_server import errors
+from mapless_server.method.views import Features, View
+from mapless_server.store import NewReference, Store
+from mapless_server.store.postgresql import PostgresqlDatabase
+from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
+from mapless_server.store.verify import verify
+from mapless_server.tenancy import SceneKey
+
+SCENE = SceneKey("office")
+EXTRACTOR, DESCRIPTOR = "sift", "vlad"
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+COUNTS = (
+    "SELECT (SELECT count(*) FROM image), (SELECT count(*) FROM features), (SELECT count(*) FROM global_descriptor)"
+)
+WAIT_S = 30.0
+DATABASE_IS_KILLED_EVERY = 8
+"""Rounds; in between it is the server."""
+DIES_YOUNG_EVERY = 5
+"""Rounds: before it has opened the store."""
+
+
+def make_reference(reference_id: str) -> NewReference:
+    """A reference of about 30 kB, all of it determined by its id."""
+    generator = np.random.default_rng(list(reference_id.encode()))
+    features = Features(
+        generator.random((20, 2), np.float32), generator.random((20, 128), np.float32), generator.random(20, np.float32)
+    )
+    pose = RigidTransform(np.eye(3), generator.normal(size=3))
+    view = View(CAMERA, features)
+    descriptor = generator.random(64, np.float32)
+    return NewReference(
+        reference_id, generator.bytes(20_000), CAMERA, pose, {EXTRACTOR: view}, {DESCRIPTOR: descriptor}
+    )
+
+
+def open_store(address: str) -> Store:
+    return Store.connect(address) if address.startswith("postgresql:") else Store.open(Path(address))
+
+
+def change_until_killed(address: str, prefix: str) -> None:
+    """Adds some references at a time; every fourth change deletes one that is known to be there."""
+    with open_store(address) as store:
+        added: list[str] = []
+        for index in range(100_000):
+            if index % 4 == 3 and added:
+                verb, ids = "delete", [added.pop()]
+            else:
+                verb, ids = "add", [f"{prefix}-{index}-{item}" for item in range(1 + index % 5)]
+            change = " ".join([verb, *ids])
+            say(f"try {change}")
+            try:
+                if verb == "add":
+                    store.add_references(SCENE, [make_reference(it) for it in ids])
+                    added += ids
+                else:
+                    store.delete_reference(SCENE, ids[0])
+            except errors.Unavailable:
+                say(f"lost {change}")
+                time.sleep(0.01)
+            else:
+                say(f"done {change}")
+
+
+def say(line: str) -> None:
+    """At once, and as a whole."""
+    os.write(1, f"{line}\n".encode())
+
+
+def nurse(address: str) -> None:
+    import psycopg  # noqa: F401 # so that no victim spends its life importing
+
+    with TemporaryDirectory() as folder, Store.open(Path(folder)) as store:
+        store.create_scene(SCENE)
+        store.add_references(SCENE, [make_reference("first")])
+    for line in sys.stdin:
+        victim = os.fork()
+        if victim == 0:
+            change_until_killed(address, line.strip())
+        say(f"born {victim}")
+        _, status = os.waitpid(victim, 0)
+        say(f"ended {os.waitstatus_to_exitcode(status)}")
+
+
+class Nursery:
+    """Bears one victim at a time."""
+
+    def __init__(self, address: str) -> None:
+        environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+        self._process = subprocess.Popen(
+            [sys.executable, __file__, address],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+            start_new_session=True,
+        )
+
+    def bear(self, prefix: str) -> int:
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{prefix}\n")
+        self._process.stdin.flush()
+        self.said: list[str] = []
+        return int(self._read_until("born "))
+
+    def wait_for_work(self) -> None:
+        self.said.append(f"try {self._read_until('try ')}")
+
+    def bury(self, victim: int) -> list[str]:
+        """What it said in its life."""
+        os.kill(victim, signal.SIGKILL)
+        assert self._read_until("ended ") == "-9", "the victim ended by itself"
+        return self.said
+
+    def end(self) -> None:
+        os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.communicate()
+
+    def _read_until(self, start: str) -> str:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            if line.startswith(start):
+                return line.removeprefix(start).strip()
+            self.said.append(line.strip())
+        raise AssertionError(f"the nursery died: {self.said[-3:]}")
+
+
+class Ledger:
+    """What must be there, may be there, and was checked already."""
+
+    def __init__(self) -> None:
+        self.stored: set[str] = set()
+        self.acknowledged = 0
+        self.generation: int | None = None
+
+    def note(self, lines: list[str]) -> list[str]:
+        """Takes in what was acknowledged; the changes whose fate is unknown."""
+        unknown: list[str] = []
+        for line in lines:
+            outcome, change = line.split(" ", 1)
+            if outcome == "try":
+                unknown.append(change)
+            elif outcome == "done":
+                unknown.remove(change)
+                self.acknowledged += 1
+                self._apply(change)
+        return unknown
+
+    def settle(self, unknown: list[str], found: set[str]) -> None:
+        """Each of these happened as a whole or not at all."""
+        for change in unknown:
+            verb, *ids = change.split()
+            there = [it in found for it in ids]
+            assert all(there) or not any(there), f"half of it is there: {change}"
+            if there[0] == (verb == "add"):
+                self._apply(change)
+
+    def check(self, place: Place, store: Store, unknown: list[str]) -> None:
+        """Nothing is missing, nothing is there that nobody added, and what is new is whole."""
+        changes = store.list_changes(SCENE, self.generation, DESCRIPTOR)
+        scene = store.get_scene(SCENE)
+        found = {row[0] for row in place.fetch("SELECT reference_id FROM reference")}
+        self.settle(unknown, found)
+        assert found == self.stored
+        assert scene.reference_count == len(found)
+        assert scene.generation >= 1 + self.acknowledged
+        assert place.fetch(COUNTS) == [(len(found),) * 3]
+        snapshot = store.load_references(SCENE, [it.reference_id for it in changes.added], EXTRACTOR)
+        assert not snapshot.undescribed
+        for loaded, indexed in zip(snapshot.references, changes.added, strict=True):
+            made = make_reference(loaded.record.reference_id)
+            features, expected = loaded.view.features, made.views[EXTRACTOR].features
+            assert store.read_image_of(loaded.record.key) == made.image
+            assert features.descriptors.tobytes() == expected.descriptors.tobytes()
+            assert loaded.record.world_from_camera.translation.tobytes() == made.world_from_camera.translation.tobytes()
+            assert indexed.descriptor is not None
+            assert np.array_equal(indexed.descriptor, made.descriptors[DESCRIPTOR].astype(np.float16))
+        self.generation = changes.generation
+
+    def _apply(self, change: str) -> None:
+        verb, *ids = change.split()
+        self.stored = self.stored | set(ids) if verb == "add" else self.stored - set(ids)
+
+
+@contextmanager
+def place_of_its_own(database: str, folder: Path) -> Iterator[tuple[Place, postgres.Cluster | None]]:
+    """With the database process to be killed, where there is one."""
+    if database == "sqlite":
+        yield Folder(folder), None
+        return
+    postgres.require()
+    cluster = postgres.Cluster()
+    try:
+        yield Shared(cluster.fresh_url()), cluster
+    finally:
+        cluster.remove()
+
+
+def kill_database(cluster: postgres.Cluster, moments: random.Random) -> None:
+    """One of its processes, upon which it ends all others and recovers; or all of it."""
+    if moments.random() < 0.5:
+        cluster.stop()
+        cluster.start()
+        return
+    with cluster.connect() as connection:
+        found = connection.execute("SELECT pid FROM pg_stat_activity WHERE application_name = 'mapless-server'")
+        victims = [int(str(row[0])) for row in found]
+    for victim in victims[:1]:
+        os.kill(victim, signal.SIGKILL)
+
+
+def wait_for_the_dead(cluster: postgres.Cluster) -> None:
+    """PostgreSQL finishes what a killed server has sent it, so that it may still happen for a moment."""
+    give_up = time.monotonic() + WAIT_S
+    while time.monotonic() < give_up:
+        if cluster.lets_in():
+            with cluster.connect() as connection:
+                count = connection.execute(
+                    "SELECT count(*) FROM pg_stat_activity WHERE application_name = 'mapless-server'"
+                ).fetchone()
+            if count == (0,):
+                return
+        time.sleep(0.01)
+    raise AssertionError("the dead server's connections do not end")
+
+
+def kill_and_check(database: str, folder: Path, rounds: int) -> None:
+    moments = random.Random(20)
+    ledger = Ledger()
+    with place_of_its_own(database, folder) as (place, cluster):
+        with place.open() as store:
+            store.create_scene(SCENE)
+        nursery = Nursery(place.url if isinstance(place, Shared) else str(folder))
+        try:
+            for number in range(rounds):
+                victim = nursery.bear(f"round{number}")
+                if number % DIES_YOUNG_EVERY:
+                    nursery.wait_for_work()
+                time.sleep(moments.uniform(0.005, 0.15))
+                if cluster is not None and number % DATABASE_IS_KILLED_EVERY == DATABASE_IS_KILLED_EVERY - 1:
+                    kill_database(cluster, moments)
+                    time.sleep(moments.uniform(0.1, 0.3))  # the server goes on by itself
+                unknown = ledger.note(nursery.bury(victim))
+                if cluster is not None:
+                    wait_for_the_dead(cluster)
+                with place.open() as store:
+                    ledger.check(place, store, unknown)
+        finally:
+            nursery.end()
+        assert ledger.acknowledged >= rounds
+        address = place.url if isinstance(place, Shared) else ""
+        looked_at = PostgresqlDatabase.look_at(address) if address else SqliteDatabase.look_at(folder / DATABASE_FILE)
+        with closing(looked_at), looked_at.read() as connection:
+            assert verify(connection).faults == ()
+
+
+@pytest.mark.parametrize("database", DATABASES)
+def test_killed_at_random_moments(database: str, tmp_path: Path) -> None:
+    kill_and_check(database, tmp_path, 10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("database", DATABASES)
+def test_killed_two_hundred_times(database: str, tmp_path: Path) -> None:
+    kill_and_check(database, tmp_path, 200)
+
+
+if __name__ == "__main__":
+    nurse(sys.argv[1])
