@@ -8,8 +8,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from .audit.coverage import Coverage
+from .audit.neighbourhood import PairMatches
 from .audit.verdict import ReferenceAudit
-from .auditing import SceneAudit
+from .auditing import SceneExaminer, Tools, Viewpoint
 from .choosing import ReferenceChooser
 from .decode import ImageLimits
 from .describing import Describer, Description
@@ -39,6 +41,9 @@ HOST, DEVICE = "host", "device"
 
 DESCRIBE, RETRIEVE, AUDIT, COVERAGE = "describe", "retrieve", "audit", "coverage"
 """What is computed beside localizing, item by item."""
+
+REMEMBERED_PAIRS = 2000
+"""Whose matches audits remember, about 10 KB a pair."""
 
 
 @dataclass(frozen=True)
@@ -100,11 +105,14 @@ class Engine:
         self.tiers = tuple(tiers)
         self.options = options
         extractors = [tier.extractor for tier in self.tiers]
-        self._descriptor = descriptor = descriptor or VladDescriptor.of(extractors[0])
+        descriptor = descriptor or VladDescriptor.of(extractors[0])
         self._library = ReferenceLibrary(store)
         indexes = SceneIndexes(store, self._library, descriptor, extractors[0], options.index_cache_bytes)
         self._describer = Describer(extractors, descriptor, options.image_limits)
         self._chooser = ReferenceChooser(indexes, descriptor, extractors[0])
+        ratio = self.tiers[0].pipeline.matcher.options.reference_ratio
+        pairs = PairMatches(ratio, REMEMBERED_PAIRS)
+        self._tools = Tools(self._library, indexes, descriptor, extractors[0], pairs)
         self._stages = QueryStages(self.tiers, self._chooser, options.escalation, method)
         # A backend that lives on correspondences computes on the CPU, one query at a time.
         on_cpu = all(tier.pipeline.reconstructor.uses_correspondences for tier in tiers)
@@ -189,9 +197,19 @@ class Engine:
         Raises:
             RequestError: an unknown scene or reference, a full queue, a passed deadline.
         """
-        audit = SceneAudit(self._library, self._chooser.indexes, self._descriptor, self.tiers[0], scene_key)
-        audits = await self._each(AUDIT, reference_ids, audit.audit, caller, 0, jobs=1)
-        return audit.generation, audits
+        examiner = SceneExaminer(self._tools, scene_key)
+        audits = await self._each(AUDIT, reference_ids, examiner.audit, caller, 0, jobs=1)
+        return examiner.generation, audits
+
+    async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
+        """The scene's generation, and whether a photograph would be localized there.
+
+        Raises:
+            RequestError: an unknown scene, a full queue, a passed deadline.
+        """
+        examiner = SceneExaminer(self._tools, scene_key)
+        (coverage,) = await self._each(COVERAGE, [view], examiner.check_coverage, caller, 0)
+        return examiner.generation, coverage
 
     async def _each(
         self,

@@ -5,20 +5,11 @@ from __future__ import annotations
 from mapless import names, wire
 from mapless.v1 import reference_service_pb2 as pb
 
-from .audit.verdict import ReferenceAudit, Verdict
+from .audit.coverage import Coverage
+from .audit.verdict import ReferenceAudit
+from .enums import enum_to_message
 from .retrieval.chosen import Choice
 from .store import ReferenceRecord, SceneRecord
-
-VERDICTS = {
-    Verdict.CONSISTENT: pb.AUDIT_VERDICT_CONSISTENT,
-    Verdict.WRONG_POSE: pb.AUDIT_VERDICT_WRONG_POSE,
-    Verdict.WRONG_FOCAL: pb.AUDIT_VERDICT_WRONG_INTRINSICS,
-    Verdict.WRONG_POSE_AND_FOCAL: pb.AUDIT_VERDICT_WRONG_POSE_AND_INTRINSICS,
-    Verdict.SWAPPED: pb.AUDIT_VERDICT_SWAPPED_IMAGE,
-    Verdict.DUPLICATE: pb.AUDIT_VERDICT_DUPLICATE,
-    Verdict.CHANGED: pb.AUDIT_VERDICT_SCENE_CHANGED,
-    Verdict.UNVERIFIABLE: pb.AUDIT_VERDICT_UNVERIFIABLE,
-}
 
 
 def scene_to_message(scene: SceneRecord) -> pb.Scene:
@@ -59,7 +50,7 @@ def audit_to_message(audit: ReferenceAudit) -> pb.ReferenceAudit:
     """Message of an audit; what is not known is 0."""
     return pb.ReferenceAudit(
         name=audit.reference,
-        verdict=VERDICTS[audit.verdict],
+        verdict=enum_to_message(audit.verdict, pb.AuditVerdict),
         message=audit.message,
         neighbour_count=audit.neighbour_count,
         match_count=audit.match_count,
@@ -69,4 +60,16 @@ def audit_to_message(audit: ReferenceAudit) -> pb.ReferenceAudit:
         rotation_offset_deg=audit.rotation_offset_deg or 0.0,
         focal_ratio=audit.focal_ratio or 0.0,
         other=audit.other,
+    )
+
+
+def coverage_to_message(coverage: Coverage) -> pb.CheckCoverageResponse:
+    """Message of a forecast, without the generation."""
+    return pb.CheckCoverageResponse(
+        verdict=enum_to_message(coverage.verdict, pb.CoverageVerdict),
+        message=coverage.message,
+        expected_match_count=coverage.expected_match_count,
+        image_share=coverage.image_share,
+        position_68_m=coverage.position_68_m or 0.0,
+        references=coverage.references,
     )

@@ -14,6 +14,7 @@ from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1 import reference_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
 
+from .auditing import Viewpoint
 from .engine import Engine
 from .errors import AlreadyExists
 from .naming import reference_ids_from_names, reference_key_from_name, scene_key_from_name
@@ -21,7 +22,13 @@ from .pages import Page, Record
 from .photos import photo_from_message
 from .priors import narrowing_from_message
 from .query import DEFAULT_REFERENCE_COUNT, Photo
-from .reference_messages import audit_to_message, choice_to_message, reference_to_message, scene_to_message
+from .reference_messages import (
+    audit_to_message,
+    choice_to_message,
+    coverage_to_message,
+    reference_to_message,
+    scene_to_message,
+)
 from .rpc import Call
 from .store import NewReference, ReferenceRecord, Store
 from .tenancy import SceneKey, key_of, scene_id_of
@@ -166,6 +173,20 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         found = await self._stored(self._store.list_references, scene_key, page.limit, page.after)
         references, token = page.cut(found, lambda reference: reference.reference_id)
         return [reference.reference_id for reference in references], token
+
+    async def CheckCoverage(self, request: pb.CheckCoverageRequest, call: Call) -> pb.CheckCoverageResponse:
+        """Implements ReferenceService.CheckCoverage."""
+        engine = self._engine()
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        for field in ("world_from_camera", "intrinsics"):
+            if not request.HasField(field):
+                raise FieldError(field, "is required")
+        pose = wire.transform_from_message(request.world_from_camera, "world_from_camera", wire.MAX_COORDINATE_M)
+        view = Viewpoint(wire.camera_from_message(request.intrinsics, "intrinsics"), pose)
+        generation, coverage = await engine.check_coverage(scene_key, view, call.caller)
+        message = coverage_to_message(coverage)
+        message.store_generation = generation
+        return message
 
     def _draft(self, request: pb.CreateReferenceRequest, path: str) -> Draft:
         """What a request asks to store, all checked but the pixels; FieldError or InvalidArgument names the field."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from enum import Enum
-from typing import Any, TypeVar
 
 from mapless import wire
 from mapless.v1 import localization_service_pb2 as pb
@@ -16,6 +14,7 @@ from mapless.wire import FieldError
 from . import __version__
 from .decode import ImageLimits
 from .engine import Engine
+from .enums import enum_from_message, enum_to_message
 from .method.accuracy import accuracy_from_covariance
 from .method.localize import Localization, LocalizeOptions
 from .method.rejection import Rejection
@@ -32,9 +31,6 @@ from .tenancy import key_of
 MAX_REFERENCES = 64
 MAX_CANDIDATES = 1000
 """References that a request may name when the server is to choose among them."""
-
-
-E = TypeVar("E", bound=Enum)
 
 
 class LocalizationService(rpcs.LocalizationServiceServicer):
@@ -103,7 +99,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             backend=reconstructor.name,
             weights_sha256=reconstructor.weights_sha256,
             features=attempt.tier.extractor.name,
-            variant=_enum_to_message(options.variant, pb.Variant),
+            variant=enum_to_message(options.variant, pb.Variant),
             store_generation=attempt.generation,
             scale=_scale_to_message(answer.scale) if answer.scale else None,
             processed_width_px=attempt.processed.width_px,
@@ -152,8 +148,8 @@ def _query_from_message(request: pb.LocalizeRequest, tenant: str, limits: ImageL
 def _options_from_message(message: pb.LocalizeOptions) -> LocalizeOptions:
     defaults = LocalizeOptions()
     return LocalizeOptions(
-        variant=_enum_from_message(message.variant, pb.Variant, defaults.variant, "options.variant"),
-        scale_strategy=_enum_from_message(
+        variant=enum_from_message(message.variant, pb.Variant, defaults.variant, "options.variant"),
+        scale_strategy=enum_from_message(
             message.scale_strategy, pb.ScaleStrategy, defaults.scale_strategy, "options.scale_strategy"
         ),
     )
@@ -162,7 +158,7 @@ def _options_from_message(message: pb.LocalizeOptions) -> LocalizeOptions:
 def _localization_to_message(localization: Localization) -> pb.Localization:
     message = pb.Localization(
         world_from_camera=wire.transform_to_message(localization.world_from_camera),
-        pose_stage=_enum_to_message(localization.pose_stage, pb.PoseStage),
+        pose_stage=enum_to_message(localization.pose_stage, pb.PoseStage),
         inlier_count=localization.inlier_count,
         match_count=localization.match_count,
         reprojection_error_px=localization.reprojection_error_px,
@@ -183,27 +179,12 @@ def _localization_to_message(localization: Localization) -> pb.Localization:
 
 
 def _rejection_to_message(rejection: Rejection) -> pb.Rejection:
-    return pb.Rejection(reason=_enum_to_message(rejection.reason, pb.RejectionReason), message=rejection.message)
+    return pb.Rejection(reason=enum_to_message(rejection.reason, pb.RejectionReason), message=rejection.message)
 
 
 def _scale_to_message(scale: MetricScale) -> pb.ScaleEstimate:
     return pb.ScaleEstimate(
         metres_per_unit=scale.metres_per_unit,
-        stage=_enum_to_message(scale.stage, pb.ScaleStage),
+        stage=enum_to_message(scale.stage, pb.ScaleStage),
         deviation=scale.deviation,
     )
-
-
-# An enum here and its twin on the wire have the same value names, but for the wire's prefix, "VARIANT_".
-
-
-def _enum_to_message(value: Enum, enum: wire.ProtoEnum) -> Any:
-    return enum.Value(wire.enum_prefix(enum) + value.name)
-
-
-def _enum_from_message(number: int, enum: wire.ProtoEnum, default: E, field: str) -> E:
-    if number == 0:
-        return default
-    if number not in enum.values():
-        raise FieldError(field, f"{number} is no value of {enum.DESCRIPTOR.name}")
-    return type(default)[enum.Name(number).removeprefix(wire.enum_prefix(enum))]

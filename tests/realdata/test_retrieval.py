@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -30,9 +31,15 @@ def describe(frame: Frame) -> Vector:
     return DESCRIPTOR.describe(EXTRACTOR.extract(image, frame.camera))
 
 
+def described(frames: list[Frame]) -> list[Vector]:
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(describe, frames))
+
+
 def index_of(frames: list[Frame]) -> SceneIndex:
     index = SceneIndex(DESCRIPTOR.dimension)
-    added = tuple(IndexedReference(it.name, it.name, it.world_from_camera, describe(it)) for it in frames)
+    vectors = zip(frames, described(frames), strict=True)
+    added = tuple(IndexedReference(it.name, it.name, it.world_from_camera, vector) for it, vector in vectors)
     index.apply(SceneChanges(1, added, frozenset(), True))
     return index
 
@@ -49,7 +56,7 @@ def test_kitchen_queries_find_a_reference_within_half_a_metre_and_30_degrees(pho
     assert len(split.references) == 100
     assert len(split.queries) >= 100
     entries = index_of([frames[i] for i in split.references]).entries()
-    queries = [(frames[i], describe(frames[i])) for i in split.queries]
+    queries = list(zip([frames[i] for i in split.queries], described([frames[i] for i in split.queries]), strict=True))
     for options in (RankOptions(), RankOptions(nearby_weight=1.0)):
         found = [rank_references(entries, vector, 10, options=options) for _, vector in queries]
         shares = np.mean([sees_the_same(frame, it) for (frame, _), it in zip(queries, found, strict=True)])

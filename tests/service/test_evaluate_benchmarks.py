@@ -190,7 +190,7 @@ def test_takes_the_references_of_a_pairs_file(chess: Path, tmp_path: Path) -> No
         (("--choose", "luck"), "'luck'"),
         (("--pairs", "/nowhere/pairs.txt"), "no file /nowhere/pairs.txt"),
         (("--output", "/proc/nowhere"), "/proc/nowhere cannot be written"),
-        (("--references", "10"), "--references: flags like it are for a folder with cameras.json"),
+        (("--references", "10"), "--references: only for a folder with cameras.json"),
     ],
 )
 def test_wrong_arguments_are_one_line(chess: Path, tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:

@@ -102,7 +102,8 @@ def test_wrong_arguments_are_one_line(folder: Path, arguments: tuple[object, ...
 
 
 def test_wrong_folders_are_one_line(folder: Path, tmp_path: Path) -> None:
-    assert "cameras.json" in refusal("evaluate", tmp_path / "nowhere")
+    assert "nowhere" in refusal("evaluate", tmp_path / "nowhere")
+    assert "cameras.json" in refusal("evaluate", tmp_path)
     content = json.loads((folder / "cameras.json").read_text())
     (tmp_path / "cameras.json").write_text(json.dumps(content))
     assert "there is no file" in refusal("evaluate", tmp_path)

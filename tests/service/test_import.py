@@ -199,11 +199,11 @@ def test_a_folder_without_a_layout_is_named(tmp_path: Path) -> None:
 def test_terminated_in_the_middle_the_next_run_goes_on(tmp_path: Path) -> None:
     """Without an address: a server of its own on the settings' store, which goes with the command."""
     folder = tmp_path / "many"
-    count = 120
+    count = 80
     images = []
     for i, pose in enumerate(truth(count).poses):
-        write_image(folder / "images" / f"p{i:03d}.png", i, 320, 240)
-        images.append(PosedImage(f"p{i:03d}.png", Camera(320, 240, 300.0, 300.0, 159.5, 119.5), pose))
+        write_image(folder / "images" / f"p{i:03d}.png", i, 160, 120)
+        images.append(PosedImage(f"p{i:03d}.png", Camera(160, 120, 150.0, 150.0, 79.5, 59.5), pose))
     (folder / "cameras.json").write_text(LAYOUTS["cameras"](images, "a test")["cameras.json"])
     environment = os.environ | {"MAPLESS_DATA_DIR": str(tmp_path / "store"), "MAPLESS_WARM_UP": "false"}
     report = tmp_path / "report.json"
@@ -213,7 +213,7 @@ def test_terminated_in_the_middle_the_next_run_goes_on(tmp_path: Path) -> None:
         assert process.stderr is not None
         while "storing references" not in process.stderr.readline():
             assert process.poll() is None
-        time.sleep(0.7)
+        time.sleep(0.3)
         process.send_signal(signal.SIGTERM)
         output, _ = process.communicate(timeout=60)
     finally:

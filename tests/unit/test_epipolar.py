@@ -15,10 +15,10 @@ from scenes import CAMERA, SceneOptions, look_at, make_scene, observe, random_fo
 
 from mapless.geometry import Camera, Quaternion, RigidTransform, rotation_from_vector
 from mapless_server.dataset import Frame
-from mapless_server.decode import ImageLimits
 from mapless_server.ingest.check import check_frames
+from mapless_server.ingest.pair_errors import MatchedPair
 from mapless_server.ingest.pairs import more_pairs, pairs_by_order, pairs_by_pose
-from mapless_server.ingest.verdict import MatchedPair, Verdict, judge, suspects_of
+from mapless_server.ingest.verdict import Verdict, judge, suspects_of
 from mapless_server.method.epipolar import consistent_matches, pair_error_px, sampson_px
 from mapless_server.method.views import PosedView, View
 
@@ -142,6 +142,18 @@ def test_intrinsics_of_another_image_size_are_named_with_their_factor(scale: flo
     assert verdict.explained_px < 1
 
 
+def test_axes_that_are_mixed_are_named_with_the_photographs() -> None:
+    views = planted("mixed", count=9)
+    pairs = matched(views)
+    mixed = {1, 4, 6, 7}
+    fault = turned(OPENGL)
+    wrong = [replace(v, world_from_camera=fault(v.world_from_camera)) if i in mixed else v for i, v in enumerate(views)]
+    verdict = verdict_of(wrong, pairs)
+    assert verdict.is_wrong
+    assert verdict.explanation.startswith("with some photographs, not all, the camera axes are OpenGL's")
+    assert set(verdict.suspects) == mixed
+
+
 def test_poses_of_nothing_are_wrong_without_an_explanation() -> None:
     views = planted("nonsense")
     pairs = matched(views)
@@ -228,9 +240,7 @@ def test_poses_that_hide_who_is_near_are_still_explained(tmp_path: Path, fault: 
     """Photographs that are near in the folder's order are compared as well."""
     views = planted("hidden", count=10)
     steps: list[str] = []
-    verdict = check_frames(
-        frames_of(tmp_path, views, fault), ImageLimits(), lambda step, *_: steps.append(step), NumberedViews(views)
-    )
+    verdict = check_frames(frames_of(tmp_path, views, fault), lambda step, *_: steps.append(step), NumberedViews(views))
     assert verdict.is_wrong
     assert ("OpenGL" if fault is not RigidTransform.inverse else "camera_from_world") in verdict.explanation
     assert set(steps) == {"checking poses"}
@@ -241,7 +251,7 @@ def test_photographs_that_cannot_be_read_are_left_to_the_upload(tmp_path: Path) 
     frames = frames_of(tmp_path, views, lambda pose: pose)
     (tmp_path / "0.png").write_bytes(b"no image")
     (tmp_path / "1.png").unlink()
-    verdict = check_frames(frames, ImageLimits(), lambda *_: None, NumberedViews(views))
+    verdict = check_frames(frames, lambda *_: None, NumberedViews(views))
     assert (verdict.is_known, verdict.is_wrong) == (True, False)
     assert not {0, 1} & {i for error in verdict.pairs for i in error.pair}
-    assert not check_frames(frames[:1], ImageLimits(), lambda *_: None, NumberedViews(views)).is_known
+    assert not check_frames(frames[:1], lambda *_: None, NumberedViews(views)).is_known

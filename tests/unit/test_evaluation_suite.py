@@ -6,17 +6,21 @@ import csv
 import json
 import math
 import xml.etree.ElementTree as ElementTree
+from contextlib import nullcontext
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from images import textured
 
+from mapless import Internal
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.dataset import Dataset, Frame, Refusal
+from mapless_server.evaluation import suite as suite_module
 from mapless_server.evaluation.averages import groups_of
 from mapless_server.evaluation.benchmarks import BENCHMARKS, ScenePlace, find_scenes
 from mapless_server.evaluation.charts import ablation, along_sequence, cumulative, sparsity
@@ -27,13 +31,14 @@ from mapless_server.evaluation.page import page
 from mapless_server.evaluation.pairs import chosen, pairs_file, read_pairs
 from mapless_server.evaluation.paper import DENSE
 from mapless_server.evaluation.pictures import WorstQuery, data_uri, fit_true_poses
-from mapless_server.evaluation.plan import UsageError
+from mapless_server.evaluation.plan import EvaluationOptions, PlannedQuery, UsageError
 from mapless_server.evaluation.protocol import Method, SuiteOptions, split_scene
 from mapless_server.evaluation.provenance import Provenance, commit_of
-from mapless_server.evaluation.suite import Failure, Run, SceneWork, Suite
+from mapless_server.evaluation.suite import Apparatus, Failure, Run, SceneWork, Suite, measure
 from mapless_server.evaluation.svg import Axis, Chart, Curve, draw, log_range
-from mapless_server.evaluation.tables import FAILED, NOTHING, OURS, Table, format_median, tables_of
+from mapless_server.evaluation.tables import FAILED, NOTHING, OURS, Table, format_median, tables_of, text_lines
 from mapless_server.method.views import Features, View
+from mapless_server.settings import Settings
 
 CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
 
@@ -192,6 +197,7 @@ class TestProtocol:
         own = Dataset("own", frames, True, "", format="cameras")
         split = split_scene(own, 5, SuiteOptions())
         assert len(split.references) == 5
+        assert split.test_count == 49 - 5
         assert not {f.name for f in split.references} & {f.name for f in split.queries}
         with pytest.raises(UsageError, match="no frame of the train split"):
             split_scene(own, DENSE, SuiteOptions())
@@ -237,9 +243,9 @@ class TestPairs:
     def test_gives_the_first_k_that_are_references_of_the_setting(self, tmp_path: Path) -> None:
         file = self.write(tmp_path, "q0.png r7.png", "q0 r3", "q0.png r3.png", "q0.png r5.png", "", "q1.png r0.png")
         pairs = read_pairs(file, dataset(), Path("/data"))
-        query, references = frame("q0", "test"), tuple(f for f in dataset().frames if f.name in ("r3", "r5", "r7"))
+        query, references = frame("q0", "test"), {"r3", "r5", "r7"}
         assert [f.name for f in chosen(pairs, query, references, 2)] == ["r7", "r3"]
-        assert [f.name for f in chosen(pairs, query, references[:1], 2)] == ["r3"]
+        assert [f.name for f in chosen(pairs, query, {"r3"}, 2)] == ["r3"]
         with pytest.raises(UsageError, match="no reference of the query q1"):
             chosen(pairs, frame("q1", "test"), references, 2)
 
@@ -299,6 +305,55 @@ class TestJournal:
             assert list(again.results) == (["q0"] if size >= one else [])
             again.add(result("q1", 0.02))
             assert "q1" in Journal(tmp_path, "chess.dense", self.IDENTITY).results
+
+
+class TestMeasure:
+    """The suite's own logic, with a server that is not there."""
+
+    def measure(
+        self, folder: Path, options: SuiteOptions, monkeypatch: pytest.MonkeyPatch, limit: int = 99
+    ) -> tuple[list[str], Suite]:
+        """The calls that were made until the one after `limit` failed, as setting/variant/query, and the figures."""
+        calls: list[str] = []
+
+        def localize(
+            client: object, scene: str, query: PlannedQuery, given: EvaluationOptions, references: object
+        ) -> QueryResult:
+            if len(calls) == limit:
+                raise Internal("GONE", "the server is gone")
+            calls.append(f"{scene}/{given.variant}/{query.frame.name}")
+            return result(query.frame.name, 0.01)
+
+        monkeypatch.setattr(suite_module, "child_server", lambda _: nullcontext(SimpleNamespace(address="nowhere")))
+        monkeypatch.setattr(suite_module, "Client", lambda *_: nullcontext())
+        monkeypatch.setattr(suite_module, "store_references", lambda *_: None)
+        monkeypatch.setattr(suite_module, "localize_query", localize)
+        planned = suite({"chess": 0.01}, options)
+        apparatus = Apparatus(options, Settings(), planned.provenance, folder, lambda *_: None)
+        return calls, measure(planned.scenes, apparatus, None, lambda _: None)
+
+    def test_goes_on_where_it_ended(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        options = SuiteOptions(sparse=(5,), variants=("best", "full"), max_queries=3)
+        wanted = [f"{s}/{v}/{q}" for s in ("dense", "N-5") for v in options.variants for q in ("q0", "q4", "q8")]
+        calls, measured = self.measure(tmp_path, options, monkeypatch, limit=4)
+        assert calls == wanted[:4]
+        assert [(run.split.setting, run.method.variant) for run in measured.runs] == [(DENSE, "best")]
+        assert [failure.scene for failure in measured.failures] == ["chess"]
+        assert "the server is gone" in measured.failures[0].message
+        calls, measured = self.measure(tmp_path, options, monkeypatch)
+        assert calls == wanted[4:]
+        assert (len(measured.runs), len(measured.failures)) == (4, 0)
+        calls, measured = self.measure(tmp_path, options, monkeypatch)
+        assert calls == []
+        assert (len(measured.runs), len(measured.failures)) == (4, 0)
+
+    def test_other_options_are_other_runs_and_more_queries_are_not(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        options = SuiteOptions(protocols=("dense",), max_queries=3)
+        for its, count in ((options, 3), (replace(options, k=5), 3), (replace(options, max_queries=None), 9 - 3)):
+            calls, _ = self.measure(tmp_path, its, monkeypatch)
+            assert len(calls) == count
 
 
 class TestAverages:
@@ -363,6 +418,7 @@ class TestTables:
         for table in tables_of(group):
             assert {len(line.cells) for line in table.rows} == {len(table.head)}
             assert any(line.whose == OURS for line in table.rows)
+            assert len({len(line) for line in text_lines(table)}) == 1
 
 
 class TestCharts:

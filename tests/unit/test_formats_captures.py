@@ -61,9 +61,9 @@ def test_an_applied_transform_and_scale_are_undone(tmp_path: Path) -> None:
     turn[:3, 3] = [1.0, 2.0, 3.0]
 
     def applied(matrix: np.ndarray) -> np.ndarray:
-        moved = turn @ matrix
+        moved: np.ndarray = turn @ matrix
         moved[:3, 3] *= 0.25
-        return moved
+        return np.asarray(moved)
 
     folder = write_transforms(tmp_path, applied, applied_transform=turn[:3].tolist(), applied_scale=0.25)
     dataset = read_dataset(folder)

@@ -29,8 +29,10 @@ from mapless import (
 from mapless.geometry import RigidTransform
 from mapless_server.dataset import Dataset, Frame
 from mapless_server.ingest.existing import KnownReferences
+from mapless_server.ingest.items import BATCH_BYTES, BATCH_COUNT
 from mapless_server.ingest.report import ImportReport
-from mapless_server.ingest.upload import BATCH_BYTES, BATCH_COUNT, Uploader, UploadOptions
+from mapless_server.ingest.upload import Uploader
+from mapless_server.ingest.waiting import UploadOptions
 
 Fault = Callable[[Sequence[NewReference], int], MaplessError | None]
 """What the server answers to a message and to which call, None to store it."""

@@ -93,7 +93,7 @@ class TestScenes:
             lambda: store.read_image(NOWHERE, "a"),
             lambda: store.list_references(NOWHERE, 10),
             lambda: store.delete_reference(NOWHERE, "a"),
-            lambda: store.list_poses(NOWHERE),
+            lambda: store.list_changes(NOWHERE, None, "vlad"),
             lambda: store.load_references(NOWHERE, None, EXTRACTOR),
             lambda: store.load_references(NOWHERE, ["a"], EXTRACTOR),
         )
@@ -191,7 +191,7 @@ class TestReferences:
             image = store.read_image(OFFICE, "a")
             assert store.read_image_of(created.key) == image
             (loaded,) = store.load_references(OFFICE, ["a"], EXTRACTOR).references
-            _, (pose,) = store.list_poses(OFFICE)
+            (pose,) = store.list_changes(OFFICE, None, "vlad").added
         assert image == new.image
         assert read.camera == new.camera
         assert repr(read.camera) == repr(new.camera)  # tells -0.0 from 0.0
@@ -325,7 +325,7 @@ class TestReferences:
         store.add_references(OFFICE, [make_reference(it, count=1) for it in ids])
         assert len(store.load_references(OFFICE, None, EXTRACTOR).references) == 1100
         assert len(store.load_references(OFFICE, ids[::-1], EXTRACTOR).references) == 1100
-        assert len(store.list_poses(OFFICE)[1]) == 1100
+        assert len(store.list_changes(OFFICE, None, "vlad").added) == 1100
         with pytest.raises(errors.AlreadyExists):
             store.add_references(OFFICE, [make_reference(it, count=1) for it in ["new", *ids]])
 
@@ -345,7 +345,7 @@ IDS = st.text("ab_-.AZ09", min_size=1, max_size=3)
 
 
 class TestPages:
-    @settings(max_examples=15, deadline=None)
+    @settings(max_examples=10, deadline=None)
     @given(names=st.sets(IDS, max_size=12), limit=st.integers(1, 5))
     def test_pages_are_a_partition_in_order(
         self, database: str, tmp_path_factory: pytest.TempPathFactory, names: set[str], limit: int
@@ -366,7 +366,7 @@ class TestPages:
                 assert len(references) <= limit
                 reference_ids += [it.reference_id for it in references]
                 after = references[-1].reference_id
-            poses = [it.reference_id for it in store.list_poses(SCENE)[1]]
+            poses = [it.reference_id for it in store.list_changes(SCENE, None, "vlad").added]
             assert store.get_scene(SCENE).reference_count == len(names)
         assert scene_ids == sorted({"scene", *("s" + name for name in names)})
         assert reference_ids == poses == sorted(names)
@@ -395,16 +395,6 @@ class TestMemory:
         ):
             with pytest.raises(ValueError, match="read-only"):
                 array[:] = 0
-
-    def test_poses_follow_changes(self, store: Store) -> None:
-        store.create_scene(OFFICE)
-        assert store.list_poses(OFFICE) == (1, ())
-        store.add_references(OFFICE, [make_reference("a")])
-        generation, poses = store.list_poses(OFFICE)
-        assert [it.reference_id for it in poses] == ["a"]
-        assert store.list_poses(OFFICE)[1] is poses
-        store.delete_reference(OFFICE, "a")
-        assert store.list_poses(OFFICE) == (generation + 1, ())
 
     @given(
         capacity=st.integers(0, 20),
@@ -454,8 +444,11 @@ class TestThreads:
             sizes: dict[int, int] = {}
             while not done.is_set():
                 snapshot = store.load_references(OFFICE, None, EXTRACTOR)
-                generation, poses = store.list_poses(OFFICE)
-                for seen, size in ((snapshot.generation, len(snapshot.references)), (generation, len(poses))):
+                whole = store.list_changes(OFFICE, None, "vlad")
+                for seen, size in (
+                    (snapshot.generation, len(snapshot.references)),
+                    (whole.generation, len(whole.added)),
+                ):
                     assert sizes.setdefault(seen, size) == size
             return len(sizes)
 

@@ -226,7 +226,7 @@ def test_another_references_descriptor_is_damage(place: Place) -> None:
 STEPS = st.lists(st.tuples(st.sampled_from("addfnk"), st.integers(0, 4)), max_size=25)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(steps=STEPS)
 def test_following_is_reading_whole(
     database: str, tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int]]

@@ -46,7 +46,6 @@ class TestSharing:
             assert reader.get_scene(OFFICE).reference_count == round_ + 1
             changes = reader.list_changes(OFFICE, snapshot.generation - 1, NAME)
             assert [it.key for it in changes.added] == [record.key]
-            assert len(reader.list_poses(OFFICE)[1]) == round_ + 1
 
     def test_what_is_in_memory_is_not_believed_after_the_other_changed_it(self, both: tuple[Store, Store]) -> None:
         one, other = both
@@ -172,7 +171,6 @@ def operations(store: Store) -> tuple[Callable[[], object], ...]:
         lambda: store.list_scenes(DEFAULT_TENANT, 10),
         lambda: store.load_references(OFFICE, ["a"], EXTRACTOR),
         lambda: store.list_changes(OFFICE, 1, NAME),
-        lambda: store.list_poses(OFFICE),
         lambda: store.read_image(OFFICE, "a"),
         lambda: store.add_references(OFFICE, [make_reference("lost")]),
         lambda: store.delete_reference(OFFICE, "a"),

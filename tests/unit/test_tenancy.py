@@ -21,12 +21,14 @@ from mapless import wire
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.wire import FieldError
+from mapless_server.audit.coverage import Coverage, CoverageVerdict
 from mapless_server.decode import ImageLimits
 from mapless_server.describing import Description
 from mapless_server.errors import NotFound, RequestError
 from mapless_server.method.views import Features, View
 from mapless_server.principal import DEFAULT_TENANT, Principal
 from mapless_server.reference_service import ReferenceService
+from mapless_server.retrieval.chosen import Choice
 from mapless_server.rpc import Call
 from mapless_server.store import Store
 from mapless_server.tenancy import SceneKey, check_tenant, end_of_keys, key_of, scene_id_of, tenant_of
@@ -68,11 +70,23 @@ class TestKeys:
 class StandInEngine:
     """Finds one feature in every photograph."""
 
+    store: Store
     options: Any = field(default_factory=lambda: SimpleNamespace(image_limits=ImageLimits()))
 
     async def describe(self, photos: Sequence[Any], *_: Any, **__: Any) -> list[Description]:
         features = Features(np.zeros((1, 2), np.float32), np.ones((1, 4), np.float32), np.ones(1, np.float32))
         return [Description({"stand-in": View(photo.camera.pinhole(), features)}, {}) for photo in photos]
+
+    async def retrieve(self, scene_key: SceneKey, *_: Any) -> Choice:
+        self.store.get_scene(scene_key)
+        return Choice((), "stand-in", 1)
+
+    async def audit(self, scene_key: SceneKey, reference_ids: Sequence[str], _: Any) -> Any:
+        return self.store.get_scene(scene_key).generation, []
+
+    async def check_coverage(self, scene_key: SceneKey, *_: Any) -> Any:
+        nowhere = Coverage(CoverageVerdict.NOT_LOCALIZABLE, "nothing is looked at", 0, 0.0, None, ())
+        return self.store.get_scene(scene_key).generation, nowhere
 
 
 @dataclass
@@ -109,7 +123,7 @@ class Server:
 @contextmanager
 def serving(folder: Path) -> Iterator[Server]:
     with Store.open(folder) as store:
-        engine = cast(Any, StandInEngine())
+        engine = cast(Any, StandInEngine(store))
         service = ReferenceService(lambda: engine, store)
         try:
             yield Server(service, store)
@@ -148,6 +162,15 @@ def requests_for(scene_id: str, reference_id: str) -> dict[str, Any]:
         "CreateReference": new,
         "BatchCreateReferences": pb.BatchCreateReferencesRequest(scene=scene, requests=[new]),
         "DeleteReference": pb.DeleteReferenceRequest(name=reference),
+        "RetrieveReferences": pb.RetrieveReferencesRequest(
+            scene=scene, image=PHOTO, intrinsics=wire.camera_to_message(CAMERA)
+        ),
+        "AuditScene": pb.AuditSceneRequest(scene=scene),
+        "CheckCoverage": pb.CheckCoverageRequest(
+            scene=scene,
+            world_from_camera=new.reference.world_from_camera,
+            intrinsics=wire.camera_to_message(CAMERA),
+        ),
         "DeleteScene": pb.DeleteSceneRequest(name=scene),
     }
 
@@ -258,11 +281,11 @@ def test_what_one_tenant_loaded_is_not_in_anothers_cache(server: Server) -> None
     server.call("acme", "CreateReference", create_request("s", "r"))
     mine = key_of("acme", "s")
     assert len(server.store.load_references(mine, ["r"], "stand-in").references) == 1
-    assert len(server.store.list_poses(mine)[1]) == 1
+    assert len(server.store.list_changes(mine, None, "").added) == 1
     look_ups: list[Callable[[SceneKey], Any]] = [
         lambda key: server.store.load_references(key, ["r"], "stand-in"),
         lambda key: server.store.load_references(key, None, "stand-in"),
-        server.store.list_poses,
+        lambda key: server.store.list_changes(key, None, ""),
     ]
     for tenant in TENANTS:
         for look_up in look_ups if tenant != "acme" else []:
@@ -272,8 +295,9 @@ def test_what_one_tenant_loaded_is_not_in_anothers_cache(server: Server) -> None
             # The same id and the same generation, and yet other references.
             server.call(tenant, "CreateScene", pb.CreateSceneRequest(scene_id="s"))
             server.call(tenant, "CreateReference", create_request("s", f"of.{tenant}.own"))
-            generation, (pose,) = server.store.list_poses(key_of(tenant, "s"))
-            assert (generation, pose.reference_id) == (server.store.list_poses(mine)[0], f"of.{tenant}.own")
+            theirs = server.store.list_changes(key_of(tenant, "s"), None, "")
+            assert [it.reference_id for it in theirs.added] == [f"of.{tenant}.own"]
+            assert theirs.generation == server.store.get_scene(mine).generation
 
 
 ENTANGLED = [DEFAULT_TENANT, "acme", "ACME", "acme0"]

@@ -20,7 +20,7 @@ import numpy as np
 
 from mapless.geometry import RigidTransform
 
-from .change import Change, changed_region
+from .change import SAME_VIEWPOINT, Change, changed_region
 from .duplicates import Likeness, likeness
 from .look import Look, look_at, pose_difference
 from .neighbourhood import PairMatches
@@ -76,19 +76,21 @@ class Auditor:
         verdict, blamed = self._judge(look), ""
         if verdict.is_alarm:
             look, verdict, blamed = self._without_suspects(look, verdict, is_wide)
-        if verdict in (Verdict.WRONG_POSE, Verdict.WRONG_POSE_AND_FOCAL):
+        if verdict in (Verdict.WRONG_POSE, Verdict.WRONG_POSE_AND_INTRINSICS):
             partner = self._swapped_with(look)
             if partner:
-                return describe(look, Verdict.SWAPPED, other=partner)
+                return describe(look, Verdict.SWAPPED_IMAGE, other=partner)
         if verdict.is_alarm:
             return describe(look, verdict, other=twin[0] if twin[1] is Likeness.SAME_PHOTOGRAPH else "")
-        change = self._change(name, look, verdict)
+        change = None if blamed else self._change(look, verdict)
         if change is not None and change.is_alarm:
-            return describe(look, Verdict.CHANGED, change=change)
+            return describe(look, Verdict.SCENE_CHANGED, change=change)
         if verdict is Verdict.UNVERIFIABLE:
             return describe(look, verdict, other=blamed)
         if twin[0]:
-            return describe(look, Verdict.DUPLICATE, other=twin[0], same=twin[1] is Likeness.SAME_PHOTOGRAPH, change=change)
+            return describe(
+                look, Verdict.DUPLICATE, other=twin[0], same=twin[1] is Likeness.SAME_PHOTOGRAPH, change=change
+            )
         return describe(look, Verdict.CONSISTENT, change=change)
 
     def _first_look(self, name: str) -> tuple[Look, tuple[str, Likeness]]:
@@ -136,14 +138,16 @@ class Auditor:
         return look.verdict(noise_m, noise_deg)
 
     def _without_suspects(self, look: Look, verdict: Verdict, is_wide: bool) -> tuple[Look, Verdict, str]:
-        """The look and verdict that are left when faulty neighbours are left out, and one of them if that undid it all."""
+        """Look and verdict without neighbours that look faulty; and the worst of them, if too few others are left."""
         names = [reference.name for reference in look.neighbourhood.references]
         suspects = [name for name in names if self._first_look(name)[0].verdict().is_alarm]
         if not suspects:
             return look, verdict, ""
         rest = [name for name in names if name not in suspects]
         if not is_wide:
-            spare = [n for n in self._around.near(look.subject.name, 2 * self._options.candidate_count) if n not in names]
+            spare = [
+                n for n in self._around.near(look.subject.name, 2 * self._options.candidate_count) if n not in names
+            ]
             rest += [n for n in spare if not self._first_look(n)[0].verdict().is_alarm]
         second, _ = self._look(look.subject.name, rest)
         if second.is_usable:
@@ -154,7 +158,7 @@ class Auditor:
         return second, Verdict.UNVERIFIABLE, worse
 
     def _swapped_with(self, look: Look) -> str:
-        """The reference at whose pose the photograph was taken, if that one's was taken here; empty if there is none."""
+        """The reference at whose pose the photograph was taken, if that one's was taken here; empty if none is."""
         found, given = look.world_from_camera, look.subject.world_from_camera
         for name in self._around.near_pose(found, 4, look.subject.name):
             if not self._is_near(found, self._around.pose(name), look):
@@ -175,8 +179,10 @@ class Auditor:
             self._options.rotation_tolerance_deg, sigma * look.sigma_deg
         )
 
-    def _change(self, name: str, look: Look, verdict: Verdict) -> Change | None:
+    def _change(self, look: Look, verdict: Verdict) -> Change | None:
         """What of the image does not show what the neighbours show; None where that cannot be said."""
-        if verdict is Verdict.UNVERIFIABLE:
-            look, _ = self._first_look(name)
-        return changed_region(look)
+        if verdict is not Verdict.UNVERIFIABLE:
+            return changed_region(look)
+        name = look.subject.name
+        nearest = self._around.views(self._around.near(name, self._options.neighbour_count))
+        return changed_region(look_at(look.subject, nearest, self._pairs, self._options), SAME_VIEWPOINT)

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
-from scipy.stats import binom
+from scipy.special import bdtr
 
 from mapless.geometry import Array
 
@@ -36,6 +36,7 @@ class ChangeOptions:
         max_chance: and when chance would do that in fewer than so many cells.
         min_points: fewer expected points in the whole image are no ground for a judgement.
         alarm_share: a connected region that misses its points and is so large a share of the judged image is an alarm.
+            Of 133 unaltered photographs the worst, a blurred one, had 0.30, the next 0.20.
     """
 
     columns: int = 8
@@ -47,12 +48,20 @@ class ChangeOptions:
     missing_share: float = 0.3
     max_chance: float = 1e-3
     min_points: int = 100
-    alarm_share: float = 0.3
+    alarm_share: float = 0.33
 
     def __post_init__(self) -> None:
         shares = (self.missing_share, self.max_chance, self.alarm_share)
         if not (0 < min(shares) <= max(shares) < 1 and min(self.columns, self.rows, self.radius_px) > 0):
             raise ValueError(f"senseless options: {self}")
+
+
+SAME_VIEWPOINT = ChangeOptions(max_turn_deg=8.0, max_scale=1.25)
+"""For a photograph that nothing explains. With a wall between it and its neighbours it would show nothing of theirs and
+be right, so it must stand where they stand: whatever is in its way is in theirs."""
+
+_LEAST_OBSERVERS = 3
+"""So many references must see what a photograph should show; one alone may be the one that changed."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +90,14 @@ def changed_region(look: Look, options: ChangeOptions | None = None) -> Change |
     given one when nothing explains them.
     """
     options = options or ChangeOptions()
+    if len(look.neighbourhood.structure.x_in_world) < options.min_points:
+        return None
     subject = look.subject
     if look.is_usable:
         subject = replace(subject, world_from_camera=look.world_from_camera)
     bounds = VisibilityOptions(options.max_turn_deg, options.max_scale)
     visible = visible_points(subject.view.camera, subject.world_from_camera, look.neighbourhood, bounds)
-    if len(visible) < options.min_points:
+    if len(visible) < options.min_points or len(np.unique(visible.reference)) < _LEAST_OBSERVERS:
         return None
     found = _found(subject, look.neighbourhood, visible, options)
     camera = subject.view.camera
@@ -94,10 +105,11 @@ def changed_region(look: Look, options: ChangeOptions | None = None) -> Change |
     index = (cell[:, 1] * options.columns + cell[:, 0]).astype(np.intp)
     cells = options.columns * options.rows
     expected_by_cell = np.bincount(index, minlength=cells)
-    found_by_cell = np.bincount(index, weights=found, minlength=cells)
+    found_by_cell = np.bincount(index, weights=found.astype(float), minlength=cells).astype(np.float64)
     missing, judged = _missing(expected_by_cell, found_by_cell, options)
-    regions, count = label(missing.reshape(options.rows, options.columns))
-    largest = max((int((regions == k).sum()) for k in range(1, count + 1)), default=0)
+    grid = missing.reshape(options.rows, options.columns).astype(np.uint8)
+    count, regions = cv2.connectedComponents(grid, connectivity=4)
+    largest = max((int((regions == k).sum()) for k in range(1, count)), default=0)
     share = largest / max(int(judged.sum()), 1)
     enough = judged.sum() >= cells / 4
     return Change(
@@ -112,8 +124,8 @@ def _missing(
     usual = _usual_share(expected, found)
     limit = options.missing_share * usual
     # A cell can be judged when finding nothing at all would be no chance.
-    judged = binom.cdf(0, expected, usual) < options.max_chance
-    unlikely = binom.cdf(found, expected, usual) < options.max_chance
+    judged = bdtr(0, expected, usual) < options.max_chance
+    unlikely = bdtr(found, expected, usual) < options.max_chance
     return judged & unlikely & (found <= limit * expected), judged
 
 

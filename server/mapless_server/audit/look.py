@@ -1,4 +1,4 @@
-"""One look at a reference from given others: does its photograph fit its pose and focal length, and if not, what would?"""
+"""One look at a reference from given others: whether its pose and focal length fit, and if not, what would."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Look:
     def focal_sigma(self) -> float:
         """Standard deviation of the focal ratio."""
         information = float(self.explanations[Freedom.FOCAL].information[6, 6])
-        return _INFLATION / np.sqrt(max(information, 1e-12))
+        return float(_INFLATION / np.sqrt(max(information, 1e-12)))
 
     def excess(self, freedom: Freedom) -> float:
         """Robust cost per match above that of the freest explanation."""
@@ -117,10 +117,10 @@ class Look:
         pose_stays = self.severity(noise_m, noise_deg, both.world_from_camera) <= 1
         focal_stays = abs(both.camera.focal_x_px / self.subject.view.camera.focal_x_px - 1) <= allowed
         if pose_stays != focal_stays:
-            return Verdict.WRONG_POSE if focal_stays else Verdict.WRONG_FOCAL
+            return Verdict.WRONG_POSE if focal_stays else Verdict.WRONG_INTRINSICS
         if not pose_stays and min(self.excess(Freedom.POSE), self.excess(Freedom.FOCAL)) > options.both_excess:
-            return Verdict.WRONG_POSE_AND_FOCAL
-        return Verdict.WRONG_FOCAL if focal_could_be else Verdict.WRONG_POSE
+            return Verdict.WRONG_POSE_AND_INTRINSICS
+        return Verdict.WRONG_INTRINSICS if focal_could_be else Verdict.WRONG_POSE
 
     def severity(
         self, noise_m: float = 0.0, noise_deg: float = 0.0, world_from_camera: RigidTransform | None = None
@@ -143,9 +143,7 @@ class Look:
         return _INFLATION**2 * world_covariance(information, self.world_from_camera)
 
 
-def look_at(
-    subject: PosedView, neighbours: Sequence[PosedView], pairs: PairMatches, options: AuditOptions
-) -> Look:
+def look_at(subject: PosedView, neighbours: Sequence[PosedView], pairs: PairMatches, options: AuditOptions) -> Look:
     """Looks at a reference from these others, whose poses it believes as far as they agree with one another."""
     neighbourhood = build_neighbourhood(neighbours, pairs, options.epipolar_px, options.structure)
     sighting = sight(subject, neighbourhood, pairs)
@@ -169,4 +167,4 @@ def _along(covariance: Array, direction: Array) -> float:
     if not length > 0:
         return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
     unit = direction / length
-    return float(np.sqrt(max(unit @ covariance @ unit, 0.0)))
+    return float(np.sqrt(np.clip(unit @ covariance @ unit, 0.0, None)))

@@ -73,6 +73,10 @@ def build_neighbourhood(
     references: Sequence[PosedView], pairs: PairMatches, epipolar_px: float, options: StructureOptions
 ) -> Neighbourhood:
     """Triangulates what the references match among themselves; possibly nothing."""
+    if len(references) < 2:
+        nothing = np.empty(0, np.intp)
+        structure = Structure(np.empty((0, 3)), Tracks(nothing, nothing, nothing), options.first_noise)
+        return Neighbourhood(tuple(references), structure, np.empty((0, 3, 3)))
     matches = {}
     for i, j in combinations(range(len(references)), 2):
         first, second = references[i], references[j]
@@ -91,6 +95,8 @@ def build_neighbourhood(
 
 def sight(subject: PosedView, neighbourhood: Neighbourhood, pairs: PairMatches) -> Sighting:
     """The neighbourhood's points that the subject's photograph shows, by descriptors alone."""
+    if not len(neighbourhood.structure.x_in_world):
+        return Sighting(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0))
     matches = tuple(pairs.match(subject, reference) for reference in neighbourhood.references)
     counts = [len(r.view.features) for r in neighbourhood.references]
     found = vote(neighbourhood.structure, counts, Correspondences({}, matches))

@@ -44,9 +44,9 @@ class _Numbers:
             return
         best, given = look.explanations[Freedom.BOTH], look.explanations[Freedom.NOTHING]
         self.error_px = float(np.median(np.nan_to_num(given.error_px[best.inliers], nan=1e6)))
-        if verdict is Verdict.WRONG_FOCAL:
+        if verdict is Verdict.WRONG_INTRINSICS:
             self.offset_m, self.turn_deg, self.focal_ratio = 0.0, 0.0, look.focal_ratio
-        elif verdict is Verdict.WRONG_POSE_AND_FOCAL:
+        elif verdict is Verdict.WRONG_POSE_AND_INTRINSICS:
             pose = best.world_from_camera
             self.offset_m, self.turn_deg = look.distance(pose)
             self.focal_ratio = best.camera.focal_x_px / look.subject.view.camera.focal_x_px
@@ -60,29 +60,31 @@ def _message(numbers: _Numbers, verdict: Verdict, other: str, same: bool, change
         if other:
             return f"contradicts {other}, and no other neighbours can tell which of the two is wrong"
         return f"too little in common with {numbers.neighbour_count} neighbours to judge: {seen}"
-    if verdict is Verdict.CHANGED:
+    if verdict is Verdict.SCENE_CHANGED:
         assert change is not None
         return (
-            f"does not show what its neighbours show: {change.found_count} of {change.expected_count} points that should"
-            f" be seen are found, and {100 * change.changed_share:.0f} % of the image in one piece has none"
+            f"does not show what its neighbours show: {change.found_count} of {change.expected_count} points that"
+            f" should be seen are found, and {100 * change.changed_share:.0f} % of the image in one piece has few"
         )
     pose = f"{_length(numbers.offset_m)} from and turned by {numbers.turn_deg:.2f} degrees against"
-    focal = f"{100 * ((numbers.focal_ratio or 1.0) - 1):+.1f} %"
     # What is told is what is wrong with the given value, so the inverse of what would put it right.
     given_focal = f"{100 * (1 / (numbers.focal_ratio or 1.0) - 1):+.1f} %"
-    del focal
-    if verdict is Verdict.SWAPPED:
+    if verdict is Verdict.SWAPPED_IMAGE:
         return f"the photograph fits the pose of {other}, and that one's fits here: swapped; {seen}"
     if verdict is Verdict.WRONG_POSE:
         twin = f"; the same photograph is stored as {other}" if other else ""
         return f"the given pose is {pose} the one that explains its matches; {seen}{twin}"
-    if verdict is Verdict.WRONG_FOCAL:
+    if verdict is Verdict.WRONG_INTRINSICS:
         return f"the given focal length is off by {given_focal}; the pose is right; {seen}"
-    if verdict is Verdict.WRONG_POSE_AND_FOCAL:
-        return f"the given pose is {pose} the one that explains its matches, with a focal length off by {given_focal}; {seen}"
+    if verdict is Verdict.WRONG_POSE_AND_INTRINSICS:
+        return (
+            f"the given pose is {pose} the one that explains its matches, and the given focal length is off by"
+            f" {given_focal}; {seen}"
+        )
     if verdict is Verdict.DUPLICATE:
         return f"{'the same photograph as' if same else 'the same view from the same place as'} {other}"
-    return f"consistent: {_length(numbers.offset_m)} and {numbers.turn_deg:.2f} degrees from where its neighbours see it; {seen}"
+    where = f"{_length(numbers.offset_m)} and {numbers.turn_deg:.2f} degrees from where its neighbours see it"
+    return f"consistent: {where}; {seen}"
 
 
 def _length(metres: float | None) -> str:

@@ -6,8 +6,8 @@ pose; or by another focal length; or by another of both. Each explanation is a r
     min  sum_m c^2 log(1 + |r_m|^2 / (sigma_m^2 c^2))     (Cauchy, which forgets wrong matches),
 
 over a left perturbation of camera_from_world (6), the logarithm of the focal length (1), or both. A match's sigma has
-two parts, the keypoint's own and what the point's uncertainty looks like in this image: where few references triangulate
-a point, it is uncertain along their rays.
+two parts, the keypoint's own and what the point's uncertainty looks like in this image: where few references
+triangulate a point, it is uncertain along their rays.
 """
 
 from __future__ import annotations
@@ -109,8 +109,7 @@ def explain(
 ) -> Explanation:
     """The best fit of those begun at each start; where the pose is not free, the first start is the pose."""
     candidates = [
-        _minimize(sighting, camera, start, freedom, options)
-        for start in (starts if 0 in freedom.value else starts[:1])
+        _minimize(sighting, camera, start, freedom, options) for start in (starts if 0 in freedom.value else starts[:1])
     ]
     return min(candidates, key=lambda candidate: candidate.cost)
 
@@ -159,9 +158,7 @@ def _minimize(
 
 def _moved(camera: Camera, camera_from_world: RigidTransform, step: Array) -> tuple[Camera, RigidTransform]:
     turn = rotation_from_vector(step[3:6])
-    pose = RigidTransform(
-        turn @ camera_from_world.rotation, turn @ camera_from_world.translation + step[:3]
-    )
+    pose = RigidTransform(turn @ camera_from_world.rotation, turn @ camera_from_world.translation + step[:3])
     return with_focal(camera, float(np.exp(np.clip(step[6], -0.5, 0.5)))), pose
 
 

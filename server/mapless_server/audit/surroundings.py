@@ -1,14 +1,14 @@
-"""The references around one: near by pose, or similar by looks. Poses of the whole scene fit in memory, features do not.
+"""The references around one: near by pose, or similar by looks.
 
-A reference is judged from its neighbours and, if these are in doubt, from theirs; so a scene of any size is audited
-page by page, and references are loaded as they are needed.
+Poses of the whole scene fit in memory, features do not. A reference is judged from its neighbours and, if these are in
+doubt, from theirs; so a scene of any size is audited page by page, and references are loaded as they are needed.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -40,7 +40,14 @@ class PosedName:
 
 
 class Surroundings:
-    """The references of a scene, found by pose or by looks."""
+    """The references of a scene, found by pose or by looks.
+
+    All poses that it gives and takes are in a world whose origin is the first reference's position.
+
+    Attributes:
+        poses: of all references.
+        origin: (3,) where that is in the caller's world, metres.
+    """
 
     def __init__(
         self,
@@ -57,7 +64,9 @@ class Surroundings:
             similar: how to find similar ones; None looks at the nearest by position instead.
             remembered_views: loaded references that are kept, about 1.2 MB each.
         """
-        self.poses = tuple(poses)
+        # World coordinates may be millions of metres (UTM, ECEF), too long for the digits of differences of squares.
+        self.origin: Array = poses[0].world_from_camera.translation if poses else np.zeros(3)
+        self.poses = tuple(PosedName(p.name, p.world_from_camera.shifted(-self.origin)) for p in poses)
         self._load, self._similar = load, similar
         self._remembered_views = remembered_views
         self._views: OrderedDict[str, PosedView] = OrderedDict()
@@ -72,7 +81,9 @@ class Surroundings:
         missing = [name for name in names if name not in self._views]
         found = {name: self._views[name] for name in names if name in self._views}
         if missing:
-            found |= dict(zip(missing, self._load(missing), strict=True))
+            loaded = self._load(missing)
+            shifted = [replace(v, world_from_camera=v.world_from_camera.shifted(-self.origin)) for v in loaded]
+            found |= dict(zip(missing, shifted, strict=True))
         for name in names:
             self._views[name] = found[name]
             self._views.move_to_end(name)
@@ -86,6 +97,8 @@ class Surroundings:
 
     def near_pose(self, world_from_camera: RigidTransform, count: int, but: str = "") -> list[str]:
         """Names of the references nearest to a pose by position and heading, the nearest first."""
+        if not self.poses:
+            return []
         distance, index = self._nearest(world_from_camera, 4 * count + 1)
         others = np.array([self.poses[i].name != but for i in index])
         distance, index = distance[others], index[others]
@@ -109,6 +122,8 @@ class Surroundings:
         return self.poses[self._index[name]].world_from_camera
 
     def _nearest(self, world_from_camera: RigidTransform, count: int) -> tuple[Array, NDArray[np.intp]]:
+        if not self.poses:
+            return np.empty(0), np.empty(0, np.intp)
         distance, index = self._tree.query(world_from_camera.translation, k=min(count, len(self.poses)))
         return np.atleast_1d(distance), np.atleast_1d(index)
 

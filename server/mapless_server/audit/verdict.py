@@ -9,12 +9,12 @@ from enum import Enum
 class Verdict(str, Enum):
     """What is the matter with a reference; the worst first."""
 
-    SWAPPED = "swapped"
+    SWAPPED_IMAGE = "swapped_image"
     """Its photograph was taken at another reference's pose, and that one's at its."""
     WRONG_POSE = "wrong_pose"
-    WRONG_FOCAL = "wrong_focal"
-    WRONG_POSE_AND_FOCAL = "wrong_pose_and_focal"
-    CHANGED = "changed"
+    WRONG_INTRINSICS = "wrong_intrinsics"
+    WRONG_POSE_AND_INTRINSICS = "wrong_pose_and_intrinsics"
+    SCENE_CHANGED = "scene_changed"
     """Pose and intrinsics fit, or cannot be judged, but it does not show what its neighbours show there."""
     DUPLICATE = "duplicate"
     """Nothing is wrong, but another reference is the same photograph, or the same view from the same place."""
@@ -30,11 +30,11 @@ class Verdict(str, Enum):
 
 ALARMS = frozenset(
     {
-        Verdict.SWAPPED,
+        Verdict.SWAPPED_IMAGE,
         Verdict.WRONG_POSE,
-        Verdict.WRONG_FOCAL,
-        Verdict.WRONG_POSE_AND_FOCAL,
-        Verdict.CHANGED,
+        Verdict.WRONG_INTRINSICS,
+        Verdict.WRONG_POSE_AND_INTRINSICS,
+        Verdict.SCENE_CHANGED,
     }
 )
 

@@ -65,7 +65,7 @@ def visible_points(
     x_in_camera = world_from_camera.inverse().apply(structure.x_in_world)
     pixel = camera.project(x_in_camera)
     size = np.array([camera.width_px, camera.height_px])
-    inside = ((pixel >= -0.5) & (pixel < size - 0.5)).all(axis=1)
+    inside = np.all((pixel >= -0.5) & (pixel < size - 0.5), axis=1)
 
     centres = np.stack([r.world_from_camera.translation for r in neighbourhood.references])
     focals = np.array([r.view.camera.focal_x_px for r in neighbourhood.references])
@@ -78,7 +78,7 @@ def visible_points(
     ratio = (camera.focal_x_px / np.maximum(our_distance, 1e-12)) / (focals[view] / their_distance)
     scale = np.maximum(ratio, 1 / np.maximum(ratio, 1e-12))
 
-    alike = inside[point] & (turn_deg < options.max_turn_deg) & (scale < options.max_scale)
+    alike: NDArray[np.bool_] = inside[point] & (turn_deg < options.max_turn_deg) & (scale < options.max_scale)
     rows = np.flatnonzero(alike)
     # Of a point's observations the one that is most alike, each step in scale worth its share of the angle.
     unlikeness = turn_deg[rows] / options.max_turn_deg + np.log(scale[rows]) / np.log(options.max_scale)

@@ -93,13 +93,15 @@ def evaluate_command(
 
     try:
         if _is_own_folder(folder, layout) and protocol is None and output is None:
-            _refuse("are for --protocol or --output", sparse=sparse, pairs=pairs, max_queries=max_queries)
+            benchmarks = {"sparse": sparse, "max_queries": max_queries, "pairs": pairs, "ground_truth": ground_truth}
+            _refuse("with --protocol or --output", **benchmarks, partial=partial)
             from .command import evaluate_folder
 
             options: dict[str, Any] = {"reference_count": references, "query_count": queries, "k": k}
             evaluate_folder(folder, json, **options, variant=variants, scale_strategy=scales)
             return
-        _refuse("are for a folder with cameras.json", references=references, queries=queries, json=json)
+        own = {"references": references, "queries": queries, "json": json}
+        _refuse("for a folder with cameras.json, and without --protocol or --output", **own)
         from .paper_command import evaluate_benchmarks
         from .protocol import PROTOCOLS, SCALES, VARIANTS
 
@@ -124,7 +126,7 @@ def evaluate_command(
     except UsageError as error:
         print(f"mapless-server: {error}", file=sys.stderr)
         raise typer.Exit(2) from None
-    except (ServerFailed, MaplessError) as error:
+    except (ServerFailed, MaplessError, OSError) as error:
         print(f"mapless-server: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     raise typer.Exit(0 if complete else 1)
@@ -134,13 +136,13 @@ def _is_own_folder(folder: Path, layout: str) -> bool:
     return layout in ("auto", "cameras") and (folder / "cameras.json").is_file()
 
 
-def _refuse(why: str, **flags: object) -> None:
+def _refuse(only: str, **flags: object) -> None:
     """Raises UsageError if a flag is given that has no effect here."""
     from .plan import UsageError
 
-    given = [f"--{name.replace('_', '-')}" for name, value in flags.items() if value is not None]
+    given = [f"--{name.replace('_', '-')}" for name, value in flags.items() if value not in (None, False)]
     if given:
-        raise UsageError(f"{', '.join(given)}: these {why}" if len(given) > 1 else f"{given[0]}: flags like it {why}")
+        raise UsageError(f"{', '.join(given)}: only {only}")
 
 
 def _words(text: str, known: tuple[str, ...]) -> tuple[str, ...]:

@@ -88,7 +88,7 @@ def _ground_truths(scenes: Iterable[SceneWork]) -> list[str]:
     by_truth: dict[tuple[str, str], list[str]] = {}
     for scene in scenes:
         benchmark = scene.place.benchmark
-        truth = scene.dataset.ground_truth or "not named by its files"
+        truth = scene.dataset.ground_truth or scene.dataset.source or "not named by its files"
         by_truth.setdefault((truth, benchmark.ground_truth if benchmark else ""), []).append(scene.place.name)
     return [
         f"{', '.join(names)}: {truth}" + (f" (the paper's figures: {papers})" if papers else "")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from pathlib import Path
 
 from ..dataset import Dataset, Frame
@@ -60,14 +60,13 @@ def read_pairs(file: Path, dataset: Dataset, folder: Path) -> Pairs:
     return {query: tuple(references) for query, references in pairs.items()}
 
 
-def chosen(pairs: Pairs, query: Frame, references: tuple[Frame, ...], k: int) -> tuple[Frame, ...]:
-    """The first k of a query's pairs that are references of the setting.
+def chosen(pairs: Pairs, query: Frame, references: Set[str], k: int) -> tuple[Frame, ...]:
+    """The first k of a query's pairs that are among the references of the setting, which are named.
 
     Raises:
         UsageError: there are none.
     """
-    known = {frame.name for frame in references}
-    its = tuple(frame for frame in pairs.get(query.name, ()) if frame.name in known)[:k]
+    its = tuple(frame for frame in pairs.get(query.name, ()) if frame.name in references)[:k]
     if not its:
         raise UsageError(f"the pairs file names no reference of the query {query.name} among those of the setting")
     return its

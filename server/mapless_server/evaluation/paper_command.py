@@ -7,9 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table as RichTable
-
 from ..dataset import Dataset
 from ..formats import ReadOptions, read_dataset
 from ..serve import image_limits
@@ -27,7 +24,7 @@ from .protocol import SuiteOptions, split_scene
 from .provenance import provenance_of
 from .run import first_features
 from .suite import Apparatus, Run, SceneWork, Suite, measure
-from .tables import OURS, tables_of
+from .tables import tables_of, text_lines
 
 PAGE_FILE = "report.html"
 RUNS_FOLDER = "runs"
@@ -81,7 +78,7 @@ def evaluate_benchmarks(
             progress("pictures", done, len(runs))
             shown += worst_of(run, worst, extractor, ratio, image_limits(settings))
     (output / PAGE_FILE).write_text(page(suite, shown), encoding="utf-8")
-    _print(suite, Console())
+    _print(suite)
     print(f"{output / PAGE_FILE}, with evaluation.json, evaluation.csv and queries.csv beside it")
     return not suite.failures
 
@@ -121,8 +118,9 @@ def _scenes(
         if pairs is not None:
             its = read_pairs(pairs_file(pairs, place.name, len(places)), dataset, place.path)
             for split in splits:
+                known = {frame.name for frame in split.references}
                 for query in split.queries:
-                    chosen(its, query, split.references, options.k)
+                    chosen(its, query, known, options.k)
         scenes.append(SceneWork(place, dataset, splits, its))
     return scenes
 
@@ -149,16 +147,12 @@ def _shown_runs(suite: Suite) -> list[Run]:
     return shown
 
 
-def _print(suite: Suite, console: Console) -> None:
+def _print(suite: Suite) -> None:
     for group in groups_of(suite):
         for table in (table for table in tables_of(group) if not table.wide):
-            printed = RichTable(*table.head, title=f"{group.title}. {table.title}", title_justify="left")
-            for row in table.rows:
-                printed.add_row(*row.cells, style="bold" if row.whose == OURS else "")
-            console.print(printed, highlight=False, markup=False)
-            for note in table.notes:
-                console.print(note, highlight=False, markup=False)
+            print(f"\n{group.title}. {table.title}")
+            print("\n".join((*text_lines(table), *table.notes)))
+    print()
     for name, value in told(suite).items():
-        console.print(f"{name}: {value}", highlight=False, markup=False)
-    for line in problems(suite):
-        console.print(line, highlight=False, markup=False)
+        print(f"{name}: {value}")
+    print("\n".join(problems(suite)))

@@ -148,7 +148,7 @@ def split_scene(dataset: Dataset, setting: int, options: SuiteOptions) -> SceneS
     if setting != DENSE and not train and not test and dataset.format == "cameras":
         split = split_frames(len(dataset.frames), EvaluationOptions(setting, options.max_queries))
         references, queries = ([dataset.frames[i] for i in part] for part in (split.references, split.queries))
-        return SceneSplit(setting, tuple(references), tuple(queries), len(queries))
+        return SceneSplit(setting, tuple(references), tuple(queries), len(dataset.frames) - len(references))
     for name, frames in (("train", train), ("test", test)):
         if not frames:
             raise UsageError(f"{dataset.name} has no frame of the {name} split: is its file of the split there?")

@@ -153,26 +153,25 @@ class _WaitingRun:
 
 def _waiting_runs(scene: SceneWork, apparatus: Apparatus) -> list[_WaitingRun]:
     runs = []
+    queries = _digest(_told(frame) for frame in scene.dataset.frames if frame.split != "train")
     for split in scene.splits:
+        references = _digest(map(_told, split.references))
         for method in apparatus.options.methods():
             name = ".".join((scene.place.name.replace("/", "_"), setting_name(split.setting), *asdict(method).values()))
-            journal = Journal(apparatus.journals, name, _identity(scene, split, method, apparatus))
+            data = {"scene": scene.place.name, "references": references, "queries": queries, **asdict(method)}
+            journal = Journal(apparatus.journals, name, {**data, **_identity(scene, apparatus)})
             runs.append(_WaitingRun(scene, split, method, journal))
     return runs
 
 
-def _identity(scene: SceneWork, split: SceneSplit, method: Method, apparatus: Apparatus) -> Identity:
-    """What a run's results depend on. The queries are not in it: more of them go on where fewer ended."""
+def _identity(scene: SceneWork, apparatus: Apparatus) -> Identity:
+    """What a scene's results depend on beside the data; how many queries is no part: more go on where fewer ended."""
     made, options = apparatus.provenance, apparatus.options
     pairs = None
     if scene.pairs is not None:
         pairs = _digest(f"{query} {frame.name}" for query, its in sorted(scene.pairs.items()) for frame in its)
     return {
-        "scene": scene.place.name,
         "ground_truth": scene.dataset.ground_truth,
-        "references": _digest(map(_told, split.references)),
-        "frames": _digest(map(_told, (f for f in scene.dataset.frames if f.split != "train"))),
-        **asdict(method),
         "k": options.k,
         "choice": "pairs" if pairs else options.choice,
         "pairs": pairs,
@@ -232,7 +231,8 @@ def _with_references(
     options = apparatus.options
     if scene.pairs is not None:
         pairs = scene.pairs
-        return tuple(PlannedQuery(query, chosen(pairs, query, split.references, options.k)) for query in split.queries)
+        known = {frame.name for frame in split.references}
+        return tuple(PlannedQuery(query, chosen(pairs, query, known, options.k)) for query in split.queries)
     if options.choice == "matches":
         extractor, ratio = first_features(apparatus.settings)
         limits = image_limits(apparatus.settings)

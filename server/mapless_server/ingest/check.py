@@ -6,7 +6,7 @@ photographs that are near in the folder's order are compared as well.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -16,20 +16,23 @@ from ..errors import InvalidArgument
 from ..method.epipolar import consistent_matches
 from ..method.features import FeatureExtractor, SiftExtractor
 from ..method.views import PosedView
+from ..progress import ProgressFunction
 from ..settings import available_cores
+from .pair_errors import MatchedPair
 from .pairs import Pair, more_pairs, pairs_by_order, pairs_by_pose
-from .verdict import MatchedPair, Verdict, judge
+from .verdict import Verdict, judge
 
 MAX_ACCUSED = 12
 """Photographs of bad pairs that are compared with more neighbours, to tell which of the two it is."""
 
 MORE_PAIRS = 3
 
-Progress = Callable[[str, int, int], None]
+LIMITS = ImageLimits(max_bytes=2**28, max_pixels=200_000_000)
+"""Of photographs that are looked at here; what a server accepts is the server's business."""
 
 
 def check_frames(
-    frames: Sequence[Frame], limits: ImageLimits, progress: Progress, extractor: FeatureExtractor | None = None
+    frames: Sequence[Frame], progress: ProgressFunction, extractor: FeatureExtractor | None = None
 ) -> Verdict:
     """The verdict on frames; pairs and suspects are indices among them.
 
@@ -37,14 +40,13 @@ def check_frames(
 
     Args:
         frames: with the poses to check.
-        limits: of images that are decoded.
         progress: told how far it is.
         extractor: SIFT if none.
     """
     poses = [frame.world_from_camera for frame in frames]
     if len(frames) < 2:
         return judge({}, [])
-    work = _Comparison(frames, limits, extractor or SiftExtractor(), progress)
+    work = _Comparison(frames, extractor or SiftExtractor(), progress)
     work.compare(pairs_by_pose(poses))
     verdict = work.verdict()
     if verdict.is_wrong or len(verdict.pairs) <= verdict.unmatched_count:
@@ -61,9 +63,8 @@ class _Comparison:
     """Pairs compared so far, and the views that it took."""
 
     frames: Sequence[Frame]
-    limits: ImageLimits
     extractor: FeatureExtractor
-    progress: Progress
+    progress: ProgressFunction
     views: dict[int, PosedView | None] = field(default_factory=dict)
     matched: list[MatchedPair] = field(default_factory=list)
     pairs: list[Pair] = field(default_factory=list)
@@ -88,7 +89,7 @@ class _Comparison:
     def _view(self, index: int) -> PosedView | None:
         frame = self.frames[index]
         try:
-            image = decode_image(frame.image_path.read_bytes(), self.limits)
+            image = decode_image(frame.image_path.read_bytes(), LIMITS)
         except (OSError, InvalidArgument):
             return None
         if image.shape[:2] != (frame.camera.height_px, frame.camera.width_px):

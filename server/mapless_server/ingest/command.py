@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_format
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -64,7 +63,7 @@ def import_command(
     from ..settings import ConfigError, load_settings
     from .connection import Connection
     from .importing import ImportOptions
-    from .upload import UploadOptions
+    from .waiting import UploadOptions
 
     try:
         options = ImportOptions(
@@ -100,7 +99,7 @@ def export_command(
     from mapless import MaplessError
 
     from ..child import ServerFailed
-    from ..evaluation.command import progress_bars
+    from ..progress import progress_bars
     from ..settings import ConfigError, load_settings
     from ..signals import terminable
     from .connection import Connection, connected
@@ -130,10 +129,11 @@ def _run_import(
     """An import, without a connection a dry one; raises typer.Exit."""
     from mapless.names import check_id
 
-    from ..evaluation.command import check_writable, progress_bars
-    from ..serve import image_limits
+    from ..output_files import check_writable
+    from ..progress import progress_bars
     from ..signals import terminable
-    from .importing import check_poses, read_frames
+    from .check import check_frames
+    from .importing import read_frames
     from .report import ImportReport, verdict_lines
 
     try:
@@ -150,10 +150,9 @@ def _run_import(
     with terminable(), _reported(report, report_file):
         if options.check:
             with progress_bars() as progress:
-                check_poses(frames, report, image_limits(settings), progress)
-            if report.verdict is not None:
-                for line in verdict_lines(report.verdict, frames):
-                    _say(line)
+                report.verdict = check_frames(frames, progress)
+            for line in verdict_lines(report.verdict, frames):
+                _say(line)
         if connection is not None:
             _store(report, options, settings, connection)
     raise typer.Exit(0 if report.went_well else 1)
@@ -163,7 +162,7 @@ def _store(report: ImportReport, options: ImportOptions, settings: Settings, con
     from mapless import MaplessError
 
     from ..child import ServerFailed
-    from ..evaluation.command import progress_bars
+    from ..progress import progress_bars
     from .connection import connected
     from .importing import store_frames
 
@@ -181,6 +180,7 @@ def _reported(report: ImportReport, file: Path | None) -> Iterator[None]:
     """Whatever way the block is left, the report is printed and written."""
     from rich.console import Console
 
+    from ..output_files import write_json
     from .report import print_report, to_json
 
     try:
@@ -191,8 +191,7 @@ def _reported(report: ImportReport, file: Path | None) -> Iterator[None]:
     finally:
         print_report(report, Console(soft_wrap=True))
         if file is not None:
-            text = json_format.dumps(to_json(report), indent=1, ensure_ascii=False, allow_nan=False)
-            file.write_text(text + "\n", encoding="utf-8")
+            write_json(file, to_json(report))
 
 
 def _intrinsics(text: str) -> Intrinsics | None:

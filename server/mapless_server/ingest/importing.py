@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -10,14 +9,12 @@ from mapless import AlreadyExists, Client, Reference
 from mapless.names import check_id
 
 from ..dataset import MAX_NAME_LENGTH, Dataset, Frame
-from ..decode import ImageLimits
 from ..formats import ReadOptions, read_dataset
-from .check import check_frames
+from ..progress import ProgressFunction
 from .existing import KnownReferences
 from .report import ImportReport
-from .upload import Uploader, UploadOptions
-
-Progress = Callable[[str, int, int], None]
+from .upload import Uploader
+from .waiting import UploadOptions
 
 
 @dataclass(frozen=True)
@@ -73,12 +70,7 @@ def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Fr
     return dataset, tuple(_prefixed(frame, options.id_prefix) for frame in frames)
 
 
-def check_poses(frames: Sequence[Frame], report: ImportReport, limits: ImageLimits, progress: Progress) -> None:
-    """Compares photographs with the poses and tells the report."""
-    report.verdict = check_frames(frames, limits, progress)
-
-
-def store_frames(client: Client, report: ImportReport, options: UploadOptions, progress: Progress) -> None:
+def store_frames(client: Client, report: ImportReport, options: UploadOptions, progress: ProgressFunction) -> None:
     """Stores the report's chosen frames in its scene, which is made if there is none.
 
     Raises:

@@ -95,8 +95,8 @@ def print_report(report: ImportReport, console: Console) -> None:
     """The report, at most SHOWN reasons of a kind."""
     _print_reasons("refused", report.refused, console)
     if report.is_dry:
-        counts = f"{len(report.chosen)} references could be imported, {len(report.refused)} are refused"
-        console.print(counts, markup=False, highlight=False)
+        summary = f"{len(report.chosen)} references could be imported, {len(report.refused)} are refused"
+        console.print(summary, markup=False, highlight=False)
         return
     _print_reasons("skipped as duplicates", [it for it in report.skipped if it.reason != ALREADY_THERE], console)
     rate = f" ({len(report.added) / report.seconds:.1f} a second)" if report.added and report.seconds > 0 else ""

@@ -7,13 +7,11 @@ stored all the same, so an id that is taken is looked at before it is called a d
 
 from __future__ import annotations
 
-import hashlib
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 from mapless import (
     AlreadyExists,
@@ -22,59 +20,21 @@ from mapless import (
     Internal,
     InvalidArgument,
     MaplessError,
-    NewReference,
     NotFound,
     ResourceExhausted,
     Unavailable,
 )
 
 from ..dataset import Frame, Refusal
-from ..decode import image_size
-from ..errors import InvalidArgument as BadImage
-from ..formats.collecting import ANY_SIZE
+from ..progress import ProgressFunction
 from .existing import KnownReferences, Stored, difference, stored_of
+from .items import Item, batches_of, read_item
 from .report import ALREADY_THERE, ImportReport
-
-BATCH_COUNT = 8
-"""References a message: progress shows, and little is sent again when one is refused."""
-
-BATCH_BYTES = 6 * 2**20
-"""Of images a message; large ones take the server long to receive, which its other callers feel."""
+from .waiting import UploadOptions, Waiting
 
 STORE_FULL = "STORE_FULL"
 
 _REQUEST = re.compile(r"requests\[(\d+)\]")
-
-
-@dataclass(frozen=True)
-class UploadOptions:
-    """Options of storing.
-
-    Attributes:
-        parallel: messages in flight. The server describes their photographs side by side; more only wait.
-        busy_patience_s: how long a server may say that it is too busy before the import gives up.
-        away_patience_s: how long it may be unreachable; a restart takes seconds.
-    """
-
-    parallel: int = 3
-    busy_patience_s: float = 600.0
-    away_patience_s: float = 60.0
-
-    def __post_init__(self) -> None:
-        if not (1 <= self.parallel <= 64 and self.busy_patience_s > 0 and self.away_patience_s > 0):
-            raise ValueError("parallel must be 1 to 64 and times above 0")
-
-
-@dataclass(frozen=True, eq=False)
-class _Item:
-    """A frame that is ready to be sent."""
-
-    frame: Frame
-    image: bytes
-    stored: Stored
-
-    def reference(self) -> NewReference:
-        return NewReference(self.frame.name, self.image, self.frame.camera, self.frame.world_from_camera)
 
 
 class _Stopped(Exception):
@@ -90,7 +50,7 @@ class Uploader:
         known: KnownReferences,
         report: ImportReport,
         options: UploadOptions,
-        progress: Callable[[str, int, int], None],
+        progress: ProgressFunction,
     ) -> None:
         self._client = client
         self._known = known
@@ -103,7 +63,7 @@ class Uploader:
 
     def run(self) -> None:
         """Stores the report's chosen frames. An interruption stops it soon, and goes through."""
-        batches = _batches(self._report.chosen)
+        batches = batches_of(self._report.chosen)
         total = len(self._report.chosen)
         self._progress("storing references", 0, total)
         start_s = time.monotonic()
@@ -138,10 +98,10 @@ class Uploader:
             self._stop.set()
             raise
 
-    def _load(self, frame: Frame) -> _Item | None:
+    def _load(self, frame: Frame) -> Item | None:
         """The frame with its image's bytes; None if it is not to be sent, which the report then says."""
         try:
-            item = _read(frame)
+            item = read_item(frame)
         except ValueError as error:
             self._refuse(frame, str(error))
             return None
@@ -151,9 +111,9 @@ class Uploader:
         self._duplicate(frame, there, item.stored)
         return None
 
-    def _send(self, items: Sequence[_Item]) -> None:
+    def _send(self, items: Sequence[Item]) -> None:
         """Stores items, in one message if it is taken."""
-        waiting = _Waiting(self._options, self._stop)
+        waiting = Waiting(self._options, self._stop)
         left = list(items)
         while left:
             if self._stop.is_set():
@@ -183,7 +143,7 @@ class Uploader:
                 self._add(left)
                 return
 
-    def _reconcile(self, items: Sequence[_Item], waiting: _Waiting, error: AlreadyExists) -> list[_Item]:
+    def _reconcile(self, items: Sequence[Item], waiting: Waiting, error: AlreadyExists) -> list[Item]:
         """Items that are not there yet, after an id was taken."""
         left = []
         for item in items:
@@ -204,14 +164,14 @@ class Uploader:
             self._end(str(error))
         return left
 
-    def _without_guilty(self, items: Sequence[_Item], error: InvalidArgument) -> list[_Item]:
+    def _without_guilty(self, items: Sequence[Item], error: InvalidArgument) -> list[Item]:
         """Items without the one that the server names; those it does not name it are sent one by one."""
         named = _REQUEST.match(error.field or "")
         if named and int(named[1]) < len(items):
             return self._without(items, int(named[1]), error)
         return self._halves(items, error)
 
-    def _halves(self, items: Sequence[_Item], error: MaplessError) -> list[_Item]:
+    def _halves(self, items: Sequence[Item], error: MaplessError) -> list[Item]:
         """Nothing: what was refused together is sent in parts, and what is refused alone is refused."""
         if len(items) == 1:
             return self._without(items, 0, error)
@@ -220,7 +180,7 @@ class Uploader:
         self._send(items[middle:])
         return []
 
-    def _without(self, items: Sequence[_Item], index: int, error: MaplessError) -> list[_Item]:
+    def _without(self, items: Sequence[Item], index: int, error: MaplessError) -> list[Item]:
         field = _REQUEST.sub("", error.field or "").lstrip(".")
         request = f" (request {error.request_id})" if isinstance(error, Internal) else ""
         self._refuse(items[index].frame, f"{f'{field}: ' if field else ''}{error.message}{request}")
@@ -240,7 +200,7 @@ class Uploader:
         with self._lock:
             self._report.refused.append(Refusal(frame.name, reason))
 
-    def _add(self, items: Sequence[_Item]) -> None:
+    def _add(self, items: Sequence[Item]) -> None:
         with self._lock:
             self._report.added += [item.frame.name for item in items]
 
@@ -251,64 +211,3 @@ class Uploader:
                 self._report.stopped = reason
             self._stop.set()
         raise _Stopped
-
-
-def _read(frame: Frame) -> _Item:
-    """A frame with its image's bytes; ValueError if they cannot be what its camera took."""
-    file, camera = frame.image_path, frame.camera
-    try:
-        image = file.read_bytes()
-        width, height = image_size(image, ANY_SIZE)
-    except OSError as error:
-        raise ValueError(f"{file} cannot be read: {error.strerror}") from error
-    except BadImage as error:
-        raise ValueError(f"{file}: {error}") from error
-    if (width, height) != (camera.width_px, camera.height_px):
-        raise ValueError(f"{file} has {width}x{height} pixels, its camera {camera.width_px}x{camera.height_px}")
-    stored = Stored(frame.name, hashlib.sha256(image).hexdigest(), camera, frame.world_from_camera)
-    return _Item(frame, image, stored)
-
-
-class _Waiting:
-    """Waiting for the server on behalf of one message."""
-
-    def __init__(self, options: UploadOptions, stop: threading.Event) -> None:
-        self.lost_an_answer = False
-        self._options = options
-        self._stop = stop
-        self._start_s = time.monotonic()
-        self._away_s = 0.0
-
-    def for_busy(self, retry_after_s: float) -> bool:
-        """Waits as the server asks; False when that has been going on for too long."""
-        if time.monotonic() - self._start_s > self._options.busy_patience_s:
-            return False
-        self._stop.wait(min(max(retry_after_s, 0.05), 30.0))
-        return True
-
-    def for_return(self) -> bool:
-        """Waits a little longer each time; False when it has been long enough."""
-        if self._away_s >= self._options.away_patience_s:
-            return False
-        pause_s = min(max(0.5, self._away_s / 2), 5.0)
-        self._stop.wait(pause_s)
-        self._away_s += pause_s
-        return True
-
-
-def _batches(frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
-    """Frames in their order, as many together as one message shall have; their files are not read."""
-    batch: list[Frame] = []
-    batch_bytes = 0
-    for frame in frames:
-        try:
-            size_bytes = frame.image_path.stat().st_size
-        except OSError:  # whoever reads it says so
-            size_bytes = 0
-        if batch and (len(batch) == BATCH_COUNT or batch_bytes + size_bytes > BATCH_BYTES):
-            yield batch
-            batch, batch_bytes = [], 0
-        batch.append(frame)
-        batch_bytes += size_bytes
-    if batch:
-        yield batch

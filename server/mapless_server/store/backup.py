@@ -43,7 +43,7 @@ GENERATIONS_SKIPPED = 1_000_000
 
 _BYTES_AT_A_TIME = 8 * 2**20
 _ROWS_AT_A_TIME = 1000
-_PAGES_AT_A_TIME = 1000
+_PAGES_AT_A_TIME = 250
 _NOT_RESTORED = (store_version, alembic_version, scene_generation, removed_reference)
 """What the store has of its own, and tombstones, of which nobody asks who reads the scene as a whole."""
 
@@ -63,10 +63,12 @@ def back_up(database: Database, path: Path, on_progress: Progress = ignore_progr
         with _faults_said(f"backup {path} cannot be made"):
             with database.read() as source:
                 database.take_your_time(source)
+                version = read_version(source)  # from here on, the transaction sees one moment
+                assert version is not None
                 if source.dialect.name == "sqlite":
                     _copy_pages(source, unfinished, on_progress)
                 else:
-                    _copy_rows_to_file(source, unfinished, on_progress)
+                    _copy_rows_to_file(source, version, unfinished, on_progress)
                 found = _verify_copy(source, unfinished, on_progress)
             _sync(unfinished)
             unfinished.rename(path)
@@ -116,9 +118,7 @@ def _copy_pages(source: Connection, path: Path, on_progress: Progress) -> None:
         target.execute("PRAGMA journal_mode=DELETE")  # one file, which can be read where nothing can be written
 
 
-def _copy_rows_to_file(source: Connection, path: Path, on_progress: Progress) -> None:
-    version = read_version(source)
-    assert version is not None
+def _copy_rows_to_file(source: Connection, version: int, path: Path, on_progress: Progress) -> None:
     with closing(SqliteDatabase.open_scratch(path, version)) as database, database.write() as target:
         _copy_rows(source, target, _tables_of(target, (store_version, alembic_version)), on_progress)
 

@@ -11,9 +11,8 @@ from sqlalchemy import Connection
 from mapless_server.store.cache import LruCache
 from mapless_server.store.database import Database
 from mapless_server.store.observed import StoreObserver, Unobserved
-from mapless_server.store.records import DescribedReference, ReferencePose
+from mapless_server.store.records import DescribedReference
 
-POSE_CACHE_BYTES = 32 * 2**20
 NAME_CACHE_BYTES = 16 * 2**20
 
 
@@ -40,8 +39,6 @@ class BaseStore:
         self.observer: StoreObserver = Unobserved()
         # By (key, extractor): references never change and keys are never reused, so no entry is ever stale.
         self._described = described
-        # By (scene_key, generation), which are never reused either.
-        self._poses: LruCache[tuple[ReferencePose, ...]] = LruCache(POSE_CACHE_BYTES)
         # What names meant, by scene and names. Where this process alone writes, it holds as long as nothing was written
         # since, and the database is not asked at all; where others write, as long as the generation is the same.
         self._resolved: LruCache[Resolved] = LruCache(NAME_CACHE_BYTES)

@@ -102,7 +102,7 @@ def _settings(config: Path | None, data_dir: Path | None) -> tuple[str | None, P
     from ..settings import load_settings
 
     settings = load_settings({"data_dir": data_dir}, config).settings
-    url = None if data_dir else getattr(settings, "database_url", None)
+    url = None if data_dir else settings.database_url
     return url.get_secret_value() if url else None, settings.data_dir
 
 
@@ -139,9 +139,7 @@ def _progress() -> Iterator[Progress]:
 
 
 def _report(found: Verification, verdict: str) -> None:
-    contents = ", ".join(
-        f"{count} {name.replace('_', ' ')}s".replace("ss", "s") for name, count in found.counts.items()
-    )
+    contents = ", ".join(f"{name.replace('_', ' ')}: {count}" for name, count in found.counts.items())
     print(f"schema version {found.version}; {contents}")
     for fault in found.faults[:FAULTS_SHOWN]:
         print(f"damaged: {fault}")

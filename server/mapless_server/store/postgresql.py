@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy import URL, Connection, Engine, create_engine, make_url
+from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
@@ -163,19 +163,26 @@ def _create_engine(url: URL, cursors_are_binary: bool = True) -> Engine:
     except ImportError:
         raise StoreError("PostgreSQL needs psycopg: pip install 'mapless[postgres]'") from None
 
-    def binary_cursor(*args: Any, **kwargs: Any) -> psycopg.Cursor[Any]:
-        # As text, bytes would come as hexadecimal digits: twice as many, and to be read one by one.
-        cursor: psycopg.Cursor[Any] = psycopg.Cursor(*args, **kwargs)
-        cursor.format = Format.BINARY if cursors_are_binary else Format.TEXT
-        return cursor
+    # As text, bytes would come as hexadecimal digits: twice as many, and to be read one by one.
+    wire_format = Format.BINARY if cursors_are_binary else Format.TEXT
+
+    def cursor(*args: Any, **kwargs: Any) -> psycopg.Cursor[Any]:
+        made: psycopg.Cursor[Any] = psycopg.Cursor(*args, **kwargs)
+        made.format = wire_format
+        return made
+
+    def server_cursor(*args: Any, **kwargs: Any) -> psycopg.ServerCursor[Any]:
+        made: psycopg.ServerCursor[Any] = psycopg.ServerCursor(*args, **kwargs)
+        made.format = wire_format
+        return made
 
     options = {name: value for name, value in _CONNECT_OPTIONS.items() if name not in url.query}
     session = [f"-c {name}={value}" for name, value in _SESSION_OPTIONS.items()]
     given = url.query.get("options", ())
     options["options"] = " ".join([*session, *([given] if isinstance(given, str) else given)])
-    return create_engine(
+    engine = create_engine(
         url.difference_update_query(["options"]),
-        connect_args=options | {"cursor_factory": binary_cursor},
+        connect_args=options | {"cursor_factory": cursor},
         pool_size=CONNECTIONS_KEPT,
         max_overflow=CONNECTIONS_AT_MOST - CONNECTIONS_KEPT,
         pool_timeout=CONNECTION_WAIT_S,
@@ -183,6 +190,12 @@ def _create_engine(url: URL, cursors_are_binary: bool = True) -> Engine:
         isolation_level="READ COMMITTED",
         hide_parameters=True,  # an error's text must not carry image bytes into the log
     )
+
+    @event.listens_for(engine, "connect")
+    def set_connection(connection: Any, _record: object) -> None:
+        connection.server_cursor_factory = server_cursor
+
+    return engine
 
 
 @contextmanager

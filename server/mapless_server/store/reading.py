@@ -12,7 +12,6 @@ from mapless_server.store.changes import read_changes
 from mapless_server.store.observed import observed
 from mapless_server.store.records import (
     DescribedReference,
-    ReferencePose,
     ReferenceRecord,
     SceneChanges,
     SceneRecord,
@@ -22,8 +21,8 @@ from mapless_server.tenancy import SceneKey
 
 NAME_BYTES = 300
 """About the size of a reference's id and key in memory."""
-POSE_BYTES = 700
-"""About the size of a ReferencePose in memory, arrays and strings included."""
+RECORD_BYTES = 700
+"""About the size of a ReferenceRecord in memory, arrays and strings included."""
 
 
 class ReadingStore(BaseStore):
@@ -105,27 +104,6 @@ class ReadingStore(BaseStore):
         return [rows.reference_record(row) for row in found]
 
     @observed
-    def list_poses(self, scene_key: SceneKey) -> tuple[int, tuple[ReferencePose, ...]]:
-        """The scene's generation and the poses of all its references, by id; from memory when nothing has changed.
-
-        Raises:
-            NotFound: there is no such scene.
-            DataLoss: camera and pose of a reference are damaged.
-        """
-        column = tables.reference.c
-        with self._database.read() as connection:
-            generation = queries.read_generation(connection, scene_key)
-            poses = self._poses.get((scene_key, generation))
-            if poses is not None:
-                return generation, poses
-            statement = select(tables.reference).where(column.scene_id == scene_key).order_by(column.reference_id)
-            found = connection.execute(statement).all()
-        records = [rows.reference_record(row) for row in found]
-        poses = tuple(ReferencePose(it.reference_id, it.key, it.world_from_camera) for it in records)
-        self._poses.put((scene_key, generation), poses, POSE_BYTES * len(poses))
-        return generation, poses
-
-    @observed
     def load_references(
         self, scene_key: SceneKey, reference_ids: Sequence[str] | None, extractor: str
     ) -> SceneSnapshot:
@@ -175,7 +153,7 @@ class ReadingStore(BaseStore):
             self._resolved.put((scene_key, names), Resolved(state, generation, tuple(wanted)), size_bytes)
         for key, row in found.items():
             described[key] = rows.described_reference(row)
-            self._described.put((key, extractor), described[key], len(row.data) + POSE_BYTES)
+            self._described.put((key, extractor), described[key], len(row.data) + RECORD_BYTES)
         return SceneSnapshot(
             generation,
             tuple(described[key] for key in wanted if key in described),

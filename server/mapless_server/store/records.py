@@ -92,15 +92,6 @@ class ReferenceRecord:
 
 
 @dataclass(frozen=True, eq=False)
-class ReferencePose:
-    """Where a reference stands; enough to choose among references without loading their features."""
-
-    reference_id: str
-    key: str
-    world_from_camera: RigidTransform
-
-
-@dataclass(frozen=True, eq=False)
 class DescribedReference:
     """A stored reference and what one extractor found in its image; read-only arrays."""
 

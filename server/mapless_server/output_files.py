@@ -1,0 +1,20 @@
+"""Files that commands write for programs."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+
+def check_writable(file: Path) -> None:
+    """Raises ValueError if a file cannot be written: before the work, not after it. Makes nothing yet."""
+    target = file if file.exists() else file.parent
+    if file.is_dir() or not file.parent.is_dir() or not os.access(target, os.W_OK):
+        raise ValueError(f"{file} cannot be written")
+
+
+def write_json(file: Path, content: Any) -> None:
+    """Writes strict JSON; it has no infinities."""
+    file.write_text(json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")

@@ -1,0 +1,61 @@
+"""How far a command is, on standard error: a bar for a person who watches, lines for a log."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+LINES = 10
+"""Lines that a step gets where nobody watches, after that of its beginning."""
+
+ProgressFunction = Callable[[str, int, int], None]
+"""Told a step's name, how much of it is done, and how much there is."""
+
+
+@contextmanager
+def progress_bars() -> Iterator[ProgressFunction]:
+    """A bar for each step; where standard error is not a terminal, a line now and then. For one thread at a time."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines()
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def progress(step: str, done: int, total: int) -> None:
+            if step not in tasks:
+                tasks[step] = bars.add_task(step, total=total)
+            bars.update(tasks[step], completed=done, total=total)
+
+        yield progress
+
+
+def _lines() -> ProgressFunction:
+    said: dict[str, int] = {}
+
+    def progress(step: str, done: int, total: int) -> None:
+        part = done * LINES // total if total else LINES
+        if part > said.get(step, -1):
+            print(f"{step}: {f'{done} of ' if done else ''}{total}", file=sys.stderr, flush=True)
+            said[step] = part
+
+    return progress

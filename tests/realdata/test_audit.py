@@ -1,0 +1,138 @@
+"""The audit on real photographs: planted faults are named with kind and amount, and nothing else is.
+
+Each fault is planted in several references in turn. Whatever is not its victim must be found consistent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless_server.audit import (
+    CoverageVerdict,
+    PairMatches,
+    Verdict,
+    audit_references,
+    check_coverage,
+    surroundings_of,
+)
+from mapless_server.audit.resection import with_focal
+from mapless_server.audit.verdict import ReferenceAudit
+from mapless_server.dataset import Dataset, read_folder
+from mapless_server.decode import ImageLimits, decode_image
+from mapless_server.method.features import make_extractor
+from mapless_server.method.views import PosedView
+
+pytestmark = [pytest.mark.realdata, pytest.mark.timeout(300)]
+
+Photographs = Callable[[str], Dataset]
+KITCHEN = "7scenes-redkitchen-seq01-first600"
+FOUNTAIN = "fountain-P11"
+COUNTS = {KITCHEN: 30, FOUNTAIN: 11, "herz-jesus-P8": 8, "tum-fr3-office": 16, "kitti-drive-a": 26}
+PAIRS = PairMatches()
+"""Of all tests: matches depend on the photographs alone."""
+
+
+@cache
+def described(folder: Path) -> tuple[PosedView, ...]:
+    """References evenly spread over a dataset; keys and names are the photographs'."""
+    dataset = read_folder(folder)
+    chosen = np.linspace(0, len(dataset.frames) - 1, COUNTS[dataset.name]).round().astype(int)
+    extractor = make_extractor("sift")
+    views = []
+    for frame in (dataset.frames[i] for i in chosen):
+        view = extractor.extract(decode_image(frame.image_path.read_bytes(), ImageLimits()), frame.camera)
+        views.append(PosedView(f"{dataset.name}/{frame.name}", frame.name, view, frame.world_from_camera))
+    return tuple(views)
+
+
+def load(photographs: Photographs, name: str) -> list[PosedView]:
+    return list(described(photographs(name).frames[0].image_path.parents[1]))
+
+
+def audit(references: list[PosedView], indices: list[int] | None = None) -> list[ReferenceAudit]:
+    names = [references[i].name for i in indices or range(len(references))]
+    return audit_references(names, surroundings_of(references), pairs=PAIRS)
+
+
+def plant(reference: PosedView, fault: str, random: np.random.Generator) -> PosedView:
+    pose, view = reference.world_from_camera, reference.view
+    axis = random.standard_normal(3)
+    axis /= np.linalg.norm(axis)
+    if fault == "moved":
+        return replace(reference, world_from_camera=pose.shifted(0.05 * axis))
+    if fault == "moved ahead":
+        return replace(reference, world_from_camera=pose.shifted(0.05 * pose.rotation[:, 2]))
+    if fault == "turned":
+        turned = rotation_from_vector(np.radians(2) * axis) @ pose.rotation
+        return replace(reference, world_from_camera=RigidTransform(turned, pose.translation))
+    return replace(reference, view=replace(view, camera=with_focal(view.camera, {"long": 1.05, "short": 0.95}[fault])))
+
+
+def check_fault(found: ReferenceAudit, fault: str) -> None:
+    if fault.startswith("moved"):
+        assert found.verdict is Verdict.WRONG_POSE, found.message
+        assert found.position_offset_m == pytest.approx(0.05, abs=0.012)
+    elif fault == "turned":
+        assert found.verdict is Verdict.WRONG_POSE, found.message
+        assert found.rotation_offset_deg == pytest.approx(2.0, abs=0.3)
+    else:
+        assert found.verdict is Verdict.WRONG_INTRINSICS, found.message
+        assert found.focal_ratio == pytest.approx(1 / {"long": 1.05, "short": 0.95}[fault], abs=0.01)
+
+
+@pytest.mark.parametrize("scene", list(COUNTS))
+def test_nothing_is_found_where_nothing_was_planted(photographs: Photographs, scene: str) -> None:
+    audits = audit(load(photographs, scene))
+    assert [(a.reference, a.message) for a in audits if a.verdict is not Verdict.CONSISTENT] == []
+
+
+@pytest.mark.parametrize("fault", ["moved", "moved ahead", "turned", "long", "short"])
+@pytest.mark.parametrize(("scene", "victims"), [(FOUNTAIN, (0, 5, 10)), (KITCHEN, (7, 15, 23))])
+def test_a_planted_fault_is_named_and_nothing_else(
+    photographs: Photographs, scene: str, victims: tuple[int, ...], fault: str
+) -> None:
+    random = np.random.default_rng(1)
+    for victim in victims:
+        references = load(photographs, scene)
+        references[victim] = plant(references[victim], fault, random)
+        near = [i for i in range(len(references)) if abs(i - victim) <= 4]
+        audits = dict(zip(near, audit(references, near), strict=True))
+        check_fault(audits.pop(victim), fault)
+        assert [(a.reference, a.message) for a in audits.values() if a.verdict is not Verdict.CONSISTENT] == []
+
+
+@pytest.mark.parametrize(("scene", "pair"), [(FOUNTAIN, (1, 8)), (FOUNTAIN, (4, 5)), (KITCHEN, (3, 20))])
+def test_swapped_photographs_name_each_other_and_nothing_else(
+    photographs: Photographs, scene: str, pair: tuple[int, int]
+) -> None:
+    references = load(photographs, scene)
+    first, second = (references[i] for i in pair)
+    references[pair[0]] = replace(first, view=second.view, key=second.key)
+    references[pair[1]] = replace(second, view=first.view, key=first.key)
+    found = {a.reference: a for a in audit(references)}
+    assert [found[first.name].other, found[second.name].other] == [second.name, first.name]
+    assert found.pop(first.name).verdict is Verdict.SWAPPED_IMAGE
+    assert found.pop(second.name).verdict is Verdict.SWAPPED_IMAGE
+    assert [(a.reference, a.message) for a in found.values() if a.verdict is not Verdict.CONSISTENT] == []
+
+
+def test_coverage_is_foretold_where_photographs_were_taken_and_not_where_none_looks(photographs: Photographs) -> None:
+    """From every other reference, of the ones between: all of these are localized by the method."""
+    views = load(photographs, KITCHEN)
+    around = surroundings_of(views[::2])
+    verdicts = [
+        check_coverage(v.view.camera, v.world_from_camera, around, PAIRS).verdict is CoverageVerdict.LOCALIZABLE
+        for v in views[1::2]
+    ]
+    assert sum(verdicts) >= 13
+    pose, camera = views[1].world_from_camera, views[1].view.camera
+    back = RigidTransform(pose.rotation @ np.diag([-1.0, 1.0, -1.0]), pose.translation)
+    for nowhere in (back, pose.shifted([20.0, 0.0, 0.0])):
+        assert check_coverage(camera, nowhere, around, PAIRS).verdict is CoverageVerdict.NOT_LOCALIZABLE

@@ -1,0 +1,58 @@
+"""The epipolar check of imports on real photographs: good poses pass, and planted mistakes are named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapless.geometry import RigidTransform
+from mapless_server.dataset import Dataset, Frame
+from mapless_server.ingest.check import check_frames
+from mapless_server.ingest.verdict import Verdict
+
+pytestmark = pytest.mark.realdata
+
+Photographs = Callable[[str], Dataset]
+FOUNTAIN = "fountain-P11"
+KITCHEN = "7scenes-redkitchen-seq01-first600"
+
+
+def check(frames: tuple[Frame, ...]) -> Verdict:
+    return check_frames(frames, lambda *_: None)
+
+
+@pytest.mark.parametrize(
+    ("folder", "median_px"),
+    [(FOUNTAIN, 0.2), (KITCHEN, 0.5), ("tum-fr3-office", 1.2), ("kitti-drive-a", 0.5), ("reichstag-internet", 0.5)],
+)
+def test_real_poses_pass_without_a_warning(photographs: Photographs, folder: str, median_px: float) -> None:
+    verdict = check(photographs(folder).frames)
+    assert verdict.median_px < median_px
+    assert (verdict.is_wrong, verdict.suspects) == (False, ())
+    assert len(verdict.pairs) > 10
+
+
+@pytest.mark.parametrize("folder", [FOUNTAIN, "tum-fr3-office"])
+def test_opengl_axes_and_inverse_poses_are_named(photographs: Photographs, folder: str) -> None:
+    frames = photographs(folder).frames
+    flip = np.diag([1.0, -1.0, -1.0])
+    for name, fault in (
+        ("OpenGL", lambda pose: RigidTransform(pose.rotation @ flip, pose.translation)),
+        ("camera_from_world, not", RigidTransform.inverse),
+    ):
+        verdict = check(tuple(replace(f, world_from_camera=fault(f.world_from_camera)) for f in frames))
+        assert verdict.is_wrong
+        assert name in verdict.explanation
+
+
+def test_two_swapped_images_are_both_named(photographs: Photographs) -> None:
+    frames = list(photographs(FOUNTAIN).frames)
+    second, ninth = frames[1], frames[8]
+    frames[1] = replace(second, image_path=ninth.image_path)
+    frames[8] = replace(ninth, image_path=second.image_path)
+    verdict = check(tuple(frames))
+    assert not verdict.is_wrong or not verdict.explanation
+    assert {1, 8} <= set(verdict.suspects)

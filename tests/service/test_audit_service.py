@@ -1,0 +1,96 @@
+"""Through the service: planted faults are named, page by page, and coverage is foretold where references look."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from images import encode
+from servers import listening
+from wall import wall
+
+from mapless import Camera, Client, InvalidArgument, NewReference, NotFound, RigidTransform
+from mapless_server.serve import make_engine
+from mapless_server.settings import Settings
+from mapless_server.store import Store
+
+CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
+SHOTS = wall(CAMERA, 7)
+MOVED, BY_M = 3, np.array([0.06, 0.0, 0.08])
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
+    folder: Path = tmp_path_factory.mktemp("data")
+    settings = Settings(host="127.0.0.1", port=0, data_dir=folder, workers=2, metrics=False, warm_up=False)
+    with (
+        listening(settings, Store.open(folder), make_engine) as (running, _),
+        Client(running.address) as client,
+    ):
+        client.create_scene("wall")
+        for i, (pixels, pose) in enumerate(SHOTS):
+            given = RigidTransform(pose.rotation, pose.translation + BY_M) if i == MOVED else pose
+            client.add_reference("wall", NewReference(f"r{i}", encode(".png", pixels), CAMERA, given))
+        yield client
+
+
+def test_the_fault_is_named_and_nobody_else(client: Client) -> None:
+    audits = {audit.name.rpartition("/")[2]: audit for audit in client.audit_scene("wall")}
+    assert list(audits) == [f"r{i}" for i in range(len(SHOTS))]
+    assert {name: audit.verdict for name, audit in audits.items() if audit.verdict != "CONSISTENT"} == {
+        f"r{MOVED}": "WRONG_POSE"
+    }
+    found = audits[f"r{MOVED}"]
+    assert found.position_offset_m == pytest.approx(0.1, abs=0.02)
+    assert found.inlier_count <= found.match_count
+    assert "10." in found.message
+
+
+def test_pages_tell_the_same(client: Client) -> None:
+    """A verdict depends on the neighbours, not on who else is on the page."""
+    assert list(client.audit_scene("wall", page_size=3)) == list(client.audit_scene("wall"))
+
+
+def test_named_references_are_audited_in_their_order(client: Client) -> None:
+    names = ["r5", f"r{MOVED}"]
+    audits = list(client.audit_scene("wall", names))
+    assert [audit.name.rpartition("/")[2] for audit in audits] == names
+    assert [audit.verdict for audit in audits] == ["CONSISTENT", "WRONG_POSE"]
+
+
+def test_what_is_wrong_with_an_audit_is_named(client: Client) -> None:
+    with pytest.raises(NotFound) as scene:
+        list(client.audit_scene("nowhere"))
+    assert scene.value.field == "scene"
+    with pytest.raises(NotFound) as reference:
+        list(client.audit_scene("wall", ["nobody"]))
+    assert reference.value.field == "references"
+    with pytest.raises(InvalidArgument) as size:
+        list(client.audit_scene("wall", page_size=-1))
+    assert size.value.field == "page_size"
+    with pytest.raises(InvalidArgument) as twice:
+        list(client.audit_scene("wall", ["r1", "r1"]))
+    assert twice.value.field == "references[1]"
+
+
+def test_an_empty_scene_has_nothing_to_audit(client: Client) -> None:
+    client.create_scene("empty")
+    assert list(client.audit_scene("empty")) == []
+    assert client.check_coverage("empty", SHOTS[0][1], CAMERA).verdict == "NOT_LOCALIZABLE"
+    client.delete_scene("empty")
+
+
+def test_coverage_is_where_references_look_and_not_behind_them(client: Client) -> None:
+    _, between = SHOTS[4]
+    ahead = client.check_coverage("wall", between, CAMERA)
+    assert ahead.verdict == "LOCALIZABLE"
+    assert ahead.expected_match_count > 50
+    assert 0 < ahead.position_68_m < 0.1
+    assert ahead.references[0].startswith("scenes/wall/references/r")
+    behind = RigidTransform(between.rotation @ np.diag([-1.0, 1.0, -1.0]), between.translation)
+    away = client.check_coverage("wall", behind, CAMERA)
+    assert (away.verdict, away.expected_match_count, away.references) == ("NOT_LOCALIZABLE", 0, ())
+    with pytest.raises(NotFound):
+        client.check_coverage("nowhere", between, CAMERA)
