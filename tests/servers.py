@@ -75,7 +75,7 @@ class StandInDescriptor:
         rows, columns = (np.linspace(0, side, 5).astype(int)[:-1] for side in grey.shape)
         patches = np.add.reduceat(np.add.reduceat(grey, rows, axis=0), columns, axis=1).ravel()
         patches -= patches.mean()
-        return (patches / (np.linalg.norm(patches) + 1e-9)).astype(np.float32)
+        return np.asarray(patches / (np.linalg.norm(patches) + 1e-9), np.float32)
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def whole(localize: Callable[..., Answer]) -> Method:
     """A method whose work is all done in the last part, by `localize(query, references, pipeline, options, check)`."""
 
     def prepare(*arguments: Any) -> Any:
-        *asked, _ = arguments
+        *asked, _, _ = arguments  # nobody asks, and what is matched already does not matter
         return SimpleNamespace(asked=asked, bucket="stand-in")
 
     def refine(coarse: Any, check: Callable[[], None]) -> Answer:

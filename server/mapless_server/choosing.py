@@ -10,7 +10,7 @@ from .query_views import QueryViews
 from .retrieval.chosen import Choice
 from .retrieval.descriptor import GlobalDescriptor
 from .retrieval.narrowing import Narrowing
-from .retrieval.ranking import rank_references
+from .retrieval.ranking import RankOptions, rank_references
 from .scene_indexes import SceneIndexes
 from .tenancy import SceneKey, scene_id_of
 from .turns import Turn
@@ -43,6 +43,7 @@ class ReferenceChooser:
         narrowing: Narrowing,
         among: Sequence[str],
         turn: Turn,
+        options: RankOptions | None = None,
     ) -> Choice:
         """At most `count` references for a photograph.
 
@@ -53,6 +54,7 @@ class ReferenceChooser:
             narrowing: what is known of where it was taken.
             among: ids of those that come into question; empty for all.
             turn: counts the time.
+            options: of the ranking.
 
         Raises:
             NotFound: there is no such scene (field "scene") or reference (field "references[i]").
@@ -69,5 +71,5 @@ class ReferenceChooser:
         view = views.view(self._extractor, turn)
         with turn.stage("retrieval"):
             vector = self._descriptor.describe(view)
-            ranked = rank_references(entries, vector, count, narrowing, frozenset(among) if among else None)
+            ranked = rank_references(entries, vector, count, narrowing, frozenset(among) if among else None, options)
         return Choice(tuple(ranked), self._descriptor.name, entries.generation)

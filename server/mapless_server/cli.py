@@ -14,6 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from . import __version__
+from .evaluation.cli import evaluate_command
 from .ingest.command import export_command, import_command
 from .load.command import load_app
 from .security.command import token_app
@@ -36,6 +37,7 @@ app.add_typer(load_app, name="load")
 app.add_typer(store_app, name="store")
 app.command("import")(import_command)
 app.command("export")(export_command)
+app.command("evaluate")(evaluate_command)
 
 
 def _help(setting: str) -> str:
@@ -143,43 +145,6 @@ def demo_command(
     except (ServerFailed, MaplessError) as error:
         _fail(str(error), code=1)
     raise typer.Exit(0 if went_well else 1)
-
-
-@app.command("evaluate")
-def evaluate_command(
-    folder: Annotated[Path, typer.Argument(help="Folder with images/ and cameras.json.")],
-    references: Annotated[
-        int | None, typer.Option(help="References, evenly spread over the frames; default: leave one out.")
-    ] = None,
-    queries: Annotated[
-        int | None, typer.Option(help="Queries, evenly spread; default: 40, or every frame when one is left out.")
-    ] = None,
-    k: Annotated[int, typer.Option(help="References that a query is given.")] = 10,
-    variant: Annotated[str, typer.Option(help="Form of the method: coarse, no_structure, full or best.")] = "best",
-    scale: Annotated[str, typer.Option(help="Metric scale: triangulation, trajectory or two_stage.")] = "two_stage",
-    json: Annotated[Path | None, typer.Option(help="File to write the figures to, with every query.")] = None,
-) -> None:
-    """Measure accuracy and latency on photographs with known poses, through a server of its own."""
-    from mapless import MaplessError
-
-    from .child import ServerFailed
-    from .evaluation.command import evaluate_folder
-    from .evaluation.plan import UsageError
-
-    try:
-        evaluate_folder(
-            folder,
-            json,
-            reference_count=references,
-            query_count=queries,
-            k=k,
-            variant=variant,
-            scale_strategy=scale,
-        )
-    except UsageError as error:
-        _fail(str(error))
-    except (ServerFailed, MaplessError) as error:
-        _fail(str(error), code=1)
 
 
 @app.command("bench")

@@ -18,14 +18,17 @@ from .errors import NotFound, Unavailable
 from .failures import failure_of
 from .library import NotDescribedYet
 from .method import localize as method
+from .method.correspond import Matches
 from .method.features import FeatureExtractor
 from .method.localize import Answer, Coarse, Localization, Prepared
 from .method.rejection import Rejection, RejectionReason
+from .method.retrieve import spread_choice
 from .method.views import PosedView, View
 from .query import Query, Result
 from .query_views import QueryViews
 from .retrieval.chosen import Choice
 from .retrieval.narrowing import Narrowing
+from .retrieval.ranking import RankOptions
 from .scheduling.jobs import Done, Fallback, Job, Next, Over, Step, Verdict
 from .scheduling.observer import Ending
 from .scheduling.work_queue import Failure
@@ -38,6 +41,13 @@ log = logging.getLogger(__name__)
 P = TypeVar("P", Prepared, Coarse)
 
 PREPARE, COARSE, REFINE = "prepare", "coarse", "refine"
+
+SHORTLIST = 2
+"""So many times the references wanted are matched with the photograph, and the best of them used (see BENCHMARKS.md).
+Those that are chosen would have been matched anyhow."""
+
+AS_THEY_COME = RankOptions(nearby_weight=1.0)
+"""What is near one another is thinned out by matches, which tell better what is worth it."""
 
 MAX_LISTINGS = 3
 """When a reference goes while it is used, the scene is listed again; more often than this it is being emptied."""
@@ -115,6 +125,7 @@ class Found:
         view: the photograph.
         seconds: where the time went.
         choice: how they were chosen; None if they were used as they were named.
+        query_matches: of the photograph with each, where they were chosen by these.
     """
 
     references: tuple[PosedView, ...]
@@ -122,6 +133,7 @@ class Found:
     view: View
     seconds: dict[str, float]
     choice: Choice | None = None
+    query_matches: tuple[Matches, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +211,9 @@ class QueryStages:
             unknown = work.query.narrowing.is_empty
             where = "the scene has no references" if unknown else "no reference is where the prior says"
             return self._conclude(work, found, Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, where)))
-        part = self._method.prepare(found.view, found.references, tier.pipeline, work.query.options, job.check)
+        part = self._method.prepare(
+            found.view, found.references, tier.pipeline, work.query.options, job.check, found.query_matches
+        )
         if isinstance(part, Answer):
             return self._conclude(work, found, part)
         return self._next(work, Step(COARSE, work.kind, str(part.bucket), Underway(work, found, part)))
@@ -207,24 +221,40 @@ class QueryStages:
     def _find(self, work: Work, tier: Tier, turn: Turn) -> Found:
         """The references that are named, or those that the photograph resembles most."""
         query = work.query
-        choice: Choice | None = None
-        reference_ids: Sequence[str] = query.reference_ids
         if query.chooses:
-            choice = self._chooser.choose(
-                query.scene_key,
-                work.views,
-                query.reference_count,
-                query.narrowing,
-                query.reference_ids,
-                turn,
-            )
-            reference_ids = [chosen.reference_id for chosen in choice.references]
+            return self._choose(work, tier, turn)
         # References come first: a name that is wrong is found out before the photograph is described.
-        # Only the first tier's references are waited for: there is an answer before the others'.
-        generation, references = work.source.load(
-            query.scene_key, reference_ids, tier.extractor, turn, waits=work.best is None
+        generation, references = self._load(work, query.reference_ids, tier, turn)
+        return Found(references, generation, work.views.view(tier.extractor, turn), turn.stage_seconds)
+
+    def _choose(self, work: Work, tier: Tier, turn: Turn) -> Found:
+        """The references that have the most feature matches, among those that resemble the photograph most."""
+        query = work.query
+        choice = self._chooser.choose(
+            query.scene_key,
+            work.views,
+            SHORTLIST * query.reference_count,
+            query.narrowing,
+            query.reference_ids,
+            turn,
+            AS_THEY_COME,
         )
-        return Found(references, generation, work.views.view(tier.extractor, turn), turn.stage_seconds, choice)
+        ranked = [chosen.reference_id for chosen in choice.references]
+        generation, shortlist = self._load(work, ranked, tier, turn)
+        view = work.views.view(tier.extractor, turn)
+        with turn.stage("shortlist"):
+            matches = tier.pipeline.matcher.match_query(view, shortlist, turn.check)
+            centres = [reference.world_from_camera.translation for reference in shortlist]
+            order = spread_choice([len(it) for it in matches], centres, query.reference_count)
+        references, query_matches = tuple(shortlist[i] for i in order), tuple(matches[i] for i in order)
+        return Found(references, generation, view, turn.stage_seconds, choice, query_matches)
+
+    def _load(
+        self, work: Work, reference_ids: Sequence[str], tier: Tier, turn: Turn
+    ) -> tuple[int, tuple[PosedView, ...]]:
+        # Only the first tier's references are waited for: there is an answer before the others'.
+        waits = work.best is None
+        return work.source.load(work.query.scene_key, reference_ids, tier.extractor, turn, waits=waits)
 
     def _after_coarse(self, underway: Underway[Prepared], part: Coarse | Answer | Exception) -> Verdict:
         if isinstance(part, Exception):

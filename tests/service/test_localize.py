@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from images import cmyk_jpeg, encode, png_claiming, textured, with_exif_orientation
-from servers import CAMERA, COVARIANCE, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose, serving
+from servers import CAMERA, COVARIANCE, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose
 
 from mapless import (
     Client,
     ConnectOptions,
-    FailedPrecondition,
     InvalidArgument,
     LocalizationResult,
     NewReference,

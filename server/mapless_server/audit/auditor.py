@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from mapless.geometry import RigidTransform
-
-from .change import SAME_VIEWPOINT, Change, changed_region
+from ..method.views import PosedView
+from .change import SAME_VIEWPOINT, Change, ChangeOptions, changed_region
 from .duplicates import Likeness, likeness
 from .look import Look, look_at, pose_difference
 from .neighbourhood import PairMatches
@@ -159,30 +159,40 @@ class Auditor:
 
     def _swapped_with(self, look: Look) -> str:
         """The reference at whose pose the photograph was taken, if that one's was taken here; empty if none is."""
-        found, given = look.world_from_camera, look.subject.world_from_camera
-        for name in self._around.near_pose(found, 4, look.subject.name):
-            if not self._is_near(found, self._around.pose(name), look):
+        for name in self._around.near_pose(look.world_from_camera, 4, look.subject.name):
+            apart_m, apart_deg = pose_difference(look.world_from_camera, self._around.pose(name))
+            options, sigma = self._options, self._options.significance_sigma
+            reach_m = options.swap_reach * max(options.position_tolerance_m, sigma * look.largest_sigma_m)
+            reach_deg = options.swap_reach * max(options.rotation_tolerance_deg, sigma * look.sigma_deg)
+            if apart_m > reach_m or apart_deg > reach_deg:
                 continue
-            other, _ = self._first_look(name)
-            if not other.is_usable:
-                other, _ = self._wide_look(name, ("", Likeness.DIFFERENT))
-            if other.is_usable and self._is_near(other.world_from_camera, given, other):
+            partner = self._around.view(name)
+            if self._fits(look.subject, partner) and self._fits(partner, look.subject):
                 return name
         return ""
 
-    def _is_near(self, found: RigidTransform, given: RigidTransform, look: Look) -> bool:
-        """Whether a given pose is what a look found, as far as it can tell."""
-        apart_m, apart_deg = pose_difference(found, given)
-        sigma = self._options.significance_sigma
-        largest_sigma_m = look.largest_sigma_m
-        return apart_m <= max(self._options.position_tolerance_m, sigma * largest_sigma_m) and apart_deg <= max(
-            self._options.rotation_tolerance_deg, sigma * look.sigma_deg
-        )
+    def _fits(self, photographed: PosedView, posed: PosedView) -> bool:
+        """Whether the one reference's photograph fits the other's pose, by the neighbours of that pose."""
+        names = self._around.near(posed.name, self._options.candidate_count)
+        others = [view for view in self._around.views(names) if view.name != photographed.name]
+        others.sort(key=lambda other: -len(self._pairs.match(photographed, other)))
+        moved = replace(photographed, world_from_camera=posed.world_from_camera)
+        look = look_at(moved, others[: self._options.neighbour_count], self._pairs, self._options)
+        return self._judge(look) is Verdict.CONSISTENT
 
     def _change(self, look: Look, verdict: Verdict) -> Change | None:
         """What of the image does not show what the neighbours show; None where that cannot be said."""
-        if verdict is not Verdict.UNVERIFIABLE:
-            return changed_region(look)
-        name = look.subject.name
-        nearest = self._around.views(self._around.near(name, self._options.neighbour_count))
-        return changed_region(look_at(look.subject, nearest, self._pairs, self._options), SAME_VIEWPOINT)
+        subject = look.subject
+        if verdict is Verdict.UNVERIFIABLE:
+            nearest = self._around.views(self._around.near(subject.name, self._options.neighbour_count))
+            look, options = look_at(subject, nearest, self._pairs, self._options), SAME_VIEWPOINT
+        else:
+            options = ChangeOptions()
+        change = changed_region(look, options)
+        if change is None or not change.is_alarm:
+            return change
+        # Points of neighbours whose poses are wrong lie where nothing is.
+        honest = [r for r in look.neighbourhood.references if not self._first_look(r.name)[0].verdict().is_alarm]
+        if len(honest) == len(look.neighbourhood.references):
+            return change
+        return changed_region(look_at(subject, honest, self._pairs, self._options), options)

@@ -27,6 +27,8 @@ class AuditOptions:
         epipolar_px: as for matching references.
         min_inliers: fewer are no ground for a judgement. Repeated texture has fooled up to 23.
         max_log10_false_alarms: as of the pose solver, with a reserve: an audit makes thousands of judgements.
+        swap_reach: a reference so many tolerances from where a photograph was taken may be its partner in a swap, since
+            that was found from neighbours of the wrong place. Whether it is, is then looked at from the right ones.
         both_excess: robust cost per match that a changed pose or focal length alone must leave unexplained for both to
             be blamed. One true cause leaves up to 0.75, two leave 4.
         same_photograph_px: keypoints of the same photograph, recompressed, are closer than this in the median.
@@ -48,6 +50,7 @@ class AuditOptions:
     epipolar_px: float = 2.0
     min_inliers: int = 25
     max_log10_false_alarms: float = -6.0
+    swap_reach: float = 4.0
     both_excess: float = 2.0
     same_photograph_px: float = 0.5
     same_photograph_share: float = 0.7
@@ -59,7 +62,13 @@ class AuditOptions:
     def __post_init__(self) -> None:
         tolerances = (self.position_tolerance_m, self.rotation_tolerance_deg, self.focal_tolerance, self.epipolar_px)
         counts = (self.candidate_count, self.neighbour_count - 1, self.wide_count, self.min_inliers - 7)
-        factors = (self.significance_sigma, self.neighbour_noise, self.both_excess, self.same_photograph_px)
+        factors = (
+            self.significance_sigma,
+            self.neighbour_noise,
+            self.swap_reach,
+            self.both_excess,
+            self.same_photograph_px,
+        )
         shares = (self.same_photograph_share, self.same_view_share, self.same_view_matched_share)
         if not (min(*tolerances, *counts, *factors) > 0 and 0 < min(shares) <= max(shares) <= 1):
             raise ValueError(f"senseless options: {self}")

@@ -9,6 +9,9 @@ from .look import Look
 from .resection import Freedom
 from .verdict import ReferenceAudit, Verdict
 
+_WORTH_MENTIONING = 0.15
+"""Share of the image; of 133 unaltered photographs 6 have as much."""
+
 
 def describe(
     look: Look, verdict: Verdict, other: str = "", same: bool = False, change: Change | None = None
@@ -84,7 +87,10 @@ def _message(numbers: _Numbers, verdict: Verdict, other: str, same: bool, change
     if verdict is Verdict.DUPLICATE:
         return f"{'the same photograph as' if same else 'the same view from the same place as'} {other}"
     where = f"{_length(numbers.offset_m)} and {numbers.turn_deg:.2f} degrees from where its neighbours see it"
-    return f"consistent: {where}; {seen}"
+    missing = ""
+    if change is not None and change.changed_share >= _WORTH_MENTIONING:
+        missing = f"; {100 * change.changed_share:.0f} % of the image in one piece shows few of its neighbours' points"
+    return f"consistent: {where}; {seen}{missing}"
 
 
 def _length(metres: float | None) -> str:

@@ -100,7 +100,7 @@ class Surroundings:
         if not self.poses:
             return []
         distance, index = self._nearest(world_from_camera, 4 * count + 1)
-        others = np.array([self.poses[i].name != but for i in index])
+        others = np.array([self.poses[i].name != but for i in index], bool)
         distance, index = distance[others], index[others]
         if not len(index):
             return []

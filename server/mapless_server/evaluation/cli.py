@@ -102,7 +102,7 @@ def evaluate_command(
             return
         own = {"references": references, "queries": queries, "json": json}
         _refuse("for a folder with cameras.json, and without --protocol or --output", **own)
-        from .paper_command import evaluate_benchmarks
+        from .benchmark_command import evaluate_benchmarks
         from .protocol import PROTOCOLS, SCALES, VARIANTS
 
         default = "sparse" if _is_own_folder(folder, layout) else ",".join(PROTOCOLS)

@@ -154,7 +154,7 @@ class Matcher:
         """Matches between all pairs of references, widely if so asked, and between the query and each.
 
         Calls `check` before each pair, and lets what it raises through. `query_matches` that are known already, from
-        another call with the same references, are taken as they are.
+        `match_query` or another call with the same references, are taken as they are.
         """
 
         def of_pair(pair: tuple[int, int]) -> Matches:
@@ -164,8 +164,14 @@ class Matcher:
         pairs = list(combinations(range(len(references)), 2))
         pair_matches = self._pool.map(of_pair, pairs)
         if query_matches is None:
-            query_matches = self._query_matching.match(query, references, check)
+            query_matches = self.match_query(query, references, check)
         return Correspondences(dict(zip(pairs, pair_matches, strict=True)), tuple(query_matches))
+
+    def match_query(
+        self, query: View, references: Sequence[PosedView], check: Callable[[], None] = lambda: None
+    ) -> Sequence[Matches]:
+        """Matches between the query and each reference; `check` as in `correspond`."""
+        return self._query_matching.match(query, references, check)
 
     def close(self) -> None:
         """Ends the threads."""

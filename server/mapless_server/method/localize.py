@@ -30,7 +30,7 @@ from .adjust import adjust_pose
 from .answer import Answer, Localization, LocalizeOptions, Variant, is_better, shifted
 from .coarse import Bucket, Outcome, Reconstruction, Reconstructor, Request, reconstruct_one
 from .coarse.geometric import GeometricReconstructor
-from .correspond import Correspondences, Matcher
+from .correspond import Correspondences, Matcher, Matches
 from .match import MatchOptions, PointMatches, match_points
 from .pnp import PoseEstimate, PoseStage, solve_pose
 from .rejection import Rejection, RejectionReason
@@ -174,8 +174,11 @@ def prepare(
     pipeline: Pipeline,
     options: LocalizeOptions,
     check: Check = _somebody_waits,
+    query_matches: Sequence[Matches] | None = None,
 ) -> Prepared | Answer:
     """The first of the three parts, with the arguments of `localize`; an answer if there is nothing to go on with.
+
+    `query_matches` with each reference are taken as they are, where the references were chosen by them.
 
     Raises:
         ValueError: a view lacks what the coarse backend looks at.
@@ -191,7 +194,7 @@ def prepare(
     bucket = pipeline.reconstructor.bucket(query, nearby)
     stage_seconds: dict[str, float] = {}
     with _stage("correspond", stage_seconds, check):
-        correspondences = pipeline.matcher.correspond(query, nearby, False, check, None)
+        correspondences = pipeline.matcher.correspond(query, nearby, False, check, query_matches)
     return Prepared(query, nearby, origin, pipeline, options, correspondences, bucket, stage_seconds)
 
 

@@ -29,9 +29,9 @@ class RankOptions:
         apart_m: references closer together than this triangulate nothing (the paper's baseline),
         apart_deg: if their optical axes are closer than this too: one that looks elsewhere sees other things.
         nearby_weight: what is left of a reference's lead over the scene's typical similarity when one nearby is chosen
-            already. 1 does not thin, 0 spreads at any price. In the kitchen of 7-Scenes (100 references, 60 queries) the
-            median errors with 1, 0.75 and 0.5 are 0.13, 0.15 and 0.15 cm, 90 % of them below 0.27, 0.29 and 0.32; with
-            0 the chosen share half as many matches with the query.
+            already. 1 does not thin, 0 spreads at any price. In the kitchen of 7-Scenes (100 references, 60 queries)
+            the median errors with 1, 0.75 and 0.5 are 0.13, 0.15 and 0.15 cm, and 90 % lie below 0.27, 0.29 and 0.32;
+            with 0 the chosen share half as many matches with the query.
         pool: so many times the references that are wanted are looked at, the most similar ones. Those behind them are
             never chosen instead of one that is nearby.
         smallest_pool: but at least so many.

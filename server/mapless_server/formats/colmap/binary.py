@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,8 +21,12 @@ class _Cursor:
         self.file = file
         self.position = 0
         self.record = "header"
+        self._data: mmap.mmap | bytes
         try:
-            self._data = file.read_bytes()
+            with file.open("rb") as stream:
+                # Observations make files of gigabytes, of which little is looked at. An empty file cannot be mapped.
+                size = file.stat().st_size
+                self._data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
         except OSError as error:
             raise ValueError(f"{file} cannot be read: {error.strerror}") from error
 

@@ -32,7 +32,7 @@ def read_cameras(file: Path) -> Iterator[ColmapCamera]:
 
 def read_images(file: Path) -> Iterator[ImageRecord]:
     """The images of an images.txt; their observations are passed over."""
-    lines = enumerate(read_text(file).splitlines(), 1)
+    lines = enumerate(_lines(file), 1)
     for number, line in lines:
         if not line.strip() or line.startswith("#"):
             continue
@@ -47,3 +47,14 @@ def read_images(file: Path) -> Iterator[ImageRecord]:
             raise ValueError(f"{file}:{number}: {error}") from error
         yield record
         next(lines, None)
+
+
+def _lines(file: Path) -> Iterator[str]:
+    """The lines, one after the other: observations make files of gigabytes."""
+    try:
+        with file.open(encoding="utf-8") as stream:
+            yield from stream
+    except OSError as error:
+        raise ValueError(f"{file} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{file} is not text: {error}") from error

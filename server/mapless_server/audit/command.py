@@ -1,0 +1,158 @@
+"""`mapless-server audit`: examines the references of a scene on a server and prints what it found, the worst first."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from ..ingest.command import Address, Ca, Cert, ClientId, Key, Scene, Tls, TokenFile
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from mapless import ReferenceAudit
+
+ALARMS = ("SWAPPED_IMAGE", "WRONG_POSE_AND_INTRINSICS", "WRONG_POSE", "WRONG_INTRINSICS", "SCENE_CHANGED")
+"""Findings that mislead whoever is localized, the worst first."""
+
+_ORDER = (*ALARMS, "DUPLICATE", "UNVERIFIABLE", "CONSISTENT")
+
+
+def audit_command(
+    scene: Scene,
+    report: Annotated[Path | None, typer.Option(help="JSON file for the whole report.")] = None,
+    html: Annotated[Path | None, typer.Option(help="HTML file for the whole report.")] = None,
+    page_size: Annotated[int, typer.Option(help="References a call, 1 to 100; each takes up to a second.")] = 10,
+    everything: Annotated[bool, typer.Option("--all", help="Print consistent references, too.")] = False,
+    address: Address = "",
+    tls: Tls = False,
+    ca: Ca = None,
+    cert: Cert = None,
+    key: Key = None,
+    token_file: TokenFile = None,
+    client_id: ClientId = "",
+) -> None:
+    """Examine the references of a scene against their neighbours; exit code 1 when any of them is wrong."""
+    from rich.console import Console
+
+    from mapless import MaplessError
+
+    from ..child import ServerFailed
+    from ..ingest.connection import Connection, connected
+    from ..output_files import check_writable, write_json
+    from ..progress import progress_bars
+    from ..settings import ConfigError, load_settings
+    from ..signals import terminable
+
+    try:
+        for file in filter(None, (report, html)):
+            check_writable(file)
+        settings = load_settings({}).settings
+        connection = Connection(address, tls, ca, cert, key, token_file, client_id)
+        with terminable(), connected(connection, settings) as client, progress_bars() as progress:
+            total = client.get_scene(scene).reference_count
+            audits: list[ReferenceAudit] = []
+            progress("audit", 0, total)
+            for found in client.audit_scene(scene, page_size=page_size):
+                audits.append(found)
+                progress("audit", len(audits), total)
+    except (ValueError, ConfigError) as error:
+        _fail(str(error), code=2)
+    except (MaplessError, ServerFailed) as error:
+        _fail(str(error), code=1)
+    ordered = worst_first(audits)
+    shown = [a for a in ordered if everything or a.verdict != "CONSISTENT"]
+    console = Console(soft_wrap=True)
+    if shown:
+        console.print(table_of(shown))
+    console.print(summary_of(ordered))
+    if report is not None:
+        write_json(report, to_json(scene, ordered))
+    if html is not None:
+        html.write_text(to_html(scene, ordered), encoding="utf-8")
+    if any(a.verdict in ALARMS for a in ordered):
+        raise typer.Exit(1)
+
+
+def worst_first(audits: Iterable[ReferenceAudit]) -> list[ReferenceAudit]:
+    """By finding, then by how far the position is off, then by name."""
+    return sorted(audits, key=lambda a: (_rank(a.verdict), -a.position_offset_m, -a.rotation_offset_deg, a.name))
+
+
+def _rank(verdict: str) -> int:
+    return _ORDER.index(verdict) if verdict in _ORDER else len(_ORDER)
+
+
+def summary_of(audits: Sequence[ReferenceAudit]) -> str:
+    """How many there are of each finding, in one line."""
+    counts = Counter(a.verdict for a in audits)
+    parts = [f"{counts[v]} {v.lower().replace('_', ' ')}" for v in sorted(counts, key=_rank)]
+    return f"{len(audits)} references: {', '.join(parts) or 'none'}"
+
+
+def cells_of(audit: ReferenceAudit) -> tuple[str, ...]:
+    """The figures of one reference, in the order of `COLUMNS`; a dash where one is not known."""
+    is_known = audit.focal_ratio > 0
+    return (
+        audit.name.rsplit("/", 1)[-1],
+        audit.verdict.lower().replace("_", " "),
+        f"{100 * audit.position_offset_m:.1f}" if is_known else "-",
+        f"{audit.rotation_offset_deg:.2f}" if is_known else "-",
+        f"{100 * (1 / audit.focal_ratio - 1):+.1f}" if is_known else "-",
+        f"{audit.inlier_count}/{audit.match_count}",
+        f"{audit.reprojection_error_px:.1f}" if audit.inlier_count else "-",
+        audit.message,
+    )
+
+
+COLUMNS = ("reference", "finding", "off, cm", "turned, deg", "focal, %", "agree", "error, px", "in words")
+
+
+def table_of(audits: Sequence[ReferenceAudit]) -> Table:
+    """The table for a terminal."""
+    from rich.table import Table
+
+    table = Table()
+    for i, column in enumerate(COLUMNS):
+        table.add_column(column, justify="right" if 2 <= i <= 6 else "left", overflow="fold")
+    for audit in audits:
+        style = "red" if audit.verdict in ALARMS else "" if audit.verdict == "CONSISTENT" else "yellow"
+        table.add_row(*cells_of(audit), style=style)
+    return table
+
+
+def to_json(scene: str, audits: Sequence[ReferenceAudit]) -> dict[str, Any]:
+    """The report for programs."""
+    return {"scene": scene, "summary": summary_of(audits), "references": [asdict(a) for a in audits]}
+
+
+_STYLE = """body{font:14px sans-serif;margin:2em}table{border-collapse:collapse}td,th{padding:.3em .6em;
+border-bottom:1px solid #ccc;text-align:left}.alarm{background:#fdd}.note{background:#ffd}"""
+
+
+def to_html(scene: str, audits: Sequence[ReferenceAudit]) -> str:
+    """The report as one page that needs nothing else."""
+    from html import escape
+
+    rows = []
+    for audit in audits:
+        kind = "alarm" if audit.verdict in ALARMS else "" if audit.verdict == "CONSISTENT" else "note"
+        cells = "".join(f"<td>{escape(cell)}</td>" for cell in cells_of(audit))
+        rows.append(f'<tr class="{kind}">{cells}</tr>')
+    head = "".join(f"<th>{escape(column)}</th>" for column in COLUMNS)
+    title = escape(f"Audit of scene {scene}")
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
+        f"<h1>{title}</h1><p>{escape(summary_of(audits))}</p><table><tr>{head}</tr>{''.join(rows)}</table></html>\n"
+    )
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    print(f"mapless-server: {message}", file=sys.stderr)
+    raise typer.Exit(code)
