@@ -19,7 +19,6 @@ ProtoEnum = Any
 """A generated enum: the wrapper that has `Name`, `Value` and `values`."""
 
 MIN_SIDE_PX, MAX_SIDE_PX = 32, 16384
-MAX_COORDINATE_M = 1e7
 MAX_DISTORTION = 100.0
 MAX_FOCAL_PER_SIDE = 100.0
 

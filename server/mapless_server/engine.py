@@ -17,7 +17,6 @@ from .decode import ImageLimits
 from .describing import Describer, Description
 from .errors import DeadlineExceeded, Overloaded, RequestError, Unavailable
 from .failures import failure_of
-from .items import Compute, Item, Items, Outcome, work_off
 from .library import ReferenceLibrary
 from .query import Caller, Photo, Query, Result
 from .query_stages import COARSE, PREPARE, REFINE, Method, QueryStages, ReferenceSource, Work
@@ -27,6 +26,7 @@ from .retrieval.descriptor import GlobalDescriptor
 from .retrieval.narrowing import Narrowing
 from .retrieval.vlad import VladDescriptor
 from .scene_indexes import SceneIndexes
+from .scheduling.items import Compute, Item, Items, Outcome, work_off
 from .scheduling.jobs import Expired, Refused, Stage, Step, Visit
 from .scheduling.observer import Observer, Refusal
 from .scheduling.schedule import Quota

@@ -64,13 +64,6 @@ class AlreadyExists(RequestError):
     reason = "ALREADY_EXISTS"
 
 
-class FailedPrecondition(RequestError):
-    """The request is fine, the state of the scene is not."""
-
-    code = "FAILED_PRECONDITION"
-    reason = "FAILED_PRECONDITION"
-
-
 class Overloaded(RequestError):
     """Too many calls wait already; carries `retry_after_s`."""
 

@@ -6,7 +6,6 @@ import re
 
 from .errors import (
     AlreadyExists,
-    FailedPrecondition,
     InvalidArgument,
     NotFound,
     PermissionDenied,
@@ -14,7 +13,7 @@ from .errors import (
 )
 from .scheduling.work_queue import Failure
 
-_CALLERS = (InvalidArgument, Unauthenticated, PermissionDenied, NotFound, AlreadyExists, FailedPrecondition)
+_CALLERS = (InvalidArgument, Unauthenticated, PermissionDenied, NotFound, AlreadyExists)
 """What the caller has to mend. The other errors of requests are told to callers, too, but are the server's."""
 
 _LOST = re.compile(r"CUDA error|CUBLAS_STATUS_(?!ALLOC_FAILED)|CUDNN_STATUS_(?!ALLOC_FAILED)|device-side assert")

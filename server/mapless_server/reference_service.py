@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 from mapless import names, wire
-from mapless.geometry import RigidTransform
+from mapless.geometry import MAX_COORDINATE_M, RigidTransform
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1 import reference_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
@@ -17,18 +17,18 @@ from mapless.wire import FieldError
 from .auditing import Viewpoint
 from .engine import Engine
 from .errors import AlreadyExists
-from .naming import reference_ids_from_names, reference_key_from_name, scene_key_from_name
-from .pages import Page, Record
-from .photos import photo_from_message
-from .priors import narrowing_from_message
-from .query import DEFAULT_REFERENCE_COUNT, Photo
-from .reference_messages import (
+from .messages.naming import reference_ids_from_names, reference_key_from_name, scene_key_from_name
+from .messages.pages import Page, Record
+from .messages.photos import photo_from_message
+from .messages.priors import narrowing_from_message
+from .messages.references import (
     audit_to_message,
     choice_to_message,
     coverage_to_message,
     reference_to_message,
     scene_to_message,
 )
+from .query import DEFAULT_REFERENCE_COUNT, Photo
 from .rpc import Call
 from .store import NewReference, ReferenceRecord, Store
 from .tenancy import SceneKey, key_of, scene_id_of
@@ -181,7 +181,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         for field in ("world_from_camera", "intrinsics"):
             if not request.HasField(field):
                 raise FieldError(field, "is required")
-        pose = wire.transform_from_message(request.world_from_camera, "world_from_camera", wire.MAX_COORDINATE_M)
+        pose = wire.transform_from_message(request.world_from_camera, "world_from_camera", MAX_COORDINATE_M)
         view = Viewpoint(wire.camera_from_message(request.intrinsics, "intrinsics"), pose)
         generation, coverage = await engine.check_coverage(scene_key, view, call.caller)
         message = coverage_to_message(coverage)
@@ -198,7 +198,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         if not reference.HasField("world_from_camera"):
             raise FieldError(f"{path}.world_from_camera", "is required")
         world_from_camera = wire.transform_from_message(
-            reference.world_from_camera, f"{path}.world_from_camera", wire.MAX_COORDINATE_M
+            reference.world_from_camera, f"{path}.world_from_camera", MAX_COORDINATE_M
         )
         photo = photo_from_message(reference, path, self._engine().options.image_limits)
         return reference_id, photo, world_from_camera

@@ -14,15 +14,15 @@ from mapless.wire import FieldError
 from . import __version__
 from .decode import ImageLimits
 from .engine import Engine
-from .enums import enum_from_message, enum_to_message
+from .messages.enums import enum_from_message, enum_to_message
+from .messages.naming import reference_ids_from_names
+from .messages.photos import photo_from_message
+from .messages.priors import narrowing_from_message
 from .method.accuracy import accuracy_from_covariance
 from .method.localize import Localization, LocalizeOptions
 from .method.rejection import Rejection
 from .method.scale import MetricScale
-from .naming import reference_ids_from_names
 from .observability.metrics import LOCALIZED, Metrics
-from .photos import photo_from_message
-from .priors import narrowing_from_message
 from .query import DEFAULT_REFERENCE_COUNT, Query, Result
 from .rpc import Call
 from .scheduling.jobs import Visit

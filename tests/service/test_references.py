@@ -15,7 +15,8 @@ from servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, pose, servi
 
 from mapless import AlreadyExists, Client, ConnectOptions, InvalidArgument, NewReference, NotFound, wire
 from mapless.v1 import reference_service_pb2 as pb
-from mapless_server import reference_messages, reference_service
+from mapless_server import reference_service
+from mapless_server.messages import references
 from mapless_server.store import ReferenceRecord
 
 
@@ -204,7 +205,7 @@ def test_references_of_an_unknown_scene(client: Client) -> None:
 
 def test_a_page_is_made_off_the_event_loop(client: Client, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand messages take tens of milliseconds, in which nobody else would be answered."""
-    to_message, threads = reference_messages.reference_to_message, set[str]()
+    to_message, threads = references.reference_to_message, set[str]()
 
     def told(record: ReferenceRecord) -> pb.Reference:
         threads.add(threading.current_thread().name)

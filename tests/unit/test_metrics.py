@@ -54,6 +54,7 @@ GAUGES = {
     "mapless_queue_cost_seconds": {"stage"},
     "mapless_inflight": {"stage"},
     "mapless_reference_cache_bytes": set(),
+    "mapless_retrieval_index_bytes": set(),
     "mapless_token_cache_bytes": {"tier"},
     "mapless_scheduler_heartbeat_timestamp_seconds": set(),
     "mapless_gpu_memory_bytes": {"kind"},

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapless import names, wire
-from mapless.geometry import Camera, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
+from mapless.geometry import MAX_COORDINATE_M, Camera, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
 from mapless.v1 import geometry_pb2 as pb
 from mapless.v1 import localization_service_pb2 as localization_pb
 
@@ -93,7 +93,7 @@ def test_camera_limits_are_inclusive() -> None:
 )
 def test_bad_transforms_are_refused_by_field(message: pb.RigidTransform, field: str) -> None:
     with pytest.raises(wire.FieldError) as caught:
-        wire.transform_from_message(message, "pose", wire.MAX_COORDINATE_M)
+        wire.transform_from_message(message, "pose", MAX_COORDINATE_M)
     assert caught.value.field == f"pose.{field}"
 
 

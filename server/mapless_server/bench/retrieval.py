@@ -73,11 +73,17 @@ class Case:
         """The references less the query itself."""
         return [reference for reference in self.references if reference != query]
 
-    def retrieved(self, query: int, options: RankOptions | None = None) -> list[int]:
-        """What the server would choose."""
+    def retrieved(self, query: int, options: RankOptions | None = None, count: int = COUNT) -> list[int]:
+        """What RetrieveReferences answers."""
         vector = self.descriptor.describe(self.views[query])
         among = {str(reference) for reference in self.others(query)}
-        return [int(it.reference_id) for it in rank_references(self.entries, vector, COUNT, None, among, options)]
+        return [int(it.reference_id) for it in rank_references(self.entries, vector, count, None, among, options)]
+
+    def matched(self, query: int, ratio: float, times: int) -> list[int]:
+        """What Localize uses: those with the most matches, of so many times the references that resemble it most."""
+        shortlist = self.retrieved(query, UNTHINNED, times * COUNT)
+        chosen = choose_references(self.views[query], self.posed(shortlist), COUNT, ratio=ratio)
+        return [shortlist[i] for i in chosen]
 
     def errors(self, query: int, references: Sequence[int]) -> Array:
         """Distance and angle (N, 2) between the query's camera and references'."""
@@ -155,8 +161,10 @@ def localize_table(cases: Sequence[Case], features: str, query_count: int) -> It
         queries = [case.queries[i] for i in spread]
 
         rules: dict[str, Callable[[int], list[int]]] = {
-            "retrieved": case.retrieved,
-            "retrieved, not thinned": partial(case.retrieved, options=UNTHINNED),
+            "similar": case.retrieved,
+            "similar, not thinned": partial(case.retrieved, options=UNTHINNED),
+            "most matches, of the 20 most similar": partial(case.matched, ratio=ratio, times=2),
+            "most matches, of the 30 most similar": partial(case.matched, ratio=ratio, times=3),
             "most matches, of all": partial(case.most_matching, ratio=ratio),
             "truly nearest": case.nearest,
         }

@@ -14,8 +14,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from mapless.geometry import Array, Camera, RigidTransform
-from mapless.wire import MAX_COORDINATE_M
+from mapless.geometry import MAX_COORDINATE_M, Array, Camera, RigidTransform
 
 from ..dataset import Dataset, Frame, Refusal, image_file, legal_id
 from ..decode import ImageLimits, image_size

@@ -10,7 +10,7 @@ import numpy as np
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.wire import FieldError, vector_from_message
 
-from .retrieval.narrowing import HeadingPrior, Narrowing, PositionPrior
+from ..retrieval.narrowing import HeadingPrior, Narrowing, PositionPrior
 
 
 def narrowing_from_message(

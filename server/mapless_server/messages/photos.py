@@ -6,8 +6,8 @@ from typing import Any
 
 from mapless.wire import FieldError, camera_from_message, joined
 
-from .decode import ImageLimits, image_size
-from .query import Photo
+from ..decode import ImageLimits, image_size
+from ..query import Photo
 
 
 def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:

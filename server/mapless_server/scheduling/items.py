@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar
 
-from .scheduling.jobs import Done, Job, Next, Verdict
+from .jobs import Done, Job, Next, Verdict
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from mapless import names, wire
 from mapless.wire import FieldError
 
-from .tenancy import SceneKey, key_of
+from ..tenancy import SceneKey, key_of
 
 
 def scene_key_from_name(name: str, field: str, tenant: str) -> SceneKey:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from mapless import names, wire
 from mapless.v1 import reference_service_pb2 as pb
 
-from .audit.coverage import Coverage
-from .audit.verdict import ReferenceAudit
+from ..audit.coverage import Coverage
+from ..audit.verdict import ReferenceAudit
+from ..retrieval.chosen import Choice
+from ..store import ReferenceRecord, SceneRecord
 from .enums import enum_to_message
-from .retrieval.chosen import Choice
-from .store import ReferenceRecord, SceneRecord
 
 
 def scene_to_message(scene: SceneRecord) -> pb.Scene:
