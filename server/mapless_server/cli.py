@@ -14,6 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from . import __version__
+from .audit.command import audit_command
 from .evaluation.cli import evaluate_command
 from .ingest.command import export_command, import_command
 from .load.command import load_app
@@ -37,6 +38,7 @@ app.add_typer(load_app, name="load")
 app.add_typer(store_app, name="store")
 app.command("import")(import_command)
 app.command("export")(export_command)
+app.command("audit")(audit_command)
 app.command("evaluate")(evaluate_command)
 
 

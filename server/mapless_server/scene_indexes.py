@@ -136,6 +136,13 @@ class _Held:
         with self._updating:
             since = self.index.generation
             changes = store.list_changes(scene_key, since if since >= 0 else None, descriptor)
+            for reference_id in changes.damaged:
+                log.error(
+                    "reference %s of scene %s is damaged in the store and is not chosen any more: delete it and add it "
+                    "again",
+                    reference_id,
+                    scene_key,
+                )
             if changes.is_whole or changes.generation != since:
                 self.index.apply(changes)
             return self.index.entries()

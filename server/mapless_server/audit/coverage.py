@@ -40,8 +40,8 @@ class CoverageOptions:
     Attributes:
         neighbour_count: references that are asked, nearest by position and heading; as many as a query has.
         epipolar_px: as for matching references.
-        repeatability: share of the points seen from the same direction at the same distance that are matched: 0.55 of
-            75,000.
+        repeatability: share of the points that are matched when seen from the same direction and distance; with the two
+            below it follows what was found of 60,000 points at less than 15 degrees and 15,000 beyond.
         turn_deg: angle between the rays at which the share has fallen to 1/e: it is 0.45 up to 15, 0.22 at 25, 0.1 at
             35.
         log_scale: logarithm of the ratio of scales at which it has: a ratio of 1.35 costs half.

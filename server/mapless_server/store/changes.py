@@ -23,28 +23,31 @@ def read_changes(
     generation: int = row.generation
     # A generation yet to come is one of a database that a backup has taken the place of since.
     if since_generation is None or not row.first_generation <= since_generation <= generation:
-        return SceneChanges(generation, _read(connection, scene_key, -1, descriptor_name), frozenset(), True)
+        added, damaged = _read(connection, scene_key, -1, descriptor_name)
+        return SceneChanges(generation, added, frozenset(), True, damaged)
     if since_generation == generation:
         return SceneChanges(generation, (), frozenset(), False)
     removed = removed_reference.c
     gone = select(removed.reference_key).where(removed.scene_id == scene_key, removed.generation > since_generation)
-    return SceneChanges(
-        generation,
-        _read(connection, scene_key, since_generation, descriptor_name),
-        frozenset(connection.scalars(gone)),
-        False,
-    )
+    added, damaged = _read(connection, scene_key, since_generation, descriptor_name)
+    return SceneChanges(generation, added, frozenset(connection.scalars(gone)), False, damaged)
 
 
 def _read(
     connection: Connection, scene_key: SceneKey, after_generation: int, descriptor_name: str
-) -> tuple[IndexedReference, ...]:
+) -> tuple[tuple[IndexedReference, ...], tuple[str, ...]]:
+    """References that changed, by id, and the ids of those that are damaged."""
     statement = _select_indexed(descriptor_name).where(
         reference.c.scene_id == scene_key, reference.c.generation > after_generation
     )
     result = connection.execution_options(yield_per=_ROWS_AT_A_TIME).execute(statement)
-    found = [it for portion in result.partitions() for it in rows.indexed_references(portion, descriptor_name)]
-    return tuple(sorted(found, key=lambda it: it.reference_id))
+    found: list[IndexedReference] = []
+    damaged: list[str] = []
+    for portion in result.partitions():
+        references, damaged_ids = rows.indexed_references(portion, descriptor_name)
+        found += references
+        damaged += damaged_ids
+    return tuple(sorted(found, key=lambda it: it.reference_id)), tuple(sorted(damaged))
 
 
 def _select_indexed(descriptor_name: str) -> Select[Any]:

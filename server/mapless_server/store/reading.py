@@ -171,7 +171,6 @@ class ReadingStore(BaseStore):
 
         Raises:
             NotFound: there is no such scene.
-            DataLoss: camera and pose, or the descriptor, of one of them are damaged.
         """
         with self._database.read() as connection:
             return read_changes(connection, scene_key, since_generation, descriptor_name)

@@ -142,9 +142,11 @@ class SceneChanges:
             what was known.
         removed: keys of references that are gone; they may never have been known.
         is_whole: what was known before is void, and `added` is the whole scene.
+        damaged: ids of references whose pose or descriptor is not what was stored; they are left out, by id.
     """
 
     generation: int
     added: tuple[IndexedReference, ...]
     removed: frozenset[str]
     is_whole: bool
+    damaged: tuple[str, ...] = ()

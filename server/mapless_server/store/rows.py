@@ -124,25 +124,27 @@ def descriptor_owner(key: str, name: str) -> str:
     return f"{key}#{name}"
 
 
-def indexed_references(found: Sequence[Row[Any]], descriptor_name: str) -> list[IndexedReference]:
-    """From rows as ``changes.py`` selects them, all at once for speed. Raises DataLoss if one is damaged."""
-    for row in found:
-        _check_indexed(row, descriptor_name)
-    poses = codec.decode_poses([row.geometry for row in found])
-    vectors = iter(codec.decode_descriptors([row.data for row in found if row.sha256 is not None]))
-    return [
+def indexed_references(found: Sequence[Row[Any]], descriptor_name: str) -> tuple[list[IndexedReference], list[str]]:
+    """From rows as ``changes.py`` selects them, all at once for speed; and the ids of those that are damaged."""
+    whole = [row for row in found if _is_whole(row, descriptor_name)]
+    poses = codec.decode_poses([row.geometry for row in whole])
+    vectors = iter(codec.decode_descriptors([row.data for row in whole if row.sha256 is not None]))
+    references = [
         IndexedReference(row.reference_id, row.key, pose, None if row.sha256 is None else next(vectors))
-        for row, pose in zip(found, poses, strict=True)
+        for row, pose in zip(whole, poses, strict=True)
     ]
+    intact = {row.key for row in whole}
+    return references, [row.reference_id for row in found if row.key not in intact]
 
 
-def _check_indexed(row: Row[Any], descriptor_name: str) -> None:
+def _is_whole(row: Row[Any], descriptor_name: str) -> bool:
     try:
         codec.check(row.key, row.geometry, row.geometry_sha256, "camera and pose")
         if row.sha256 is not None:
             codec.check(descriptor_owner(row.key, descriptor_name), row.data, row.sha256, "global descriptor")
-    except codec.Damaged as error:
-        raise data_loss(row.reference_id, str(error)) from error
+    except codec.Damaged:
+        return False
+    return True
 
 
 def described_reference(row: Row[Any]) -> DescribedReference:
