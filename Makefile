@@ -10,7 +10,7 @@ TORCH  ?= torch==2.13.0
 PROTO_TOOLS := grpcio-tools==1.71.2 setuptools==80.9.0
 PROTO_VENV  := $(VENV)/proto-tools
 
-.PHONY: help setup test lint format proto demo bench bench-gpu load clean
+.PHONY: help setup test thorough lint format proto demo bench bench-gpu load clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -27,6 +27,9 @@ setup: $(VENV)/.installed  ## Create .venv with everything
 THREADS ?= 1
 test: setup $(PROTO_VENV)/.installed  ## Run the tests; ARGS=... for pytest, ARGS="-m slow" THREADS=2 for the slow ones
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=$(THREADS) PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(ARGS)
+
+thorough:  ## Run the tests that repeat with many cases what others show with few: ten minutes
+	$(MAKE) test ARGS="-m thorough --timeout=600"
 
 lint: setup  ## Check style, types and protos
 	$(BIN)/ruff check .

@@ -221,7 +221,7 @@ class Client:
         heading_prior: HeadingPrior | None = None,
         timeout_s: float | None = None,
     ) -> list[RetrievedReference]:
-        """The references that resemble a photograph most, as `localize` chooses them when it is given none.
+        """The references that resemble a photograph most; `localize` chooses among twice as many, by feature matches.
 
         Args:
             image: the photograph.
@@ -247,7 +247,7 @@ class Client:
         Args:
             scene: the scene.
             references: which, at most 100; none: all.
-            page_size: references a call, each of which takes up to a second of computing; 0 is the server's default.
+            page_size: references a call, each of which takes about half a second of computing; 0 is the server's default.
             timeout_s: deadline of each call.
         """
         name = _scene_name(scene)

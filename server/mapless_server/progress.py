@@ -10,22 +10,22 @@ from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    Progress,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.progress import Progress as Bars
 
 LINES = 10
 """Lines that a step gets where nobody watches, after that of its beginning."""
 
-ProgressFunction = Callable[[str, int, int], None]
+Progress = Callable[[str, int, int], None]
 """Told a step's name, how much of it is done, and how much there is."""
 
 
 @contextmanager
-def progress_bars() -> Iterator[ProgressFunction]:
+def progress_bars() -> Iterator[Progress]:
     """A bar for each step; where standard error is not a terminal, a line now and then. For one thread at a time."""
     console = Console(stderr=True)
     if not console.is_terminal:
@@ -38,7 +38,7 @@ def progress_bars() -> Iterator[ProgressFunction]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True) as bars:
+    with Bars(*columns, console=console, transient=True) as bars:
         tasks: dict[str, TaskID] = {}
 
         def progress(step: str, done: int, total: int) -> None:
@@ -49,7 +49,7 @@ def progress_bars() -> Iterator[ProgressFunction]:
         yield progress
 
 
-def _lines() -> ProgressFunction:
+def _lines() -> Progress:
     said: dict[str, int] = {}
 
     def progress(step: str, done: int, total: int) -> None:

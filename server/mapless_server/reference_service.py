@@ -150,7 +150,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         photo = photo_from_message(request, "", engine.options.image_limits)
         count = request.count or DEFAULT_REFERENCE_COUNT
         choice = await engine.retrieve(scene_key, photo, count, narrowing, call.caller)
-        return choice_to_message(choice, scene_id_of(scene_key))
+        return await asyncio.to_thread(choice_to_message, choice, scene_id_of(scene_key))
 
     async def AuditScene(self, request: pb.AuditSceneRequest, call: Call) -> pb.AuditSceneResponse:
         """Implements ReferenceService.AuditScene."""

@@ -195,7 +195,7 @@ def test_a_folder_without_a_layout_is_named(tmp_path: Path) -> None:
     assert run("import", tmp_path, "not an id", "--dry-run").exit_code == 2
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_terminated_in_the_middle_the_next_run_goes_on(tmp_path: Path) -> None:
     """Without an address: a server of its own on the settings' store, which goes with the command."""
     folder = tmp_path / "many"

@@ -284,7 +284,7 @@ def test_killed_at_random_moments(database: str, tmp_path: Path) -> None:
     kill_and_check(database, tmp_path, 10)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("database", DATABASES)
 def test_killed_two_hundred_times(database: str, tmp_path: Path) -> None:
     kill_and_check(database, tmp_path, 200)

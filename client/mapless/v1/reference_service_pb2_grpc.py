@@ -204,8 +204,9 @@ class ReferenceServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def RetrieveReferences(self, request, context):
-        """Finds the references that resemble a photograph most, as Localize does when it is given none. Takes the role
-        localize. A scene without references is answered with an empty list.
+        """Finds the references that resemble a photograph most. Localize, when it is given none, takes twice as many as it wants
+        in this way, and of these the ones with the most feature matches. Takes the role localize. A scene without references
+        is answered with an empty list.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

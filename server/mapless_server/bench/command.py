@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..dataset import read_folder
-from ..evaluation.command import progress_bars, usage_errors, write_json
-from ..evaluation.plan import EvaluationOptions, Progress, UsageError
+from ..evaluation.command import usage_errors
+from ..evaluation.plan import EvaluationOptions, UsageError
 from ..evaluation.run import Evaluation, evaluate
 from ..machine import cpu_model
+from ..output_files import write_json
+from ..progress import Progress, progress_bars
 from ..settings import available_cores, load_settings
 from ..signals import terminable
 from .latency import measure_latency

@@ -11,8 +11,9 @@ from mapless import Client
 from ..child import Memory, child_server
 from ..dataset import Dataset
 from ..evaluation.metrics import QueryResult
-from ..evaluation.plan import EvaluationOptions, Plan, Progress
+from ..evaluation.plan import EvaluationOptions, Plan
 from ..evaluation.run import CONNECT, localize_queries, plan_for, upload
+from ..progress import Progress
 from ..settings import Settings
 
 REFERENCE_COUNT = 30

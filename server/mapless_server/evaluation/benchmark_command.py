@@ -9,17 +9,18 @@ from typing import Any
 
 from ..dataset import Dataset
 from ..formats import ReadOptions, read_dataset
+from ..progress import Progress, progress_bars
 from ..serve import image_limits
 from ..settings import Settings, load_settings
 from ..signals import terminable
 from .averages import groups_of
 from .benchmarks import ScenePlace, find_scenes
-from .command import progress_bars, usage_errors
+from .command import usage_errors
 from .figures import write_figures
 from .page import page, problems, told
 from .pairs import chosen, pairs_file, read_pairs
 from .pictures import WorstQuery, worst_of
-from .plan import Progress, UsageError, check_images
+from .plan import UsageError, check_images
 from .protocol import SuiteOptions, split_scene
 from .provenance import provenance_of
 from .run import first_features

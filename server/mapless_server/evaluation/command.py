@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import os
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Bars
 
 from ..dataset import read_folder
+from ..output_files import check_writable, write_json
+from ..progress import progress_bars
 from ..settings import ConfigError, load_settings
 from ..signals import terminable
-from .plan import EvaluationOptions, Progress, UsageError
+from .plan import EvaluationOptions, UsageError
 from .report import print_report, to_json
 from .run import evaluate
 
@@ -55,35 +52,3 @@ def evaluate_folder(folder: Path, json_file: Path | None, **options: Any) -> Non
     print_report(evaluation, Console())
     if json_file is not None:
         write_json(json_file, to_json(evaluation))
-
-
-def check_writable(file: Path) -> None:
-    """Raises ValueError if a file cannot be written: before the work, not after it. Makes nothing yet."""
-    target = file if file.exists() else file.parent
-    if file.is_dir() or not file.parent.is_dir() or not os.access(target, os.W_OK):
-        raise ValueError(f"{file} cannot be written")
-
-
-def write_json(file: Path, content: Any) -> None:
-    """Writes strict JSON; it has no infinities."""
-    file.write_text(json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
-
-
-@contextmanager
-def progress_bars() -> Iterator[Progress]:
-    """A bar for each step, on standard error; where that is not a terminal, a line when a step begins."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    console = Console(stderr=True)
-    with Bars(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
-        tasks: dict[str, TaskID] = {}
-
-        def progress(step: str, done: int, total: int) -> None:
-            if step not in tasks:
-                tasks[step] = bars.add_task(step, total=total)
-            bars.update(tasks[step], completed=done, total=total)
-
-        def announce(step: str, done: int, total: int) -> None:
-            if done == 0:
-                print(f"{step}: {total}", file=sys.stderr, flush=True)
-
-        yield progress if console.is_terminal else announce

@@ -17,11 +17,10 @@ from ..method.localize import Variant
 from ..method.retrieve import choose_references
 from ..method.scale import ScaleStrategy
 from ..method.views import PosedView, View
+from ..progress import Progress
 from ..settings import available_cores
 
 T = TypeVar("T")
-Progress = Callable[[str, int, int], None]
-"""Told a step's name, how much of it is done, and how much there is."""
 
 MAX_K = 64
 """What one call of Localize takes."""

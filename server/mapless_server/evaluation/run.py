@@ -19,11 +19,12 @@ from ..child import child_server
 from ..dataset import Dataset, Frame
 from ..method.correspond import OPTIONS
 from ..method.features import FeatureExtractor
+from ..progress import Progress
 from ..serve import image_limits
 from ..settings import Settings
 from ..weights import WeightsError
 from .metrics import QueryResult, pose_error, trajectory_radius
-from .plan import EvaluationOptions, Plan, PlannedQuery, Progress, UsageError, make_plan
+from .plan import EvaluationOptions, Plan, PlannedQuery, UsageError, make_plan
 
 SCENE = "evaluation"
 

@@ -16,13 +16,14 @@ from mapless import Client, MaplessError
 
 from ..child import ServerFailed, child_server
 from ..dataset import Dataset, Frame
+from ..progress import Progress
 from ..serve import image_limits
 from ..settings import Settings
 from .benchmarks import ScenePlace
 from .journal import Identity, Journal
 from .metrics import QueryResult
 from .pairs import Pairs, chosen
-from .plan import EvaluationOptions, PlannedQuery, Progress, UsageError, rank_by_matches
+from .plan import EvaluationOptions, PlannedQuery, UsageError, rank_by_matches
 from .protocol import Method, SceneSplit, SuiteOptions, setting_name
 from .provenance import Provenance
 from .run import CONNECT, first_features, localize_query, store_references

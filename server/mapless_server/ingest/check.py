@@ -16,7 +16,7 @@ from ..errors import InvalidArgument
 from ..method.epipolar import consistent_matches
 from ..method.features import FeatureExtractor, SiftExtractor
 from ..method.views import PosedView
-from ..progress import ProgressFunction
+from ..progress import Progress
 from ..settings import available_cores
 from .pair_errors import MatchedPair
 from .pairs import Pair, more_pairs, pairs_by_order, pairs_by_pose
@@ -31,9 +31,7 @@ LIMITS = ImageLimits(max_bytes=2**28, max_pixels=200_000_000)
 """Of photographs that are looked at here; what a server accepts is the server's business."""
 
 
-def check_frames(
-    frames: Sequence[Frame], progress: ProgressFunction, extractor: FeatureExtractor | None = None
-) -> Verdict:
+def check_frames(frames: Sequence[Frame], progress: Progress, extractor: FeatureExtractor | None = None) -> Verdict:
     """The verdict on frames; pairs and suspects are indices among them.
 
     Photographs that cannot be read are left out: the upload reports them.
@@ -64,7 +62,7 @@ class _Comparison:
 
     frames: Sequence[Frame]
     extractor: FeatureExtractor
-    progress: ProgressFunction
+    progress: Progress
     views: dict[int, PosedView | None] = field(default_factory=dict)
     matched: list[MatchedPair] = field(default_factory=list)
     pairs: list[Pair] = field(default_factory=list)

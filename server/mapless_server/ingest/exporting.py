@@ -11,7 +11,7 @@ from mapless import Client, Reference
 
 from ..formats.colmap.writing import PosedImage
 from ..formats.writing import IMAGES, LAYOUTS, image_name, write_file
-from ..progress import ProgressFunction
+from ..progress import Progress
 
 PARALLEL = 4
 
@@ -30,7 +30,7 @@ def check_target(folder: Path, layout: str) -> None:
         raise ValueError(f"{folder} is not empty; an export does not write over anything")
 
 
-def export_scene(client: Client, scene: str, folder: Path, layout: str, progress: ProgressFunction) -> int:
+def export_scene(client: Client, scene: str, folder: Path, layout: str, progress: Progress) -> int:
     """Writes a scene's references into a folder; the number of them.
 
     The description comes last, so that a folder without it is an export that was cut off.

@@ -10,7 +10,7 @@ from mapless.names import check_id
 
 from ..dataset import MAX_NAME_LENGTH, Dataset, Frame
 from ..formats import ReadOptions, read_dataset
-from ..progress import ProgressFunction
+from ..progress import Progress
 from .existing import KnownReferences
 from .report import ImportReport
 from .upload import Uploader
@@ -70,7 +70,7 @@ def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Fr
     return dataset, tuple(_prefixed(frame, options.id_prefix) for frame in frames)
 
 
-def store_frames(client: Client, report: ImportReport, options: UploadOptions, progress: ProgressFunction) -> None:
+def store_frames(client: Client, report: ImportReport, options: UploadOptions, progress: Progress) -> None:
     """Stores the report's chosen frames in its scene, which is made if there is none.
 
     Raises:

@@ -26,7 +26,7 @@ from mapless import (
 )
 
 from ..dataset import Frame, Refusal
-from ..progress import ProgressFunction
+from ..progress import Progress
 from .existing import KnownReferences, Stored, difference, stored_of
 from .items import Item, batches_of, read_item
 from .report import ALREADY_THERE, ImportReport
@@ -50,7 +50,7 @@ class Uploader:
         known: KnownReferences,
         report: ImportReport,
         options: UploadOptions,
-        progress: ProgressFunction,
+        progress: Progress,
     ) -> None:
         self._client = client
         self._known = known

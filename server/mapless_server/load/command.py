@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from ..evaluation.plan import Progress
+    from ..progress import Progress
     from .report import Check
 
 load_app = typer.Typer(
@@ -135,8 +135,8 @@ def _measuring() -> Iterator[Progress]:
     from mapless import MaplessError
 
     from ..child import ServerFailed
-    from ..evaluation.command import progress_bars
     from ..evaluation.plan import UsageError
+    from ..progress import progress_bars
     from ..signals import terminable
 
     try:

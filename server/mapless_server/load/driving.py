@@ -14,8 +14,8 @@ from mapless import Client
 
 from ..child import child_server
 from ..demo.run import Place
-from ..evaluation.plan import Progress
 from ..evaluation.run import CONNECT
+from ..progress import Progress
 from .arrivals import Mix, Requests, plan_calls
 from .records import CallRecord, Fate
 from .requests import METHOD, read_answer, requests_for, store_references

@@ -14,7 +14,7 @@ from mapless import Client, RigidTransform
 
 from ..child import ChildServer, child_module
 from ..demo.run import Photograph
-from ..evaluation.plan import Progress
+from ..progress import Progress
 from . import no_op
 from .driving import CLOSED_SETTLE_SHARE
 from .echo import ECHO_METHOD, SHORT_METHOD

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
-from ..evaluation.command import write_json
 from ..machine import cpu_model
+from ..output_files import write_json
 from ..settings import available_cores
 from .records import Fate
 from .step import Step

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..demo.run import Place
-from ..evaluation.plan import Progress
+from ..progress import Progress
 from .arrivals import Mix
 from .driving import LoadedServer, calling, closed_step, find_saturation, open_step, server_with_scene
 from .records import Fate

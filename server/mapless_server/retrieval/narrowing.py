@@ -86,7 +86,8 @@ class Narrowing:
             away = centres - self.position.position
             kept &= np.einsum("ij,ij->i", away, away) <= (self.position.radius_m + self.margin_m) ** 2
         if self.heading is not None:
-            widest_deg = self.heading.max_angle_deg + self.margin_deg + 0.01
-            # A hundredth of a degree forgives rounding, where an angle of 0 or 180 is asked for.
-            kept &= axes @ self.heading.forward >= np.cos(np.radians(min(180.0, widest_deg)))
+            widest_deg = self.heading.max_angle_deg + self.margin_deg
+            if widest_deg < 180:
+                # A hundredth of a degree forgives rounding.
+                kept &= axes @ self.heading.forward >= np.cos(np.radians(widest_deg + 0.01))
         return kept
