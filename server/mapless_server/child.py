@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import threading
@@ -9,6 +10,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+
+from pydantic import SecretStr
+
+from .settings import PREFIX
 
 START_TIMEOUT_S = 120.0
 GRACE_S = 1.0
@@ -52,10 +57,14 @@ class ChildServer:
 
 
 @contextmanager
-def child_server(data_dir: Path, more_flags: Mapping[str, str] | None = None) -> Iterator[ChildServer]:
+def child_server(store: Path | SecretStr, more_flags: Mapping[str, str] | None = None) -> Iterator[ChildServer]:
     """A server on a free port of the loopback interface until the block is left, by whatever way.
 
     Settings of the environment hold for it, except where it listens and stores, and those of `more_flags`.
+
+    Args:
+        store: a data folder, or the URL of a database that servers share.
+        more_flags: of the command `serve`, with their values.
 
     Raises:
         ServerFailed: it ended, or did not listen within `START_TIMEOUT_S`.
@@ -63,23 +72,37 @@ def child_server(data_dir: Path, more_flags: Mapping[str, str] | None = None) ->
     flags = {
         "--host": "127.0.0.1",
         "--port": "0",
-        "--data-dir": str(data_dir),
         "--log-level": "warning",
         "--drain-grace-s": str(GRACE_S),
         "--metrics-port": "0",
     } | dict(more_flags or {})
-    with child_module("mapless_server", "serve", *(part for flag in flags.items() for part in flag)) as server:
+    environment = {}
+    if isinstance(store, Path):
+        flags["--data-dir"] = str(store)  # as a flag, it stands above any database of the environment
+    else:
+        environment[f"{PREFIX}DATABASE_URL"] = store.get_secret_value()  # all users can read a command line
+    arguments = [part for flag in flags.items() for part in flag]
+    with child_module("mapless_server", "serve", *arguments, environment=environment) as server:
         yield server
 
 
 @contextmanager
-def child_module(module: str, *arguments: str) -> Iterator[ChildServer]:
-    """A module that runs as a server and announces itself as ours does; otherwise as `child_server`."""
+def child_module(
+    module: str, *arguments: str, environment: Mapping[str, str] | None = None
+) -> Iterator[ChildServer]:
+    """A module that runs as a server and announces itself as ours does; otherwise as `child_server`.
+
+    Args:
+        module: its name.
+        arguments: of its command line.
+        environment: variables that are added to our own, or replace them.
+    """
     process = subprocess.Popen(
         [sys.executable, "-m", module, *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         text=True,
+        env=os.environ | (environment or {}),
     )
     try:
         yield ChildServer(_read_address(process), process.pid)

@@ -233,7 +233,7 @@ def _numbers(entry: Mapping[str, Any], field: str, shape: tuple[int, ...] | None
         raise ValueError(f"{field} is missing")
     try:
         values = np.array(entry[field], dtype=float)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:  # JSON's integers have any number of digits
         raise ValueError(f"{field} must be numbers") from error
     if shape is not None and values.shape != shape:
         raise ValueError(

@@ -53,7 +53,7 @@ class Settings(BaseSettings):
 
     host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on; 0.0.0.0 for all.")
     port: int = Field(default=50051, ge=0, le=65535, description="Port to listen on; 0 for any free one.")
-    data_dir: Path = Field(default=Path("mapless-data"), description="Folder of the store, on a local disk.")
+    data_dir: Path = Field(default=Path("mapless-data"), description="Folder of the store, on a local disk; as a flag, above database_url.")
     database_url: SecretStr | None = Field(
         default=None,
         description="Of a PostgreSQL that several servers share, postgresql://user:password@host/name; else data_dir.",
@@ -193,6 +193,9 @@ class LoadedSettings:
 def load_settings(flags: Mapping[str, Any], config: Path | None = None) -> LoadedSettings:
     """Settings from all sources.
 
+    A ``data_dir`` among the flags is where the store is meant to be, so that a ``database_url`` of elsewhere is void: a
+    program that starts a server on a folder of its own must not write to the database that its environment names.
+
     Args:
         flags: values given on the command line, by name; None means not given.
         config: a TOML file; None means that of MAPLESS_CONFIG, if any.
@@ -211,6 +214,8 @@ def load_settings(flags: Mapping[str, Any], config: Path | None = None) -> Loade
     for origin, given in sources.items():
         values |= given
         origins |= dict.fromkeys(given, origin)
+    if origins["data_dir"] == "flag" and origins["database_url"] != "flag":
+        values["database_url"], origins["database_url"] = None, "flag"
     try:
         return LoadedSettings(Settings(**values), origins)
     except ValidationError as error:

@@ -125,7 +125,7 @@ def _numbers(content: Mapping[str, Any], field: str, count: int) -> Array:
         raise ValueError(f"{field} is missing")
     try:
         values = np.array(content[field], dtype=float).reshape(-1)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:  # JSON's integers have any number of digits
         raise ValueError(f"{field} must be numbers") from error
     if len(values) != count or not np.isfinite(values).all():
         raise ValueError(f"{field} must be {count} finite numbers")

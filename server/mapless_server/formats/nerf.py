@@ -165,7 +165,7 @@ def _splits(content: Mapping[str, Any]) -> dict[str, str]:
 def _matrix(value: Any) -> Array:
     try:
         matrix = np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:  # JSON's integers have any number of digits
         raise ValueError("must be numbers") from error
     if not np.isfinite(matrix).all():
         raise ValueError("is not finite")
@@ -174,9 +174,15 @@ def _matrix(value: Any) -> Array:
 
 def _number(value: Mapping[str, Any], field: str, default: float) -> float:
     number = value.get(field, default)
-    if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
+    if isinstance(number, bool) or not isinstance(number, int | float):
         raise ValueError(f"{field} must be a number, is {number!r}")
-    return float(number)
+    try:
+        number = float(number)
+    except OverflowError as error:  # JSON's integers have any number of digits
+        raise ValueError(f"{field} is too large") from error
+    if not math.isfinite(number):
+        raise ValueError(f"{field} must be a number, is {number!r}")
+    return number
 
 
 def _whole(value: Mapping[str, Any], field: str) -> int:

@@ -69,7 +69,7 @@ def connected(connection: Connection, settings: Settings) -> Iterator[Client]:
     if options.tls or options.token is not None:
         options = ConnectOptions(timeout_s=options.timeout_s, upload_timeout_s=options.upload_timeout_s)
     with (
-        child_server(settings.data_dir) as server,
+        child_server(settings.database_url or settings.data_dir) as server,
         Client(server.address, options) as client,
     ):
         yield client

@@ -98,11 +98,11 @@ def _look(config: Path | None, data_dir: Path | None) -> Database:
 
 
 def _settings(config: Path | None, data_dir: Path | None) -> tuple[str | None, Path]:
-    """URL of the shared database, if there is one, and the data folder. A folder given by hand is what is meant."""
+    """URL of the shared database, if there is one, and the data folder."""
     from ..settings import load_settings
 
     settings = load_settings({"data_dir": data_dir}, config).settings
-    url = None if data_dir else settings.database_url
+    url = settings.database_url
     return url.get_secret_value() if url else None, settings.data_dir
 
 

@@ -153,6 +153,9 @@ def _parse(database_url: str) -> URL:
     # The text is never repeated: what is wrong with it may be that its password is taken for something else.
     if url is None or url.drivername not in ("postgresql", "postgres", DRIVER) or not url.database:
         raise StoreError("database_url must be like postgresql://user:password@host:5432/database")
+    # Hosts are looked up and named in messages, and here a part of the password would be taken for one.
+    if "@" in f"{url.host}{url.database}":
+        raise StoreError("database_url has an @ too many: one in the user's name or password must be written %40")
     return url.set(drivername=DRIVER)
 
 
