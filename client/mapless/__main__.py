@@ -218,6 +218,8 @@ def _delete_reference(client: Client, arguments: argparse.Namespace) -> int:
 
 
 def _localize(client: Client, arguments: argparse.Namespace) -> int:
+    if arguments.rerank and not arguments.reference:
+        raise ValueError("--rerank chooses among references that --reference names")
     position_prior, heading_prior = _priors(arguments)
     answer = client.localize(
         arguments.photo,
@@ -252,7 +254,9 @@ def _retrieve(client: Client, arguments: argparse.Namespace) -> int:
 
 def _coverage(client: Client, arguments: argparse.Namespace) -> int:
     pose, camera = _read_pose(arguments.pose), _read_camera(arguments.camera)
-    return _print(client.check_coverage(arguments.scene, pose, camera))
+    coverage = client.check_coverage(arguments.scene, pose, camera)
+    _print(coverage)
+    return EXIT_REJECTED if coverage.verdict == "NOT_LOCALIZABLE" else 0
 
 
 def _read_camera(source: str) -> Camera:

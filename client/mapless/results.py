@@ -211,7 +211,7 @@ class Coverage:
         message: one sentence for a person, with the numbers that decided.
         expected_match_count: 2D-3D matches that a photograph is expected to have.
         image_share: share of the image in which there would be any, 0 to 1.
-        position_68_m: position error expected not to be exceeded in 68 % of cases; 0 where there is none to expect.
+        position_68_m: position error expected not to be exceeded in 68 % of cases; None where there is none to expect.
         references: names of those that would serve, those that see most first.
     """
 
@@ -219,7 +219,7 @@ class Coverage:
     message: str
     expected_match_count: int
     image_share: float
-    position_68_m: float
+    position_68_m: float | None
     references: tuple[str, ...]
 
 
@@ -278,7 +278,7 @@ def coverage_from_message(message: reference_pb.CheckCoverageResponse) -> Covera
         message=message.message,
         expected_match_count=message.expected_match_count,
         image_share=message.image_share,
-        position_68_m=message.position_68_m,
+        position_68_m=message.position_68_m or None,
         references=tuple(message.references),
     )
 

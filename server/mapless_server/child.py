@@ -87,9 +87,7 @@ def child_server(store: Path | SecretStr, more_flags: Mapping[str, str] | None =
 
 
 @contextmanager
-def child_module(
-    module: str, *arguments: str, environment: Mapping[str, str] | None = None
-) -> Iterator[ChildServer]:
+def child_module(module: str, *arguments: str, environment: Mapping[str, str] | None = None) -> Iterator[ChildServer]:
     """A module that runs as a server and announces itself as ours does; otherwise as `child_server`.
 
     Args:

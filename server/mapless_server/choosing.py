@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .errors import NotFound
+from .errors import DataLoss, NotFound
 from .method.features import FeatureExtractor
 from .query_views import QueryViews
 from .retrieval.chosen import Choice
@@ -58,12 +58,16 @@ class ReferenceChooser:
 
         Raises:
             NotFound: there is no such scene (field "scene") or reference (field "references[i]").
+            DataLoss: one that is named is damaged (field "references[i]").
             InvalidArgument: the image is bad.
         """
         # The scene comes first: a name that is wrong is found out before the photograph is described.
         entries = self.indexes.entries(scene_key, turn)
         for index, reference_id in enumerate(among):
             if reference_id not in entries:
+                if self.indexes.is_damaged(scene_key, reference_id):
+                    message = f"reference {reference_id!r} is damaged in the store: delete it and add it again"
+                    raise DataLoss(message, field=f"references[{index}]")
                 message = f"there is no reference {reference_id!r} in scene {scene_id_of(scene_key)!r}"
                 raise NotFound(message, field=f"references[{index}]")
         if not len(entries):

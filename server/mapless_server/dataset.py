@@ -22,6 +22,8 @@ from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangentia
 
 FILE_NAME = "cameras.json"
 MAX_NAME_LENGTH = 128
+MAX_SIDE_PX = 2**30
+"""No image's: what arithmetic with doubles and 32 bits takes without complaint."""
 SPLITS = ("", "train", "test")
 
 
@@ -200,7 +202,7 @@ def read_frame(folder: Path, entry: object, taken: Container[str]) -> Frame:
 
 def _camera(entry: Mapping[str, Any]) -> Camera:
     for side in ("width", "height"):
-        if not isinstance(entry.get(side), int) or isinstance(entry[side], bool) or entry[side] < 1:
+        if not isinstance(entry.get(side), int) or isinstance(entry[side], bool) or not 0 < entry[side] <= MAX_SIDE_PX:
             raise ValueError(f"{side} must be a whole number of pixels")
     k = _numbers(entry, "K", (3, 3))
     if not (k[0, 0] > 0 and k[1, 1] > 0):

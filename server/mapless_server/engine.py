@@ -190,16 +190,18 @@ class Engine:
         return choice
 
     async def audit(
-        self, scene_key: SceneKey, reference_ids: Sequence[str], caller: Caller
+        self, scene_key: SceneKey, reference_ids: Sequence[str], caller: Caller, are_listed: bool = False
     ) -> tuple[int, list[ReferenceAudit]]:
         """The scene's generation, and what the neighbours of some of its references say about them, in order.
 
+        Those that are not there are left out if they were listed, not named by the caller.
+
         Raises:
-            RequestError: an unknown scene or reference, a full queue, a passed deadline.
+            RequestError: an unknown scene or named reference, a full queue, a passed deadline.
         """
-        examiner = SceneExaminer(self._tools, scene_key)
+        examiner = SceneExaminer(self._tools, scene_key, () if are_listed else reference_ids)
         audits = await self._each(AUDIT, reference_ids, examiner.audit, caller, 0, jobs=1)
-        return examiner.generation, audits
+        return examiner.generation, [audit for audit in audits if audit is not None]
 
     async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
         """The scene's generation, and whether a photograph would be localized there.

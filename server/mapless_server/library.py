@@ -21,7 +21,7 @@ from mapless.names import reference_name
 
 from .claims import Claims
 from .decode import ImageLimits, decode_image
-from .errors import AlreadyExists, DataLoss, InvalidArgument
+from .errors import AlreadyExists, DataLoss, InvalidArgument, RequestError
 from .method.features import FeatureExtractor
 from .method.views import Photograph, PosedView
 from .store import DescribedReference, ReferenceRecord, Store
@@ -33,7 +33,8 @@ log = logging.getLogger(__name__)
 STORED_IMAGES = ImageLimits(max_bytes=2**31, max_pixels=2**30, min_side_px=1, max_side_px=2**20)
 """Stored photographs were let in under the limits of their time; limits set lower since do not make them unreadable."""
 
-_POLL_S = 0.05
+Loaded = tuple[int, tuple[PosedView, ...]]
+"""A scene's generation, and references of it."""
 
 
 class NotDescribedYet(Exception):
@@ -67,7 +68,7 @@ class ReferenceLibrary:
         extractor: FeatureExtractor,
         turn: Turn,
         waits: bool = True,
-    ) -> tuple[int, tuple[PosedView, ...]]:
+    ) -> Loaded:
         """The scene's generation and references of it, in the order asked for.
 
         Those without features of the extractor are described now, one by one until the turn is over; what was done by
@@ -149,6 +150,46 @@ class ReferenceLibrary:
             return decode_image(data, STORED_IMAGES)
         except InvalidArgument as error:
             raise DataLoss(f"the photograph of reference {record.reference_id!r} cannot be read: {error}") from error
+
+
+def load_usable(
+    load: Callable[[Sequence[str]], Loaded],
+    reference_ids: Sequence[str],
+    unusable: tuple[type[RequestError], ...],
+    tell: Callable[[str, RequestError], None],
+) -> Loaded:
+    """References of these ids, in order, less those that cannot be had.
+
+    Where all can be had they are read at one moment, and so are those that are left after a second look.
+
+    Args:
+        load: how to load some; it fails if it fails for one of them.
+        reference_ids: of the references.
+        unusable: what loading one of them raises that is to be left out; about the scene it is let through.
+        tell: called for each that is left out.
+    """
+    try:
+        return load(reference_ids)
+    except unusable as error:
+        if error.field == "scene":
+            raise
+    return load([it for it in reference_ids if _is_usable(load, it, unusable, tell)])
+
+
+def _is_usable(
+    load: Callable[[Sequence[str]], Loaded],
+    reference_id: str,
+    unusable: tuple[type[RequestError], ...],
+    tell: Callable[[str, RequestError], None],
+) -> bool:
+    try:
+        load([reference_id])
+    except unusable as error:
+        if error.field == "scene":
+            raise
+        tell(reference_id, error)
+        return False
+    return True
 
 
 def _announce(records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:

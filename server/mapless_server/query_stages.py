@@ -11,12 +11,13 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Generic, Protocol, TypeVar
 
 from .choosing import ReferenceChooser
-from .errors import NotFound, Unavailable
+from .errors import DataLoss, NotFound, Unavailable
 from .failures import failure_of
-from .library import NotDescribedYet
+from .library import Loaded, NotDescribedYet, load_usable
 from .method import localize as method
 from .method.correspond import Matches
 from .method.features import FeatureExtractor
@@ -46,7 +47,7 @@ SHORTLIST = 2
 """So many times the references wanted are matched with the photograph, and the best of them used (see BENCHMARKS.md).
 Those that are chosen would have been matched anyhow."""
 
-AS_THEY_COME = RankOptions(nearby_weight=1.0)
+THINNED_LATER = RankOptions(nearby_weight=1.0)
 """What is near one another is thinned out by matches, which tell better what is worth it."""
 
 MAX_LISTINGS = 3
@@ -237,10 +238,10 @@ class QueryStages:
             query.narrowing,
             query.reference_ids,
             turn,
-            AS_THEY_COME,
+            THINNED_LATER,
         )
         ranked = [chosen.reference_id for chosen in choice.references]
-        generation, shortlist = self._load(work, ranked, tier, turn)
+        generation, shortlist = self._load_chosen(work, ranked, tier, turn)
         view = work.views.view(tier.extractor, turn)
         with turn.stage("shortlist"):
             matches = tier.pipeline.matcher.match_query(view, shortlist, turn.check)
@@ -249,9 +250,14 @@ class QueryStages:
         references, query_matches = tuple(shortlist[i] for i in order), tuple(matches[i] for i in order)
         return Found(references, generation, view, turn.stage_seconds, choice, query_matches)
 
-    def _load(
-        self, work: Work, reference_ids: Sequence[str], tier: Tier, turn: Turn
-    ) -> tuple[int, tuple[PosedView, ...]]:
+    def _load_chosen(self, work: Work, reference_ids: Sequence[str], tier: Tier, turn: Turn) -> Loaded:
+        """Without those that are damaged, which were not the caller's choice; unless the caller named them."""
+        if work.query.reference_ids:
+            return self._load(work, reference_ids, tier, turn)
+        tell = partial(self._chooser.indexes.tell_damaged, work.query.scene_key)
+        return load_usable(lambda some: self._load(work, some, tier, turn), reference_ids, (DataLoss,), tell)
+
+    def _load(self, work: Work, reference_ids: Sequence[str], tier: Tier, turn: Turn) -> Loaded:
         # Only the first tier's references are waited for: there is an answer before the others'.
         waits = work.best is None
         return work.source.load(work.query.scene_key, reference_ids, tier.extractor, turn, waits=waits)

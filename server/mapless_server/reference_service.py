@@ -157,9 +157,11 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         engine = self._engine()
         scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
         reference_ids, token = await self._audit_page(request, scene_key, call)
-        generation, audits = await engine.audit(scene_key, reference_ids, call.caller) if reference_ids else (0, [])
         if not reference_ids:
             generation = (await self._stored(self._store.get_scene, scene_key)).generation
+            return pb.AuditSceneResponse(store_generation=generation)
+        are_listed = not request.references
+        generation, audits = await engine.audit(scene_key, reference_ids, call.caller, are_listed)
         messages = map(audit_to_message, audits)
         return pb.AuditSceneResponse(audits=messages, next_page_token=token, store_generation=generation)
 

@@ -7,7 +7,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 
-from .errors import NotFound
+from .errors import DataLoss, NotFound
 from .library import ReferenceLibrary
 from .method.features import FeatureExtractor
 from .retrieval.descriptor import GlobalDescriptor, Vector
@@ -45,27 +45,48 @@ class SceneIndexes:
         self._extractor = extractor
         self._capacity_bytes = capacity_bytes
         self._held: OrderedDict[SceneKey, _Held] = OrderedDict()
+        self._size_bytes = 0
         self._lock = threading.Lock()
 
     def entries(self, scene_key: SceneKey, turn: Turn) -> Entries:
         """The references of a scene as it is now.
 
         Those without a descriptor are described now, one by one until the turn is over; what was done by then stays
-        done.
+        done. One that cannot be described because it is damaged stays without.
 
         Raises:
             NotFound: there is no such scene (field "scene").
             Over: the turn is over.
-            DataLoss: what is stored of a reference is damaged.
         """
         entries = self._refresh(scene_key)
-        while undescribed := entries.undescribed():
+        while undescribed := self._find(scene_key).describable(entries):
             log.info("describing %d references of scene %s for retrieval", len(undescribed), scene_key)
             with turn.stage("describe"):
                 for reference_id, key in undescribed:
                     self._describe(scene_key, reference_id, key, turn)
             entries = self._refresh(scene_key)
         return entries
+
+    def is_damaged(self, scene_key: SceneKey, reference_id: str) -> bool:
+        """Whether a reference is in the scene, but not among its entries, since its pose or descriptor is damaged."""
+        held = self._find(scene_key)
+        if reference_id not in held.damaged_ids:
+            return False
+        try:
+            self._store.get_reference(scene_key, reference_id)
+        except DataLoss:
+            return True
+        except NotFound:  # its deletion was told by its key, which nobody knows of one that is damaged
+            held.damaged_ids.discard(reference_id)
+            return False
+        return True
+
+    def tell_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
+        """Logs, once while the scene is held, that a reference is not used because it is damaged."""
+        told = self._find(scene_key).told
+        if reference_id not in told:
+            told.add(reference_id)
+            log.error("reference %s of scene %s is not used: %s", reference_id, scene_key, error)
 
     def _describe(self, scene_key: SceneKey, reference_id: str, key: str, turn: Turn) -> None:
         """Finds and keeps a reference's descriptor; nothing if it was deleted since."""
@@ -83,6 +104,10 @@ class SceneIndexes:
                 self._store.add_descriptor(key, self._descriptor.name, vector)
             except NotFound:
                 return
+            except DataLoss as error:
+                self._find(scene_key).undescribable.add(key)
+                self.tell_damaged(scene_key, reference_id, error)
+                return
         self._find(scene_key).describe({key: vector})
 
     def _refresh(self, scene_key: SceneKey) -> Entries:
@@ -93,14 +118,14 @@ class SceneIndexes:
             # What cannot be brought up to date is not to be believed; and a scene that is gone takes no memory.
             self._forget(scene_key, held)
             raise
-        self._make_room(scene_key)
+        self._make_room(scene_key, held)
         return entries
 
     @property
     def size_bytes(self) -> int:
         """What all indexes hold in memory."""
         with self._lock:
-            return sum(held.index.size_bytes for held in self._held.values())
+            return self._size_bytes
 
     def _find(self, scene_key: SceneKey) -> _Held:
         with self._lock:
@@ -114,23 +139,43 @@ class SceneIndexes:
         with self._lock:
             if self._held.get(scene_key) is held:
                 del self._held[scene_key]
+                self._size_bytes -= held.counted_bytes
 
-    def _make_room(self, used: SceneKey) -> None:
+    def _make_room(self, used: SceneKey, held: _Held) -> None:
+        """Counts what the scene takes now, and forgets those used longest ago until there is room for it."""
         with self._lock:
-            size_bytes = sum(held.index.size_bytes for held in self._held.values())
-            for scene_key in list(self._held):
-                if size_bytes <= self._capacity_bytes:
-                    return
-                if scene_key != used:
-                    size_bytes -= self._held.pop(scene_key).index.size_bytes
+            if self._held.get(used) is not held:
+                return
+            size_bytes = held.index.size_bytes
+            self._size_bytes += size_bytes - held.counted_bytes
+            held.counted_bytes = size_bytes
+            while self._size_bytes > self._capacity_bytes and len(self._held) > 1:
+                _, oldest = self._held.popitem(last=False)
+                self._size_bytes -= oldest.counted_bytes
 
 
 class _Held:
-    """An index and the lock of who brings it up to date."""
+    """An index and the lock of who brings it up to date.
+
+    Attributes:
+        index: of the scene.
+        counted_bytes: what it took when it was last counted.
+        damaged_ids: of references that were left out of it; some may be deleted by now.
+        undescribable: keys of references that were found damaged when they were to be described.
+        told: ids of references that the log has been told of.
+    """
 
     def __init__(self, index: SceneIndex) -> None:
         self.index = index
+        self.counted_bytes = 0
+        self.damaged_ids: set[str] = set()
+        self.undescribable: set[str] = set()
+        self.told: set[str] = set()
         self._updating = threading.Lock()
+
+    def describable(self, entries: Entries) -> list[tuple[str, str]]:
+        """Id and key of the entries that have no descriptor and may get one."""
+        return [(reference_id, key) for reference_id, key in entries.undescribed() if key not in self.undescribable]
 
     def refresh(self, store: Store, scene_key: SceneKey, descriptor: str) -> Entries:
         with self._updating:
@@ -143,6 +188,10 @@ class _Held:
                     reference_id,
                     scene_key,
                 )
+            if changes.is_whole:
+                self.damaged_ids.clear()
+            self.damaged_ids.difference_update(it.reference_id for it in changes.added)
+            self.damaged_ids.update(changes.damaged)
             if changes.is_whole or changes.generation != since:
                 self.index.apply(changes)
             return self.index.entries()

@@ -53,7 +53,9 @@ class Settings(BaseSettings):
 
     host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on; 0.0.0.0 for all.")
     port: int = Field(default=50051, ge=0, le=65535, description="Port to listen on; 0 for any free one.")
-    data_dir: Path = Field(default=Path("mapless-data"), description="Folder of the store, on a local disk; as a flag, above database_url.")
+    data_dir: Path = Field(
+        default=Path("mapless-data"), description="Folder of the store, on a local disk; as a flag, above database_url."
+    )
     database_url: SecretStr | None = Field(
         default=None,
         description="Of a PostgreSQL that several servers share, postgresql://user:password@host/name; else data_dir.",
@@ -214,7 +216,7 @@ def load_settings(flags: Mapping[str, Any], config: Path | None = None) -> Loade
     for origin, given in sources.items():
         values |= given
         origins |= dict.fromkeys(given, origin)
-    if origins["data_dir"] == "flag" and origins["database_url"] != "flag":
+    if origins["data_dir"] == "flag" and origins["database_url"] in ("file", "environment"):
         values["database_url"], origins["database_url"] = None, "flag"
     try:
         return LoadedSettings(Settings(**values), origins)

@@ -66,7 +66,7 @@ def test_what_is_wrong_with_an_audit_is_named(client: Client) -> None:
     assert scene.value.field == "scene"
     with pytest.raises(NotFound) as reference:
         list(client.audit_scene("wall", ["nobody"]))
-    assert reference.value.field == "references"
+    assert reference.value.field == "references[0]"
     with pytest.raises(InvalidArgument) as size:
         list(client.audit_scene("wall", page_size=-1))
     assert size.value.field == "page_size"
@@ -87,6 +87,7 @@ def test_coverage_is_where_references_look_and_not_behind_them(client: Client) -
     ahead = client.check_coverage("wall", between, CAMERA)
     assert ahead.verdict == "LOCALIZABLE"
     assert ahead.expected_match_count > 50
+    assert ahead.position_68_m is not None
     assert 0 < ahead.position_68_m < 0.1
     assert ahead.references[0].startswith("scenes/wall/references/r")
     behind = RigidTransform(between.rotation @ np.diag([-1.0, 1.0, -1.0]), between.translation)

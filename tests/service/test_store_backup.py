@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 import subprocess
 import sys
 import threading
@@ -91,6 +92,26 @@ def test_either_database_comes_back_as_either(place: Place, destination: str, ba
             restore(backup, store.database)
         with pytest.raises(StoreError, match="exists already"):
             back_up(store.database, backup)
+
+
+def test_a_backup_is_its_owners_alone(
+    place: Place, backup: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From its first byte on: it holds everybody's photographs."""
+    seen: list[int] = []
+
+    def look(*_: object) -> None:
+        seen.extend(stat.S_IMODE(it.stat().st_mode) for it in tmp_path.iterdir() if it.is_file())
+
+    before = os.umask(0o022)
+    try:
+        with place.open() as store:
+            fill(store)
+            with closing(look_at(place)) as database:
+                back_up(database, backup, look)
+    finally:
+        os.umask(before)
+    assert set(seen) == {stat.S_IMODE(backup.stat().st_mode)} == {0o600}
 
 
 def test_a_backup_beside_writers_shows_one_moment(place: Place, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +11,9 @@ from scenes import SceneOptions, make_scene
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.audit import AuditOptions, PairMatches, Verdict, audit_references, surroundings_of
+from mapless_server.audit.auditor import Auditor
 from mapless_server.audit.resection import with_focal
-from mapless_server.audit.surroundings import PosedName, Surroundings
+from mapless_server.audit.surroundings import Gone, PosedName, Surroundings, places_of
 from mapless_server.audit.verdict import ReferenceAudit
 from mapless_server.method.views import Features, PosedView
 
@@ -185,11 +187,39 @@ def test_references_are_loaded_as_they_are_needed(references: list[PosedView], p
         loaded.extend(names)  # type: ignore[arg-type]
         return [by_name[name] for name in names]  # type: ignore[attr-defined]
 
-    around = Surroundings([PosedName(r.name, r.world_from_camera) for r in by_name.values()], load)
+    around = Surroundings(places_of([PosedName(r.name, r.world_from_camera) for r in by_name.values()]), load)
     options = AuditOptions(candidate_count=4, neighbour_count=4)
     assert audit_references([references[0].name], around, options, pairs)[0].verdict is Verdict.CONSISTENT
     assert set(loaded) <= {r.name for r in references}
     assert len(loaded) == len(set(loaded)) == 5
+
+
+def test_a_neighbour_that_cannot_be_loaded_is_no_witness(references: list[PosedView], pairs: PairMatches) -> None:
+    """The verdict is the same as if it had never been there, and it is asked for once."""
+    lost = references[VICTIM + 1].name
+    scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
+    left = {r.name: r for r in scene if r.name != lost}
+    asked: list[str] = []
+
+    def load(names: Sequence[str]) -> list[PosedView]:
+        asked.extend(names)
+        return [left[name] for name in names if name in left]
+
+    around = Surroundings(places_of([PosedName(r.name, r.world_from_camera) for r in scene]), load)
+    names = [r.name for r in scene if r.name != lost]
+    audits = audit_references(names, around, pairs=pairs)
+    assert [a.verdict for a in audits] == [a.verdict for a in audit(list(left.values()), pairs)]
+    assert asked.count(lost) == 1
+    with pytest.raises(Gone):
+        audit_references([lost], around, pairs=pairs)
+
+
+def test_what_is_remembered_of_neighbours_changes_no_verdict(references: list[PosedView], pairs: PairMatches) -> None:
+    scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
+    names = [r.name for r in scene]
+    forgetful = Auditor(surroundings_of(scene), AuditOptions(), pairs, remembered_findings=1)
+    assert [forgetful.audit(name) for name in names] == audit(scene, pairs)
+    assert len(forgetful._findings) == 1
 
 
 def test_senseless_options_are_refused() -> None:

@@ -8,7 +8,7 @@ from io import StringIO
 from rich.console import Console
 
 from mapless import ReferenceAudit
-from mapless_server.audit.command import cells_of, summary_of, table_of, to_html, to_json, worst_first
+from mapless_server.audit.command import Examined, cells_of, summary_of, table_of, to_html, to_json, worst_first
 
 
 def finding(name: str, verdict: str, offset_m: float = 0.0, focal_ratio: float = 1.0) -> ReferenceAudit:
@@ -33,8 +33,8 @@ def test_the_worst_comes_first() -> None:
 
 def test_the_summary_counts_every_finding() -> None:
     expected = "5 references: 1 swapped image, 2 wrong pose, 1 unverifiable, 1 consistent"
-    assert summary_of(worst_first(FINDINGS)) == expected
-    assert summary_of([]) == "0 references: none"
+    assert summary_of(Examined("hall", worst_first(FINDINGS), 5)) == expected
+    assert summary_of(Examined("hall", total=0)) == "0 references: none"
 
 
 def test_figures_that_are_not_known_are_dashes_not_zeros() -> None:
@@ -53,9 +53,9 @@ def test_the_table_has_a_row_for_each_reference() -> None:
 
 
 def test_the_reports_hold_every_reference_and_names_cannot_break_the_page() -> None:
-    content = json.loads(json.dumps(to_json("hall", FINDINGS), allow_nan=False))
+    content = json.loads(json.dumps(to_json(Examined("hall", FINDINGS, 5)), allow_nan=False))
     assert [r["verdict"] for r in content["references"]] == [a.verdict for a in FINDINGS]
-    page = to_html("hall", FINDINGS)
+    page = to_html(Examined("hall", FINDINGS, 5))
     assert page.count('<tr class="') == 5
     assert page.count('<tr class="alarm">') == 3
     assert "&lt;far&gt;" in page

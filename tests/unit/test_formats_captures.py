@@ -141,9 +141,31 @@ def test_frames_of_transforms_that_are_wrong_are_refused_by_name(tmp_path: Path)
         assert part in why
 
 
+def test_numbers_that_no_double_holds_refuse_their_frame(tmp_path: Path) -> None:
+    """JSON's integers have any number of digits, and so have the names of files."""
+    folder = write_transforms(tmp_path)
+
+    def change(content: Any) -> None:
+        frames = content["frames"]
+        frames[0]["fl_x"] = 10**400
+        frames[1]["transform_matrix"][0][0] = 10**400
+        frames[2]["file_path"] = "1" * 5000
+
+    edit(folder / "transforms.json", change)
+    dataset = read_dataset(folder)
+    assert len(dataset.frames) == 1
+    why = sorted(reasons(dataset).values())
+    for reason, part in zip(
+        why, ("fl_x is too large", "File name too long", "transform_matrix: must be num"), strict=True
+    ):
+        assert part in reason
+
+
 @pytest.mark.parametrize(
     ("about", "message"),
     [
+        ({"applied_scale": 10**400}, "applied_scale is too large"),
+        ({"applied_transform": [[10**400, 0, 0, 0]] * 3}, "applied_transform: must be numbers"),
         ({"applied_transform": np.diag([1.0, -1.0, 1.0, 1.0])[:3].tolist()}, "applied_transform: .*reflection"),
         ({"applied_scale": 0}, "applied_scale must be above 0"),
         ({"frames": []}, "frames must be a list"),
@@ -256,11 +278,20 @@ def test_corrected_poses_are_preferred(tmp_path: Path) -> None:
 def test_frames_of_captures_that_are_wrong_are_refused_by_name(tmp_path: Path) -> None:
     write_polycam(tmp_path)
     cameras = tmp_path / "keyframes" / "corrected_cameras"
+    whole = (cameras / "1003.json").read_bytes()
     edit(cameras / "1000.json", lambda content: content.update(width=640))
     edit(cameras / "1001.json", lambda content: content.pop("t_12"))
     (cameras / "1002.json").write_text("{")
+    edit(cameras / "1003.json", lambda content: content.update(fx=10**400))
+    write_image(tmp_path / "keyframes" / "corrected_images" / "1004.jpg")
+    (cameras / "1004.json").write_bytes(whole)
     dataset = read_dataset(tmp_path)
-    assert [frame.name for frame in dataset.frames] == ["1003"]
+    assert [frame.name for frame in dataset.frames] == ["1004"]
     why = " | ".join(reasons(dataset).values())
-    for part in ("640x64, the image is 96x64", "1001.json: t_12 is missing", "1002.json is not JSON"):
+    for part in (
+        "640x64, the image is 96x64",
+        "1001.json: t_12 is missing",
+        "1002.json is not JSON",
+        "1003.json: intrinsics must",
+    ):
         assert part in why

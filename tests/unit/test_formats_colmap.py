@@ -93,6 +93,17 @@ def test_hlocs_list_of_queries_is_the_split(tmp_path: Path) -> None:
     assert [frame.split for frame in read_dataset(folder).frames] == ["train", "test", "train", "test"]
 
 
+def test_names_in_hlocs_list_may_have_spaces(tmp_path: Path) -> None:
+    folder = write_binary(tmp_path)
+    images = folder / "sparse" / "0" / "images.bin"
+    images.write_bytes(images.read_bytes().replace(b"cam0/0001.png\0", b"cam0/00 1.png\0"))
+    (folder / "images" / "cam0" / "0001.png").rename(folder / "images" / "cam0" / "00 1.png")
+    (folder / "sparse" / "0" / "list_test.txt").write_text("cam0/00 1.png\r\n\ncam0/0003.png\n")
+    dataset = read_dataset(folder)
+    tests = [frame.image_path.name for frame in dataset.frames if frame.split == "test"]
+    assert (sorted(tests), len(dataset.frames)) == (["00 1.png", "0003.png"], 4)
+
+
 def test_images_may_lie_anywhere(tmp_path: Path) -> None:
     folder = write_text(tmp_path / "model")
     (folder / "images").rename(tmp_path / "elsewhere")

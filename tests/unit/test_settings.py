@@ -36,6 +36,21 @@ def test_precedence_and_origins(config: Path, monkeypatch: pytest.MonkeyPatch) -
     assert {name: loaded.origins[name] for name in expected} == expected
 
 
+@pytest.mark.parametrize("origin", ["file", "environment"])
+def test_a_folder_given_by_hand_stands_above_a_database_of_elsewhere(
+    origin: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, url = tmp_path / "mapless.toml", "postgresql://u:secret@h/db"
+    config.write_text(f'database_url = "{url}"\n' if origin == "file" else "")
+    if origin == "environment":
+        monkeypatch.setenv("MAPLESS_DATABASE_URL", url)
+    loaded = load_settings({"data_dir": tmp_path}, config)
+    assert (loaded.settings.database_url, loaded.origins["database_url"]) == (None, "flag")
+    assert loaded.settings.data_dir == tmp_path
+    monkeypatch.setenv("MAPLESS_DATA_DIR", "elsewhere")
+    assert load_settings({"data_dir": None}, config).settings.database_url == SecretStr(url)
+
+
 def test_the_file_may_be_named_by_the_environment(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MAPLESS_CONFIG", str(config))
     assert load_settings({}).settings.port == 1000

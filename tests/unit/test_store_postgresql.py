@@ -297,6 +297,9 @@ class TestOpening:
             "mysql://u:secret@h/db",
             "postgresql://u:secret@h",
             "postgresql://u:sec@ret:secret@h:port/db",
+            "postgresql://u:p@secret@127.0.0.1:1/db",
+            "postgresql://u:p@127.0.0.1/secret@127.0.0.1:1/db",
+            "postgresql://u@secret:p@127.0.0.1:1/db",
             "secret",
             "",
             "postgresql://u:secret@127.0.0.1:1/db",
@@ -308,6 +311,7 @@ class TestOpening:
         with pytest.raises(StoreError) as caught:
             Store.connect(url)
         assert "secret" not in str(caught.value)
+        assert ("%40" in str(caught.value)) == (url.count("@") > 1 and "port" not in url)
         assert "\n" not in str(caught.value)
         assert caught.value.__cause__ is None
 

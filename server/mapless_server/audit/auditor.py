@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from .report import describe
 from .resection import Freedom
 from .surroundings import Surroundings
 from .verdict import ReferenceAudit, Verdict
+
+_WHOLE_LOOKS = 10
+"""First looks that are kept whole."""
 
 
 def audit_references(
@@ -51,8 +54,35 @@ def audit_references(
     return [auditor.audit(name) for name in names]
 
 
+@dataclass(frozen=True)
+class _Finding:
+    """What is remembered of a first look, which itself takes megabytes.
+
+    Attributes:
+        is_usable, offset_m, turn_deg, excess: as of the look; zeros where it is not usable.
+        is_alarm: whether its verdict is.
+    """
+
+    is_usable: bool
+    is_alarm: bool
+    offset_m: float = 0.0
+    turn_deg: float = 0.0
+    excess: float = 0.0
+
+    @staticmethod
+    def of(look: Look) -> _Finding:
+        if not look.is_usable:
+            return _Finding(False, look.verdict().is_alarm)
+        return _Finding(True, look.verdict().is_alarm, look.offset_m, look.turn_deg, look.excess(Freedom.NOTHING))
+
+
 class Auditor:
-    """Audits references; remembers looks, since neighbours are asked again and again. Of one thread."""
+    """Audits references; of one thread.
+
+    Neighbours are asked again and again, so what first looks found is remembered, in some hundred bytes each. The last
+    few looks are kept whole, at about 1.6 MiB each and the references that they look at; beyond these it takes what
+    its surroundings remember.
+    """
 
     def __init__(
         self,
@@ -60,14 +90,15 @@ class Auditor:
         options: AuditOptions,
         pairs: PairMatches,
         check: Callable[[], None] = lambda: None,
-        remembered_looks: int = 300,
+        remembered_findings: int = 3000,
     ) -> None:
         self._around, self._options, self._pairs, self._check = surroundings, options, pairs, check
-        self._remembered_looks = remembered_looks
+        self._remembered_findings = remembered_findings
+        self._findings: OrderedDict[str, _Finding] = OrderedDict()
         self._looks: OrderedDict[str, tuple[Look, tuple[str, Likeness]]] = OrderedDict()
 
     def audit(self, name: str) -> ReferenceAudit:
-        """The verdict on one reference."""
+        """The verdict on one reference. Raises Gone if one cannot be loaded any more that could be before."""
         look, twin = self._first_look(name)
         is_wide = False
         if not look.is_usable:
@@ -94,13 +125,22 @@ class Auditor:
         return describe(look, Verdict.CONSISTENT, change=change)
 
     def _first_look(self, name: str) -> tuple[Look, tuple[str, Likeness]]:
-        """From the neighbours by pose, and the reference most like it among them; remembered."""
+        """From the neighbours by pose, and the reference most like it among them; the last few are remembered."""
         if name not in self._looks:
             self._looks[name] = self._look(name, self._around.near(name, self._options.candidate_count))
-            while len(self._looks) > self._remembered_looks:
+            while len(self._looks) > _WHOLE_LOOKS:
                 self._looks.popitem(last=False)
         self._looks.move_to_end(name)
         return self._looks[name]
+
+    def _finding(self, name: str) -> _Finding:
+        """What the first look found; remembered."""
+        if name not in self._findings:
+            self._findings[name] = _Finding.of(self._first_look(name)[0])
+            while len(self._findings) > self._remembered_findings:
+                self._findings.popitem(last=False)
+        self._findings.move_to_end(name)
+        return self._findings[name]
 
     def _wide_look(self, name: str, twin: tuple[str, Likeness]) -> tuple[Look, tuple[str, Likeness]]:
         """From those that look like it."""
@@ -129,8 +169,8 @@ class Auditor:
         verdict = look.verdict()
         if not verdict.is_alarm:
             return verdict
-        looks = [self._first_look(reference.name)[0] for reference in look.neighbourhood.references]
-        usable = [other for other in looks if other.is_usable]
+        findings = [self._finding(reference.name) for reference in look.neighbourhood.references]
+        usable = [other for other in findings if other.is_usable]
         if not usable:
             return verdict
         noise_m = float(np.median([other.offset_m for other in usable]))
@@ -140,20 +180,19 @@ class Auditor:
     def _without_suspects(self, look: Look, verdict: Verdict, is_wide: bool) -> tuple[Look, Verdict, str]:
         """Look and verdict without neighbours that look faulty; and the worst of them, if too few others are left."""
         names = [reference.name for reference in look.neighbourhood.references]
-        suspects = [name for name in names if self._first_look(name)[0].verdict().is_alarm]
+        suspects = [name for name in names if self._finding(name).is_alarm]
         if not suspects:
             return look, verdict, ""
         rest = [name for name in names if name not in suspects]
         if not is_wide:
-            spare = [
-                n for n in self._around.near(look.subject.name, 2 * self._options.candidate_count) if n not in names
-            ]
-            rest += [n for n in spare if not self._first_look(n)[0].verdict().is_alarm]
+            wider = self._around.near(look.subject.name, 2 * self._options.candidate_count)
+            spare = [view.name for view in self._around.views([n for n in wider if n not in names])]
+            rest += [n for n in spare if not self._finding(n).is_alarm]
         second, _ = self._look(look.subject.name, rest)
         if second.is_usable:
             return second, self._judge(second), ""
-        worse = max(suspects, key=lambda n: self._first_look(n)[0].excess(Freedom.NOTHING))
-        if self._first_look(worse)[0].excess(Freedom.NOTHING) < look.excess(Freedom.NOTHING):
+        worse = max(suspects, key=lambda n: self._finding(n).excess)
+        if self._finding(worse).excess < look.excess(Freedom.NOTHING):
             return look, verdict, ""
         return second, Verdict.UNVERIFIABLE, worse
 
@@ -166,9 +205,9 @@ class Auditor:
             reach_deg = options.swap_reach * max(options.rotation_tolerance_deg, sigma * look.sigma_deg)
             if apart_m > reach_m or apart_deg > reach_deg:
                 continue
-            partner = self._around.view(name)
-            if self._fits(look.subject, partner) and self._fits(partner, look.subject):
-                return name
+            for partner in self._around.views([name]):
+                if self._fits(look.subject, partner) and self._fits(partner, look.subject):
+                    return name
         return ""
 
     def _fits(self, photographed: PosedView, posed: PosedView) -> bool:
@@ -192,7 +231,7 @@ class Auditor:
         if change is None or not change.is_alarm:
             return change
         # Points of neighbours whose poses are wrong lie where nothing is.
-        honest = [r for r in look.neighbourhood.references if not self._first_look(r.name)[0].verdict().is_alarm]
+        honest = [r for r in look.neighbourhood.references if not self._finding(r.name).is_alarm]
         if len(honest) == len(look.neighbourhood.references):
             return change
         return changed_region(look_at(subject, honest, self._pairs, self._options), options)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
 
 ALARMS = ("SWAPPED_IMAGE", "WRONG_POSE_AND_INTRINSICS", "WRONG_POSE", "WRONG_INTRINSICS", "SCENE_CHANGED")
 """Findings that mislead whoever is localized, the worst first."""
+
+MAX_PAGE = 100
+MAX_TIMEOUT_S = 600.0
+"""Servers give no call more, unless they are set to."""
 
 _ORDER = (*ALARMS, "DUPLICATE", "UNVERIFIABLE", "CONSISTENT")
 
@@ -38,46 +43,88 @@ def audit_command(
     token_file: TokenFile = None,
     client_id: ClientId = "",
 ) -> None:
-    """Examine the references of a scene against their neighbours; exit code 1 when any of them is wrong."""
-    from rich.console import Console
+    """Examine the references of a scene against their neighbours; exit code 1 when any of them is wrong.
 
+    What was found by then is told, too, when it ends early: exit code 1 after an error, 130 after Ctrl-C.
+    """
     from mapless import MaplessError
 
     from ..child import ServerFailed
     from ..ingest.connection import Connection, connected
-    from ..output_files import check_writable, write_json
+    from ..output_files import check_writable
     from ..progress import progress_bars
     from ..settings import ConfigError, load_settings
     from ..signals import terminable
 
+    examined = Examined(scene)
     try:
         for file in filter(None, (report, html)):
             check_writable(file)
         settings = load_settings({}).settings
         connection = Connection(address, tls, ca, cert, key, token_file, client_id)
         with terminable(), connected(connection, settings) as client, progress_bars() as progress:
-            total = client.get_scene(scene).reference_count
-            audits: list[ReferenceAudit] = []
-            progress("audit", 0, total)
-            for found in client.audit_scene(scene, page_size=page_size):
-                audits.append(found)
-                progress("audit", len(audits), total)
+            examined.total = client.get_scene(scene).reference_count
+            progress("audit", 0, examined.total)
+            for found in client.audit_scene(scene, page_size=page_size, timeout_s=timeout_s(page_size)):
+                examined.audits.append(found)
+                progress("audit", len(examined.audits), examined.total)
     except (ValueError, ConfigError) as error:
         _fail(str(error), code=2)
     except (MaplessError, ServerFailed) as error:
-        _fail(str(error), code=1)
-    ordered = worst_first(audits)
-    shown = [a for a in ordered if everything or a.verdict != "CONSISTENT"]
+        examined.stopped = str(error)
+        print(f"mapless-server: {error}", file=sys.stderr)
+        raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        examined.stopped = "interrupted"
+        raise typer.Exit(128 + signal.SIGINT) from None
+    except SystemExit:
+        examined.stopped = "terminated"
+        raise
+    finally:
+        if examined.total is not None:
+            _tell(examined, everything, report, html)
+    if any(a.verdict in ALARMS for a in examined.audits):
+        raise typer.Exit(1)
+
+
+@dataclass
+class Examined:
+    """How far an audit came.
+
+    Attributes:
+        scene: which.
+        audits: of the references so far, in the order they came.
+        total: how many references the scene has; None before that is known.
+        stopped: why it ended early; empty if it did not.
+    """
+
+    scene: str
+    audits: list[ReferenceAudit] = field(default_factory=list)
+    total: int | None = None
+    stopped: str = ""
+
+
+def timeout_s(page_size: int) -> float:
+    """Deadline of a page: some seconds, and three times what a reference takes at most, as far as servers go along."""
+    return min(5.0 + 3.0 * (page_size or MAX_PAGE), MAX_TIMEOUT_S)
+
+
+def _tell(examined: Examined, everything: bool, report: Path | None, html: Path | None) -> None:
+    """Prints and writes what was found, all of it or as far as it came."""
+    from rich.console import Console
+
+    from ..output_files import write_json
+
+    examined = replace(examined, audits=worst_first(examined.audits))
+    shown = [a for a in examined.audits if everything or a.verdict != "CONSISTENT"]
     console = Console(soft_wrap=True)
     if shown:
         console.print(table_of(shown))
-    console.print(summary_of(ordered))
+    console.print(summary_of(examined), markup=False)
     if report is not None:
-        write_json(report, to_json(scene, ordered))
+        write_json(report, to_json(examined))
     if html is not None:
-        html.write_text(to_html(scene, ordered), encoding="utf-8")
-    if any(a.verdict in ALARMS for a in ordered):
-        raise typer.Exit(1)
+        html.write_text(to_html(examined), encoding="utf-8")
 
 
 def worst_first(audits: Iterable[ReferenceAudit]) -> list[ReferenceAudit]:
@@ -89,11 +136,14 @@ def _rank(verdict: str) -> int:
     return _ORDER.index(verdict) if verdict in _ORDER else len(_ORDER)
 
 
-def summary_of(audits: Sequence[ReferenceAudit]) -> str:
+def summary_of(examined: Examined) -> str:
     """How many there are of each finding, in one line."""
-    counts = Counter(a.verdict for a in audits)
+    counts = Counter(a.verdict for a in examined.audits)
     parts = [f"{counts[v]} {v.lower().replace('_', ' ')}" for v in sorted(counts, key=_rank)]
-    return f"{len(audits)} references: {', '.join(parts) or 'none'}"
+    found = f"{len(examined.audits)} references: {', '.join(parts) or 'none'}"
+    if not examined.stopped:
+        return found
+    return f"stopped after {len(examined.audits)} of {examined.total} references ({examined.stopped}); {found}"
 
 
 def cells_of(audit: ReferenceAudit) -> tuple[str, ...]:
@@ -127,29 +177,35 @@ def table_of(audits: Sequence[ReferenceAudit]) -> Table:
     return table
 
 
-def to_json(scene: str, audits: Sequence[ReferenceAudit]) -> dict[str, Any]:
-    """The report for programs."""
-    return {"scene": scene, "summary": summary_of(audits), "references": [asdict(a) for a in audits]}
+def to_json(examined: Examined) -> dict[str, Any]:
+    """The report for programs; `stopped` says why it ended early and is empty if it did not."""
+    return {
+        "scene": examined.scene,
+        "summary": summary_of(examined),
+        "stopped": examined.stopped,
+        "reference_count": examined.total,
+        "references": [asdict(a) for a in examined.audits],
+    }
 
 
 _STYLE = """body{font:14px sans-serif;margin:2em}table{border-collapse:collapse}td,th{padding:.3em .6em;
 border-bottom:1px solid #ccc;text-align:left}.alarm{background:#fdd}.note{background:#ffd}"""
 
 
-def to_html(scene: str, audits: Sequence[ReferenceAudit]) -> str:
+def to_html(examined: Examined) -> str:
     """The report as one page that needs nothing else."""
     from html import escape
 
     rows = []
-    for audit in audits:
+    for audit in examined.audits:
         kind = "alarm" if audit.verdict in ALARMS else "" if audit.verdict == "CONSISTENT" else "note"
         cells = "".join(f"<td>{escape(cell)}</td>" for cell in cells_of(audit))
         rows.append(f'<tr class="{kind}">{cells}</tr>')
     head = "".join(f"<th>{escape(column)}</th>" for column in COLUMNS)
-    title = escape(f"Audit of scene {scene}")
+    title = escape(f"Audit of scene {examined.scene}")
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
-        f"<h1>{title}</h1><p>{escape(summary_of(audits))}</p><table><tr>{head}</tr>{''.join(rows)}</table></html>\n"
+        f"<h1>{title}</h1><p>{escape(summary_of(examined))}</p><table><tr>{head}</tr>{''.join(rows)}</table></html>\n"
     )
 
 

@@ -120,10 +120,11 @@ def check_coverage(
     options = options or CoverageOptions()
     world_from_camera = world_from_camera.shifted(-surroundings.origin)
     names = surroundings.near_pose(world_from_camera, options.neighbour_count)
-    if len(names) < 2:
-        message = f"{len(names)} references, at least 2 are needed"
+    references = surroundings.views(names)
+    if len(references) < 2:
+        message = f"{len(references)} references, at least 2 are needed"
         return Coverage(CoverageVerdict.NOT_LOCALIZABLE, message, 0, 0.0, None, ())
-    neighbourhood = build_neighbourhood(surroundings.views(names), pairs, options.epipolar_px, StructureOptions())
+    neighbourhood = build_neighbourhood(references, pairs, options.epipolar_px, StructureOptions())
     return forecast(camera, world_from_camera, neighbourhood, options)
 
 

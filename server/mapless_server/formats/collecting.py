@@ -160,4 +160,8 @@ def numbers(words: Sequence[str], count: int, what: str) -> Array:
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:
     """Sorts "frame-9" before "frame-10"."""
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
+    key: list[tuple[int, int, str]] = []
+    for part in filter(None, re.split(r"(\d+)", name)):
+        digits = part.lstrip("0")  # not as a number: Python reads none of thousands of digits
+        key.append((0, len(digits), digits) if part.isdecimal() else (1, 0, part))
+    return key

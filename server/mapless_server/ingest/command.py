@@ -133,7 +133,7 @@ def _run_import(
     from ..progress import progress_bars
     from ..signals import terminable
     from .check import check_frames
-    from .importing import read_frames
+    from .importing import read_frames, refuse_wrong_images
     from .report import ImportReport, verdict_lines
 
     try:
@@ -146,6 +146,10 @@ def _run_import(
     _say(f"{folder}: {len(dataset.frames)} frames in layout {dataset.format}, {len(frames)} of them chosen")
     for note in dataset.notes:
         _say(f"note: {note}")
+    if not dataset.metric and not dataset.notes:
+        _say(
+            "note: its unit of length is not the metre; it is taken for metres, and all distances are then in that unit"
+        )
     report = ImportReport(scene, dataset, frames, is_dry=connection is None)
     with terminable(), _reported(report, report_file):
         if options.check:
@@ -153,7 +157,11 @@ def _run_import(
                 report.verdict = check_frames(frames, progress)
             for line in verdict_lines(report.verdict, frames):
                 _say(line)
-        if connection is not None:
+        if connection is None:
+            refuse_wrong_images(report)
+        elif report.verdict is not None and report.verdict.is_wrong:
+            report.stopped = "nothing is stored while the poses do not fit the photographs; --skip-check does it anyhow"
+        else:
             _store(report, options, settings, connection)
     raise typer.Exit(0 if report.went_well else 1)
 

@@ -8,7 +8,9 @@ from pathlib import Path
 from mapless import AlreadyExists, Client, Reference
 from mapless.names import check_id
 
-from ..dataset import MAX_NAME_LENGTH, Dataset, Frame
+from ..dataset import MAX_NAME_LENGTH, Dataset, Frame, Refusal
+from ..decode import ImageLimits, image_size
+from ..errors import InvalidArgument
 from ..formats import ReadOptions, read_dataset
 from ..progress import Progress
 from .existing import KnownReferences
@@ -68,6 +70,20 @@ def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Fr
         step = len(frames) / options.max_count
         frames = [frames[int(i * step)] for i in range(options.max_count)]
     return dataset, tuple(_prefixed(frame, options.id_prefix) for frame in frames)
+
+
+def refuse_wrong_images(report: ImportReport) -> None:
+    """Refuses the report's chosen frames whose image a server would refuse by its header; for a dry run."""
+    for frame in report.chosen:
+        try:
+            size = image_size(frame.image_path.read_bytes(), ImageLimits())
+        except (OSError, InvalidArgument) as error:
+            report.refused.append(Refusal(frame.name, str(error)))
+            continue
+        camera = frame.camera
+        if size != (camera.width_px, camera.height_px):
+            reason = f"has {size[0]}x{size[1]} pixels, its camera {camera.width_px}x{camera.height_px}"
+            report.refused.append(Refusal(frame.name, f"{frame.image_path.name} {reason}"))
 
 
 def store_frames(client: Client, report: ImportReport, options: UploadOptions, progress: Progress) -> None:

@@ -65,9 +65,10 @@ def verdict_lines(verdict: Verdict, frames: Sequence[Frame]) -> list[str]:
         return [
             "warning: the poses could not be checked: none of the photographs that were compared have enough matches"
         ]
+    compared = {index for error in verdict.pairs for index in error.pair}
     errors = (
         f"epipolar error of matched points under the given poses: median {verdict.median_px:.2f} px over "
-        f"{len(verdict.pairs)} pairs of neighbours, {100 * verdict.bad_share:.0f} % of them above "
+        f"{len(verdict.pairs)} pairs of neighbours among {len(compared)} of {len(frames)} photographs, {100 * verdict.bad_share:.0f} % of them above "
         f"{verdict.threshold_px:.1f} px"
     )
     lines = [errors]
@@ -95,7 +96,8 @@ def print_report(report: ImportReport, console: Console) -> None:
     """The report, at most SHOWN reasons of a kind."""
     _print_reasons("refused", report.refused, console)
     if report.is_dry:
-        summary = f"{len(report.chosen)} references could be imported, {len(report.refused)} are refused"
+        good = len(report.chosen) - (len(report.refused) - len(report.dataset.refused))
+        summary = f"{good} references could be imported, {len(report.refused)} are refused"
         console.print(summary, markup=False, highlight=False)
         return
     _print_reasons("skipped as duplicates", [it for it in report.skipped if it.reason != ALREADY_THERE], console)
@@ -107,7 +109,8 @@ def print_report(report: ImportReport, console: Console) -> None:
     console.print(f"scene {report.scene}: {', '.join(counts)}", markup=False, highlight=False)
     if report.stopped:
         console.print(f"stopped: {report.stopped}", markup=False, highlight=False)
-        console.print("what is in stays in; the same command goes on from there", markup=False)
+        if report.added:
+            console.print("what is in stays in; the same command goes on from there", markup=False)
 
 
 def to_json(report: ImportReport) -> dict[str, Any]:

@@ -61,6 +61,7 @@ def back_up(database: Database, path: Path, on_progress: Progress = ignore_progr
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
     try:
         with _faults_said(f"backup {path} cannot be made"):
+            unfinished.touch(mode=0o600)  # everybody's photographs, which the store keeps from other users, too
             with database.read() as source:
                 database.take_your_time(source)
                 version = read_version(source)  # from here on, the transaction sees one moment
@@ -95,6 +96,7 @@ def restore(path: Path, database: Database, on_progress: Progress = ignore_progr
             database.write() as target,
         ):
             database.take_your_time(target)
+            queries.forget_removed(target)
             if target.scalar(select(func.count()).select_from(scene)):
                 raise StoreError(f"database {database.name} has scenes; a backup needs an empty store")
             _copy_rows(source, target, _tables_of(source, _NOT_RESTORED), on_progress)
@@ -102,6 +104,7 @@ def restore(path: Path, database: Database, on_progress: Progress = ignore_progr
             written = verify(target, on_progress)
             if written.faults or not found.counts.items() <= written.counts.items():
                 raise StoreError(f"database {database.name} does not keep what is written to it")
+            queries.forget_removed(target)
     return written
 
 
@@ -143,7 +146,7 @@ def _portions(source: Connection, table: Table) -> Iterator[list[dict[str, Any]]
     """Rows, some megabytes at a time."""
     portion: list[dict[str, Any]] = []
     size_bytes = 0
-    for row in source.execution_options(yield_per=BLOBS_AT_A_TIME).execute(select(table)).mappings():
+    for row in source.execute(select(table), execution_options={"yield_per": BLOBS_AT_A_TIME}).mappings():
         portion.append(dict(row))
         size_bytes += sum(len(value) for value in row.values() if isinstance(value, bytes))
         if size_bytes >= _BYTES_AT_A_TIME or len(portion) == _ROWS_AT_A_TIME:
@@ -162,7 +165,7 @@ def _skip_generations(source: Connection, target: Connection) -> None:
         raised = {key: max(saved[key], former.get(key, 0)) + GENERATIONS_SKIPPED for key in saved}
         target.execute(insert(scene_generation), [{"scene_id": key, "generation": it} for key, it in raised.items()])
     latest = select(column.generation).where(column.scene_id == scene.c.scene_id).scalar_subquery()
-    target.execute(update(scene).values(first_generation=latest))
+    target.execute(update(scene).where(~queries.is_set_apart(scene.c.scene_id)).values(first_generation=latest))
 
 
 def _verify_copy(source: Connection, path: Path, on_progress: Progress) -> Verification:

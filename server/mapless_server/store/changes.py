@@ -40,7 +40,7 @@ def _read(
     statement = _select_indexed(descriptor_name).where(
         reference.c.scene_id == scene_key, reference.c.generation > after_generation
     )
-    result = connection.execution_options(yield_per=_ROWS_AT_A_TIME).execute(statement)
+    result = connection.execute(statement, execution_options={"yield_per": _ROWS_AT_A_TIME})
     found: list[IndexedReference] = []
     damaged: list[str] = []
     for portion in result.partitions():

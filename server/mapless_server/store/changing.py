@@ -17,9 +17,12 @@ from mapless_server.store.observed import observed
 from mapless_server.store.records import NewReference, ReferenceRecord, SceneRecord
 from mapless_server.tenancy import SceneKey, scene_id_of
 
+REFERENCES_DELETED_AT_A_TIME = 100
+"""About a second: less than others wait who want to write to SQLite."""
+
 
 class ChangingStore(BaseStore):
-    """Each method is one transaction: all of it happens or nothing."""
+    """Each method is one transaction, in others' eyes at least: all of it happens or nothing."""
 
     @observed
     def create_scene(self, scene_key: SceneKey) -> SceneRecord:
@@ -41,12 +44,25 @@ class ChangingStore(BaseStore):
     def delete_scene(self, scene_key: SceneKey) -> None:
         """Delete a scene and all its references.
 
+        A large one is first gone, in one transaction, and then deleted, a portion at a time, so that nobody has to wait
+        for it. What is left when we are cut off in between is deleted together with the next scene.
+
         Raises:
             NotFound: there is no such scene.
         """
+        column = tables.scene.c
         with self._changing() as connection:
             queries.begin_change(connection, scene_key)
-            connection.execute(delete(tables.scene).where(tables.scene.c.scene_id == scene_key))
+            self._database.take_your_time(connection)
+            count = connection.execute(select(column.reference_count).where(column.scene_id == scene_key)).scalar_one()
+            if count > REFERENCES_DELETED_AT_A_TIME:
+                queries.set_apart(connection, scene_key)
+            else:
+                connection.execute(delete(tables.scene).where(column.scene_id == scene_key))
+        is_more = True
+        while is_more:
+            with self._database.write() as connection:  # changes nothing that anybody sees
+                is_more = queries.delete_portion(connection, REFERENCES_DELETED_AT_A_TIME)
 
     @observed
     def add_references(self, scene_key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, Table, select, update
+from sqlalchemy import ColumnElement, Connection, Row, Select, Table, delete, insert, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
 from mapless_server.errors import AlreadyExists, NotFound
@@ -15,6 +16,10 @@ from mapless_server.tenancy import KEY_SEPARATOR, SceneKey, end_of_keys, key_of,
 
 _IDS_PER_STATEMENT = 500
 """Databases bound the number of parameters of a statement."""
+_REMOVED = "-/"
+"""What keys of deleted scenes begin with: no tenant's name is a hyphen."""
+_END_OF_REMOVED = "-0"
+"""The first text, by code point, after all of them."""
 
 
 def select_scenes() -> Select[Any]:
@@ -88,6 +93,48 @@ def begin_change(connection: Connection, scene_key: SceneKey, added_count: int =
     return generation
 
 
+def set_apart(connection: Connection, scene_key: SceneKey) -> str:
+    """Delete a scene but keep its references' rows, under a key at which nobody finds them; the caller has its lock.
+
+    That is one short row a reference, where deleting means megabytes: `delete_portion` does that afterwards.
+
+    Returns:
+        The key.
+    """
+    key = f"{_REMOVED}{uuid.uuid4().hex}"
+    # It gets no generation, without which no statement here takes it for a scene.
+    connection.execute(insert(scene).values(scene_id=key, create_time_us=0))
+    connection.execute(update(reference).where(reference.c.scene_id == scene_key).values(scene_id=key))
+    connection.execute(delete(scene).where(scene.c.scene_id == scene_key))
+    return key
+
+
+def delete_portion(connection: Connection, count: int) -> bool:
+    """Delete some of what was set apart, by whomever; whether there may be more.
+
+    What another server is deleting at this moment is left to it.
+    """
+    column = reference.c
+    portion = select(column.key).where(is_set_apart(column.scene_id)).limit(count)
+    keys = connection.scalars(portion.with_for_update(skip_locked=True)).all()
+    if keys:
+        connection.execute(delete(reference).where(column.key.in_(keys)))
+        return True
+    is_empty = ~select(column.key).where(column.scene_id == scene.c.scene_id).exists()
+    connection.execute(delete(scene).where(is_set_apart(scene.c.scene_id), is_empty))
+    return False
+
+
+def forget_removed(connection: Connection) -> None:
+    """Delete all that was set apart, at once."""
+    connection.execute(delete(scene).where(is_set_apart(scene.c.scene_id)))
+
+
+def is_set_apart(scene_id: ColumnElement[str]) -> ColumnElement[bool]:
+    """Whether a row's scene is one that was deleted."""
+    return (scene_id >= _REMOVED) & (scene_id < _END_OF_REMOVED)
+
+
 def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
     """Keys by id, of those of these references that exist."""
     statement = select(reference.c.reference_id, reference.c.key).where(reference.c.scene_id == scene_key)
@@ -155,7 +202,7 @@ def hold_reference(connection: Connection, key: str) -> Row[Any]:
 
     Raises NotFound if it was deleted.
     """
-    statement: Select[Any] = select(reference.c.scene_id, reference.c.reference_id).where(reference.c.key == key)
+    statement: Select[Any] = select(reference.c.scene_id, reference.c.reference_id).where(_is_there(key))
     row = connection.execute(statement.with_for_update(read=True, key_share=True)).one_or_none()
     if row is None:
         raise reference_deleted()
@@ -164,7 +211,7 @@ def hold_reference(connection: Connection, key: str) -> Row[Any]:
 
 def find_scene_key(connection: Connection, key: str) -> SceneKey:
     """Scene of the reference with this key. Raises NotFound if it was deleted."""
-    scene_key: str | None = connection.scalar(select(reference.c.scene_id).where(reference.c.key == key))
+    scene_key: str | None = connection.scalar(select(reference.c.scene_id).where(_is_there(key)))
     if scene_key is None:
         raise reference_deleted()
     return SceneKey(scene_key)
@@ -175,7 +222,7 @@ def find_image(connection: Connection, key: str) -> Row[Any]:
     statement: Select[Any] = (
         select(reference.c.reference_id, reference.c.image_sha256, image.c.data)
         .outerjoin(image, image.c.reference_key == reference.c.key)
-        .where(reference.c.key == key)
+        .where(_is_there(key))
     )
     row = connection.execute(statement).one_or_none()
     if row is None:
@@ -186,7 +233,8 @@ def find_image(connection: Connection, key: str) -> Row[Any]:
 def has_features(connection: Connection, key: str, extractor: str) -> bool:
     """Whether there are features of this extractor."""
     column = features.c
-    statement = select(column.extractor).where(column.reference_key == key, column.extractor == extractor)
+    statement = select(column.extractor).join(reference, reference.c.key == column.reference_key)
+    statement = statement.where(_is_there(key), column.extractor == extractor)
     return connection.scalar(statement) is not None
 
 
@@ -200,6 +248,11 @@ def insert_new(connection: Connection, table: Table, row: Mapping[str, Any]) -> 
     """Insert a row unless one with its primary key is there already; whether it was inserted."""
     addition = _upsert(connection, table).values(row).on_conflict_do_nothing()
     return connection.execute(addition, execution_options={"preserve_rowcount": True}).rowcount == 1
+
+
+def _is_there(key: str) -> ColumnElement[bool]:
+    """The one row of ``reference`` with a key, unless its scene was deleted."""
+    return (reference.c.key == key) & ~is_set_apart(reference.c.scene_id)
 
 
 def _upsert(connection: Connection, table: Table) -> Any:

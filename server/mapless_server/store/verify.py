@@ -44,6 +44,8 @@ def ignore_progress(what: str, done: int, total: int) -> None:
 def verify(connection: Connection, on_progress: Progress = ignore_progress) -> Verification:
     """Check the whole store, in the caller's transaction, which must see one moment.
 
+    What is left of a deleted scene is counted, and not looked at.
+
     Raises:
         ValueError: it is no store, or one of a newer program.
         DataLoss: the database itself is damaged, so that not even its rows can be read.
@@ -79,6 +81,7 @@ def _check_references(connection: Connection, counts: dict[str, int], on_progres
         image.c.data,
         select(func.count()).where(features.c.reference_key == column.key).scalar_subquery().label("feature_sets"),
     ).outerjoin(image, image.c.reference_key == column.key)
+    statement = statement.where(~queries.is_set_apart(column.scene_id))
     for row in _stream(connection, statement, "references", counts[reference.name], on_progress):
         yield from _fault(row, "camera and pose", codec.decode_geometry, row.key, row.geometry, row.geometry_sha256)
         yield from _fault(row, "image", rows.image, row)
@@ -91,6 +94,7 @@ def _check_features(connection: Connection, counts: dict[str, int], on_progress:
     statement: Select[Any] = select(reference.c.scene_id, reference.c.reference_id, reference.c.key, features).join(
         reference, reference.c.key == features.c.reference_key
     )
+    statement = statement.where(~queries.is_set_apart(reference.c.scene_id))
     for row in _stream(connection, statement, "features", counts[features.name], on_progress):
         owner = rows.features_owner(row.key, row.extractor)
         yield from _fault(row, f"features of {row.extractor}", codec.decode_view, owner, row.data, row.sha256)
@@ -101,6 +105,7 @@ def _check_descriptors(connection: Connection, counts: dict[str, int], on_progre
     statement: Select[Any] = select(
         reference.c.scene_id, reference.c.reference_id, reference.c.key, global_descriptor
     ).join(reference, reference.c.key == global_descriptor.c.reference_key)
+    statement = statement.where(~queries.is_set_apart(reference.c.scene_id))
     for row in _stream(connection, statement, "descriptors", counts[global_descriptor.name], on_progress):
         owner, what = rows.descriptor_owner(row.key, row.name), f"global descriptor {row.name}"
         yield from _fault(row, what, codec.check, owner, row.data, row.sha256, what)
@@ -109,12 +114,13 @@ def _check_descriptors(connection: Connection, counts: dict[str, int], on_progre
 
 def _check_counts(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:
     references = select(reference.c.scene_id, reference.c.generation)
+    references = references.where(~queries.is_set_apart(reference.c.scene_id))
     found, latest = Counter[str](), dict[str, int]()
     for row in _stream(connection, references, "scenes", counts[reference.name], on_progress):
         found[row.scene_id] += 1
         latest[row.scene_id] = max(row.generation, latest.get(row.scene_id, 0))
     generations = queries.read_generations(connection)
-    for row in connection.execute(select(scene)):
+    for row in connection.execute(select(scene).where(~queries.is_set_apart(scene.c.scene_id))):
         key, generation = row.scene_id, generations.get(row.scene_id)
         if row.reference_count != found.pop(key, 0):
             yield f"{_scene(key)}: its count of references is wrong"
@@ -135,7 +141,7 @@ def _stream(
     connection: Connection, statement: Select[Any], what: str, total: int, on_progress: Progress
 ) -> Iterator[Row[Any]]:
     done = 0
-    for portion in connection.execution_options(yield_per=BLOBS_AT_A_TIME).execute(statement).partitions():
+    for portion in connection.execute(statement, execution_options={"yield_per": BLOBS_AT_A_TIME}).partitions():
         yield from portion
         done += len(portion)
         on_progress(f"checking {what}", done, total)

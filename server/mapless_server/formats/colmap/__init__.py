@@ -35,7 +35,8 @@ def read(path: Path, options: ReadOptions) -> Dataset:
     images = _images_folder(path, folders[0], model, options.images)
     collector = Collector(images)
     queries = folders[0] / "list_test.txt"  # hloc's name
-    tests = set(read_text(queries).split()) if queries.is_file() else set()
+    lines = read_text(queries).splitlines() if queries.is_file() else []
+    tests = {line.strip() for line in lines} - {""}  # one a line: COLMAP's names may have spaces
     for name in sorted(model.images, key=natural_order):
         with collector.attempt(name):
             camera, pose = model.camera_and_pose(name)

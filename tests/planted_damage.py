@@ -1,0 +1,21 @@
+"""Damage to what is stored, as a bad disk would do it: bytes that are not those that were stored."""
+
+from __future__ import annotations
+
+from mapless_server.store import Store
+from mapless_server.tenancy import SceneKey
+
+_COLUMN = {
+    "features": "UPDATE features SET data = zeroblob(64) WHERE reference_key = ?",
+    "descriptor": "UPDATE global_descriptor SET data = zeroblob(64) WHERE reference_key = ?",
+    "pose": "UPDATE reference SET geometry = zeroblob(64) WHERE key = ?",
+}
+
+
+def damage(store: Store, scene_key: SceneKey, reference_id: str, what: str) -> None:
+    """Damages the "features", the "descriptor" or the "pose" of a reference, by the store's back door."""
+    with store.database.write() as connection:
+        key = connection.exec_driver_sql(
+            "SELECT key FROM reference WHERE scene_id = ? AND reference_id = ?", (scene_key, reference_id)
+        ).scalar_one()
+        assert connection.exec_driver_sql(_COLUMN[what], (key,)).rowcount > 0
