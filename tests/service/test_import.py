@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 from images import encode
@@ -193,6 +194,36 @@ def test_a_folder_without_a_layout_is_named(tmp_path: Path) -> None:
     assert done.exit_code == 2
     assert "no layout that is known" in done.stderr
     assert run("import", tmp_path, "not an id", "--dry-run").exit_code == 2
+
+
+def test_poses_that_do_not_fit_are_not_stored_unless_told_to(
+    server: RunningServer, client: Client, scene: str, tmp_path: Path
+) -> None:
+    """A script sees it by the exit code."""
+    folder = write_wall(tmp_path)
+    file = folder / "cameras.json"
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        pose = np.array(frame["world_from_camera"])
+        frame["world_from_camera"] = (pose @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
+    file.write_text(json.dumps(content))
+    refused = run_import(server, folder, scene)
+    assert refused.exit_code == 1
+    assert "axes" in refused.stderr
+    assert "nothing is stored while the poses do not fit the photographs; --skip-check" in refused.stdout
+    assert run_import(server, folder, scene, "--skip-check").exit_code == 0
+    assert len(stored(client, scene)) == len(content["frames"])
+
+
+def test_a_dry_run_finds_images_of_another_size(folder: Path) -> None:
+    file = folder / "cameras.json"
+    content = json.loads(file.read_text())
+    content["frames"][2]["width"] = 640
+    file.write_text(json.dumps(content))
+    done = run("import", folder, "scene", "--dry-run", "--skip-check")
+    assert done.exit_code == 1
+    assert f"{COUNT - 1} references could be imported, 1 are refused" in done.stdout
+    assert "its camera 640x" in done.stdout
 
 
 @pytest.mark.thorough

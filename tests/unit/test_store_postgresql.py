@@ -299,7 +299,6 @@ class TestOpening:
             "postgresql://u:sec@ret:secret@h:port/db",
             "postgresql://u:p@secret@127.0.0.1:1/db",
             "postgresql://u:p@127.0.0.1/secret@127.0.0.1:1/db",
-            "postgresql://u@secret:p@127.0.0.1:1/db",
             "secret",
             "",
             "postgresql://u:secret@127.0.0.1:1/db",

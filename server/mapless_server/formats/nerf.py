@@ -11,6 +11,7 @@ Pixels: nerfstudio shoots the ray of pixel (0, 0) through (0.5, 0.5), so princip
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -80,7 +81,8 @@ def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
         raise ValueError("file_path must be a path")
     path = str(PurePosixPath(path))
     named = (path + ending for ending in _ENDINGS)
-    found = next((name for name in named if (collector.folder / name).is_file()), path)
+    # Not Path.is_file, which raises where a name is longer than any file's.
+    found = next((name for name in named if os.path.isfile(collector.folder / name)), path)
     collector.image(found)
     return found
 

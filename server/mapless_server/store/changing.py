@@ -20,6 +20,9 @@ from mapless_server.tenancy import SceneKey, scene_id_of
 REFERENCES_DELETED_AT_A_TIME = 100
 """About a second: less than others wait who want to write to SQLite."""
 
+GENERATIONS_REMEMBERED = 100_000
+"""How far back `list_changes` knows what was deleted: some 10 MB a scene; who asks less often may read it all."""
+
 
 class ChangingStore(BaseStore):
     """Each method is one transaction, in others' eyes at least: all of it happens or nothing."""
@@ -158,6 +161,7 @@ class ChangingStore(BaseStore):
             connection.execute(delete(tables.reference).where(tables.reference.c.key == key))
             tombstone = {"scene_id": scene_key, "generation": generation, "reference_key": key}
             connection.execute(insert(tables.removed_reference).values(tombstone))
+            queries.forget_removals(connection, scene_key, generation - GENERATIONS_REMEMBERED)
 
 
 def _now() -> datetime:

@@ -11,7 +11,15 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.principal import DEFAULT_TENANT
-from mapless_server.store.tables import features, global_descriptor, image, reference, scene, scene_generation
+from mapless_server.store.tables import (
+    features,
+    global_descriptor,
+    image,
+    reference,
+    removed_reference,
+    scene,
+    scene_generation,
+)
 from mapless_server.tenancy import KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
 
 _IDS_PER_STATEMENT = 500
@@ -133,6 +141,15 @@ def forget_removed(connection: Connection) -> None:
 def is_set_apart(scene_id: ColumnElement[str]) -> ColumnElement[bool]:
     """Whether a row's scene is one that was deleted."""
     return (scene_id >= _REMOVED) & (scene_id < _END_OF_REMOVED)
+
+
+def forget_removals(connection: Connection, scene_key: SceneKey, until_generation: int) -> None:
+    """Forget which references were deleted up to a generation: who knows the scene as of before reads it as a whole."""
+    removed = removed_reference.c
+    old = delete(removed_reference).where(removed.scene_id == scene_key, removed.generation <= until_generation)
+    if connection.execute(old).rowcount:
+        known = update(scene).where(scene.c.scene_id == scene_key)
+        connection.execute(known.values(first_generation=until_generation))
 
 
 def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:

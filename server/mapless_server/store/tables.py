@@ -79,7 +79,7 @@ reference = Table(
     Index("reference_by_generation", "scene_id", "generation"),
 )
 
-# References that were deleted, as long as their scene exists.
+# References that were deleted in the latest generations of a scene, see GENERATIONS_REMEMBERED.
 removed_reference = Table(
     "removed_reference",
     metadata,
