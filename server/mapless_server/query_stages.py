@@ -211,6 +211,8 @@ class QueryStages:
         if not found.references:
             unknown = work.query.narrowing.is_empty
             where = "the scene has no references" if unknown else "no reference is where the prior says"
+            if found.choice is not None and found.choice.references:
+                where = "what is stored of the references that resemble the photograph is damaged"
             return self._conclude(work, found, Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, where)))
         part = self._method.prepare(
             found.view, found.references, tier.pipeline, work.query.options, job.check, found.query_matches

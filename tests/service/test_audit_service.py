@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from images import encode
+from planted_damage import damage
 from servers import listening
 from wall import wall
 
@@ -15,6 +16,7 @@ from mapless import Camera, Client, InvalidArgument, NewReference, NotFound, Rig
 from mapless_server.serve import make_engine
 from mapless_server.settings import Settings
 from mapless_server.store import Store
+from mapless_server.tenancy import SceneKey
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
 SHOTS = wall(CAMERA, 7)
@@ -73,6 +75,21 @@ def test_what_is_wrong_with_an_audit_is_named(client: Client) -> None:
     with pytest.raises(InvalidArgument) as twice:
         list(client.audit_scene("wall", ["r1", "r1"]))
     assert twice.value.field == "references[1]"
+
+
+@pytest.mark.parametrize("what", ["features", "descriptor"])
+def test_a_damaged_reference_is_named_on_its_page_and_by_its_name(tmp_path: Path, what: str) -> None:
+    settings = Settings(host="127.0.0.1", port=0, data_dir=tmp_path, workers=2, metrics=False, warm_up=False)
+    store = Store.open(tmp_path)
+    with listening(settings, store, make_engine) as (running, _), Client(running.address) as client:
+        client.create_scene("s")
+        news = [NewReference(f"r{i}", encode(".png", pixels), CAMERA, pose) for i, (pixels, pose) in enumerate(SHOTS)]
+        client.add_references("s", news[:4])
+        damage(store, SceneKey("s"), "r1", what)
+        listed = list(client.audit_scene("s"))
+        assert [audit.verdict for audit in listed] == ["CONSISTENT", "UNVERIFIABLE", "CONSISTENT", "CONSISTENT"]
+        assert listed[1].message == "is damaged in the store: delete it and add it again"
+        assert list(client.audit_scene("s", ["r1"])) == listed[1:2]
 
 
 def test_an_empty_scene_has_nothing_to_audit(client: Client) -> None:

@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from images import encode, textured
+from planted_damage import damage
 from servers import CAMERA, RunningServer, pose, serving
 
 from mapless import (
     Camera,
     Client,
+    DataLoss,
     HeadingPrior,
     InvalidArgument,
     LocalizationResult,
@@ -21,6 +23,8 @@ from mapless import (
     PositionPrior,
     Rejected,
 )
+from mapless_server.store import Store
+from mapless_server.tenancy import SceneKey
 
 COUNT = 12
 PHOTOS = [encode(".png", textured(seed=i)) for i in range(COUNT)]
@@ -141,6 +145,41 @@ def test_a_store_without_descriptors_is_described_by_the_first_call(tmp_path: Pa
             assert ids([use.name for use in answer.diagnostics.references]) == ["r2"]
             assert answer.diagnostics.retrieval == "others"
         assert ["describe" in it.diagnostics.stage_s for it in (first, second)] == [True, False]
+
+
+@pytest.mark.parametrize("what", ["features", "descriptor", "pose"])
+def test_a_damaged_reference_costs_itself_unless_it_is_named(tmp_path: Path, what: str) -> None:
+    """A scene of four, whose first one the photograph resembles most."""
+    store = Store.open(tmp_path)
+    with serving(tmp_path, store=store) as server, Client(server.address) as client:
+        client.create_scene("s")
+        client.add_references("s", [NewReference(f"r{i}", PHOTOS[i], CAMERA, pose(float(i))) for i in range(4)])
+        damage(store, SceneKey("s"), "r0", what)
+        answer = client.localize(PHOTOS[0], CAMERA, "s", reference_count=2)
+        assert isinstance(answer, LocalizationResult)
+        used = ids([use.name for use in answer.diagnostics.references])
+        assert len(used) == 2
+        assert "r0" not in used
+        for is_reranked in (True, False):
+            if what == "descriptor" and not is_reranked:  # nobody looks at it
+                continue
+            with pytest.raises(DataLoss, match="'r0' is damaged"):
+                client.localize(PHOTOS[0], CAMERA, "s", ["r1", "r0"], rerank_references=is_reranked)
+
+
+def test_a_damaged_reference_without_a_descriptor_does_not_keep_the_others_from_being_found(tmp_path: Path) -> None:
+    with serving(tmp_path) as server, Client(server.address) as client:
+        client.create_scene("s")
+        client.add_references("s", [NewReference(f"r{i}", PHOTOS[i], CAMERA, pose(float(i))) for i in range(3)])
+    store = Store.open(tmp_path)
+    damage(store, SceneKey("s"), "r0", "features")
+    with serving(tmp_path, descriptor_name="others", store=store) as server, Client(server.address) as client:
+        for _ in range(2):
+            found = client.retrieve_references(PHOTOS[2], CAMERA, "s", 1)
+            assert ids([it.name for it in found]) == ["r2"]
+            answer = client.localize(PHOTOS[2], CAMERA, "s")
+            assert isinstance(answer, LocalizationResult)
+            assert sorted(ids([use.name for use in answer.diagnostics.references])) == ["r1", "r2"]
 
 
 @pytest.mark.parametrize(

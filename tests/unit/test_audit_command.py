@@ -3,12 +3,29 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import StringIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
-from mapless import ReferenceAudit
-from mapless_server.audit.command import Examined, cells_of, summary_of, table_of, to_html, to_json, worst_first
+from mapless import ReferenceAudit, Unavailable
+from mapless_server.audit.command import (
+    Examined,
+    cells_of,
+    summary_of,
+    table_of,
+    timeout_s,
+    to_html,
+    to_json,
+    worst_first,
+)
+from mapless_server.cli import app
 
 
 def finding(name: str, verdict: str, offset_m: float = 0.0, focal_ratio: float = 1.0) -> ReferenceAudit:
@@ -35,6 +52,58 @@ def test_the_summary_counts_every_finding() -> None:
     expected = "5 references: 1 swapped image, 2 wrong pose, 1 unverifiable, 1 consistent"
     assert summary_of(Examined("hall", worst_first(FINDINGS), 5)) == expected
     assert summary_of(Examined("hall", total=0)) == "0 references: none"
+
+
+def test_an_audit_that_was_stopped_says_how_far_it_came() -> None:
+    stopped = Examined("hall", worst_first(FINDINGS[:2]), 40, "the server is gone")
+    assert summary_of(stopped).startswith("stopped after 2 of 40 references (the server is gone); 2 references: ")
+    content = to_json(stopped)
+    assert (content["stopped"], content["reference_count"], len(content["references"])) == ("the server is gone", 40, 2)
+    assert "stopped after 2 of 40" in to_html(stopped)
+
+
+def test_a_page_has_time_for_all_its_references_and_no_more_than_servers_give() -> None:
+    assert [timeout_s(size) for size in (1, 10, 100, 1000)] == [8.0, 35.0, 305.0, 600.0]
+
+
+@pytest.mark.parametrize(
+    ("failure", "code", "why"),
+    [
+        (Unavailable("UNAVAILABLE", "the server is gone"), 1, "gone"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (SystemExit(143), 143, "terminated"),
+    ],
+    ids=["error", "ctrl-c", "sigterm"],
+)
+def test_what_was_found_before_the_end_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException, code: int, why: str
+) -> None:
+    asked: list[float | None] = []
+
+    class Ending:
+        def get_scene(self, scene: str) -> Any:
+            return SimpleNamespace(reference_count=40)
+
+        def audit_scene(self, scene: str, *, page_size: int, timeout_s: float | None) -> Iterator[ReferenceAudit]:
+            asked.append(timeout_s)
+            yield from FINDINGS
+            raise failure
+
+    @contextmanager
+    def connected(*_: Any) -> Iterator[Ending]:
+        yield Ending()
+
+    monkeypatch.setattr("mapless_server.ingest.connection.connected", connected)
+    report, html = tmp_path / "report.json", tmp_path / "report.html"
+    arguments = ["audit", "hall", "--address", "127.0.0.1:1", "--report", str(report), "--html", str(html)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == code
+    content = json.loads(report.read_text())
+    assert [r["verdict"] for r in content["references"]] == [a.verdict for a in worst_first(FINDINGS)]
+    assert why in content["stopped"]
+    assert f"stopped after {len(FINDINGS)} of 40 references" in result.output.replace("\n", "")
+    assert "stopped after" in html.read_text()
+    assert asked == [35.0]
 
 
 def test_figures_that_are_not_known_are_dashes_not_zeros() -> None:

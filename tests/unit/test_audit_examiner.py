@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from mapless_server.tenancy import SceneKey
 KEY = SceneKey("s")
 OPTIONS = SceneOptions(point_count=250, reference_count=6, baseline_m=0.4, noise_px=0.3, distractor_count=40)
 REFERENCES: list[PosedView] = list(make_scene(np.random.default_rng(7), OPTIONS).references)
+FLAT = {"flat": np.full(4, 0.5, np.float32)}
 
 
 class Extractor:
@@ -51,7 +52,7 @@ class Descriptor:
 
 def new(i: int) -> NewReference:
     reference = REFERENCES[i]
-    views, descriptors = {"planted": reference.view}, {"flat": np.full(4, 0.5, np.float32)}
+    views, descriptors = {"planted": reference.view}, FLAT
     camera = reference.view.camera
     return NewReference(f"r{i}", b"photograph %d" % i, camera, reference.world_from_camera, views, descriptors)
 
@@ -77,7 +78,7 @@ def go_on() -> None:
 
 def verdicts(examiner: SceneExaminer, ids: list[str]) -> list[Verdict | None]:
     audits = [examiner.audit(it, go_on) for it in ids]
-    return [audit and audit.verdict for audit in audits]
+    return [None if audit is None else audit.verdict for audit in audits]
 
 
 @pytest.mark.parametrize("what", ["features", "descriptor", "pose"])
@@ -138,8 +139,13 @@ def test_one_that_was_added_since_the_scene_was_read_is_audited(store: Store) ->
 def test_a_scene_that_never_holds_still_is_unavailable(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its subject is loaded, and not there any more when it is looked at; again and again."""
     examiner = SceneExaminer(tools_of(store), KEY)
-    readings = []
-    monkeypatch.setattr(examiner, "_load", lambda names: readings.append(names) or [])
+    readings: list[Sequence[str]] = []
+
+    def load(names: Sequence[str]) -> list[PosedView]:
+        readings.append(names)
+        return []
+
+    monkeypatch.setattr(examiner, "_load", load)
     with pytest.raises(Unavailable) as caught:
         examiner.audit("r0", go_on)
     assert caught.value.reason == "SCENE_CHANGED"
@@ -149,14 +155,10 @@ def test_a_scene_that_never_holds_still_is_unavailable(store: Store, monkeypatch
 def test_a_page_of_a_large_scene_makes_no_pose_for_each_reference(store: Store) -> None:
     """Poses are made for the few that are looked at, not for the scene."""
     tools = tools_of(store)
-    far = [RigidTransform(np.eye(3), np.array([1000.0 + i, 0.0, 0.0])) for i in range(300)]
-    store.add_references(
-        KEY,
-        [
-            NewReference(f"far{i}", b"far %d" % i, REFERENCES[0].view.camera, pose, {"planted": REFERENCES[0].view})
-            for i, pose in enumerate(far)
-        ],
-    )
+    view = REFERENCES[0].view
+    far = [RigidTransform(np.eye(3), np.array([1000.0 + i, 0.0, 0.0])) for i in range(100)]
+    distant = [NewReference(f"far{i}", b"far %d" % i, view.camera, far[i], {"planted": view}, FLAT) for i in range(100)]
+    store.add_references(KEY, distant)
     examiner = SceneExaminer(tools, KEY)
     entries, made = examiner._read(), []
     original = type(entries).reference

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 from images import encode, textured
 from numpy.typing import NDArray
+from planted_damage import damage
 from servers import CAMERA, StandInExtractor, pose
 
 from mapless.geometry import Camera
 from mapless_server import library as library_module
 from mapless_server.decode import ImageLimits
-from mapless_server.errors import DataLoss, NotFound
-from mapless_server.library import NotDescribedYet, ReferenceLibrary
+from mapless_server.errors import DataLoss, NotFound, RequestError
+from mapless_server.library import Loaded, NotDescribedYet, ReferenceLibrary, load_usable
 from mapless_server.method.views import View
 from mapless_server.store import NewReference, Store
 from mapless_server.store.sqlite import DATABASE_FILE, choose_library
@@ -243,3 +244,36 @@ class TestDescribing:
 
         with pytest.raises(NotFound):
             ReferenceLibrary(store).load(SCENE, IDS, Deleting("new"), turn())
+
+
+class TestUsable:
+    """Those that cannot be had are left out, in the order asked for; what nobody expects is let through."""
+
+    def load(
+        self, store: CountingStore, ids: list[str], unusable: tuple[type[RequestError], ...], scene: SceneKey = SCENE
+    ) -> tuple[list[str], list[str]]:
+        library, told = ReferenceLibrary(store), list[str]()
+
+        def load(reference_ids: Sequence[str]) -> Loaded:
+            return library.load(scene, reference_ids, OLD, turn())
+
+        _, references = load_usable(load, ids, unusable, lambda reference_id, _: told.append(reference_id))
+        return [it.name.rpartition("/")[2] for it in references], told
+
+    def test_the_damaged_and_the_deleted_are_left_out_and_told(self, store: CountingStore) -> None:
+        damage(store, SCENE, "r1", "features")
+        store.delete_reference(SCENE, "r2")
+        assert self.load(store, IDS[::-1], (DataLoss, NotFound)) == (["r3", "r0"], ["r2", "r1"])
+        with pytest.raises(NotFound):
+            self.load(store, IDS, (DataLoss,))
+        with pytest.raises(DataLoss):
+            self.load(store, IDS, (NotFound,))
+
+    def test_nothing_may_be_left(self, store: CountingStore) -> None:
+        damage(store, SCENE, "r1", "pose")
+        assert self.load(store, ["r1"], (DataLoss,)) == ([], ["r1"])
+
+    def test_a_scene_that_is_not_there_is_an_error(self, store: CountingStore) -> None:
+        with pytest.raises(NotFound) as caught:
+            self.load(store, IDS, (DataLoss, NotFound), SceneKey("nowhere"))
+        assert caught.value.field == "scene"

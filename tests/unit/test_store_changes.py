@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from stores import DATABASES, EXTRACTOR, Place, assert_same_bits, make_descriptor, make_reference, place_on, view_of
 
 from mapless_server import errors
-from mapless_server.store import IndexedReference, NewReference, Store
+from mapless_server.store import IndexedReference, NewReference, Store, changing
+from mapless_server.store.verify import verify
 from mapless_server.tenancy import SceneKey
 
 OFFICE, HALL = SceneKey("office"), SceneKey("hall")
@@ -265,3 +266,28 @@ def test_features_of_one_more_extractor_are_no_change(store: Store) -> None:
     (a,) = store.add_references(OFFICE, [described("a")])
     store.add_features(a.key, "other", view_of(make_reference("a")))
     assert store.list_changes(OFFICE, 2, NAME).generation == 2
+
+
+def test_who_comes_after_deletions_are_forgotten_reads_all(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tombstones do not pile up; whether remembered or not, following is reading whole."""
+    remembered = 4
+    monkeypatch.setattr(changing, "GENERATIONS_REMEMBERED", remembered)
+    with place.open() as store:
+        store.create_scene(OFFICE)
+        store.add_references(OFFICE, [make_reference(f"r{it}", it, count=1) for it in range(12)])
+        followers = []
+        for index in range(12):
+            follower = Follower()
+            follower.follow(store)
+            followers.append(follower)
+            store.delete_reference(OFFICE, f"r{index}")
+            if index == 5:
+                store.add_references(OFFICE, [make_reference("late", count=1)])
+        assert place.fetch("SELECT count(*) FROM removed_reference") == [(remembered,)]
+        whole = contents({it.key: it for it in store.list_changes(OFFICE, None, NAME).added})
+        for follower in followers:
+            follower.follow(store)
+            assert contents(follower.known) == whole
+        assert [it.wholes for it in followers] == [2] * 8 + [1] * 4
+        with store.database.read() as connection:
+            assert verify(connection).faults == ()

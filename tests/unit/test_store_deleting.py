@@ -13,7 +13,7 @@ from stores import DATABASES, EXTRACTOR, Folder, Place, Shared, assert_same_view
 
 from mapless_server import errors
 from mapless_server.principal import DEFAULT_TENANT
-from mapless_server.store import Store, changing, postgresql, queries
+from mapless_server.store import Store, changing, postgresql, removing
 from mapless_server.store.backup import back_up, restore
 from mapless_server.store.postgresql import PostgresqlDatabase
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
@@ -44,13 +44,13 @@ def row_counts(place: Place) -> dict[str, int]:
 
 
 def before_each_portion(monkeypatch: pytest.MonkeyPatch, do: Callable[[], None]) -> None:
-    real = queries.delete_portion
+    real = removing.delete_portion
 
     def delete_portion(connection: Connection, count: int) -> bool:
         do()
         return real(connection, count)
 
-    monkeypatch.setattr(queries, "delete_portion", delete_portion)
+    monkeypatch.setattr(removing, "delete_portion", delete_portion)
 
 
 def fail() -> None:

@@ -80,7 +80,7 @@ class Auditor:
     """Audits references; of one thread.
 
     Neighbours are asked again and again, so what first looks found is remembered, in some hundred bytes each. The last
-    few looks are kept whole, at about 1.6 MiB each and the references that they look at; beyond these it takes what
+    few looks are kept whole, at about 2 MiB each and the references that they look at; beyond these it takes what
     its surroundings remember.
     """
 

@@ -18,7 +18,7 @@ from sqlalchemy import Connection, MetaData, Table, delete, func, insert, select
 from sqlalchemy.exc import DBAPIError
 
 from mapless_server.errors import RequestError
-from mapless_server.store import queries
+from mapless_server.store import queries, removing
 from mapless_server.store.database import Database, StoreError
 from mapless_server.store.migrations import read_version
 from mapless_server.store.sqlite import SqliteDatabase, choose_library
@@ -96,7 +96,7 @@ def restore(path: Path, database: Database, on_progress: Progress = ignore_progr
             database.write() as target,
         ):
             database.take_your_time(target)
-            queries.forget_removed(target)
+            removing.forget_removed(target)
             if target.scalar(select(func.count()).select_from(scene)):
                 raise StoreError(f"database {database.name} has scenes; a backup needs an empty store")
             _copy_rows(source, target, _tables_of(source, _NOT_RESTORED), on_progress)
@@ -104,7 +104,7 @@ def restore(path: Path, database: Database, on_progress: Progress = ignore_progr
             written = verify(target, on_progress)
             if written.faults or not found.counts.items() <= written.counts.items():
                 raise StoreError(f"database {database.name} does not keep what is written to it")
-            queries.forget_removed(target)
+            removing.forget_removed(target)
     return written
 
 
@@ -165,7 +165,7 @@ def _skip_generations(source: Connection, target: Connection) -> None:
         raised = {key: max(saved[key], former.get(key, 0)) + GENERATIONS_SKIPPED for key in saved}
         target.execute(insert(scene_generation), [{"scene_id": key, "generation": it} for key, it in raised.items()])
     latest = select(column.generation).where(column.scene_id == scene.c.scene_id).scalar_subquery()
-    target.execute(update(scene).where(~queries.is_set_apart(scene.c.scene_id)).values(first_generation=latest))
+    target.execute(update(scene).where(~removing.is_set_apart(scene.c.scene_id)).values(first_generation=latest))
 
 
 def _verify_copy(source: Connection, path: Path, on_progress: Progress) -> Verification:

@@ -11,14 +11,14 @@ from sqlalchemy import delete, insert, select, update
 
 from mapless_server.errors import AlreadyExists
 from mapless_server.method.views import View
-from mapless_server.store import queries, rows, tables
+from mapless_server.store import queries, removing, rows, tables
 from mapless_server.store.base import BaseStore
 from mapless_server.store.observed import observed
 from mapless_server.store.records import NewReference, ReferenceRecord, SceneRecord
 from mapless_server.tenancy import SceneKey, scene_id_of
 
 REFERENCES_DELETED_AT_A_TIME = 100
-"""About a second: less than others wait who want to write to SQLite."""
+"""Less than a second even on slow disks: so long others wait who want to write to SQLite."""
 
 GENERATIONS_REMEMBERED = 100_000
 """How far back `list_changes` knows what was deleted: some 10 MB a scene; who asks less often may read it all."""
@@ -59,13 +59,13 @@ class ChangingStore(BaseStore):
             self._database.take_your_time(connection)
             count = connection.execute(select(column.reference_count).where(column.scene_id == scene_key)).scalar_one()
             if count > REFERENCES_DELETED_AT_A_TIME:
-                queries.set_apart(connection, scene_key)
+                removing.set_apart(connection, scene_key)
             else:
                 connection.execute(delete(tables.scene).where(column.scene_id == scene_key))
         is_more = True
         while is_more:
             with self._database.write() as connection:  # changes nothing that anybody sees
-                is_more = queries.delete_portion(connection, REFERENCES_DELETED_AT_A_TIME)
+                is_more = removing.delete_portion(connection, REFERENCES_DELETED_AT_A_TIME)
 
     @observed
     def add_references(self, scene_key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:

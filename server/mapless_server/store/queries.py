@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, Select, Table, delete, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Row, Select, Table, delete, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
 from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.principal import DEFAULT_TENANT
+from mapless_server.store.removing import is_set_apart
 from mapless_server.store.tables import (
     features,
     global_descriptor,
@@ -24,10 +24,6 @@ from mapless_server.tenancy import KEY_SEPARATOR, SceneKey, end_of_keys, key_of,
 
 _IDS_PER_STATEMENT = 500
 """Databases bound the number of parameters of a statement."""
-_REMOVED = "-/"
-"""What keys of deleted scenes begin with: no tenant's name is a hyphen."""
-_END_OF_REMOVED = "-0"
-"""The first text, by code point, after all of them."""
 
 
 def select_scenes() -> Select[Any]:
@@ -99,48 +95,6 @@ def begin_change(connection: Connection, scene_key: SceneKey, added_count: int =
     if connection.execute(change).rowcount != 1:
         raise _scene_not_found(scene_key)
     return generation
-
-
-def set_apart(connection: Connection, scene_key: SceneKey) -> str:
-    """Delete a scene but keep its references' rows, under a key at which nobody finds them; the caller has its lock.
-
-    That is one short row a reference, where deleting means megabytes: `delete_portion` does that afterwards.
-
-    Returns:
-        The key.
-    """
-    key = f"{_REMOVED}{uuid.uuid4().hex}"
-    # It gets no generation, without which no statement here takes it for a scene.
-    connection.execute(insert(scene).values(scene_id=key, create_time_us=0))
-    connection.execute(update(reference).where(reference.c.scene_id == scene_key).values(scene_id=key))
-    connection.execute(delete(scene).where(scene.c.scene_id == scene_key))
-    return key
-
-
-def delete_portion(connection: Connection, count: int) -> bool:
-    """Delete some of what was set apart, by whomever; whether there may be more.
-
-    What another server is deleting at this moment is left to it.
-    """
-    column = reference.c
-    portion = select(column.key).where(is_set_apart(column.scene_id)).limit(count)
-    keys = connection.scalars(portion.with_for_update(skip_locked=True)).all()
-    if keys:
-        connection.execute(delete(reference).where(column.key.in_(keys)))
-        return True
-    is_empty = ~select(column.key).where(column.scene_id == scene.c.scene_id).exists()
-    connection.execute(delete(scene).where(is_set_apart(scene.c.scene_id), is_empty))
-    return False
-
-
-def forget_removed(connection: Connection) -> None:
-    """Delete all that was set apart, at once."""
-    connection.execute(delete(scene).where(is_set_apart(scene.c.scene_id)))
-
-
-def is_set_apart(scene_id: ColumnElement[str]) -> ColumnElement[bool]:
-    """Whether a row's scene is one that was deleted."""
-    return (scene_id >= _REMOVED) & (scene_id < _END_OF_REMOVED)
 
 
 def forget_removals(connection: Connection, scene_key: SceneKey, until_generation: int) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, Select, Table, func, select
 
 from mapless_server.errors import DataLoss
-from mapless_server.store import codec, queries, rows
+from mapless_server.store import codec, queries, removing, rows
 from mapless_server.store.migrations import read_version
 from mapless_server.store.tables import features, global_descriptor, image, reference, scene
 from mapless_server.tenancy import SceneKey, scene_id_of, tenant_of
@@ -81,7 +81,7 @@ def _check_references(connection: Connection, counts: dict[str, int], on_progres
         image.c.data,
         select(func.count()).where(features.c.reference_key == column.key).scalar_subquery().label("feature_sets"),
     ).outerjoin(image, image.c.reference_key == column.key)
-    statement = statement.where(~queries.is_set_apart(column.scene_id))
+    statement = statement.where(~removing.is_set_apart(column.scene_id))
     for row in _stream(connection, statement, "references", counts[reference.name], on_progress):
         yield from _fault(row, "camera and pose", codec.decode_geometry, row.key, row.geometry, row.geometry_sha256)
         yield from _fault(row, "image", rows.image, row)
@@ -94,7 +94,7 @@ def _check_features(connection: Connection, counts: dict[str, int], on_progress:
     statement: Select[Any] = select(reference.c.scene_id, reference.c.reference_id, reference.c.key, features).join(
         reference, reference.c.key == features.c.reference_key
     )
-    statement = statement.where(~queries.is_set_apart(reference.c.scene_id))
+    statement = statement.where(~removing.is_set_apart(reference.c.scene_id))
     for row in _stream(connection, statement, "features", counts[features.name], on_progress):
         owner = rows.features_owner(row.key, row.extractor)
         yield from _fault(row, f"features of {row.extractor}", codec.decode_view, owner, row.data, row.sha256)
@@ -105,7 +105,7 @@ def _check_descriptors(connection: Connection, counts: dict[str, int], on_progre
     statement: Select[Any] = select(
         reference.c.scene_id, reference.c.reference_id, reference.c.key, global_descriptor
     ).join(reference, reference.c.key == global_descriptor.c.reference_key)
-    statement = statement.where(~queries.is_set_apart(reference.c.scene_id))
+    statement = statement.where(~removing.is_set_apart(reference.c.scene_id))
     for row in _stream(connection, statement, "descriptors", counts[global_descriptor.name], on_progress):
         owner, what = rows.descriptor_owner(row.key, row.name), f"global descriptor {row.name}"
         yield from _fault(row, what, codec.check, owner, row.data, row.sha256, what)
@@ -114,13 +114,13 @@ def _check_descriptors(connection: Connection, counts: dict[str, int], on_progre
 
 def _check_counts(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:
     references = select(reference.c.scene_id, reference.c.generation)
-    references = references.where(~queries.is_set_apart(reference.c.scene_id))
+    references = references.where(~removing.is_set_apart(reference.c.scene_id))
     found, latest = Counter[str](), dict[str, int]()
     for row in _stream(connection, references, "scenes", counts[reference.name], on_progress):
         found[row.scene_id] += 1
         latest[row.scene_id] = max(row.generation, latest.get(row.scene_id, 0))
     generations = queries.read_generations(connection)
-    for row in connection.execute(select(scene).where(~queries.is_set_apart(scene.c.scene_id))):
+    for row in connection.execute(select(scene).where(~removing.is_set_apart(scene.c.scene_id))):
         key, generation = row.scene_id, generations.get(row.scene_id)
         if row.reference_count != found.pop(key, 0):
             yield f"{_scene(key)}: its count of references is wrong"
