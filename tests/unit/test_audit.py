@@ -225,3 +225,13 @@ def test_what_is_remembered_of_neighbours_changes_no_verdict(references: list[Po
 def test_senseless_options_are_refused() -> None:
     with pytest.raises(ValueError, match="senseless"):
         AuditOptions(position_tolerance_m=0.0)
+
+
+def test_one_among_many_faulty_ones_is_in_doubt_and_never_called_consistent(
+    references: list[PosedView], pairs: PairMatches
+) -> None:
+    """Every second pose is wrong by as much: who is right cannot be told, and that is what is said."""
+    many = [moved(r, (0.1 * (i - 2), 0.15, 0.0)) if i % 2 else r for i, r in enumerate(references)]
+    audits = audit(many, pairs)
+    assert all(a.verdict is not Verdict.CONSISTENT for i, a in enumerate(audits) if i % 2)
+    assert all((a.error_px or 0) < 3 for a in audits if a.verdict is Verdict.CONSISTENT)

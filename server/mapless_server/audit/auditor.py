@@ -113,6 +113,9 @@ class Auditor:
                 return describe(look, Verdict.SWAPPED_IMAGE, other=partner)
         if verdict.is_alarm:
             return describe(look, verdict, other=twin[0] if twin[1] is Likeness.SAME_PHOTOGRAPH else "")
+        if verdict is Verdict.CONSISTENT and look.verdict().is_alarm:
+            # It is off by too much, and so are its neighbours: nobody can tell who is right.
+            return describe(look, Verdict.UNVERIFIABLE)
         change = None if blamed else self._change(look, verdict)
         if change is not None and change.is_alarm:
             return describe(look, Verdict.SCENE_CHANGED, change=change)

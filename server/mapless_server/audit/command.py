@@ -119,7 +119,9 @@ def _tell(examined: Examined, everything: bool, report: Path | None, html: Path 
     shown = [a for a in examined.audits if everything or a.verdict != "CONSISTENT"]
     console = Console(soft_wrap=True)
     if shown:
-        console.print(table_of(shown))
+        Console().print(table_of(shown))
+        for audit in shown:
+            console.print(f"{reference_id_of(audit)}: {audit.message}", markup=False, highlight=False)
     console.print(summary_of(examined), markup=False)
     if report is not None:
         write_json(report, to_json(examined))
@@ -146,11 +148,16 @@ def summary_of(examined: Examined) -> str:
     return f"stopped after {len(examined.audits)} of {examined.total} references ({examined.stopped}); {found}"
 
 
+def reference_id_of(audit: ReferenceAudit) -> str:
+    """The reference's id within its scene."""
+    return audit.name.rsplit("/", 1)[-1]
+
+
 def cells_of(audit: ReferenceAudit) -> tuple[str, ...]:
     """The figures of one reference, in the order of `COLUMNS`; a dash where one is not known."""
     is_known = audit.focal_ratio > 0
     return (
-        audit.name.rsplit("/", 1)[-1],
+        reference_id_of(audit),
         audit.verdict.lower().replace("_", " "),
         f"{100 * audit.position_offset_m:.1f}" if is_known else "-",
         f"{audit.rotation_offset_deg:.2f}" if is_known else "-",
@@ -165,15 +172,15 @@ COLUMNS = ("reference", "finding", "off, cm", "turned, deg", "focal, %", "agree"
 
 
 def table_of(audits: Sequence[ReferenceAudit]) -> Table:
-    """The table for a terminal."""
+    """The table for a terminal: the figures; words would not fit beside them."""
     from rich.table import Table
 
     table = Table()
-    for i, column in enumerate(COLUMNS):
+    for i, column in enumerate(COLUMNS[:-1]):
         table.add_column(column, justify="right" if 2 <= i <= 6 else "left", overflow="fold")
     for audit in audits:
         style = "red" if audit.verdict in ALARMS else "" if audit.verdict == "CONSISTENT" else "yellow"
-        table.add_row(*cells_of(audit), style=style)
+        table.add_row(*cells_of(audit)[:-1], style=style)
     return table
 
 

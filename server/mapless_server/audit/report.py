@@ -43,6 +43,7 @@ class _Numbers:
         self.neighbour_count = len(look.neighbourhood.references)
         self.inlier_count = look.explanations[Freedom.BOTH].inlier_count if look.explanations else 0
         self.error_px = self.offset_m = self.turn_deg = self.focal_ratio = None  # type: float | None
+        self.stands_out = look.is_usable and look.verdict().is_alarm
         if not look.is_usable:
             return
         best, given = look.explanations[Freedom.BOTH], look.explanations[Freedom.NOTHING]
@@ -62,6 +63,9 @@ def _message(numbers: _Numbers, verdict: Verdict, other: str, same: bool, change
     if verdict is Verdict.UNVERIFIABLE:
         if other:
             return f"contradicts {other}, and no other neighbours can tell which of the two is wrong"
+        if numbers.stands_out:
+            off = f"{_length(numbers.offset_m)} and {numbers.turn_deg:.2f} degrees from where its neighbours see it"
+            return f"{off}, which are off by as much themselves: mend what is wrong with others, then audit it again"
         return f"too little in common with {numbers.neighbour_count} neighbours to judge: {seen}"
     if verdict is Verdict.SCENE_CHANGED:
         assert change is not None

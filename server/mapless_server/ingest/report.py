@@ -68,8 +68,8 @@ def verdict_lines(verdict: Verdict, frames: Sequence[Frame]) -> list[str]:
     compared = {index for error in verdict.pairs for index in error.pair}
     errors = (
         f"epipolar error of matched points under the given poses: median {verdict.median_px:.2f} px over "
-        f"{len(verdict.pairs)} pairs of neighbours among {len(compared)} of {len(frames)} photographs, {100 * verdict.bad_share:.0f} % of them above "
-        f"{verdict.threshold_px:.1f} px"
+        f"{len(verdict.pairs)} pairs of neighbours among {len(compared)} of {len(frames)} photographs, "
+        f"{100 * verdict.bad_share:.0f} % of them above {verdict.threshold_px:.1f} px"
     )
     lines = [errors]
     if verdict.is_wrong:
