@@ -152,7 +152,9 @@ def shared_cluster() -> Cluster:
 
 
 def require() -> None:
-    """Skips the test where there is no PostgreSQL."""
+    """Skips the test where there is no PostgreSQL; fails it where TEST_POSTGRESQL says that there has to be one."""
+    if programs() is None and os.environ.get("TEST_POSTGRESQL") == "required":
+        pytest.fail("there is no PostgreSQL: Debian's package `postgresql`")
     if programs() is None:
         pytest.skip("needs PostgreSQL: Debian's package `postgresql`")
     if os.geteuid() == 0 and not any(map(_has_user, _UNPRIVILEGED)):
