@@ -172,9 +172,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         if request.references:
             return reference_ids_from_names(request.references, scene_id_of(scene_key), MAX_AUDITS), ""
         page = Page(request, call.principal.tenant, f"{request.scene} audit", DEFAULT_AUDITS, MAX_AUDITS)
-        found = await self._stored(self._store.list_references, scene_key, page.limit, page.after)
-        references, token = page.cut(found, lambda reference: reference.reference_id)
-        return [reference.reference_id for reference in references], token
+        found = await self._stored(self._store.list_reference_ids, scene_key, page.limit, page.after)
+        return page.cut(found, lambda reference_id: reference_id)
 
     async def CheckCoverage(self, request: pb.CheckCoverageRequest, call: Call) -> pb.CheckCoverageResponse:
         """Implements ReferenceService.CheckCoverage."""

@@ -77,7 +77,7 @@ def test_what_is_wrong_with_an_audit_is_named(client: Client) -> None:
     assert twice.value.field == "references[1]"
 
 
-@pytest.mark.parametrize("what", ["features", "descriptor"])
+@pytest.mark.parametrize("what", ["features", "descriptor", "pose"])
 def test_a_damaged_reference_is_named_on_its_page_and_by_its_name(tmp_path: Path, what: str) -> None:
     settings = Settings(host="127.0.0.1", port=0, data_dir=tmp_path, workers=2, metrics=False, warm_up=False)
     store = Store.open(tmp_path)

@@ -104,6 +104,19 @@ class ReadingStore(BaseStore):
         return [rows.reference_record(row) for row in found]
 
     @observed
+    def list_reference_ids(self, scene_key: SceneKey, limit: int, after: str = "") -> list[str]:
+        """The same ids alone, of damaged references too.
+
+        Raises:
+            NotFound: there is no such scene.
+        """
+        column = tables.reference.c
+        page = select(column.reference_id).where(column.scene_id == scene_key, column.reference_id > after)
+        with self._database.read() as connection:
+            queries.read_generation(connection, scene_key)
+            return list(connection.scalars(page.order_by(column.reference_id).limit(limit)))
+
+    @observed
     def load_references(
         self, scene_key: SceneKey, reference_ids: Sequence[str] | None, extractor: str
     ) -> SceneSnapshot:
