@@ -247,7 +247,7 @@ class Client:
         Args:
             scene: the scene.
             references: which, at most 100; none: all.
-            page_size: references a call, each of which takes about half a second of computing; 0 is the server's default.
+            page_size: references a call, half a second of computing each; 0 is the server's default.
             timeout_s: deadline of each call.
         """
         name = _scene_name(scene)
