@@ -14,13 +14,13 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from . import __version__
-from .audit.command import audit_command
+from .commands.audit import audit_command
+from .commands.store import store_app
 from .evaluation.cli import evaluate_command
 from .ingest.command import export_command, import_command
 from .load.command import load_app
 from .security.command import token_app
 from .settings import ConfigError, Settings, load_settings
-from .store.command import store_app
 
 app = typer.Typer(
     help="Visual localization without a map, as a gRPC service.",

@@ -53,7 +53,7 @@ ABOVE = {
         "status",
         "receiving",
     ),
-    *("messages", "security", "observability", "demo", "ingest", "evaluation", "bench", "load"),
+    *("commands", "messages", "security", "observability", "demo", "ingest", "evaluation", "bench", "load"),
 }
 BELOW = sorted(
     {path.stem for path in SERVER.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()} - ABOVE

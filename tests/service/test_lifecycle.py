@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -156,9 +157,8 @@ def test_settings_are_shown_at_the_start(tmp_path: Path) -> None:
     with command(tmp_path / "data", "--max-batch", "7", "--log-format", "text", MAPLESS_WORKERS="1") as server:
         assert server.stop(signal.SIGTERM) == 0
         log = server.log.read_text()
-    assert "max_batch                 7  (flag)" in log
-    assert "workers                   1  (environment)" in log
-    assert "reflection                True  (default)" in log
+    for shown in (r"max_batch +7  \(flag\)", r"workers +1  \(environment\)", r"reflection +True  \(default\)"):
+        assert re.search(f"^  {shown}$", log, re.MULTILINE), shown
 
 
 @pytest.mark.parametrize(

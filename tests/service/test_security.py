@@ -107,6 +107,13 @@ def requests_on(scene_id: str) -> dict[str, Message]:
         "ReferenceService/BatchCreateReferences": reference_pb.BatchCreateReferencesRequest(
             scene=scene, requests=[reference]
         ),
+        "ReferenceService/RetrieveReferences": reference_pb.RetrieveReferencesRequest(
+            scene=scene, image=PHOTO, intrinsics=_reference().intrinsics
+        ),
+        "ReferenceService/AuditScene": reference_pb.AuditSceneRequest(scene=scene),
+        "ReferenceService/CheckCoverage": reference_pb.CheckCoverageRequest(
+            scene=scene, world_from_camera=_reference().world_from_camera, intrinsics=_reference().intrinsics
+        ),
         "ReferenceService/DeleteReference": reference_pb.DeleteReferenceRequest(name=f"{scene}/references/r"),
         "ReferenceService/DeleteScene": reference_pb.DeleteSceneRequest(name=scene),
     }

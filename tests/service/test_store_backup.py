@@ -15,10 +15,10 @@ import pytest
 from stores import DATABASES, EXTRACTOR, Folder, Place, Shared, assert_same_view, make_reference, place_on, view_of
 from typer.testing import CliRunner
 
+from mapless_server.commands.store import store_app
 from mapless_server.principal import DEFAULT_TENANT
 from mapless_server.store import Store, StoreError, codec, tables
 from mapless_server.store.backup import GENERATIONS_SKIPPED, back_up, restore
-from mapless_server.store.command import store_app
 from mapless_server.store.postgresql import PostgresqlDatabase
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase, choose_library
 from mapless_server.store.verify import verify

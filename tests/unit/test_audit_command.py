@@ -15,7 +15,8 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from mapless import ReferenceAudit, Unavailable
-from mapless_server.audit.command import (
+from mapless_server.cli import app
+from mapless_server.commands.audit import (
     Examined,
     cells_of,
     summary_of,
@@ -25,7 +26,6 @@ from mapless_server.audit.command import (
     to_json,
     worst_first,
 )
-from mapless_server.cli import app
 
 
 def finding(name: str, verdict: str, offset_m: float = 0.0, focal_ratio: float = 1.0) -> ReferenceAudit:

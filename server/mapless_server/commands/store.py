@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 if TYPE_CHECKING:
-    from .database import Database
-    from .verify import Progress, Verification
+    from ..store.database import Database
+    from ..store.verify import Progress, Verification
 
 store_app = typer.Typer(help="The store: bring it up to date, check it, back it up, restore it.", no_args_is_help=True)
 
@@ -25,7 +25,7 @@ DataDir = Annotated[Path | None, typer.Option(help="Folder of the store; default
 def migrate_command(config: Config = None, data_dir: DataDir = None) -> None:
     """Bring the store to this program's schema, as the server does when it starts; makes one where there is none."""
     with _faults_said(), closing(_open(config, data_dir)) as database:
-        from .tables import SCHEMA_VERSION
+        from ..store.tables import SCHEMA_VERSION
 
         print(f"database {database.name} has schema version {SCHEMA_VERSION}")
 
@@ -37,8 +37,8 @@ def verify_command(
     data_dir: DataDir = None,
 ) -> None:
     """Read every row of the store or of a backup and say what is damaged; exit code 1 if anything is."""
-    from .sqlite import SqliteDatabase
-    from .verify import verify
+    from ..store.sqlite import SqliteDatabase
+    from ..store.verify import verify
 
     with (
         _faults_said(),
@@ -58,7 +58,7 @@ def backup_command(
     data_dir: DataDir = None,
 ) -> None:
     """Copy the store to one file, whether it is served or not; exit code 1 if something in the store is damaged."""
-    from .backup import back_up
+    from ..store.backup import back_up
 
     with _faults_said(), _progress() as on_progress, closing(_look(config, data_dir)) as database:
         found = back_up(database, file, on_progress)
@@ -72,7 +72,7 @@ def restore_command(
     data_dir: DataDir = None,
 ) -> None:
     """Check a backup and copy it into the store, which must be empty: all of it or nothing."""
-    from .backup import restore
+    from ..store.backup import restore
 
     with _faults_said(), _progress() as on_progress, closing(_open(config, data_dir)) as database:
         found = restore(file, database, on_progress)
@@ -81,8 +81,8 @@ def restore_command(
 
 def _open(config: Path | None, data_dir: Path | None) -> Database:
     """The settings' store, brought up to date; created if missing."""
-    from .postgresql import PostgresqlDatabase
-    from .sqlite import SqliteDatabase
+    from ..store.postgresql import PostgresqlDatabase
+    from ..store.sqlite import SqliteDatabase
 
     url, folder = _settings(config, data_dir)
     return PostgresqlDatabase.open(url) if url else SqliteDatabase.open(folder)
@@ -90,8 +90,8 @@ def _open(config: Path | None, data_dir: Path | None) -> Database:
 
 def _look(config: Path | None, data_dir: Path | None) -> Database:
     """The settings' store as it is, whoever else uses it."""
-    from .postgresql import PostgresqlDatabase
-    from .sqlite import DATABASE_FILE, SqliteDatabase
+    from ..store.postgresql import PostgresqlDatabase
+    from ..store.sqlite import DATABASE_FILE, SqliteDatabase
 
     url, folder = _settings(config, data_dir)
     return PostgresqlDatabase.look_at(url) if url else SqliteDatabase.look_at(folder / DATABASE_FILE)
@@ -111,7 +111,7 @@ def _faults_said() -> Iterator[None]:
     """What goes wrong with the store ends the command with one line."""
     from ..errors import RequestError
     from ..settings import ConfigError
-    from .database import StoreError
+    from ..store.database import StoreError
 
     try:
         yield
