@@ -158,7 +158,7 @@ def test_settings_are_shown_at_the_start(tmp_path: Path) -> None:
         assert server.stop(signal.SIGTERM) == 0
         log = server.log.read_text()
     for shown in (r"max_batch +7  \(flag\)", r"workers +1  \(environment\)", r"reflection +True  \(default\)"):
-        assert re.search(f"^  {shown}$", log, re.MULTILINE), shown
+        assert re.search(f"^ +{shown}$", log, re.MULTILINE), shown
 
 
 @pytest.mark.parametrize(
