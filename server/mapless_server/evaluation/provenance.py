@@ -46,8 +46,7 @@ def provenance_of(settings: Settings) -> Provenance:
     device = device_for(settings)
     features = feature_names(settings.features, device)
     used = {settings.backend, *features, *(f"{name}-lightglue" for name in features if device != "cpu")}
-    retrieval = str(getattr(settings, "retrieval", ""))
-    if retrieval == "megaloc" or (retrieval == "auto" and device != "cpu"):
+    if settings.retrieval == "megaloc" or (settings.retrieval == "auto" and device != "cpu"):
         used.add("megaloc")
     weights = {}
     for entry in CATALOGUE:
@@ -59,7 +58,7 @@ def provenance_of(settings: Settings) -> Provenance:
         "backend": settings.backend,
         "features": ", ".join(features),
         "device": device,
-        **({"retrieval": retrieval} if retrieval else {}),
+        "retrieval": settings.retrieval,
     }
     date = datetime.now(timezone.utc).isoformat(timespec="seconds")
     return Provenance(__version__, commit_of(ROOT), weights, told, _machine(device), date)
