@@ -9,6 +9,15 @@ from typing import ClassVar as _ClassVar, Iterable as _Iterable, Mapping as _Map
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
+class Axes(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    AXES_UNSPECIFIED: _ClassVar[Axes]
+    AXES_OPENCV: _ClassVar[Axes]
+    AXES_ARKIT: _ClassVar[Axes]
+    AXES_ARCORE: _ClassVar[Axes]
+    AXES_UNITY: _ClassVar[Axes]
+    AXES_ROS: _ClassVar[Axes]
+
 class Variant(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     VARIANT_UNSPECIFIED: _ClassVar[Variant]
@@ -24,12 +33,32 @@ class ScaleStrategy(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SCALE_STRATEGY_TRAJECTORY: _ClassVar[ScaleStrategy]
     SCALE_STRATEGY_TWO_STAGE: _ClassVar[ScaleStrategy]
 
+class PriorKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    PRIOR_KIND_UNSPECIFIED: _ClassVar[PriorKind]
+    PRIOR_KIND_POSITION: _ClassVar[PriorKind]
+    PRIOR_KIND_HEADING: _ClassVar[PriorKind]
+    PRIOR_KIND_GRAVITY: _ClassVar[PriorKind]
+    PRIOR_KIND_POSE: _ClassVar[PriorKind]
+
 class PoseStage(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     POSE_STAGE_UNSPECIFIED: _ClassVar[PoseStage]
     POSE_STAGE_REFINED: _ClassVar[PoseStage]
     POSE_STAGE_INITIAL: _ClassVar[PoseStage]
     POSE_STAGE_COARSE: _ClassVar[PoseStage]
+
+class Advice(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    ADVICE_UNSPECIFIED: _ClassVar[Advice]
+    ADVICE_ADD_REFERENCES: _ClassVar[Advice]
+    ADVICE_SPREAD_REFERENCES: _ClassVar[Advice]
+    ADVICE_RETAKE_PHOTOGRAPH: _ClassVar[Advice]
+    ADVICE_LOOK_AT_REFERENCE: _ClassVar[Advice]
+    ADVICE_CHOOSE_OTHER_REFERENCES: _ClassVar[Advice]
+    ADVICE_CHECK_CALIBRATION: _ClassVar[Advice]
+    ADVICE_TELL_PLACES_APART: _ClassVar[Advice]
+    ADVICE_CHECK_PRIOR: _ClassVar[Advice]
 
 class RejectionReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -42,12 +71,20 @@ class RejectionReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REJECTION_REASON_TOO_FEW_MATCHES: _ClassVar[RejectionReason]
     REJECTION_REASON_PNP_FAILED: _ClassVar[RejectionReason]
     REJECTION_REASON_GATE: _ClassVar[RejectionReason]
+    REJECTION_REASON_AMBIGUOUS: _ClassVar[RejectionReason]
+    REJECTION_REASON_PRIOR_CONFLICT: _ClassVar[RejectionReason]
 
 class ScaleStage(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     SCALE_STAGE_UNSPECIFIED: _ClassVar[ScaleStage]
     SCALE_STAGE_TRIANGULATION: _ClassVar[ScaleStage]
     SCALE_STAGE_TRAJECTORY: _ClassVar[ScaleStage]
+AXES_UNSPECIFIED: Axes
+AXES_OPENCV: Axes
+AXES_ARKIT: Axes
+AXES_ARCORE: Axes
+AXES_UNITY: Axes
+AXES_ROS: Axes
 VARIANT_UNSPECIFIED: Variant
 VARIANT_COARSE: Variant
 VARIANT_NO_STRUCTURE: Variant
@@ -57,10 +94,24 @@ SCALE_STRATEGY_UNSPECIFIED: ScaleStrategy
 SCALE_STRATEGY_TRIANGULATION: ScaleStrategy
 SCALE_STRATEGY_TRAJECTORY: ScaleStrategy
 SCALE_STRATEGY_TWO_STAGE: ScaleStrategy
+PRIOR_KIND_UNSPECIFIED: PriorKind
+PRIOR_KIND_POSITION: PriorKind
+PRIOR_KIND_HEADING: PriorKind
+PRIOR_KIND_GRAVITY: PriorKind
+PRIOR_KIND_POSE: PriorKind
 POSE_STAGE_UNSPECIFIED: PoseStage
 POSE_STAGE_REFINED: PoseStage
 POSE_STAGE_INITIAL: PoseStage
 POSE_STAGE_COARSE: PoseStage
+ADVICE_UNSPECIFIED: Advice
+ADVICE_ADD_REFERENCES: Advice
+ADVICE_SPREAD_REFERENCES: Advice
+ADVICE_RETAKE_PHOTOGRAPH: Advice
+ADVICE_LOOK_AT_REFERENCE: Advice
+ADVICE_CHOOSE_OTHER_REFERENCES: Advice
+ADVICE_CHECK_CALIBRATION: Advice
+ADVICE_TELL_PLACES_APART: Advice
+ADVICE_CHECK_PRIOR: Advice
 REJECTION_REASON_UNSPECIFIED: RejectionReason
 REJECTION_REASON_NO_USABLE_REFERENCES: RejectionReason
 REJECTION_REASON_DEGENERATE_REFERENCES: RejectionReason
@@ -70,12 +121,14 @@ REJECTION_REASON_SCALE_UNRELIABLE: RejectionReason
 REJECTION_REASON_TOO_FEW_MATCHES: RejectionReason
 REJECTION_REASON_PNP_FAILED: RejectionReason
 REJECTION_REASON_GATE: RejectionReason
+REJECTION_REASON_AMBIGUOUS: RejectionReason
+REJECTION_REASON_PRIOR_CONFLICT: RejectionReason
 SCALE_STAGE_UNSPECIFIED: ScaleStage
 SCALE_STAGE_TRIANGULATION: ScaleStage
 SCALE_STAGE_TRAJECTORY: ScaleStage
 
 class LocalizeRequest(_message.Message):
-    __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior")
+    __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
@@ -85,6 +138,9 @@ class LocalizeRequest(_message.Message):
     CAPTURE_TIME_FIELD_NUMBER: _ClassVar[int]
     SESSION_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     HEADING_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    GEO_POSITION_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    GRAVITY_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    POSE_PRIOR_FIELD_NUMBER: _ClassVar[int]
     scene: str
     references: _containers.RepeatedScalarFieldContainer[str]
     image: bytes
@@ -94,54 +150,101 @@ class LocalizeRequest(_message.Message):
     capture_time: _timestamp_pb2.Timestamp
     session_from_camera: _geometry_pb2.RigidTransform
     heading_prior: HeadingPrior
-    def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ...) -> None: ...
+    geo_position_prior: GeoPositionPrior
+    gravity_prior: GravityPrior
+    pose_prior: PosePrior
+    def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ...) -> None: ...
 
 class PositionPrior(_message.Message):
-    __slots__ = ("position_m", "radius_m")
+    __slots__ = ("position_m", "radius_m", "covariance_m2")
     POSITION_M_FIELD_NUMBER: _ClassVar[int]
     RADIUS_M_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_M2_FIELD_NUMBER: _ClassVar[int]
     position_m: _geometry_pb2.Vector3
     radius_m: float
-    def __init__(self, position_m: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., radius_m: _Optional[float] = ...) -> None: ...
+    covariance_m2: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, position_m: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., radius_m: _Optional[float] = ..., covariance_m2: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class GeoPositionPrior(_message.Message):
+    __slots__ = ("latitude_deg", "longitude_deg", "height_m", "horizontal_sigma_m", "vertical_sigma_m")
+    LATITUDE_DEG_FIELD_NUMBER: _ClassVar[int]
+    LONGITUDE_DEG_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_M_FIELD_NUMBER: _ClassVar[int]
+    HORIZONTAL_SIGMA_M_FIELD_NUMBER: _ClassVar[int]
+    VERTICAL_SIGMA_M_FIELD_NUMBER: _ClassVar[int]
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    horizontal_sigma_m: float
+    vertical_sigma_m: float
+    def __init__(self, latitude_deg: _Optional[float] = ..., longitude_deg: _Optional[float] = ..., height_m: _Optional[float] = ..., horizontal_sigma_m: _Optional[float] = ..., vertical_sigma_m: _Optional[float] = ...) -> None: ...
 
 class HeadingPrior(_message.Message):
-    __slots__ = ("direction", "max_angle_deg")
+    __slots__ = ("direction", "max_angle_deg", "sigma_deg")
     DIRECTION_FIELD_NUMBER: _ClassVar[int]
     MAX_ANGLE_DEG_FIELD_NUMBER: _ClassVar[int]
+    SIGMA_DEG_FIELD_NUMBER: _ClassVar[int]
     direction: _geometry_pb2.Vector3
     max_angle_deg: float
-    def __init__(self, direction: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., max_angle_deg: _Optional[float] = ...) -> None: ...
+    sigma_deg: float
+    def __init__(self, direction: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., max_angle_deg: _Optional[float] = ..., sigma_deg: _Optional[float] = ...) -> None: ...
+
+class GravityPrior(_message.Message):
+    __slots__ = ("down_in_camera", "sigma_deg", "down_in_world")
+    DOWN_IN_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    SIGMA_DEG_FIELD_NUMBER: _ClassVar[int]
+    DOWN_IN_WORLD_FIELD_NUMBER: _ClassVar[int]
+    down_in_camera: _geometry_pb2.Vector3
+    sigma_deg: float
+    down_in_world: _geometry_pb2.Vector3
+    def __init__(self, down_in_camera: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., sigma_deg: _Optional[float] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ...) -> None: ...
+
+class PosePrior(_message.Message):
+    __slots__ = ("world_from_camera", "covariance")
+    WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    world_from_camera: _geometry_pb2.RigidTransform
+    covariance: PoseCovariance
+    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ...) -> None: ...
 
 class LocalizeOptions(_message.Message):
-    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse", "rerank_references")
+    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse", "rerank_references", "axes", "include_debug", "coverage")
     VARIANT_FIELD_NUMBER: _ClassVar[int]
     SCALE_STRATEGY_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
     ALLOW_COARSE_FIELD_NUMBER: _ClassVar[int]
     RERANK_REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    AXES_FIELD_NUMBER: _ClassVar[int]
+    INCLUDE_DEBUG_FIELD_NUMBER: _ClassVar[int]
+    COVERAGE_FIELD_NUMBER: _ClassVar[int]
     variant: Variant
     scale_strategy: ScaleStrategy
     reference_count: int
     allow_coarse: bool
     rerank_references: bool
-    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ..., rerank_references: bool = ...) -> None: ...
+    axes: Axes
+    include_debug: bool
+    coverage: float
+    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ..., rerank_references: bool = ..., axes: _Optional[_Union[Axes, str]] = ..., include_debug: bool = ..., coverage: _Optional[float] = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
-    __slots__ = ("localization", "rejection", "diagnostics", "capture_time", "session_from_camera")
+    __slots__ = ("localization", "rejection", "diagnostics", "capture_time", "session_from_camera", "debug")
     LOCALIZATION_FIELD_NUMBER: _ClassVar[int]
     REJECTION_FIELD_NUMBER: _ClassVar[int]
     DIAGNOSTICS_FIELD_NUMBER: _ClassVar[int]
     CAPTURE_TIME_FIELD_NUMBER: _ClassVar[int]
     SESSION_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    DEBUG_FIELD_NUMBER: _ClassVar[int]
     localization: Localization
     rejection: Rejection
     diagnostics: Diagnostics
     capture_time: _timestamp_pb2.Timestamp
     session_from_camera: _geometry_pb2.RigidTransform
-    def __init__(self, localization: _Optional[_Union[Localization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., diagnostics: _Optional[_Union[Diagnostics, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
+    debug: Debug
+    def __init__(self, localization: _Optional[_Union[Localization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., diagnostics: _Optional[_Union[Diagnostics, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., debug: _Optional[_Union[Debug, _Mapping]] = ...) -> None: ...
 
 class Localization(_message.Message):
-    __slots__ = ("world_from_camera", "covariance", "accuracy", "pose_stage", "inlier_count", "match_count", "reprojection_error_px")
+    __slots__ = ("world_from_camera", "covariance", "accuracy", "pose_stage", "inlier_count", "match_count", "reprojection_error_px", "trust", "in_axes", "geo_pose", "prior_checks")
     WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     ACCURACY_FIELD_NUMBER: _ClassVar[int]
@@ -149,6 +252,10 @@ class Localization(_message.Message):
     INLIER_COUNT_FIELD_NUMBER: _ClassVar[int]
     MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
     REPROJECTION_ERROR_PX_FIELD_NUMBER: _ClassVar[int]
+    TRUST_FIELD_NUMBER: _ClassVar[int]
+    IN_AXES_FIELD_NUMBER: _ClassVar[int]
+    GEO_POSE_FIELD_NUMBER: _ClassVar[int]
+    PRIOR_CHECKS_FIELD_NUMBER: _ClassVar[int]
     world_from_camera: _geometry_pb2.RigidTransform
     covariance: PoseCovariance
     accuracy: Accuracy
@@ -156,7 +263,67 @@ class Localization(_message.Message):
     inlier_count: int
     match_count: int
     reprojection_error_px: float
-    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., pose_stage: _Optional[_Union[PoseStage, str]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ...) -> None: ...
+    trust: float
+    in_axes: FramedPose
+    geo_pose: GeoPose
+    prior_checks: _containers.RepeatedCompositeFieldContainer[PriorCheck]
+    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., pose_stage: _Optional[_Union[PoseStage, str]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., trust: _Optional[float] = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ...) -> None: ...
+
+class FramedPose(_message.Message):
+    __slots__ = ("axes", "world_from_camera", "covariance", "world_from_session")
+    AXES_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FROM_SESSION_FIELD_NUMBER: _ClassVar[int]
+    axes: Axes
+    world_from_camera: _geometry_pb2.RigidTransform
+    covariance: PoseCovariance
+    world_from_session: _geometry_pb2.RigidTransform
+    def __init__(self, axes: _Optional[_Union[Axes, str]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., world_from_session: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
+
+class GeoPose(_message.Message):
+    __slots__ = ("position", "quaternion")
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    QUATERNION_FIELD_NUMBER: _ClassVar[int]
+    position: GeoPosition
+    quaternion: GeoQuaternion
+    def __init__(self, position: _Optional[_Union[GeoPosition, _Mapping]] = ..., quaternion: _Optional[_Union[GeoQuaternion, _Mapping]] = ...) -> None: ...
+
+class GeoPosition(_message.Message):
+    __slots__ = ("lat", "lon", "h")
+    LAT_FIELD_NUMBER: _ClassVar[int]
+    LON_FIELD_NUMBER: _ClassVar[int]
+    H_FIELD_NUMBER: _ClassVar[int]
+    lat: float
+    lon: float
+    h: float
+    def __init__(self, lat: _Optional[float] = ..., lon: _Optional[float] = ..., h: _Optional[float] = ...) -> None: ...
+
+class GeoQuaternion(_message.Message):
+    __slots__ = ("x", "y", "z", "w")
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
+    W_FIELD_NUMBER: _ClassVar[int]
+    x: float
+    y: float
+    z: float
+    w: float
+    def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ..., w: _Optional[float] = ...) -> None: ...
+
+class PriorCheck(_message.Message):
+    __slots__ = ("kind", "mahalanobis", "degrees_of_freedom", "conflict", "used")
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    MAHALANOBIS_FIELD_NUMBER: _ClassVar[int]
+    DEGREES_OF_FREEDOM_FIELD_NUMBER: _ClassVar[int]
+    CONFLICT_FIELD_NUMBER: _ClassVar[int]
+    USED_FIELD_NUMBER: _ClassVar[int]
+    kind: PriorKind
+    mahalanobis: float
+    degrees_of_freedom: int
+    conflict: bool
+    used: bool
+    def __init__(self, kind: _Optional[_Union[PriorKind, str]] = ..., mahalanobis: _Optional[float] = ..., degrees_of_freedom: _Optional[int] = ..., conflict: bool = ..., used: bool = ...) -> None: ...
 
 class PoseCovariance(_message.Message):
     __slots__ = ("row_major",)
@@ -179,12 +346,38 @@ class Accuracy(_message.Message):
     def __init__(self, position_68_m: _Optional[float] = ..., position_95_m: _Optional[float] = ..., rotation_68_deg: _Optional[float] = ..., rotation_95_deg: _Optional[float] = ..., calibrated: bool = ...) -> None: ...
 
 class Rejection(_message.Message):
-    __slots__ = ("reason", "message")
+    __slots__ = ("reason", "message", "hint", "hypotheses")
     REASON_FIELD_NUMBER: _ClassVar[int]
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    HINT_FIELD_NUMBER: _ClassVar[int]
+    HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
     reason: RejectionReason
     message: str
-    def __init__(self, reason: _Optional[_Union[RejectionReason, str]] = ..., message: _Optional[str] = ...) -> None: ...
+    hint: Hint
+    hypotheses: _containers.RepeatedCompositeFieldContainer[Hypothesis]
+    def __init__(self, reason: _Optional[_Union[RejectionReason, str]] = ..., message: _Optional[str] = ..., hint: _Optional[_Union[Hint, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ...) -> None: ...
+
+class Hint(_message.Message):
+    __slots__ = ("stage", "advice", "message", "best_reference")
+    STAGE_FIELD_NUMBER: _ClassVar[int]
+    ADVICE_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    BEST_REFERENCE_FIELD_NUMBER: _ClassVar[int]
+    stage: str
+    advice: Advice
+    message: str
+    best_reference: str
+    def __init__(self, stage: _Optional[str] = ..., advice: _Optional[_Union[Advice, str]] = ..., message: _Optional[str] = ..., best_reference: _Optional[str] = ...) -> None: ...
+
+class Hypothesis(_message.Message):
+    __slots__ = ("world_from_camera", "inlier_count", "references")
+    WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    INLIER_COUNT_FIELD_NUMBER: _ClassVar[int]
+    REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    world_from_camera: _geometry_pb2.RigidTransform
+    inlier_count: int
+    references: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., inlier_count: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Diagnostics(_message.Message):
     __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval")
@@ -249,3 +442,185 @@ class StageTiming(_message.Message):
     stage: str
     duration: _duration_pb2.Duration
     def __init__(self, stage: _Optional[str] = ..., duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ...) -> None: ...
+
+class Debug(_message.Message):
+    __slots__ = ("query_x_px", "query_y_px", "point_x_m", "point_y_m", "point_z_m", "is_inlier", "error_px", "reference", "reference_x_px", "reference_y_px")
+    QUERY_X_PX_FIELD_NUMBER: _ClassVar[int]
+    QUERY_Y_PX_FIELD_NUMBER: _ClassVar[int]
+    POINT_X_M_FIELD_NUMBER: _ClassVar[int]
+    POINT_Y_M_FIELD_NUMBER: _ClassVar[int]
+    POINT_Z_M_FIELD_NUMBER: _ClassVar[int]
+    IS_INLIER_FIELD_NUMBER: _ClassVar[int]
+    ERROR_PX_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_X_PX_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_Y_PX_FIELD_NUMBER: _ClassVar[int]
+    query_x_px: _containers.RepeatedScalarFieldContainer[float]
+    query_y_px: _containers.RepeatedScalarFieldContainer[float]
+    point_x_m: _containers.RepeatedScalarFieldContainer[float]
+    point_y_m: _containers.RepeatedScalarFieldContainer[float]
+    point_z_m: _containers.RepeatedScalarFieldContainer[float]
+    is_inlier: _containers.RepeatedScalarFieldContainer[bool]
+    error_px: _containers.RepeatedScalarFieldContainer[float]
+    reference: _containers.RepeatedScalarFieldContainer[int]
+    reference_x_px: _containers.RepeatedScalarFieldContainer[float]
+    reference_y_px: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, query_x_px: _Optional[_Iterable[float]] = ..., query_y_px: _Optional[_Iterable[float]] = ..., point_x_m: _Optional[_Iterable[float]] = ..., point_y_m: _Optional[_Iterable[float]] = ..., point_z_m: _Optional[_Iterable[float]] = ..., is_inlier: _Optional[_Iterable[bool]] = ..., error_px: _Optional[_Iterable[float]] = ..., reference: _Optional[_Iterable[int]] = ..., reference_x_px: _Optional[_Iterable[float]] = ..., reference_y_px: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class LocalizeRigRequest(_message.Message):
+    __slots__ = ("scene", "images", "options", "capture_time", "session_from_rig")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    IMAGES_FIELD_NUMBER: _ClassVar[int]
+    OPTIONS_FIELD_NUMBER: _ClassVar[int]
+    CAPTURE_TIME_FIELD_NUMBER: _ClassVar[int]
+    SESSION_FROM_RIG_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    images: _containers.RepeatedCompositeFieldContainer[RigImage]
+    options: LocalizeOptions
+    capture_time: _timestamp_pb2.Timestamp
+    session_from_rig: _geometry_pb2.RigidTransform
+    def __init__(self, scene: _Optional[str] = ..., images: _Optional[_Iterable[_Union[RigImage, _Mapping]]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
+
+class RigImage(_message.Message):
+    __slots__ = ("image", "intrinsics", "rig_from_camera", "references")
+    IMAGE_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_FIELD_NUMBER: _ClassVar[int]
+    RIG_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    image: bytes
+    intrinsics: _geometry_pb2.CameraIntrinsics
+    rig_from_camera: _geometry_pb2.RigidTransform
+    references: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., rig_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class LocalizeRigResponse(_message.Message):
+    __slots__ = ("localization", "rejection", "images", "capture_time", "session_from_rig")
+    LOCALIZATION_FIELD_NUMBER: _ClassVar[int]
+    REJECTION_FIELD_NUMBER: _ClassVar[int]
+    IMAGES_FIELD_NUMBER: _ClassVar[int]
+    CAPTURE_TIME_FIELD_NUMBER: _ClassVar[int]
+    SESSION_FROM_RIG_FIELD_NUMBER: _ClassVar[int]
+    localization: RigLocalization
+    rejection: Rejection
+    images: _containers.RepeatedCompositeFieldContainer[ImageReport]
+    capture_time: _timestamp_pb2.Timestamp
+    session_from_rig: _geometry_pb2.RigidTransform
+    def __init__(self, localization: _Optional[_Union[RigLocalization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., images: _Optional[_Iterable[_Union[ImageReport, _Mapping]]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
+
+class RigLocalization(_message.Message):
+    __slots__ = ("world_from_rig", "covariance", "accuracy", "inlier_count", "match_count", "reprojection_error_px", "world_from_session", "geo_pose")
+    WORLD_FROM_RIG_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    ACCURACY_FIELD_NUMBER: _ClassVar[int]
+    INLIER_COUNT_FIELD_NUMBER: _ClassVar[int]
+    MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
+    REPROJECTION_ERROR_PX_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FROM_SESSION_FIELD_NUMBER: _ClassVar[int]
+    GEO_POSE_FIELD_NUMBER: _ClassVar[int]
+    world_from_rig: _geometry_pb2.RigidTransform
+    covariance: PoseCovariance
+    accuracy: Accuracy
+    inlier_count: int
+    match_count: int
+    reprojection_error_px: float
+    world_from_session: _geometry_pb2.RigidTransform
+    geo_pose: GeoPose
+    def __init__(self, world_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., world_from_session: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ...) -> None: ...
+
+class ImageReport(_message.Message):
+    __slots__ = ("inlier_count", "match_count", "alone", "diagnostics")
+    INLIER_COUNT_FIELD_NUMBER: _ClassVar[int]
+    MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
+    ALONE_FIELD_NUMBER: _ClassVar[int]
+    DIAGNOSTICS_FIELD_NUMBER: _ClassVar[int]
+    inlier_count: int
+    match_count: int
+    alone: Rejection
+    diagnostics: Diagnostics
+    def __init__(self, inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., alone: _Optional[_Union[Rejection, _Mapping]] = ..., diagnostics: _Optional[_Union[Diagnostics, _Mapping]] = ...) -> None: ...
+
+class LocalizeSequenceRequest(_message.Message):
+    __slots__ = ("scene", "frames", "estimate_session_scale", "options")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_FIELD_NUMBER: _ClassVar[int]
+    ESTIMATE_SESSION_SCALE_FIELD_NUMBER: _ClassVar[int]
+    OPTIONS_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    frames: _containers.RepeatedCompositeFieldContainer[SequenceFrame]
+    estimate_session_scale: bool
+    options: LocalizeOptions
+    def __init__(self, scene: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[SequenceFrame, _Mapping]]] = ..., estimate_session_scale: bool = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ...) -> None: ...
+
+class SequenceFrame(_message.Message):
+    __slots__ = ("image", "intrinsics", "session_from_camera", "capture_time", "references")
+    IMAGE_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_FIELD_NUMBER: _ClassVar[int]
+    SESSION_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    CAPTURE_TIME_FIELD_NUMBER: _ClassVar[int]
+    REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    image: bytes
+    intrinsics: _geometry_pb2.CameraIntrinsics
+    session_from_camera: _geometry_pb2.RigidTransform
+    capture_time: _timestamp_pb2.Timestamp
+    references: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class LocalizeSequenceResponse(_message.Message):
+    __slots__ = ("localization", "rejection", "images")
+    LOCALIZATION_FIELD_NUMBER: _ClassVar[int]
+    REJECTION_FIELD_NUMBER: _ClassVar[int]
+    IMAGES_FIELD_NUMBER: _ClassVar[int]
+    localization: SequenceLocalization
+    rejection: Rejection
+    images: _containers.RepeatedCompositeFieldContainer[ImageReport]
+    def __init__(self, localization: _Optional[_Union[SequenceLocalization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., images: _Optional[_Iterable[_Union[ImageReport, _Mapping]]] = ...) -> None: ...
+
+class SequenceLocalization(_message.Message):
+    __slots__ = ("world_from_session", "session_scale", "session_scale_sigma", "poses", "covariance", "accuracy", "inlier_count", "match_count", "reprojection_error_px", "axes")
+    WORLD_FROM_SESSION_FIELD_NUMBER: _ClassVar[int]
+    SESSION_SCALE_FIELD_NUMBER: _ClassVar[int]
+    SESSION_SCALE_SIGMA_FIELD_NUMBER: _ClassVar[int]
+    POSES_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    ACCURACY_FIELD_NUMBER: _ClassVar[int]
+    INLIER_COUNT_FIELD_NUMBER: _ClassVar[int]
+    MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
+    REPROJECTION_ERROR_PX_FIELD_NUMBER: _ClassVar[int]
+    AXES_FIELD_NUMBER: _ClassVar[int]
+    world_from_session: _geometry_pb2.RigidTransform
+    session_scale: float
+    session_scale_sigma: float
+    poses: _containers.RepeatedCompositeFieldContainer[CapturedPose]
+    covariance: PoseCovariance
+    accuracy: Accuracy
+    inlier_count: int
+    match_count: int
+    reprojection_error_px: float
+    axes: Axes
+    def __init__(self, world_from_session: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., session_scale: _Optional[float] = ..., session_scale_sigma: _Optional[float] = ..., poses: _Optional[_Iterable[_Union[CapturedPose, _Mapping]]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., axes: _Optional[_Union[Axes, str]] = ...) -> None: ...
+
+class CapturedPose(_message.Message):
+    __slots__ = ("capture_time", "world_from_camera")
+    CAPTURE_TIME_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    capture_time: _timestamp_pb2.Timestamp
+    world_from_camera: _geometry_pb2.RigidTransform
+    def __init__(self, capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
+
+class WatchQueriesRequest(_message.Message):
+    __slots__ = ("scene",)
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    def __init__(self, scene: _Optional[str] = ...) -> None: ...
+
+class WatchQueriesResponse(_message.Message):
+    __slots__ = ("image", "intrinsics", "answer", "missed_count")
+    IMAGE_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_FIELD_NUMBER: _ClassVar[int]
+    ANSWER_FIELD_NUMBER: _ClassVar[int]
+    MISSED_COUNT_FIELD_NUMBER: _ClassVar[int]
+    image: bytes
+    intrinsics: _geometry_pb2.CameraIntrinsics
+    answer: LocalizeResponse
+    missed_count: int
+    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., answer: _Optional[_Union[LocalizeResponse, _Mapping]] = ..., missed_count: _Optional[int] = ...) -> None: ...

@@ -53,6 +53,21 @@ class LocalizationServiceStub(object):
                 request_serializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeRequest.SerializeToString,
                 response_deserializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeResponse.FromString,
                 _registered_method=True)
+        self.LocalizeRig = channel.unary_unary(
+                '/mapless.v1.LocalizationService/LocalizeRig',
+                request_serializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeRigRequest.SerializeToString,
+                response_deserializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeRigResponse.FromString,
+                _registered_method=True)
+        self.LocalizeSequence = channel.unary_unary(
+                '/mapless.v1.LocalizationService/LocalizeSequence',
+                request_serializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeSequenceRequest.SerializeToString,
+                response_deserializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeSequenceResponse.FromString,
+                _registered_method=True)
+        self.WatchQueries = channel.unary_stream(
+                '/mapless.v1.LocalizationService/WatchQueries',
+                request_serializer=mapless_dot_v1_dot_localization__service__pb2.WatchQueriesRequest.SerializeToString,
+                response_deserializer=mapless_dot_v1_dot_localization__service__pb2.WatchQueriesResponse.FromString,
+                _registered_method=True)
 
 
 class LocalizationServiceServicer(object):
@@ -91,6 +106,32 @@ class LocalizationServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def LocalizeRig(self, request, context):
+        """Localizes several cameras that were rigidly mounted on one another and took their photographs at one moment. One pose
+        for all: cameras that see too little alone help one another. Errors are Localize's; those of a photograph name it
+        ("images[2].intrinsics").
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def LocalizeSequence(self, request, context):
+        """Localizes a device from a short sequence of photographs and the poses that it tracked meanwhile, which may drift, and
+        whose scale may be unknown. Errors are Localize's; those of a photograph name it ("frames[2].intrinsics").
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def WatchQueries(self, request, context):
+        """Shows a scene's calls of Localize as they are answered, with their photographs, until the caller has seen enough: for
+        whoever watches over a scene. Nothing is stored; a watcher that reads too slowly misses answers. Takes the role write.
+        FAILED_PRECONDITION unless the server is configured to allow it; RESOURCE_EXHAUSTED when too many watch.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_LocalizationServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -98,6 +139,21 @@ def add_LocalizationServiceServicer_to_server(servicer, server):
                     servicer.Localize,
                     request_deserializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeRequest.FromString,
                     response_serializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeResponse.SerializeToString,
+            ),
+            'LocalizeRig': grpc.unary_unary_rpc_method_handler(
+                    servicer.LocalizeRig,
+                    request_deserializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeRigRequest.FromString,
+                    response_serializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeRigResponse.SerializeToString,
+            ),
+            'LocalizeSequence': grpc.unary_unary_rpc_method_handler(
+                    servicer.LocalizeSequence,
+                    request_deserializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeSequenceRequest.FromString,
+                    response_serializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeSequenceResponse.SerializeToString,
+            ),
+            'WatchQueries': grpc.unary_stream_rpc_method_handler(
+                    servicer.WatchQueries,
+                    request_deserializer=mapless_dot_v1_dot_localization__service__pb2.WatchQueriesRequest.FromString,
+                    response_serializer=mapless_dot_v1_dot_localization__service__pb2.WatchQueriesResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -141,6 +197,87 @@ class LocalizationService(object):
             '/mapless.v1.LocalizationService/Localize',
             mapless_dot_v1_dot_localization__service__pb2.LocalizeRequest.SerializeToString,
             mapless_dot_v1_dot_localization__service__pb2.LocalizeResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def LocalizeRig(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/mapless.v1.LocalizationService/LocalizeRig',
+            mapless_dot_v1_dot_localization__service__pb2.LocalizeRigRequest.SerializeToString,
+            mapless_dot_v1_dot_localization__service__pb2.LocalizeRigResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def LocalizeSequence(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/mapless.v1.LocalizationService/LocalizeSequence',
+            mapless_dot_v1_dot_localization__service__pb2.LocalizeSequenceRequest.SerializeToString,
+            mapless_dot_v1_dot_localization__service__pb2.LocalizeSequenceResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def WatchQueries(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/mapless.v1.LocalizationService/WatchQueries',
+            mapless_dot_v1_dot_localization__service__pb2.WatchQueriesRequest.SerializeToString,
+            mapless_dot_v1_dot_localization__service__pb2.WatchQueriesResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -1,3 +1,4 @@
+from google.protobuf import field_mask_pb2 as _field_mask_pb2
 from google.protobuf import timestamp_pb2 as _timestamp_pb2
 from mapless.v1 import geometry_pb2 as _geometry_pb2
 from mapless.v1 import localization_service_pb2 as _localization_service_pb2
@@ -42,16 +43,58 @@ COVERAGE_VERDICT_DOUBTFUL: CoverageVerdict
 COVERAGE_VERDICT_NOT_LOCALIZABLE: CoverageVerdict
 
 class Scene(_message.Message):
-    __slots__ = ("name", "generation", "reference_count", "create_time")
+    __slots__ = ("name", "generation", "reference_count", "create_time", "datum", "down_in_world", "calibration")
     NAME_FIELD_NUMBER: _ClassVar[int]
     GENERATION_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
     CREATE_TIME_FIELD_NUMBER: _ClassVar[int]
+    DATUM_FIELD_NUMBER: _ClassVar[int]
+    DOWN_IN_WORLD_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_FIELD_NUMBER: _ClassVar[int]
     name: str
     generation: int
     reference_count: int
     create_time: _timestamp_pb2.Timestamp
-    def __init__(self, name: _Optional[str] = ..., generation: _Optional[int] = ..., reference_count: _Optional[int] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
+    datum: Datum
+    down_in_world: _geometry_pb2.Vector3
+    calibration: SceneCalibration
+    def __init__(self, name: _Optional[str] = ..., generation: _Optional[int] = ..., reference_count: _Optional[int] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., calibration: _Optional[_Union[SceneCalibration, _Mapping]] = ...) -> None: ...
+
+class Datum(_message.Message):
+    __slots__ = ("latitude_deg", "longitude_deg", "height_m", "enu_from_world")
+    LATITUDE_DEG_FIELD_NUMBER: _ClassVar[int]
+    LONGITUDE_DEG_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_M_FIELD_NUMBER: _ClassVar[int]
+    ENU_FROM_WORLD_FIELD_NUMBER: _ClassVar[int]
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    enu_from_world: _geometry_pb2.Quaternion
+    def __init__(self, latitude_deg: _Optional[float] = ..., longitude_deg: _Optional[float] = ..., height_m: _Optional[float] = ..., enu_from_world: _Optional[_Union[_geometry_pb2.Quaternion, _Mapping]] = ...) -> None: ...
+
+class SceneCalibration(_message.Message):
+    __slots__ = ("position_factor_68", "position_factor_95", "rotation_factor_68", "rotation_factor_95", "query_count", "features", "backend", "variant", "server_version", "create_time")
+    POSITION_FACTOR_68_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FACTOR_95_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FACTOR_68_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FACTOR_95_FIELD_NUMBER: _ClassVar[int]
+    QUERY_COUNT_FIELD_NUMBER: _ClassVar[int]
+    FEATURES_FIELD_NUMBER: _ClassVar[int]
+    BACKEND_FIELD_NUMBER: _ClassVar[int]
+    VARIANT_FIELD_NUMBER: _ClassVar[int]
+    SERVER_VERSION_FIELD_NUMBER: _ClassVar[int]
+    CREATE_TIME_FIELD_NUMBER: _ClassVar[int]
+    position_factor_68: float
+    position_factor_95: float
+    rotation_factor_68: float
+    rotation_factor_95: float
+    query_count: int
+    features: str
+    backend: str
+    variant: _localization_service_pb2.Variant
+    server_version: str
+    create_time: _timestamp_pb2.Timestamp
+    def __init__(self, position_factor_68: _Optional[float] = ..., position_factor_95: _Optional[float] = ..., rotation_factor_68: _Optional[float] = ..., rotation_factor_95: _Optional[float] = ..., query_count: _Optional[int] = ..., features: _Optional[str] = ..., backend: _Optional[str] = ..., variant: _Optional[_Union[_localization_service_pb2.Variant, str]] = ..., server_version: _Optional[str] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
 
 class Reference(_message.Message):
     __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count")
@@ -72,10 +115,14 @@ class Reference(_message.Message):
     def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ...) -> None: ...
 
 class CreateSceneRequest(_message.Message):
-    __slots__ = ("scene_id",)
+    __slots__ = ("scene_id", "datum", "down_in_world")
     SCENE_ID_FIELD_NUMBER: _ClassVar[int]
+    DATUM_FIELD_NUMBER: _ClassVar[int]
+    DOWN_IN_WORLD_FIELD_NUMBER: _ClassVar[int]
     scene_id: str
-    def __init__(self, scene_id: _Optional[str] = ...) -> None: ...
+    datum: Datum
+    down_in_world: _geometry_pb2.Vector3
+    def __init__(self, scene_id: _Optional[str] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ...) -> None: ...
 
 class CreateSceneResponse(_message.Message):
     __slots__ = ("scene",)
@@ -90,6 +137,20 @@ class GetSceneRequest(_message.Message):
     def __init__(self, name: _Optional[str] = ...) -> None: ...
 
 class GetSceneResponse(_message.Message):
+    __slots__ = ("scene",)
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    scene: Scene
+    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ...) -> None: ...
+
+class UpdateSceneRequest(_message.Message):
+    __slots__ = ("scene", "update_mask")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    UPDATE_MASK_FIELD_NUMBER: _ClassVar[int]
+    scene: Scene
+    update_mask: _field_mask_pb2.FieldMask
+    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ..., update_mask: _Optional[_Union[_field_mask_pb2.FieldMask, _Mapping]] = ...) -> None: ...
+
+class UpdateSceneResponse(_message.Message):
     __slots__ = ("scene",)
     SCENE_FIELD_NUMBER: _ClassVar[int]
     scene: Scene

@@ -64,6 +64,11 @@ class ReferenceServiceStub(object):
                 request_serializer=mapless_dot_v1_dot_reference__service__pb2.GetSceneRequest.SerializeToString,
                 response_deserializer=mapless_dot_v1_dot_reference__service__pb2.GetSceneResponse.FromString,
                 _registered_method=True)
+        self.UpdateScene = channel.unary_unary(
+                '/mapless.v1.ReferenceService/UpdateScene',
+                request_serializer=mapless_dot_v1_dot_reference__service__pb2.UpdateSceneRequest.SerializeToString,
+                response_deserializer=mapless_dot_v1_dot_reference__service__pb2.UpdateSceneResponse.FromString,
+                _registered_method=True)
         self.ListScenes = channel.unary_unary(
                 '/mapless.v1.ReferenceService/ListScenes',
                 request_serializer=mapless_dot_v1_dot_reference__service__pb2.ListScenesRequest.SerializeToString,
@@ -148,6 +153,14 @@ class ReferenceServiceServicer(object):
 
     def GetScene(self, request, context):
         """Gets a scene.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def UpdateScene(self, request, context):
+        """Changes what is known of a scene as a whole: its datum, which way is down, its calibration. INVALID_ARGUMENT for an
+        empty mask or a field that cannot be changed.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -239,6 +252,11 @@ def add_ReferenceServiceServicer_to_server(servicer, server):
                     servicer.GetScene,
                     request_deserializer=mapless_dot_v1_dot_reference__service__pb2.GetSceneRequest.FromString,
                     response_serializer=mapless_dot_v1_dot_reference__service__pb2.GetSceneResponse.SerializeToString,
+            ),
+            'UpdateScene': grpc.unary_unary_rpc_method_handler(
+                    servicer.UpdateScene,
+                    request_deserializer=mapless_dot_v1_dot_reference__service__pb2.UpdateSceneRequest.FromString,
+                    response_serializer=mapless_dot_v1_dot_reference__service__pb2.UpdateSceneResponse.SerializeToString,
             ),
             'ListScenes': grpc.unary_unary_rpc_method_handler(
                     servicer.ListScenes,
@@ -365,6 +383,33 @@ class ReferenceService(object):
             '/mapless.v1.ReferenceService/GetScene',
             mapless_dot_v1_dot_reference__service__pb2.GetSceneRequest.SerializeToString,
             mapless_dot_v1_dot_reference__service__pb2.GetSceneResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def UpdateScene(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/mapless.v1.ReferenceService/UpdateScene',
+            mapless_dot_v1_dot_reference__service__pb2.UpdateSceneRequest.SerializeToString,
+            mapless_dot_v1_dot_reference__service__pb2.UpdateSceneResponse.FromString,
             options,
             channel_credentials,
             insecure,
