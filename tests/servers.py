@@ -150,7 +150,8 @@ def whole(localize: Callable[..., Answer]) -> Method:
     """A method whose work is all done in the last part, by `localize(query, references, pipeline, options, check)`."""
 
     def prepare(*arguments: Any) -> Any:
-        *asked, _, _ = arguments  # nobody asks, and what is matched already does not matter
+        # Nobody asks, and neither what is matched already nor what is known beforehand matters.
+        *asked, _, _, _ = arguments
         return SimpleNamespace(asked=asked, bucket="stand-in")
 
     def refine(coarse: Any, check: Callable[[], None]) -> Answer:
@@ -218,8 +219,8 @@ def serving(
 
     It has a tier for each of the `features`, and closes its store, which lies in the folder unless one is given.
     """
-    defaults = {"workers": 2, "metrics": False, "warm_up": False}
-    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, **(defaults | options))
+    defaults = {"port": 0, "workers": 2, "metrics": False, "warm_up": False}
+    settings = Settings(host="127.0.0.1", data_dir=data_dir, **(defaults | options))
     store = store or Store.open(data_dir)
     method, extractors = StandInMethod(), [StandInExtractor(name) for name in features]
     method.gate.set()

@@ -1,9 +1,31 @@
 """mapless: visual localization without a map; the client.
 
+>>> answer = mapless.localize("photo.jpg", camera)
+
+asks the server of MAPLESS_ADDRESS (or localhost:50051) in the scene of MAPLESS_SCENE (or its only one), and
+
 >>> with Client("localhost:50051") as client:
 ...     answer = client.localize("photo.jpg", camera, scene="kitchen")
+
+can do all that the interface can; `mapless.aio.Client` is the same for asyncio.
 """
 
+from . import aio
+from .answers import (
+    Accuracy,
+    Debug,
+    Diagnostics,
+    FramedPose,
+    GeoPose,
+    Hint,
+    Hypothesis,
+    LocalizationResult,
+    PriorCheck,
+    ReferenceUse,
+    Rejected,
+    ScaleEstimate,
+)
+from .cameras import read_camera, read_cameras, read_pose
 from .client import Client
 from .errors import (
     AlreadyExists,
@@ -18,35 +40,40 @@ from .errors import (
     Unauthenticated,
     Unavailable,
 )
-from .geometry import Camera, Fisheye, Quaternion, RadialTangential, RigidTransform
+from .geodesy import Datum
+from .geometry import Camera, Fisheye, Quaternion, RadialTangential, RigidTransform, Similarity
+from .groups import GroupRejected, ImageReport, RigImage, RigLocalization, SequenceFrame, SequenceLocalization
 from .options import ConnectOptions
-from .requests import HeadingPrior, NewReference, PositionPrior
-from .results import (
-    Accuracy,
-    Coverage,
-    Diagnostics,
-    LocalizationResult,
-    Reference,
-    ReferenceAudit,
-    ReferenceUse,
-    Rejected,
-    RetrievedReference,
-    ScaleEstimate,
-    Scene,
-)
+from .priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
+from .requests import NewReference
+from .results import Coverage, Reference, ReferenceAudit, RetrievedReference, Scene
+from .scenes import UNCHANGED, Calibration
+from .shortcut import localize
 
 __all__ = [
+    "UNCHANGED",
     "Accuracy",
     "AlreadyExists",
+    "Calibration",
     "Camera",
     "Client",
     "ConnectOptions",
     "Coverage",
     "DataLoss",
+    "Datum",
     "DeadlineExceeded",
+    "Debug",
     "Diagnostics",
     "Fisheye",
+    "FramedPose",
+    "GeoPose",
+    "GeoPositionPrior",
+    "GravityPrior",
+    "GroupRejected",
     "HeadingPrior",
+    "Hint",
+    "Hypothesis",
+    "ImageReport",
     "Internal",
     "InvalidArgument",
     "LocalizationResult",
@@ -54,7 +81,10 @@ __all__ = [
     "NewReference",
     "NotFound",
     "PermissionDenied",
+    "PosePrior",
     "PositionPrior",
+    "PriorCheck",
+    "Priors",
     "Quaternion",
     "RadialTangential",
     "Reference",
@@ -63,9 +93,19 @@ __all__ = [
     "Rejected",
     "ResourceExhausted",
     "RetrievedReference",
+    "RigImage",
+    "RigLocalization",
     "RigidTransform",
     "ScaleEstimate",
     "Scene",
+    "SequenceFrame",
+    "SequenceLocalization",
+    "Similarity",
     "Unauthenticated",
     "Unavailable",
+    "aio",
+    "localize",
+    "read_camera",
+    "read_cameras",
+    "read_pose",
 ]

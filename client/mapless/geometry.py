@@ -266,6 +266,19 @@ class Camera:
     principal_y_px: float
     distortion: Distortion | None = None
 
+    @classmethod
+    def from_fov(cls, width_px: int, height_px: int, horizontal_fov_deg: float) -> Camera:
+        """The pinhole camera with square pixels that looks through the image's middle: of simulators and data sheets.
+
+        Args:
+            width_px, height_px: size of the image.
+            horizontal_fov_deg: angle between its left and its right edge, above 0 and below 180.
+        """
+        if not 0 < horizontal_fov_deg < 180:
+            raise ValueError(f"a field of view is above 0 and below 180 degrees, not {horizontal_fov_deg:g}")
+        focal_px = width_px / 2 / math.tan(math.radians(horizontal_fov_deg) / 2)
+        return cls(width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2)
+
     def matrix(self) -> Array:
         """K, (3, 3)."""
         return np.array(

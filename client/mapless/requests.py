@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from . import wire
-from .geometry import Array, Camera, RigidTransform
-from .v1 import geometry_pb2
-from .v1 import localization_service_pb2 as localization_pb
+from .geometry import Camera, RigidTransform
 from .v1 import reference_service_pb2 as reference_pb
 
 ImageSource = bytes | str | os.PathLike[str]
@@ -24,22 +22,6 @@ class NewReference:
     image: ImageSource
     camera: Camera
     world_from_camera: RigidTransform
-
-
-@dataclass(frozen=True, eq=False)
-class PositionPrior:
-    """The camera is known to be within `radius_m` of `position_m` (3,), world frame."""
-
-    position_m: Array
-    radius_m: float
-
-
-@dataclass(frozen=True, eq=False)
-class HeadingPrior:
-    """The camera is known to look within `max_angle_deg` of `direction` (3,), world frame, of any length but 0."""
-
-    direction: Array
-    max_angle_deg: float
 
 
 def create_request(scene_name: str, reference: NewReference) -> reference_pb.CreateReferenceRequest:
@@ -58,22 +40,3 @@ def create_request(scene_name: str, reference: NewReference) -> reference_pb.Cre
 def read_image(image: ImageSource) -> bytes:
     """The file's bytes."""
     return image if isinstance(image, bytes) else Path(image).read_bytes()
-
-
-def set_priors(
-    request: localization_pb.LocalizeRequest | reference_pb.RetrieveReferencesRequest,
-    position: PositionPrior | None,
-    heading: HeadingPrior | None,
-) -> None:
-    """Puts what is known of the camera into a request."""
-    if position is not None:
-        request.position_prior.position_m.CopyFrom(_vector(position.position_m))
-        request.position_prior.radius_m = position.radius_m
-    if heading is not None:
-        request.heading_prior.direction.CopyFrom(_vector(heading.direction))
-        request.heading_prior.max_angle_deg = heading.max_angle_deg
-
-
-def _vector(xyz: Array) -> geometry_pb2.Vector3:
-    x, y, z = map(float, xyz)
-    return geometry_pb2.Vector3(x=x, y=y, z=z)

@@ -170,3 +170,10 @@ def vector_from_message(message: pb.Vector3, field: str, max_coordinate_m: float
 def enum_prefix(enum: ProtoEnum) -> str:
     """What the names of an enum's values begin with on the wire, "SCALE_STAGE_"."""
     return str(enum.Name(0)).removesuffix("UNSPECIFIED")
+
+
+def value_name(enum: ProtoEnum, number: int) -> str:
+    """REJECTION_REASON_LOW_OVERLAP becomes "LOW_OVERLAP"; a value newer than this client, its number as text."""
+    if number not in enum.values():
+        return str(number)
+    return str(enum.Name(number)).removeprefix(enum_prefix(enum))

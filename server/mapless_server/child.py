@@ -57,7 +57,9 @@ class ChildServer:
 
 
 @contextmanager
-def child_server(store: Path | SecretStr, more_flags: Mapping[str, str] | None = None) -> Iterator[ChildServer]:
+def child_server(
+    store: Path | SecretStr, more_flags: Mapping[str, str] | None = None, environment: Mapping[str, str] | None = None
+) -> Iterator[ChildServer]:
     """A server on a free port of the loopback interface until the block is left, by whatever way.
 
     Settings of the environment hold for it, except where it listens and stores, and those of `more_flags`.
@@ -65,6 +67,7 @@ def child_server(store: Path | SecretStr, more_flags: Mapping[str, str] | None =
     Args:
         store: a data folder, or the URL of a database that servers share.
         more_flags: of the command `serve`, with their values.
+        environment: variables that are added to our own.
 
     Raises:
         ServerFailed: it ended, or did not listen within `START_TIMEOUT_S`.
@@ -76,7 +79,7 @@ def child_server(store: Path | SecretStr, more_flags: Mapping[str, str] | None =
         "--drain-grace-s": str(GRACE_S),
         "--metrics-port": "0",
     } | dict(more_flags or {})
-    environment = {}
+    environment = dict(environment or {})
     if isinstance(store, Path):
         flags["--data-dir"] = str(store)  # as a flag, it stands above any database of the environment
     else:

@@ -14,6 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from . import __version__
+from .calibration.command import calibrate_command
 from .commands.audit import audit_command
 from .commands.store import store_app
 from .evaluation.cli import evaluate_command
@@ -21,6 +22,7 @@ from .ingest.command import export_command, import_command
 from .load.command import load_app
 from .security.command import token_app
 from .settings import ConfigError, Settings, load_settings
+from .view.command import view_command
 
 app = typer.Typer(
     help="Visual localization without a map, as a gRPC service.",
@@ -39,7 +41,9 @@ app.add_typer(store_app, name="store")
 app.command("import")(import_command)
 app.command("export")(export_command)
 app.command("audit")(audit_command)
+app.command("calibrate")(calibrate_command)
 app.command("evaluate")(evaluate_command)
+app.command("view")(view_command)
 
 
 def _help(setting: str) -> str:

@@ -4,27 +4,32 @@
 ``K`` (3x3, pixels, (0, 0) the centre of the top-left one), ``dist`` (OpenCV's k1 k2 p1 p2 [k3], or null) and
 ``world_from_camera`` (4x4, camera axes x right, y down, z forward), perhaps also ``split`` ("train" or "test") and
 ``lens`` ("fisheye": dist is then OpenCV's fisheye k1 k2 k3 k4); and beside them ``metric`` (false: the unit of length
-is arbitrary), ``source`` and ``ground_truth``.
+is arbitrary), ``source``, ``ground_truth``, ``datum`` (where the world is on the Earth, as `mapless.geodesy.Datum` has
+it: ``latitude_deg``, ``longitude_deg``, ``height_m``, ``enu_from_world`` with ``x y z w``) and ``down_in_world`` (x y z).
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential, RigidTransform
+from mapless.scenes import Vector, unit_vector
 
 FILE_NAME = "cameras.json"
 MAX_NAME_LENGTH = 128
 MAX_SIDE_PX = 2**30
 """No image's: what arithmetic with doubles and 32 bits takes without complaint."""
 SPLITS = ("", "train", "test")
+
+Told = TypeVar("Told")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +81,8 @@ class Dataset:
         format: name of the layout it was read from.
         refused: frames that are not among `frames`, and why.
         notes: what a person should know of how it was read: a choice made for them, a unit that is not metres.
+        datum: where the world is on the Earth; None if the file does not say.
+        down_in_world: unit vector to where things fall, likewise.
     """
 
     name: str
@@ -86,6 +93,8 @@ class Dataset:
     format: str = "cameras"
     refused: tuple[Refusal, ...] = ()
     notes: tuple[str, ...] = ()
+    datum: Datum | None = None
+    down_in_world: Vector | None = None
 
 
 def read_folder(path: Path) -> Dataset:
@@ -136,7 +145,7 @@ def read_json(file: Path) -> Any:
 def dataset_of(
     path: Path, content: Mapping[str, Any], frames: Sequence[Frame], refused: Sequence[Refusal] = ()
 ) -> Dataset:
-    """Frames and what `cameras.json` says of them all."""
+    """Frames and what `cameras.json` says of them all; ValueError names what it says wrongly."""
     return Dataset(
         path.resolve().name,
         tuple(frames),
@@ -144,7 +153,23 @@ def dataset_of(
         str(content.get("source", "")),
         str(content.get("ground_truth", "")),
         refused=tuple(refused),
+        datum=_told(path, content, "datum", Datum.from_json),
+        down_in_world=_told(path, content, "down_in_world", _direction),
     )
+
+
+def _told(path: Path, content: Mapping[str, Any], field: str, read: Callable[[object], Told]) -> Told | None:
+    if content.get(field) is None:
+        return None
+    try:
+        return read(content[field])
+    except ValueError as error:
+        raise ValueError(f"{path / FILE_NAME}: {field}: {error}") from error
+
+
+def _direction(content: object) -> Vector:
+    x, y, z = _numbers({"it": content}, "it", (3,)).tolist()
+    return unit_vector(x, y, z)
 
 
 def frame_label(index: int, entry: object) -> str:

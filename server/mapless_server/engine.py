@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 from .audit.coverage import Coverage
 from .audit.neighbourhood import PairMatches
@@ -36,11 +36,16 @@ from .tenancy import SceneKey
 from .tiers import EscalationOptions, Tier
 from .turns import Turn
 
+Joined = TypeVar("Joined")
+
 HOST, DEVICE = "host", "device"
 """The lanes: threads for what the CPU does, and the one that has a network's device."""
 
 DESCRIBE, RETRIEVE, AUDIT, COVERAGE = "describe", "retrieve", "audit", "coverage"
 """What is computed beside localizing, item by item."""
+
+JOIN = "join"
+"""What is computed of several photographs that were localized, together."""
 
 REMEMBERED_PAIRS = 2000
 """Whose matches audits remember, about 10 KB a pair."""
@@ -56,6 +61,7 @@ class EngineOptions:
         image_limits: what is decoded.
         index_cache_bytes: memory for what is held of scenes to choose references by.
         escalation: when stronger features are tried.
+        coverage: share of right answers to accept where a request does not say.
         queue: of the work queue.
     """
 
@@ -64,10 +70,11 @@ class EngineOptions:
     image_limits: ImageLimits = field(default_factory=ImageLimits)
     index_cache_bytes: int = 1024 * 2**20
     escalation: EscalationOptions = field(default_factory=EscalationOptions)
+    coverage: float = 0.99
     queue: WorkQueueOptions = field(default_factory=WorkQueueOptions)
 
     def __post_init__(self) -> None:
-        if self.workers < 1 or self.max_batch < 1:
+        if self.workers < 1 or self.max_batch < 1 or not 0 < self.coverage < 1:
             raise ValueError(f"senseless options: {self}")
 
 
@@ -119,7 +126,7 @@ class Engine:
         coarse = Stage(COARSE, HOST, REFINE) if on_cpu else Stage(COARSE, DEVICE, REFINE, options.max_batch)
         self.queue = WorkQueue(
             {
-                **{Stage(name, HOST): work_off for name in (DESCRIBE, RETRIEVE, AUDIT, COVERAGE)},
+                **{Stage(name, HOST): work_off for name in (DESCRIBE, RETRIEVE, AUDIT, COVERAGE, JOIN)},
                 Stage(PREPARE, HOST, COARSE): self._stages.prepare,
                 coarse: self._stages.coarse,
                 Stage(REFINE, HOST): self._stages.refine,
@@ -212,6 +219,25 @@ class Engine:
         examiner = SceneExaminer(self._tools, scene_key)
         (coverage,) = await self._each(COVERAGE, [view], examiner.check_coverage, caller, 0)
         return examiner.generation, coverage
+
+    @property
+    def parallel_queries(self) -> int:
+        """How many queries are worth being underway at a time."""
+        return max(self.options.workers, self.options.max_batch)
+
+    async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
+        """What is computed of several photographs' answers, in its turn.
+
+        Raises:
+            RequestError: a full queue, a passed deadline.
+        """
+
+        def once(_: None, check: Callable[[], None]) -> Joined:
+            check()
+            return compute()
+
+        (joined,) = await self._each(JOIN, [None], once, caller, 0)
+        return joined
 
     async def _each(
         self,

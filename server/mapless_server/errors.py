@@ -57,6 +57,13 @@ class NotFound(RequestError):
     reason = "NOT_FOUND"
 
 
+class FailedPrecondition(RequestError):
+    """The server is not configured for this; the same request succeeds once it is."""
+
+    code = "FAILED_PRECONDITION"
+    reason = "FAILED_PRECONDITION"
+
+
 class AlreadyExists(RequestError):
     """The id is taken."""
 

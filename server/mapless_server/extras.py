@@ -10,6 +10,7 @@ _EXTRA_OF = {
     "safetensors": "networks",
     "torch": "networks",
     "transformers": "superpoint",
+    "viser": "view",
 }
 """By the name under which a package is imported; what is not here, the server needs always."""
 

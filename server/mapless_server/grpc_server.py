@@ -27,6 +27,7 @@ from .rpc import Authenticate, CallInterceptor
 from .service import LocalizationService
 from .settings import Settings
 from .store import Store
+from .watching import Watchers
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +36,7 @@ SERVICE_NAMES = (
     reference_service_pb2.DESCRIPTOR.services_by_name["ReferenceService"].full_name,
 )
 
-LOCALIZE_METHOD = f"/{SERVICE_NAMES[0]}/Localize"
+LOCALIZE_METHODS = frozenset(f"/{SERVICE_NAMES[0]}/{name}" for name in ("Localize", "LocalizeRig", "LocalizeSequence"))
 
 MAX_CONCURRENT_RPCS = 2048
 """Calls at a time, from all connections. Far above what the queue admits; health probes count, and calls of which only
@@ -88,10 +89,11 @@ class GrpcServer:
         self._server = grpc.aio.server(
             interceptors=[self._interceptor], options=_options(settings), maximum_concurrent_rpcs=MAX_CONCURRENT_RPCS
         )
+        self._watchers = Watchers(settings.allow_watching)
         self._references = ReferenceService(self._ready_engine, store)
         reference_service_pb2_grpc.add_ReferenceServiceServicer_to_server(self._references, self._server)
         localization_service_pb2_grpc.add_LocalizationServiceServicer_to_server(
-            LocalizationService(self._ready_engine, metrics), self._server
+            LocalizationService(self._ready_engine, metrics, store, self._watchers), self._server
         )
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         if settings.reflection:
@@ -128,6 +130,7 @@ class GrpcServer:
         if delay_s:
             await asyncio.sleep(delay_s)
         self._is_draining = True
+        self._watchers.close()
         # Not by `stop`, which would wait for those who watch the health as well.
         await self._interceptor.wait_until_idle(grace_s)
         if self._engine is not None:
@@ -151,7 +154,7 @@ class GrpcServer:
         if self._is_draining:
             raise Unavailable("the server is stopping", reason="DRAINING", retry_after_s=1.0)
         engine = self._ready_engine()
-        if method == LOCALIZE_METHOD:
+        if method in LOCALIZE_METHODS:
             engine.check_room()
 
     def _ready_engine(self) -> Engine:

@@ -24,7 +24,7 @@ from .decode import ImageLimits, decode_image
 from .errors import AlreadyExists, DataLoss, InvalidArgument, RequestError
 from .method.features import FeatureExtractor
 from .method.views import Photograph, PosedView
-from .store import DescribedReference, ReferenceRecord, Store
+from .store import DescribedReference, ReferenceRecord, SceneAttributes, Store
 from .tenancy import SceneKey
 from .turns import Turn
 
@@ -93,6 +93,10 @@ class ReferenceLibrary:
             )
             with turn.stage("describe"):
                 self._describe_all(snapshot.undescribed, extractor, turn.check)
+
+    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        """What is known of a scene as a whole; errors as `Store.get_attributes`."""
+        return self._store.get_attributes(scene_key)
 
     def _describe_later(self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:
         with self._announcing:

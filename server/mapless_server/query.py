@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from mapless.geometry import Camera
 
 from .method.localize import LocalizeOptions
+from .method.priors import NO_PRIORS, Priors
 from .retrieval.narrowing import Narrowing
 from .scheduling.fair import Flow
 from .tenancy import SceneKey
@@ -46,11 +47,14 @@ class Query:
         scene_key: where.
         reference_ids: what to compare it with; none means that `reference_count` of the scene's are to be chosen.
         photo: the photograph.
-        narrowing: what is known of where it was taken, which chooses among references and judges the pose.
+        narrowing: limits to where it was taken, which choose among references and judge the pose.
         reference_count: see there.
         options: of the method.
         allow_coarse: whether the coarse pose is an answer where there is no time to refine it.
         rerank: whether `reference_count` of the named references are to be chosen.
+        priors: what is known of the pose, each with its uncertainty, in the scene's world.
+        is_part: whether it is one of several photographs that are to be posed together: then its matches are wanted
+            even where it cannot be localized alone.
     """
 
     scene_key: SceneKey
@@ -61,6 +65,8 @@ class Query:
     options: LocalizeOptions
     allow_coarse: bool = False
     rerank: bool = False
+    priors: Priors = NO_PRIORS
+    is_part: bool = False
 
     @property
     def chooses(self) -> bool:

@@ -21,9 +21,11 @@ from .library import Loaded, NotDescribedYet, load_usable
 from .method import localize as method
 from .method.correspond import Matches
 from .method.features import FeatureExtractor
+from .method.hints import hinted
 from .method.localize import Answer, Coarse, Localization, Prepared
 from .method.rejection import Rejection, RejectionReason
 from .method.retrieve import spread_choice
+from .method.tracked import tracked_support
 from .method.views import PosedView, View
 from .query import Query, Result
 from .query_views import QueryViews
@@ -33,6 +35,7 @@ from .retrieval.ranking import RankOptions
 from .scheduling.jobs import Done, Fallback, Job, Next, Over, Step, Verdict
 from .scheduling.observer import Ending
 from .scheduling.work_queue import Failure
+from .store import SceneAttributes
 from .tenancy import SceneKey
 from .tiers import Attempt, EscalationOptions, Tier, better_of, is_doubtful
 from .turns import Turn
@@ -79,6 +82,10 @@ class ReferenceSource(Protocol):
         """The scene's generation and references of it, in the order asked for."""
         ...
 
+    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        """What is known of a scene as a whole."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class Work:
@@ -123,6 +130,7 @@ class Found:
     Attributes:
         references: that it is to use, in order.
         generation: of the scene when they were read.
+        attributes: of the scene.
         view: the photograph.
         seconds: where the time went.
         choice: how they were chosen; None if they were used as they were named.
@@ -131,6 +139,7 @@ class Found:
 
     references: tuple[PosedView, ...]
     generation: int
+    attributes: SceneAttributes
     view: View
     seconds: dict[str, float]
     choice: Choice | None = None
@@ -215,7 +224,13 @@ class QueryStages:
                 where = "what is stored of the references that resemble the photograph is damaged"
             return self._conclude(work, found, Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, where)))
         part = self._method.prepare(
-            found.view, found.references, tier.pipeline, work.query.options, job.check, found.query_matches
+            found.view,
+            found.references,
+            tier.pipeline,
+            work.query.options,
+            job.check,
+            found.query_matches,
+            work.query.priors,
         )
         if isinstance(part, Answer):
             return self._conclude(work, found, part)
@@ -224,13 +239,14 @@ class QueryStages:
     def _find(self, work: Work, tier: Tier, turn: Turn) -> Found:
         """The references that are named, or those that the photograph resembles most."""
         query = work.query
+        attributes = work.source.attributes(query.scene_key)
         if query.chooses:
-            return self._choose(work, tier, turn)
+            return self._choose(work, attributes, tier, turn)
         # References come first: a name that is wrong is found out before the photograph is described.
         generation, references = self._load(work, query.reference_ids, tier, turn)
-        return Found(references, generation, work.views.view(tier.extractor, turn), turn.stage_seconds)
+        return Found(references, generation, attributes, work.views.view(tier.extractor, turn), turn.stage_seconds)
 
-    def _choose(self, work: Work, tier: Tier, turn: Turn) -> Found:
+    def _choose(self, work: Work, attributes: SceneAttributes, tier: Tier, turn: Turn) -> Found:
         """The references that have the most feature matches, among those that resemble the photograph most."""
         query = work.query
         choice = self._chooser.choose(
@@ -250,7 +266,7 @@ class QueryStages:
             centres = [reference.world_from_camera.translation for reference in shortlist]
             order = spread_choice([len(it) for it in matches], centres, query.reference_count)
         references, query_matches = tuple(shortlist[i] for i in order), tuple(matches[i] for i in order)
-        return Found(references, generation, view, turn.stage_seconds, choice, query_matches)
+        return Found(references, generation, attributes, view, turn.stage_seconds, choice, query_matches)
 
     def _load_chosen(self, work: Work, reference_ids: Sequence[str], tier: Tier, turn: Turn) -> Loaded:
         """Without those that are damaged, which were not the caller's choice; unless the caller named them."""
@@ -278,7 +294,10 @@ class QueryStages:
         return Next(step, Fallback(lambda: done, work.deadline_s - ANSWER_MARGIN_S))
 
     def _refine(self, underway: Underway[Coarse], job: Job) -> Verdict:
-        return self._conclude(underway.work, underway.found, self._method.refine(underway.part, job.check))
+        answer = self._method.refine(underway.part, job.check)
+        if underway.work.query.is_part and answer.support is None:
+            answer = replace(answer, support=tracked_support(underway.part.prepared, job.check))
+        return self._conclude(underway.work, underway.found, answer)
 
     def _conclude(self, work: Work, found: Found, answer: Answer) -> Verdict:
         """A tier has its answer: the better one is given, or tried to be bettered once more."""
@@ -312,9 +331,11 @@ class QueryStages:
 
     def _attempt(self, work: Work, found: Found, answer: Answer) -> Attempt:
         _check_finite(answer)
-        answer = _gated(answer, work.query.narrowing)
-        tier = self._tiers[work.tier]
-        return Attempt(tier, answer, found.references, found.generation, found.view.camera, found.choice)
+        query = work.query
+        answer = _gated(answer, query.narrowing)
+        answer = hinted(answer, found.view, found.references, not query.narrowing.is_empty)
+        tier, camera = self._tiers[work.tier], found.view.camera
+        return Attempt(tier, answer, found.references, found.generation, camera, found.choice, found.attributes)
 
     def _result(self, work: Work, best: Attempt, found: Found, answer: Answer) -> Result:
         prefix = "" if work.best is None else f"{self._tiers[work.tier].extractor.name}/"
@@ -348,4 +369,4 @@ def _gated(answer: Answer, narrowing: Narrowing) -> Answer:
     contradiction = narrowing.contradiction(answer.outcome.world_from_camera)
     if not contradiction:
         return answer
-    return replace(answer, outcome=Rejection(RejectionReason.GATE, contradiction))
+    return replace(answer, outcome=Rejection(RejectionReason.PRIOR_CONFLICT, contradiction))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TypeVar
 
 from mapless import names, wire
@@ -21,16 +22,11 @@ from .messages.naming import reference_ids_from_names, reference_key_from_name, 
 from .messages.pages import Page, Record
 from .messages.photos import photo_from_message
 from .messages.priors import narrowing_from_message
-from .messages.references import (
-    audit_to_message,
-    choice_to_message,
-    coverage_to_message,
-    reference_to_message,
-    scene_to_message,
-)
+from .messages.references import audit_to_message, choice_to_message, coverage_to_message, reference_to_message
+from .messages.scenes import attributes_from_message, changes_from_message, scene_to_message
 from .query import DEFAULT_REFERENCE_COUNT, Photo
 from .rpc import Call
-from .store import NewReference, ReferenceRecord, Store
+from .store import ContradictingDown, NewReference, ReferenceRecord, Store
 from .tenancy import SceneKey, key_of, scene_id_of
 
 MAX_BATCH = 1000
@@ -60,7 +56,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def CreateScene(self, request: pb.CreateSceneRequest, call: Call) -> pb.CreateSceneResponse:
         """Implements ReferenceService.CreateScene."""
         scene_id = wire.checked_id(request.scene_id, "scene_id")
-        scene = await self._stored(self._store.create_scene, key_of(call.principal.tenant, scene_id))
+        key, attributes = key_of(call.principal.tenant, scene_id), attributes_from_message(request)
+        scene = await self._stored(self._store.create_scene, key, attributes)
         return pb.CreateSceneResponse(scene=scene_to_message(scene))
 
     async def GetScene(self, request: pb.GetSceneRequest, call: Call) -> pb.GetSceneResponse:
@@ -69,6 +66,17 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             self._store.get_scene, scene_key_from_name(request.name, "name", call.principal.tenant)
         )
         return pb.GetSceneResponse(scene=scene_to_message(scene))
+
+    async def UpdateScene(self, request: pb.UpdateSceneRequest, call: Call) -> pb.UpdateSceneResponse:
+        """Implements ReferenceService.UpdateScene."""
+        key = scene_key_from_name(request.scene.name, "scene.name", call.principal.tenant)
+        changes = changes_from_message(request)
+        try:
+            scene = await self._stored(partial(self._store.update_scene, key, **changes))
+        except ContradictingDown as error:
+            guilty = "down_in_world" if changes.get("down_in_world") else "datum"
+            raise FieldError(f"scene.{guilty}", str(error)) from None
+        return pb.UpdateSceneResponse(scene=scene_to_message(scene))
 
     async def ListScenes(self, request: pb.ListScenesRequest, call: Call) -> pb.ListScenesResponse:
         """Implements ReferenceService.ListScenes."""
@@ -158,7 +166,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
         reference_ids, token = await self._audit_page(request, scene_key, call)
         if not reference_ids:
-            generation = (await self._stored(self._store.get_scene, scene_key)).generation
+            generation = await self._stored(self._store.get_generation, scene_key)
             return pb.AuditSceneResponse(store_generation=generation)
         are_listed = not request.references
         generation, audits = await engine.audit(scene_key, reference_ids, call.caller, are_listed)
@@ -206,7 +214,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def _add(self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call) -> Sequence[ReferenceRecord]:
         # Describing takes long: an unknown scene is worth noticing before. The store looks again when it adds.
-        await self._stored(self._store.get_scene, scene_key)
+        await self._stored(self._store.get_generation, scene_key)
         described = await self._engine().describe([photo for _, photo, _ in drafts], call.caller)
         references = [
             NewReference(reference_id, photo.image, photo.camera, world_from_camera, found.views, found.descriptors)

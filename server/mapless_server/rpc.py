@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import re
 import time
 import uuid
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
-from contextlib import suppress
+from contextlib import aclosing, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 from urllib.parse import unquote
@@ -144,11 +145,13 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         if method in OPEN_METHODS:
             return self._open.guarded(handler)
         refusal: Exception | None = None
+        streams = handler.response_streaming
 
-        async def answer(_: object, context: Context) -> bytes:
-            self._active += 1
-            self._idle.clear()
-            call = self._begin(context)
+        async def answer(_: object, context: Context) -> bytes | None:
+            if not streams:  # what may last for ever is not waited for
+                self._active += 1
+                self._idle.clear()
+            call = self._begin(context, streams)
             span = self._tracer.begin(method, _metadata(context), call.arrived_s)
             if self._observer is not None:
                 self._observer.call_started(method)
@@ -157,8 +160,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             try:
                 if refusal is not None:
                     raise refusal
-                response = await self._answer(handler, method, call, context)
-                call.note(bytes_out=len(response))
+                response = await (self._stream if streams else self._answer)(handler, method, call, context)
                 context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id),))
                 code = "OK"
                 return response
@@ -178,7 +180,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
                 await _abort(context, call, RequestError(f"internal error, id={call.request_id}"))
                 raise
             finally:
-                self._active -= 1
+                self._active -= not streams
                 if not self._active:
                     self._idle.set()
                 self._end(method, code, call, span)
@@ -190,7 +192,8 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             refusal = error
         # Not as a unary method, whose message grpc receives first: what is refused shall cost nothing, and who sends no
         # message shall not hold a place. Without a deserializer a malformed message is answered here, too.
-        return grpc.stream_unary_rpc_method_handler(answer, None, None)
+        serve = grpc.stream_stream_rpc_method_handler if streams else grpc.stream_unary_rpc_method_handler
+        return serve(answer, None, None)
 
     async def wait_until_idle(self, limit_s: float) -> None:
         """Returns when no call is being answered, or the time is over."""
@@ -200,21 +203,61 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
     def _who_calls(self, method: str, metadata: Metadata, auth_context: Mapping[str, Iterable[bytes]]) -> Principal:
         return Principal() if self._authenticate is None else self._authenticate(metadata, method, auth_context)
 
-    def _begin(self, context: Context) -> Call:
+    def _begin(self, context: Context, streams: bool) -> Call:
         now_s = time.monotonic()
-        asked_s = context.time_remaining()
-        given_s = min(self._default_deadline_s if asked_s is None else asked_s, self._max_deadline_s)
-        margin_s = min(max(ANSWER_MARGIN_S, ANSWER_MARGIN_SHARE * given_s), _MAX_MARGIN_SHARE * given_s)
+        asked_s, margin_s = context.time_remaining(), 0.0
+        if streams:
+            given_s = math.inf if asked_s is None else asked_s
+        else:
+            given_s = min(self._default_deadline_s if asked_s is None else asked_s, self._max_deadline_s)
+            margin_s = min(max(ANSWER_MARGIN_S, ANSWER_MARGIN_SHARE * given_s), _MAX_MARGIN_SHARE * given_s)
         metadata = _metadata(context)
         request_id = _well_formed(metadata, REQUEST_ID_KEY) or uuid.uuid4().hex
         client = _well_formed(metadata, CLIENT_ID_KEY) or unquote(context.peer())
         call = Call(request_id, now_s, now_s + given_s - margin_s, client=client)
-        call.note(deadline_ms=round(1000 * given_s))
+        if math.isfinite(given_s):
+            call.note(deadline_ms=round(1000 * given_s))
         return call
 
     async def _answer(self, handler: Any, method: str, call: Call, context: Context) -> bytes:
         """The servicer's answer; whatever is wrong with the request is a RequestError."""
-        data = await self._receiver.message(context, call.deadline_s - time.monotonic())
+        request, call = await self._request(handler, method, call, context)
+        try:
+            response = await self._in_time(lambda: handler.unary_unary(request, call), call.deadline_s)
+        except FieldError as error:
+            raise InvalidArgument(str(error), field=error.field) from None
+        data = bytes(handler.response_serializer(response))
+        call.note(bytes_out=len(data))
+        return data
+
+    async def _stream(self, handler: Any, method: str, call: Call, context: Context) -> None:
+        """Sends the servicer's messages as they come, until it or the caller ends, which grpc does at the deadline.
+
+        The servicer's method is a coroutine that gives an iterator of messages, with `aclose`, when they can come; the
+        caller learns of that by the initial metadata.
+        """
+        request, call = await self._request(handler, method, call, context)
+        sent_bytes = 0
+        try:
+            async with aclosing(await handler.unary_stream(request, call)) as responses:
+                await context.send_initial_metadata(())
+                async for response in responses:
+                    # The token may have been revoked, or have expired, since.
+                    self._who_calls(method, _metadata(context), context.auth_context())
+                    data = bytes(handler.response_serializer(response))
+                    await context.write(data)
+                    sent_bytes += len(data)
+        except FieldError as error:
+            raise InvalidArgument(str(error), field=error.field) from None
+        finally:
+            call.note(bytes_out=sent_bytes)
+
+    async def _request(self, handler: Any, method: str, call: Call, context: Context) -> tuple[Any, Call]:
+        """The call's message, and the call with who makes it."""
+        limit_s = call.deadline_s - time.monotonic()
+        if handler.response_streaming:  # which may have no deadline
+            limit_s = min(limit_s, self._default_deadline_s)
+        data = await self._receiver.message(context, limit_s)
         call.note(bytes_in=len(data))
         call = replace(call, principal=self._who_calls(method, _metadata(context), context.auth_context()))
         call.note(tenant=call.principal.tenant, **({"principal": call.principal.name} if call.principal.name else {}))
@@ -224,12 +267,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             request = handler.request_deserializer(data)
         except (DecodeError, ValueError):
             raise InvalidArgument("the request is not a well-formed message", reason="MALFORMED_MESSAGE") from None
-        del data  # the request has its own copy
-        try:
-            response = await self._in_time(lambda: handler.unary_unary(request, call), call.deadline_s)
-        except FieldError as error:
-            raise InvalidArgument(str(error), field=error.field) from None
-        return bytes(handler.response_serializer(response))
+        return request, call
 
     async def _in_time(self, answer: Callable[[], Coroutine[Any, Any, Message]], deadline_s: float) -> Message:
         """The answer, or DeadlineExceeded as soon as the time is over, however long it takes the servicer to stop.

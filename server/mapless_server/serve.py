@@ -72,6 +72,7 @@ def engine_options(settings: Settings) -> EngineOptions:
         max_batch=settings.max_batch,
         index_cache_bytes=settings.retrieval_cache_mib * 2**20,
         image_limits=image_limits(settings),
+        coverage=settings.coverage,
         queue=WorkQueueOptions(
             ScheduleOptions(max_queued_s=settings.max_queued_s, max_bytes=settings.max_queued_mib * 2**20),
             stall_limit_s=settings.stall_limit_s,

@@ -20,7 +20,7 @@ from pydantic_settings import (
 
 PREFIX = "MAPLESS_"
 CONFIG_VARIABLE = "MAPLESS_CONFIG"
-CLIENT_TOKEN_VARIABLE = "MAPLESS_TOKEN"
+CLIENT_TOKEN_VARIABLE, CLIENT_ADDRESS_VARIABLE = "MAPLESS_TOKEN", "MAPLESS_ADDRESS"
 """The client's, which may run in the same environment."""
 
 # Kubernetes sets these in every pod that has a service called "mapless" beside it; MAPLESS_PORT is then "tcp://...".
@@ -106,6 +106,15 @@ class Settings(BaseSettings):
         default=1024, ge=1, description="Memory for the scenes whose references are chosen from, MiB."
     )
     reference_cache_mib: int = Field(default=512, ge=0, description="Memory for references' features, MiB.")
+    coverage: float = Field(
+        default=0.99,
+        gt=0,
+        lt=1,
+        description="Share of right answers to accept where a call does not say; more, and more wrong ones pass too.",
+    )
+    allow_watching: bool = Field(
+        default=False, description="Whether WatchQueries may show callers' photographs to those with the role write."
+    )
     warm_up: bool = Field(default=True, description="Whether a localization is tried before the first call is taken.")
     drain_delay_s: float = Field(
         default=0.0,
@@ -234,7 +243,8 @@ def _read_file(path: Path) -> dict[str, Any]:
 
 
 def _read_environment() -> dict[str, Any]:
-    known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields} | {CONFIG_VARIABLE, CLIENT_TOKEN_VARIABLE}
+    clients = {CLIENT_TOKEN_VARIABLE, CLIENT_ADDRESS_VARIABLE}
+    known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields} | {CONFIG_VARIABLE} | clients
     unknown = {name for name in os.environ if name.startswith(PREFIX) and not _SERVICE_LINKS.fullmatch(name)} - known
     if unknown:
         raise ConfigError("\n".join(f"environment: {name} is not a setting" for name in sorted(unknown)))

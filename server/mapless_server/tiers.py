@@ -8,7 +8,7 @@ pose that is claimed with little support.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from .method.localize import Answer, Localization, Pipeline
 from .method.rejection import Rejection, RejectionReason
 from .method.views import PosedView
 from .retrieval.chosen import Choice
+from .store import SceneAttributes
 
 UNMENDABLE = frozenset({RejectionReason.NO_USABLE_REFERENCES, RejectionReason.DEGENERATE_REFERENCES})
 """Rejections for what the references are, whatever is seen in them."""
@@ -79,6 +80,7 @@ class Attempt:
         generation: of the scene when they were read.
         processed: the camera of the reduced image that features were found in.
         choice: how the references were chosen; None if they were used as they were named.
+        attributes: of the scene.
     """
 
     tier: Tier
@@ -87,6 +89,7 @@ class Attempt:
     generation: int
     processed: Camera
     choice: Choice | None = None
+    attributes: SceneAttributes = field(default_factory=SceneAttributes)
 
 
 def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:

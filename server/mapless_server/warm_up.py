@@ -25,6 +25,7 @@ from .method.views import Photograph, PosedView
 from .query import Caller, Photo, Query
 from .retrieval.narrowing import Narrowing
 from .scheduling.fair import Flow
+from .store import SceneAttributes
 from .tenancy import SceneKey
 from .turns import Turn
 
@@ -91,6 +92,10 @@ class _RenderedReferences:
     ) -> tuple[int, tuple[PosedView, ...]]:
         """See ReferenceSource."""
         return 1, self._views[extractor.name]
+
+    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        """See ReferenceSource."""
+        return SceneAttributes()
 
 
 def _photograph(world_from_camera: RigidTransform) -> bytes:

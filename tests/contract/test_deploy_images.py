@@ -17,7 +17,7 @@ import pytest
 import yaml  # type: ignore[import-untyped]
 from sqlalchemy import make_url
 
-from mapless.__main__ import _parser
+from mapless.cli.arguments import make_parser
 from mapless_server.security.binding import Verdict, advise
 from mapless_server.settings import PREFIX, Settings, load_settings
 from mapless_server.store.postgresql import CONNECTIONS_AT_MOST
@@ -192,7 +192,7 @@ def test_an_image_checks_its_health_with_our_client(target: str) -> None:
     (check,) = all_of(target, "HEALTHCHECK")
     options, _, command = check.partition(" CMD ")
     program, *arguments = json.loads(command)
-    parsed = _parser().parse_args(arguments)
+    parsed = make_parser().parse_args(arguments)
     assert program in PROJECT["scripts"]
     assert parsed.run.__name__ == "_health"
     assert parsed.address == f"localhost:{default('port')}"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import typer.main
 
-from mapless.__main__ import _parser
+from mapless.cli.arguments import make_parser
 from mapless_server.cli import app
 from mapless_server.errors import Unavailable
 from mapless_server.settings import Settings, load_settings
@@ -40,7 +40,7 @@ def test_the_commands_of_the_server_are_understood() -> None:
 
 def test_the_commands_of_the_client_are_understood() -> None:
     (seen,) = commands("mapless")
-    _parser().parse_args(seen)
+    make_parser().parse_args(seen)
 
 
 def test_files_that_commands_name_are_there() -> None:

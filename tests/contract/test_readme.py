@@ -15,7 +15,7 @@ from prometheus_client import generate_latest
 from servers import pose, serving
 
 from mapless import errors as client_errors
-from mapless.__main__ import _parser
+from mapless.cli.arguments import make_parser
 from mapless_server import errors
 from mapless_server.cli import app
 from mapless_server.method.localize import Variant
@@ -78,7 +78,7 @@ def test_the_commands_of_the_client_are_understood() -> None:
     seen = list(commands("mapless"))
     assert len(seen) >= 7
     for arguments in seen:
-        _parser().parse_args(arguments)  # exits where it does not understand
+        make_parser().parse_args(arguments)  # exits where it does not understand
 
 
 def test_the_commands_of_the_server_are_understood() -> None:

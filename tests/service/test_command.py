@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -74,3 +76,181 @@ def test_complaints(
     assert (code, "width" in complaint) == (2, True)
     code, _, complaint = run(server, capsys, "localize", "s", photo, "--camera", '{"width_px": 3}')
     assert (code, "camera.width_px" in complaint) == (2, True)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three photographs, of which the second is none, and the cameras of the first and the third."""
+    photos = tmp_path / "photos"
+    (photos / "images").mkdir(parents=True)
+    k = CAMERA.matrix().tolist()
+    frames = [{"image": f"images/{i}.png", "width": 96, "height": 64, "K": k, "dist": None} for i in (2, 0)]
+    (photos / "cameras.json").write_text(json.dumps({"frames": frames}))
+    for i in range(3):
+        (photos / "images" / f"{i}.png").write_bytes(PHOTO if i != 1 else b"no photograph")
+    return photos
+
+
+FOUR_NUMBERS = "80,81,47.5,31.5"
+
+
+def lines_of(printed: str) -> list[Any]:
+    return [json.loads(line) for line in printed.splitlines()]
+
+
+@pytest.mark.parametrize("parallel", ["1", "3"])
+def test_a_folder_is_a_line_of_json_for_each_photograph_in_their_order(
+    server: RunningServer, capsys: pytest.CaptureFixture[str], scene: str, folder: Path, parallel: str
+) -> None:
+    code, printed, told = run(server, capsys, "localize", scene, str(folder), "--parallel", parallel)
+    answers = lines_of(printed)
+    assert (code, told) == (0, "2 of 2 localized\n")
+    assert [answer["photo"] for answer in answers] == ["images/2.png", "images/0.png"]
+    assert all("world_from_camera" in answer for answer in answers)
+
+
+def test_a_call_that_fails_does_not_end_the_others(
+    server: RunningServer, capsys: pytest.CaptureFixture[str], scene: str, folder: Path, tmp_path: Path
+) -> None:
+    """Four numbers take the size of the image from each file; a file that has none fails by its call alone."""
+    written = tmp_path / "answers.jsonl"
+    camera = json_format.MessageToJson(wire.camera_to_message(CAMERA))
+    code, printed, told = run(
+        server, capsys, "localize", scene, str(folder / "images"), "--camera", camera, "--output", str(written)
+    )
+    assert (code, printed, told) == (1, "", "2 of 3 localized, 1 failed\n")
+    first, second, third = lines_of(written.read_text())
+    assert (second["photo"], second["error"]["code"], second["error"]["field"]) == (
+        "1.png",
+        "INVALID_ARGUMENT",
+        "image",
+    )
+    assert first["inlier_count"] == third["inlier_count"] == 90
+    (folder / "images" / "1.png").unlink()
+    assert run(server, capsys, "localize", scene, str(folder / "images"), "--camera", FOUR_NUMBERS)[0] == 0
+
+
+def test_photographs_of_a_folder_that_are_not_localized_end_with_3(
+    server: RunningServer, capsys: pytest.CaptureFixture[str], folder: Path
+) -> None:
+    assert run(server, capsys, "scene", "create", "bare")[0] == 0
+    code, printed, told = run(server, capsys, "localize", "bare", str(folder))
+    assert (code, told) == (3, "0 of 2 localized\n")
+    assert {answer["reason"] for answer in lines_of(printed)} == {"NO_USABLE_REFERENCES"}
+
+
+class TestOnATerminal:
+    @pytest.fixture
+    def terminal(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+        """To be called by the test itself: what it prints to is not there before."""
+
+        def begin() -> None:
+            for stream in (sys.stdout, sys.stderr):
+                monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
+
+        return begin
+
+    def test_a_photograph_is_a_few_lines(
+        self,
+        server: RunningServer,
+        capsys: pytest.CaptureFixture[str],
+        scene: str,
+        folder: Path,
+        terminal: Callable[[], None],
+    ) -> None:
+        terminal()
+        photo = str(folder / "images" / "0.png")
+        code, printed, _ = run(server, capsys, "localize", scene, photo, "--camera", str(folder / "cameras.json"))
+        assert code == 0
+        assert printed.startswith("localized")
+        assert "position  0.000  2.000  -1.000 m   within" in printed
+        assert "90 of 120 matches" in printed
+        assert len(printed.splitlines()) <= 6
+        assert (
+            run(server, capsys, "localize", scene, photo, "--camera", FOUR_NUMBERS, "--json")[1]["inlier_count"] == 90
+        )
+
+    def test_a_folder_is_a_table_and_a_bar(
+        self,
+        server: RunningServer,
+        capsys: pytest.CaptureFixture[str],
+        scene: str,
+        folder: Path,
+        terminal: Callable[[], None],
+    ) -> None:
+        terminal()
+        code, printed, told = run(server, capsys, "localize", scene, str(folder))
+        assert code == 0
+        assert [line.split()[0] for line in printed.splitlines()] == ["photograph", "images/2.png", "images/0.png"]
+        assert "[........................] 0/2" in told
+        assert "[############............] 1/2, 0 s to go" in told
+        assert "[########################] 2/2" in told
+        assert told.endswith("\r\x1b[K2 of 2 localized\n")
+
+    def test_one_that_is_not_localized_says_why(
+        self, server: RunningServer, capsys: pytest.CaptureFixture[str], folder: Path, terminal: Callable[[], None]
+    ) -> None:
+        terminal()
+        run(server, capsys, "scene", "create", "nothing")
+        photo = str(folder / "images" / "0.png")
+        code, printed, _ = run(server, capsys, "localize", "nothing", photo, "--camera", FOUR_NUMBERS)
+        assert code == 3
+        assert printed.startswith("not localized: NO_USABLE_REFERENCES\n  ")
+
+
+def test_drawings_are_a_page_each_and_debug_is_what_was_asked_for_by_name(
+    server: RunningServer, capsys: pytest.CaptureFixture[str], scene: str, folder: Path, tmp_path: Path
+) -> None:
+    pages = tmp_path / "pages"
+    code, printed, _ = run(server, capsys, "localize", scene, str(folder), "--draw", str(pages))
+    assert code == 0
+    assert all(answer["debug"] is None for answer in lines_of(printed))
+    assert sorted(page.name for page in pages.iterdir()) == ["images_0.png.html", "images_2.png.html"]
+    assert "images/0.png" in (pages / "images_0.png.html").read_text()
+
+
+def test_a_scene_has_its_place_on_the_earth(server: RunningServer, capsys: pytest.CaptureFixture[str]) -> None:
+    code, made, _ = run(
+        server, capsys, "scene", "create", "placed", "--datum", "47.5", "8.25", "-3", "--down", "0", "1", "0"
+    )
+    assert (code, made["datum"]["latitude_deg"], made["datum"]["height_m"]) == (0, 47.5, -3.0)
+    assert made["down_in_world"] == [0.0, 1.0, 0.0]
+    turned = ("--datum", "47.5", "8.25", "0", "--enu-from-world", "0", "0", "-1", "0")
+    code, changed, _ = run(server, capsys, "scene", "update", "placed", *turned, "--forget", "down_in_world")
+    assert (code, changed["datum"]["enu_from_world"]["z"]) == (0, -1.0)
+    assert changed["generation"] == made["generation"] + 1
+    code, got, _ = run(server, capsys, "scene", "get", "placed")
+    assert got == changed
+    assert run(server, capsys, "scene", "update", "placed")[0] == 2
+    assert run(server, capsys, "scene", "create", "x", "--enu-from-world", "0", "0", "0", "1")[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--parallel", "0"], "--parallel is the number of calls at a time, at least 1, not 0"),
+        (["--rerank"], "--rerank chooses among references"),
+        ([], "has no cameras.json: say --camera"),
+        (["--camera", FOUR_NUMBERS], "1.png"),
+        (["--camera", "1,2,3"], "1,2,3"),
+        (["--camera", "nan,1,2,3"], "nan,1,2,3"),
+        (["--camera", "cameras.json"], "cameras.json"),
+        (["--axes", "sideways", "--camera", '{"width_px": 96}'], "camera.height_px"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_asked(
+    server: RunningServer, capsys: pytest.CaptureFixture[str], folder: Path, arguments: list[str], told: str
+) -> None:
+    code, printed, complaint = run(server, capsys, "localize", "s", str(folder / "images"), *arguments)
+    assert (code, printed) == (2, "")
+    assert told in complaint
+    assert "Traceback" not in complaint
+
+
+def test_the_address_is_that_of_the_environment(
+    server: RunningServer, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MAPLESS_ADDRESS", server.address)
+    with pytest.raises(SystemExit) as caught:
+        main(["health"])
+    assert (caught.value.code, capsys.readouterr().out) == (0, "SERVING\n")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import datetime, timezone
 from pathlib import Path
 
 import pytest
@@ -14,9 +16,12 @@ from layouts import CAMERA, assert_same_camera, assert_same_pose, by_name, truth
 from servers import RunningServer
 from typer.testing import CliRunner, Result
 
-from mapless import Client, NewReference
+from mapless import Client, Datum, NewReference, Scene
+from mapless.geodesy import enu_from_y_up
 from mapless.geometry import Fisheye, RadialTangential
 from mapless_server.formats import read_dataset
+from mapless_server.formats.colmap.writing import PosedImage
+from mapless_server.formats.writing import cameras_files
 from mapless_server.ingest.command import export_command, import_command
 
 app = typer.Typer()
@@ -63,6 +68,48 @@ def test_an_export_imports_as_the_same_scene(
     again = run(server, "import", tmp_path / "out", scene, "--skip-check")
     assert again.exit_code == 0, again.output
     assert "0 added, 3 skipped as duplicates, 0 refused" in again.stdout
+
+
+def test_where_a_scene_is_on_the_earth_goes_along(
+    server: RunningServer, client: Client, filled: tuple[str, list[NewReference]], tmp_path: Path
+) -> None:
+    scene, _ = filled
+    datum = Datum(47.1 / 3, 8.1 / 3, 400.1 / 3, enu_from_y_up(30))
+    client.update_scene(scene, datum=datum, down_in_world=(0.01, -1.0, 0.02))
+    told = client.get_scene(scene)
+    assert run(server, "export", scene, tmp_path / "out").exit_code == 0
+    copy = f"{scene}-copy"
+    done = run(server, "import", tmp_path / "out", copy, "--skip-check")
+    assert done.exit_code == 0, done.output
+    found = client.get_scene(copy)
+    assert (found.datum, found.down_in_world) == (datum, told.down_in_world)
+    # One that is there keeps what is known of it.
+    client.update_scene(copy, datum=None)
+    assert run(server, "import", tmp_path / "out", copy, "--skip-check").exit_code == 0
+    assert client.get_scene(copy).datum is None
+    client.delete_scene(copy)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("datum", {"latitude_deg": 91, "longitude_deg": 0, "height_m": 0}),
+        ("datum", {"latitude_deg": "47"}),
+        ("datum", 1),
+        ("down_in_world", [0, 0, 0]),
+        ("down_in_world", [0, 1]),
+        ("down_in_world", "down"),
+    ],
+)
+def test_a_datum_or_down_that_is_none_is_refused_by_name(tmp_path: Path, field: str, value: object) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.png").write_bytes(encode(".png", textured()))
+    image = PosedImage("a.png", CAMERA, truth().poses[0])
+    scene = Scene("s", 1, 1, datetime.now(timezone.utc))
+    ((name, text),) = cameras_files([image], "test", scene).items()
+    (tmp_path / name).write_text(json.dumps(json.loads(text) | {field: value}))
+    with pytest.raises(ValueError, match=rf"cameras\.json: {field}: "):
+        read_dataset(tmp_path)
 
 
 def test_a_folder_with_something_in_it_is_not_written_to(

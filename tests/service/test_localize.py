@@ -21,6 +21,7 @@ from mapless import (
     NewReference,
     NotFound,
     PositionPrior,
+    Priors,
     Rejected,
     Unavailable,
 )
@@ -124,9 +125,9 @@ def test_a_pose_outside_the_prior_is_rejected(client: Client, scene: str) -> Non
     at_r1 = pose(1.0).translation
     near = PositionPrior(at_r1 + np.array([0.3, 0, 0]), 0.5)
     far = PositionPrior(at_r1 + np.array([0.6, 0, 0]), 0.5)
-    localized(client.localize(PHOTO, CAMERA, scene, ["r1"], position_prior=near))
-    answer = rejected(client.localize(PHOTO, CAMERA, scene, ["r1"], position_prior=far))
-    assert answer.reason == "GATE"
+    localized(client.localize(PHOTO, CAMERA, scene, ["r1"], priors=Priors(near)))
+    answer = rejected(client.localize(PHOTO, CAMERA, scene, ["r1"], priors=Priors(far)))
+    assert answer.reason == "PRIOR_CONFLICT"
     assert "0.10 m outside" in answer.message
 
 
@@ -134,10 +135,10 @@ def test_a_prior_narrows_the_choice_to_its_radius_and_ten_metres(client: Client)
     client.create_scene("street")
     client.add_references("street", [NewReference(f"x{x}", PHOTO, CAMERA, pose(float(x))) for x in (0, 8, 16, 40)])
     prior = PositionPrior(pose(4.0).translation, 3.0)
-    answer = client.localize(PHOTO, CAMERA, "street", position_prior=prior)
+    answer = client.localize(PHOTO, CAMERA, "street", priors=Priors(prior))
     assert {use.name.rpartition("/")[2] for use in answer.diagnostics.references} == {"x0", "x8", "x16"}
     nowhere = PositionPrior(np.array([1e6, 0, 0]), 3.0)
-    assert rejected(client.localize(PHOTO, CAMERA, "street", position_prior=nowhere)).reason == "NO_USABLE_REFERENCES"
+    assert rejected(client.localize(PHOTO, CAMERA, "street", priors=Priors(nowhere))).reason == "NO_USABLE_REFERENCES"
     client.delete_scene("street")
 
 

@@ -21,6 +21,7 @@ from mapless import (
     NewReference,
     NotFound,
     PositionPrior,
+    Priors,
     Rejected,
 )
 from mapless_server.store import Store
@@ -97,13 +98,15 @@ def test_a_name_that_is_wrong_is_found_out_when_reranking_too(client: Client) ->
 
 def test_a_position_prior_narrows_to_its_radius_and_ten_metres(client: Client) -> None:
     prior = PositionPrior(pose(0.0).translation, 1.0)
-    found = client.retrieve_references(PHOTOS[9], CAMERA, "hall", 1000, position_prior=prior)
+    found = client.retrieve_references(PHOTOS[9], CAMERA, "hall", 1000, priors=Priors(prior))
     assert sorted(ids([it.name for it in found])) == ["r00", "r01", "r02"]
 
 
 def test_a_heading_prior_narrows_to_its_angle_and_sixty_degrees(client: Client) -> None:
     axis = pose(0.0).rotation[:, 2]
-    near = client.retrieve_references(PHOTOS[0], CAMERA, "hall", 1000, heading_prior=HeadingPrior(3 * axis, 1.0))
+    near = client.retrieve_references(
+        PHOTOS[0], CAMERA, "hall", 1000, priors=Priors(heading=HeadingPrior(3 * axis, 1.0))
+    )
     expected = [i for i in range(COUNT) if axis @ pose(SPACING_M * i).rotation[:, 2] >= np.cos(np.radians(61))]
     assert sorted(ids([it.name for it in near])) == [f"r{i:02}" for i in expected]
     assert 0 < len(expected) < COUNT
@@ -111,11 +114,11 @@ def test_a_heading_prior_narrows_to_its_angle_and_sixty_degrees(client: Client) 
 
 def test_a_pose_that_looks_elsewhere_than_the_heading_prior_is_rejected(client: Client) -> None:
     axis = pose(0.0).rotation[:, 2]
-    ahead, behind = HeadingPrior(axis, 5.0), HeadingPrior(-axis, 5.0)
-    assert isinstance(client.localize(PHOTOS[0], CAMERA, "hall", ["r00"], heading_prior=ahead), LocalizationResult)
-    answer = client.localize(PHOTOS[0], CAMERA, "hall", ["r00"], heading_prior=behind)
+    ahead, behind = (Priors(heading=HeadingPrior(sign * axis, 5.0)) for sign in (1, -1))
+    assert isinstance(client.localize(PHOTOS[0], CAMERA, "hall", ["r00"], priors=ahead), LocalizationResult)
+    answer = client.localize(PHOTOS[0], CAMERA, "hall", ["r00"], priors=behind)
     assert isinstance(answer, Rejected)
-    assert answer.reason == "GATE"
+    assert answer.reason == "PRIOR_CONFLICT"
     assert "175.0 degrees outside" in answer.message
 
 
@@ -187,10 +190,10 @@ def test_a_damaged_reference_without_a_descriptor_does_not_keep_the_others_from_
     [
         ({"count": -1}, "count"),
         ({"count": 1001}, "count"),
-        ({"position_prior": PositionPrior(np.zeros(3), 0.0)}, "position_prior.radius_m"),
-        ({"heading_prior": HeadingPrior(np.zeros(3), 10.0)}, "heading_prior.direction"),
-        ({"heading_prior": HeadingPrior(np.array([0, 0, np.nan]), 10.0)}, "heading_prior.direction.z"),
-        ({"heading_prior": HeadingPrior(np.array([0, 0, 1.0]), 181.0)}, "heading_prior.max_angle_deg"),
+        ({"priors": Priors(PositionPrior(np.zeros(3), -1.0))}, "position_prior.radius_m"),
+        ({"priors": Priors(heading=HeadingPrior(np.zeros(3), 10.0))}, "heading_prior.direction"),
+        ({"priors": Priors(heading=HeadingPrior(np.array([0, 0, np.nan]), 10.0))}, "heading_prior.direction.z"),
+        ({"priors": Priors(heading=HeadingPrior(np.array([0, 0, 1.0]), 181.0))}, "heading_prior.max_angle_deg"),
         ({"camera": Camera(97, 64, 80.0, 81.0, 47.5, 31.5)}, "intrinsics.width_px"),
         ({"image": b"no image"}, "image"),
     ],

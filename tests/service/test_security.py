@@ -33,6 +33,7 @@ from mapless import (
 )
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as reference_pb
+from mapless.v1.geometry_pb2 import Vector3
 from mapless_server.principal import Role
 from mapless_server.security.access import METHOD_ROLES
 from mapless_server.security.errors import SecurityError
@@ -82,7 +83,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
     old = {"name": "old", "tenant": "acme", "role": "write", "sha256": sha256_of(EXPIRED), "expires": over}
     tokens_file.write_text(json.dumps({"tokens": [old]}))
     tokens = {caller: create_token(tokens_file, caller, *held, None) for caller, held in CALLERS.items()}
-    with serving(folder / "data", tokens_file=tokens_file) as server:
+    with serving(folder / "data", tokens_file=tokens_file, allow_watching=True) as server:
         guarded = Guarded(server, tokens, tokens_file)
         for caller, x_m in (("writer", 1.0), ("stranger", 2.0), ("local", 3.0)):
             with guarded.client(caller) as client:
@@ -100,6 +101,7 @@ def requests_on(scene_id: str) -> dict[str, Message]:
     reference = reference_pb.CreateReferenceRequest(scene=scene, reference_id="r", reference=_reference())
     requests: dict[str, Message] = {
         "LocalizationService/Localize": localize_request(scene_id),
+        "LocalizationService/WatchQueries": localization_pb.WatchQueriesRequest(scene=scene),
         "ReferenceService/GetScene": reference_pb.GetSceneRequest(name=scene),
         "ReferenceService/ListReferences": reference_pb.ListReferencesRequest(scene=scene),
         "ReferenceService/GetReference": reference_pb.GetReferenceRequest(name=f"{scene}/references/r"),
@@ -113,6 +115,10 @@ def requests_on(scene_id: str) -> dict[str, Message]:
         "ReferenceService/AuditScene": reference_pb.AuditSceneRequest(scene=scene),
         "ReferenceService/CheckCoverage": reference_pb.CheckCoverageRequest(
             scene=scene, world_from_camera=_reference().world_from_camera, intrinsics=_reference().intrinsics
+        ),
+        "ReferenceService/UpdateScene": reference_pb.UpdateSceneRequest(
+            scene=reference_pb.Scene(name=scene, down_in_world=Vector3(z=-1)),
+            update_mask={"paths": ["down_in_world"]},
         ),
         "ReferenceService/DeleteReference": reference_pb.DeleteReferenceRequest(name=f"{scene}/references/r"),
         "ReferenceService/DeleteScene": reference_pb.DeleteSceneRequest(name=scene),

@@ -15,9 +15,10 @@ import pytest
 from stores import DATABASES, EXTRACTOR, Folder, Place, Shared, assert_same_view, make_reference, place_on, view_of
 from typer.testing import CliRunner
 
+from mapless.geodesy import Datum
 from mapless_server.commands.store import store_app
 from mapless_server.principal import DEFAULT_TENANT
-from mapless_server.store import Store, StoreError, codec, tables
+from mapless_server.store import SceneAttributes, Store, StoreError, codec, tables
 from mapless_server.store.backup import GENERATIONS_SKIPPED, back_up, restore
 from mapless_server.store.postgresql import PostgresqlDatabase
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase, choose_library
@@ -26,6 +27,7 @@ from mapless_server.tenancy import SceneKey, key_of
 
 OFFICE = SceneKey("office")
 THEIRS = key_of("acme", "hall")
+KNOWN = {OFFICE: SceneAttributes(), THEIRS: SceneAttributes(Datum(47.5, 8.25, 400.0), (0.0, 0.0, -1.0))}
 
 
 @pytest.fixture(params=DATABASES)
@@ -41,7 +43,7 @@ def backup(tmp_path: Path) -> Path:
 def fill(store: Store) -> None:
     """Two tenants' scenes, a deleted reference, one without a descriptor."""
     for key in (OFFICE, THEIRS):
-        store.create_scene(key)
+        store.create_scene(key, KNOWN[key])
         store.add_references(key, [make_reference(f"r{seed}", seed, dimension=32 * (seed % 2)) for seed in range(5)])
     store.delete_reference(OFFICE, "r3")
 
@@ -50,6 +52,7 @@ def assert_same_contents(store: Store, skipped: int = 0) -> None:
     """That `fill` was what filled it."""
     for key, ids in ((OFFICE, "0124"), (THEIRS, "01234")):
         scene = store.get_scene(key)
+        assert scene.attributes == store.get_attributes(key) == KNOWN[key]
         assert (scene.reference_count, scene.generation) == (len(ids), skipped + (3 if key == OFFICE else 2))
         changes = store.list_changes(key, 2, "vlad")
         assert changes.is_whole is bool(skipped)
@@ -183,6 +186,14 @@ def test_a_wrong_count_is_found(place: Place) -> None:
     place.execute("UPDATE scene SET reference_count = 7 WHERE scene_id = 'acme/hall'")
     with closing(look_at(place)) as database, database.read() as connection:
         assert verify(connection).faults == ("tenant 'acme', scene 'hall': its count of references is wrong",)
+
+
+def test_damage_of_what_is_known_of_a_scene_is_found(place: Place) -> None:
+    with place.open() as store:
+        fill(store)
+    place.execute("UPDATE scene SET attributes_sha256 = ? WHERE scene_id = 'acme/hall'", "0" * 64)
+    with closing(look_at(place)) as database, database.read() as connection:
+        assert verify(connection).faults == ("tenant 'acme', scene 'hall': its datum, down and calibration",)
 
 
 def test_a_damaged_file_is_no_backup(backup: Path, tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from mapless import Camera, Client, LocalizationResult, Rejected, RigidTransform
+from mapless.answers import Diagnostics, ReferenceUse
 from mapless.geometry import RadialTangential, rotation_from_vector
-from mapless.results import Diagnostics, ReferenceUse
 from mapless_server.child import ChildServer
 from mapless_server.demo import run
 from mapless_server.demo.raycast import Quad, Surface

@@ -7,7 +7,7 @@ import hashlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -125,6 +125,14 @@ def setting(tmp_path: Path) -> Iterator[Setting]:
         setting.close()
 
 
+def is_outcome(result: Result, planted: Answer) -> bool:
+    """Whether an answer's outcome is given, to a rejection of which a hint is added."""
+    given = result.attempt.answer.outcome
+    if isinstance(given, Rejection):
+        return replace(given, hint=None) == planted.outcome
+    return given is planted.outcome
+
+
 class TestTiers:
     @pytest.mark.parametrize(
         "sure", [localized(SURE_INLIERS), rejected(RejectionReason.DEGENERATE_REFERENCES)], ids=["pose", "rejection"]
@@ -134,7 +142,7 @@ class TestTiers:
         result = setting.localize()
         assert setting.asked == ["cheap"]
         assert not setting.extractors["strong"].seen
-        assert result.attempt.answer.outcome is sure.outcome
+        assert is_outcome(result, sure)
         assert result.attempt.tier.extractor.name == "cheap"
         assert list(result.stage_seconds) == ["decode", "features", *sure.stage_seconds]
 
@@ -154,7 +162,7 @@ class TestTiers:
         result = setting.localize()
         assert setting.asked == ["cheap", "strong"]
         assert result.attempt.tier.extractor.name == answered
-        assert result.attempt.answer.outcome is {"cheap": first, "strong": second}[answered].outcome
+        assert is_outcome(result, {"cheap": first, "strong": second}[answered])
 
     def test_the_time_of_both_is_told_apart(self, setting: Setting) -> None:
         setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}

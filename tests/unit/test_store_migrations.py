@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,8 @@ from alembic.runtime.migration import MigrationContext
 from sqlalchemy import Connection, insert, text
 from stores import DATABASES, EXTRACTOR, Folder, Place, Shared, assert_same_view, make_reference, place_on, view_of
 
-from mapless_server.store import Store, StoreError, rows
+from mapless_server.store import SceneAttributes, Store, StoreError, rows
+from mapless_server.store.backup import back_up, restore
 from mapless_server.store.migrations import migrate, run_steps
 from mapless_server.store.postgresql import PostgresqlDatabase
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
@@ -90,6 +92,29 @@ def test_a_store_of_the_first_release_keeps_every_byte(place: Place) -> None:
         assert store.get_scene(OFFICE).reference_count == 3
         assert place.fetch("SELECT version_num FROM alembic_version") == [(str(SCHEMA_VERSION),)]
         assert place.fetch("SELECT schema_version FROM store_version") == [(SCHEMA_VERSION,)]
+
+
+def test_a_store_of_the_second_release_has_scenes_of_which_nothing_is_known(place: Place, tmp_path: Path) -> None:
+    """Its servers may still be there, too, and go on creating scenes."""
+    create = "INSERT INTO scene (scene_id, create_time_us, first_generation) VALUES (?, 5, 1)"
+    with Raw(place) as connection:
+        run_steps(connection, None, 2)
+        connection.execute(insert(scene_generation).values(scene_id="office", generation=1))
+        connection.execute(insert(scene_generation).values(scene_id="hall", generation=1))
+    place.execute(create, "office")
+    if isinstance(place, Folder):
+        with closing(SqliteDatabase.look_at(place.data_dir / DATABASE_FILE)) as database:
+            assert back_up(database, tmp_path / "backup").faults == ()
+        with Store.open(tmp_path / "other") as store:
+            assert restore(tmp_path / "backup", store.database).faults == ()
+            assert store.get_scene(OFFICE).attributes == SceneAttributes()
+    with place.open() as store:
+        assert store.get_attributes(OFFICE) == SceneAttributes()
+        known = store.update_scene(OFFICE, down_in_world=(0.0, 0.0, -1.0))
+        place.execute(create, "hall")
+        assert store.get_scene(SceneKey("hall")).attributes == SceneAttributes()
+    with place.open() as store:
+        assert store.get_scene(OFFICE) == known
 
 
 @pytest.mark.parametrize("start", ["nothing", "first release", "steps"])

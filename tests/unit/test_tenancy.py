@@ -20,6 +20,7 @@ from images import encode, textured
 from mapless import wire
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless.v1 import reference_service_pb2 as pb
+from mapless.v1.geometry_pb2 import Vector3
 from mapless.wire import FieldError
 from mapless_server.audit.coverage import Coverage, CoverageVerdict
 from mapless_server.decode import ImageLimits
@@ -170,6 +171,9 @@ def requests_for(scene_id: str, reference_id: str) -> dict[str, Any]:
             scene=scene,
             world_from_camera=new.reference.world_from_camera,
             intrinsics=wire.camera_to_message(CAMERA),
+        ),
+        "UpdateScene": pb.UpdateSceneRequest(
+            scene=pb.Scene(name=scene, down_in_world=Vector3(z=-1)), update_mask={"paths": ["down_in_world"]}
         ),
         "DeleteScene": pb.DeleteSceneRequest(name=scene),
     }

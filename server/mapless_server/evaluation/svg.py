@@ -85,12 +85,14 @@ class Curve:
         points: (x, y) in order; an infinite y is a failure, drawn as a cross at the upper edge, and breaks the line.
         from_paper: whether it is not of our measuring: drawn thinner and dotted.
         marked: whether each point is marked.
+        joined: whether a line goes through the points; without one, each is marked.
     """
 
     name: str
     points: tuple[tuple[float, float], ...]
     from_paper: bool = False
     marked: bool = False
+    joined: bool = True
 
 
 @dataclass(frozen=True)
@@ -173,9 +175,9 @@ def _curve(chart: Chart, curve: Curve, number: int) -> list[str]:
         if math.isfinite(y):
             piece.append(_place(chart, x, y))
             continue
-        if len(piece) > 1:
+        if len(piece) > 1 and curve.joined:
             parts.append(f'<polyline {_stroke(curve, number)} points="{" ".join(f"{a},{b}" for a, b in piece)}"/>')
-        if curve.marked or len(piece) == 1:
+        if curve.marked or not curve.joined or len(piece) == 1:
             parts += [
                 f'<circle {colour} fill="{_LIGHT[number % len(_LIGHT)]}" cx="{a}" cy="{b}" r="2.6"/>' for a, b in piece
             ]
@@ -189,7 +191,9 @@ def _curve(chart: Chart, curve: Curve, number: int) -> list[str]:
 
 def _legend(curve: Curve, number: int) -> str:
     x, y = _LEFT + 190 * (number % 3), HEIGHT + 8 + 16 * (number // 3)
-    return (
+    sign = (
         f'<line {_stroke(curve, number)} x1="{x}" y1="{y - 4}" x2="{x + 24}" y2="{y - 4}"/>'
-        f'<text x="{x + 30}" y="{y}">{escape(curve.name)}</text>'
+        if curve.joined
+        else f'<circle {_colour(number)} fill="{_LIGHT[number % len(_LIGHT)]}" cx="{x + 12}" cy="{y - 4}" r="2.6"/>'
     )
+    return f'{sign}<text x="{x + 30}" y="{y}">{escape(curve.name)}</text>'

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mapless import Scene
 from mapless.geometry import Fisheye
 
 from ..dataset import FILE_NAME
@@ -37,18 +38,23 @@ def write_file(file: Path, content: bytes) -> None:
         raise
 
 
-def cameras_files(images: Sequence[PosedImage], source: str) -> dict[str, str]:
-    """Contents of `cameras.json` by its path; images lie in the folder IMAGES."""
-    content = {"source": source, "metric": True, "units": "metre", "frames": [_entry(image) for image in images]}
+def cameras_files(images: Sequence[PosedImage], source: str, scene: Scene) -> dict[str, str]:
+    """Contents of `cameras.json` by its path, with the scene's datum and down; images lie in the folder IMAGES."""
+    content: dict[str, Any] = {"source": source, "metric": True, "units": "metre"}
+    if scene.datum is not None:
+        content["datum"] = scene.datum.to_json()
+    if scene.down_in_world is not None:
+        content["down_in_world"] = scene.down_in_world
+    content["frames"] = [_entry(image) for image in images]
     return {FILE_NAME: json.dumps(content, indent=1, allow_nan=False) + "\n"}
 
 
-def colmap_files(images: Sequence[PosedImage], source: str) -> dict[str, str]:
+def colmap_files(images: Sequence[PosedImage], source: str, _scene: Scene) -> dict[str, str]:
     """Contents of a COLMAP text model's files by their paths; images lie in the folder IMAGES."""
     return {f"sparse/0/{name}": f"# {source}\n{text}" for name, text in model_texts(images).items()}
 
 
-LAYOUTS: Mapping[str, Callable[[Sequence[PosedImage], str], dict[str, str]]] = {
+LAYOUTS: Mapping[str, Callable[[Sequence[PosedImage], str, Scene], dict[str, str]]] = {
     "cameras": cameras_files,
     "colmap": colmap_files,
 }

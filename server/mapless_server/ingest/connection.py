@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,10 +56,21 @@ def connected(connection: Connection, settings: Settings) -> Iterator[Client]:
         ValueError: the connection's options do not fit together, or the settings' server would not take us.
         ServerFailed: our own server did not start.
     """
+    with reachable(connection, settings) as (address, options), Client(address, options) as client:
+        yield client
+
+
+@contextmanager
+def reachable(
+    connection: Connection, settings: Settings, environment: Mapping[str, str] | None = None
+) -> Iterator[tuple[str, ConnectOptions]]:
+    """The address of a server until the block is left, and how to connect to it; see `connected`.
+
+    `environment` has settings for a server that is started, besides those of our own environment.
+    """
     options = connection.options()
     if connection.address:
-        with Client(connection.address, options) as client:
-            yield client
+        yield connection.address, options
         return
     if settings.tls_certificate is not None or settings.tokens_file is not None:
         raise ValueError(
@@ -68,11 +79,8 @@ def connected(connection: Connection, settings: Settings) -> Iterator[Client]:
         )
     if options.tls or options.token is not None:
         options = ConnectOptions(timeout_s=options.timeout_s, upload_timeout_s=options.upload_timeout_s)
-    with (
-        child_server(settings.database_url or settings.data_dir) as server,
-        Client(server.address, options) as client,
-    ):
-        yield client
+    with child_server(settings.database_url or settings.data_dir, environment=environment) as server:
+        yield server.address, options
 
 
 def _read(file: Path) -> bytes:

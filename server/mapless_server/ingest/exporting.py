@@ -33,6 +33,9 @@ def check_target(folder: Path, layout: str) -> None:
 def export_scene(client: Client, scene: str, folder: Path, layout: str, progress: Progress) -> int:
     """Writes a scene's references into a folder; the number of them.
 
+    The layout `cameras` says the scene's datum and down, too. A calibration is of these references on a server of this
+    version, and is measured anew elsewhere; a backup keeps it.
+
     The description comes last, so that a folder without it is an export that was cut off.
 
     Raises:
@@ -42,6 +45,7 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
         MaplessError: a call failed.
     """
     check_target(folder, layout)
+    known = client.get_scene(scene)
     references = list(client.list_references(scene, page_size=1000))
     if not references:
         raise ValueError(f"scene {scene} has no references")
@@ -55,7 +59,7 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
             progress("writing images", len(images), len(references))
     finally:
         threads.shutdown(wait=True, cancel_futures=True)
-    for path, text in LAYOUTS[layout](images, f"mapless scene {scene}").items():
+    for path, text in LAYOUTS[layout](images, f"mapless scene {scene}", known).items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         write_file(folder / path, text.encode())
     return len(images)

@@ -89,16 +89,18 @@ def refuse_wrong_images(report: ImportReport) -> None:
 def store_frames(client: Client, report: ImportReport, options: UploadOptions, progress: Progress) -> None:
     """Stores the report's chosen frames in its scene, which is made if there is none.
 
+    A scene that is made takes the dataset's datum and down; one that is there keeps its own.
+
     Raises:
         MaplessError: the scene could not be listed or made.
     """
-    known = KnownReferences(_existing(client, report.scene))
+    known = KnownReferences(_existing(client, report.scene, report.dataset))
     Uploader(client, known, report, options, progress).run()
 
 
-def _existing(client: Client, scene: str) -> list[Reference]:
+def _existing(client: Client, scene: str, dataset: Dataset) -> list[Reference]:
     try:
-        client.create_scene(scene)
+        client.create_scene(scene, datum=dataset.datum, down_in_world=dataset.down_in_world)
     except AlreadyExists:
         return list(client.list_references(scene, page_size=1000))
     return []

@@ -1,4 +1,4 @@
-"""What is known of scenes and references, as messages."""
+"""What is known of references, as messages."""
 
 from __future__ import annotations
 
@@ -8,17 +8,8 @@ from mapless.v1 import reference_service_pb2 as pb
 from ..audit.coverage import Coverage
 from ..audit.verdict import ReferenceAudit
 from ..retrieval.chosen import Choice
-from ..store import ReferenceRecord, SceneRecord
+from ..store import ReferenceRecord
 from .enums import enum_to_message
-
-
-def scene_to_message(scene: SceneRecord) -> pb.Scene:
-    """Message of a scene."""
-    message = pb.Scene(
-        name=names.scene_name(scene.scene_id), generation=scene.generation, reference_count=scene.reference_count
-    )
-    message.create_time.FromDatetime(scene.create_time)
-    return message
 
 
 def reference_to_message(reference: ReferenceRecord) -> pb.Reference:

@@ -7,12 +7,14 @@ more. So here everything moves at once,
     min  sum_obs rho(|r_o|^2 / sigma_o^2) + sum_i |xi_i|^2 / sigma_prior^2,
 
 over the query's pose, the points it sees and a small motion xi_i of every reference, which a prior holds to its given
-pose. The points are eliminated (Schur complement), leaving a dense system of 6 unknowns per camera.
+pose. What is known of the query's own pose beforehand adds its terms too, if the photograph alone does not contradict
+it. The points are eliminated (Schur complement), leaving a dense system of 6 unknowns per camera.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +25,7 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from .match import PointMatches
 from .observations import Observations, invert_symmetric
 from .pnp import PoseEstimate, PoseStage, motion_jacobian, reprojection_errors_px, world_covariance
+from .priors import NO_PRIORS, Priors
 from .structure import Structure, observe
 from .tracks import Tracks
 from .views import PosedView, View
@@ -84,6 +87,11 @@ class _State:
             turn @ self.rotation, (turn @ self.translation[:, :, None])[..., 0] + motion[:, :3], self.points + step
         )
 
+    @property
+    def world_from_query(self) -> RigidTransform:
+        """The query's pose."""
+        return RigidTransform(self.rotation[-1], self.translation[-1]).inverse()
+
 
 class _Problem:
     """The cost and its derivatives; knows nothing of how it is minimized."""
@@ -96,11 +104,18 @@ class _Problem:
         prior_sigma: Array,
         options: AdjustOptions,
     ) -> None:
+        self.priors = NO_PRIORS  # of the query, the last camera
         self.observations, self.view, self.given, self.options = observations, view, given, options
         self.information = prior_sigma**-2.0  # (V - 1, 6), of the references
         self.cameras = len(given.rotation)
         # Row v picks camera v's observations: sums over cameras become one matrix product.
         self.pick = (view == np.arange(self.cameras)[:, None]).astype(float)
+
+    def with_priors(self, priors: Priors) -> _Problem:
+        """The same with something known of the query's pose."""
+        problem = copy(self)
+        problem.priors = priors
+        return problem
 
     def at(self, state: _State) -> Observations:
         return replace(self.observations, rotation=state.rotation[self.view], translation=state.translation[self.view])
@@ -116,7 +131,20 @@ class _Problem:
         squared = (self.at(state).residuals(state.points) ** 2).sum(axis=1)
         scale = self.options.loss_scale_sigma**2
         prior = (self.prior_error(state) ** 2 * self.information).sum()
+        if self.priors:
+            prior += self.options.error_inflation**2 * self.priors.cost(state.world_from_query)
         return float(scale * np.log1p(squared / scale).sum() + prior)  # NaN for a point behind a camera
+
+    def query_terms(self, world_from_query: RigidTransform) -> tuple[Array, Array]:
+        """Gradient (6,) and information (6, 6) of the query's priors, by a left perturbation of camera_from_world.
+
+        That moves the centre by -R v and turns the camera by -R w about fixed axes (see `world_covariance`). Weighed
+        like what the observations say, which is too much by `error_inflation`.
+        """
+        gradient, information = self.priors.gradient_and_information(world_from_query)
+        turn = -np.kron(np.eye(2), world_from_query.rotation)
+        weight = self.options.error_inflation**2
+        return weight * turn.T @ gradient, weight * turn.T @ information @ turn
 
     def linearize(self, state: _State) -> _NormalEquations:
         observations = self.at(state)
@@ -134,6 +162,10 @@ class _Problem:
         pose_gradient = self.pick @ (weighted_pose @ error)[..., 0]
         pose_block[:-1] += self.information[:, :, None] * np.eye(6)
         pose_gradient[:-1] += self.information * self.prior_error(state)
+        if self.priors:
+            known_gradient, known = self.query_terms(state.world_from_query)
+            pose_gradient[-1] += known_gradient
+            pose_block[-1] += known
         cross = np.zeros((len(state.points), self.cameras, 6, 3))
         cross[observations.point, self.view] = weighted_pose @ by_point  # a point is seen once in a view
         return _NormalEquations(
@@ -190,6 +222,7 @@ def adjust_pose(
     matches: PointMatches,
     estimate: PoseEstimate,
     options: AdjustOptions,
+    priors: Priors = NO_PRIORS,
 ) -> PoseEstimate:
     """Refines an estimate together with the points it rests on and, within their noise, the references.
 
@@ -200,6 +233,8 @@ def adjust_pose(
         matches: of the query with them.
         estimate: the pose so far; its errors decide which matches take part.
         options: see there.
+        priors: what is known of the query's pose. Each is checked against the pose that the photograph alone gives;
+            those that are consistent with it take part, and the others do not.
 
     Returns:
         The estimate with another pose and covariance; unchanged when there is nothing to gain.
@@ -207,12 +242,36 @@ def adjust_pose(
     used = np.flatnonzero(estimate.errors_px < options.max_error_px)
     if len(used) < 3:  # two equations each, for six unknowns
         return estimate
-    problem, state = _pose_problem(query, references, structure, matches, used, estimate.world_from_camera, options)
-    state, equations = _minimize(problem, state, options)
+    problem, start = _pose_problem(query, references, structure, matches, used, estimate.world_from_camera, options)
+
+    def adjusted(pulling: Priors) -> PoseEstimate | None:
+        state, equations = _minimize(problem.with_priors(pulling), start, options)
+        return _conclude(query, structure, matches, used, estimate, state, equations, options)
+
+    alone = adjusted(NO_PRIORS)
+    if not priors:
+        return alone or estimate
+    checks = priors.check(alone.world_from_camera, alone.covariance) if alone else estimate.prior_checks
+    consistent = priors.consistent(checks)
+    answer = (adjusted(consistent) if consistent else alone) or estimate
+    return replace(answer, prior_checks=checks)
+
+
+def _conclude(
+    query: View,
+    structure: Structure,
+    matches: PointMatches,
+    used: NDArray[np.intp],
+    estimate: PoseEstimate,
+    state: _State,
+    equations: _NormalEquations,
+    options: AdjustOptions,
+) -> PoseEstimate | None:
+    """The estimate at the optimum; None if it has run off."""
     matrix, _, _ = equations.reduced(0.0)
     if not np.isfinite(matrix).all():
-        return estimate
-    pose = RigidTransform(state.rotation[-1], state.translation[-1]).inverse()
+        return None
+    pose = state.world_from_query
     # The query's block of the inverse is the inverse of what is left when the references are eliminated too.
     references_block, coupling = matrix[:-6, :-6], matrix[:-6, -6:]
     hessian = matrix[-6:, -6:] - coupling.T @ np.linalg.solve(references_block, coupling)
@@ -223,7 +282,7 @@ def adjust_pose(
     covariance = options.error_inflation**2 * world_covariance(hessian, pose)
     inliers = errors_px < options.inlier_px
     if inliers.sum() < options.min_kept_share * estimate.inliers.sum():
-        return estimate
+        return None
     return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, covariance)
 
 

@@ -10,11 +10,15 @@ from mapless.geometry import Array, RigidTransform
 
 from .accuracy import accuracy_from_covariance
 from .adjust import AdjustOptions
+from .gate import GateOptions
+from .judge import JudgeOptions
 from .match import PAPER_MATCH, MatchOptions
 from .pnp import PnpOptions, PoseStage
+from .priors import PriorCheck
 from .rejection import Rejection
 from .scale import MetricScale, ScaleStrategy
 from .structure import PAPER_STRUCTURE, StructureOptions
+from .support import Support
 
 
 class Variant(str, Enum):
@@ -43,7 +47,10 @@ class LocalizeOptions:
             was the better one it claimed at most 1.7 times as much; where repeated floor tiles had given it inliers,
             and centimetres of error, 40 to 80 times.
         pnp: of the pose solver.
+        gate: what is no pose at all.
         adjust: of the final adjustment.
+        judge: of what is accepted.
+        coverage: share of right answers to accept; more, and more wrong ones are accepted too (see `judge`).
     """
 
     variant: Variant = Variant.BEST
@@ -51,7 +58,14 @@ class LocalizeOptions:
     weak_inliers: int = 100
     max_radius_ratio: float = 3.0
     pnp: PnpOptions = field(default_factory=PnpOptions)
+    gate: GateOptions = field(default_factory=GateOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
+    judge: JudgeOptions = field(default_factory=JudgeOptions)
+    coverage: float = 0.99
+
+    def __post_init__(self) -> None:
+        if not 0 < self.coverage <= 1:
+            raise ValueError(f"senseless options: {self}")
 
     @property
     def structure(self) -> StructureOptions:
@@ -77,6 +91,9 @@ class Localization:
         inlier_count: 2D-3D matches that agree with it.
         match_count: 2D-3D matches tried.
         reprojection_error_px: median of the inliers, pixels of the processed image.
+        prior_checks: how the pose compares with each prior.
+        trust: 0 to 1, share of right answers that look at most as good (see `judge`); None for a pose that nothing has
+            checked, like its covariance.
     """
 
     world_from_camera: RigidTransform
@@ -85,6 +102,8 @@ class Localization:
     inlier_count: int
     match_count: int
     reprojection_error_px: float
+    prior_checks: tuple[PriorCheck, ...] = ()
+    trust: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +116,7 @@ class Answer:
         stage_seconds: time of each stage that ran, in order.
         reference_match_counts: per reference, feature matches with the query.
         reference_inlier_counts: per reference, inliers on points that it observes.
+        support: what the pose rests on, or would have; None where it did not come so far.
     """
 
     outcome: Localization | Rejection
@@ -104,6 +124,7 @@ class Answer:
     stage_seconds: dict[str, float] = field(default_factory=dict)
     reference_match_counts: tuple[int, ...] = ()
     reference_inlier_counts: tuple[int, ...] = ()
+    support: Support | None = None
 
 
 def shifted(answer: Answer, offset: Array) -> Answer:
@@ -111,6 +132,9 @@ def shifted(answer: Answer, offset: Array) -> Answer:
     outcome, scale = answer.outcome, answer.scale
     if isinstance(outcome, Localization):
         outcome = replace(outcome, world_from_camera=outcome.world_from_camera.shifted(offset))
+    elif outcome.hypotheses:
+        moved = [replace(it, world_from_camera=it.world_from_camera.shifted(offset)) for it in outcome.hypotheses]
+        outcome = replace(outcome, hypotheses=tuple(moved))
     if scale:
         world_from_local = replace(scale.world_from_local, translation=scale.world_from_local.translation + offset)
         scale = replace(

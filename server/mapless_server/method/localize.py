@@ -31,11 +31,15 @@ from .answer import Answer, Localization, LocalizeOptions, Variant, is_better, s
 from .coarse import Bucket, Outcome, Reconstruction, Reconstructor, Request, reconstruct_one
 from .coarse.geometric import GeometricReconstructor
 from .correspond import Correspondences, Matcher, Matches
+from .gate import doubts
+from .judge import judge
 from .match import MatchOptions, PointMatches, match_points
-from .pnp import PoseEstimate, PoseStage, solve_pose
+from .pnp import PoseStage, solve_pose
+from .priors import NO_PRIORS, Priors
 from .rejection import Rejection, RejectionReason
 from .scale import MetricScale, ScaleOptions, estimate_scale
 from .structure import Structure, build_structure
+from .support import Support
 from .views import PosedView, View
 
 __all__ = [
@@ -95,6 +99,7 @@ class Prepared:
         correspondences: between all photographs.
         bucket: prepared queries of the same bucket may be reconstructed together.
         stage_seconds: time of each stage so far.
+        priors: what is known of the query's pose, in the same world.
     """
 
     query: View
@@ -105,6 +110,7 @@ class Prepared:
     correspondences: Correspondences
     bucket: Bucket
     stage_seconds: dict[str, float]
+    priors: Priors = NO_PRIORS
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,13 +137,13 @@ class Coarse:
         self,
         outcome: Localization | Rejection,
         stage_seconds: dict[str, float],
-        inlier_counts: tuple[int, ...] | None = None,
+        support: Support | None = None,
     ) -> Answer:
         """What `outcome`, in the world of `prepared`, is to the caller."""
         prepared, scale = self.prepared, None if isinstance(self.scale, Rejection) else self.scale
         matches = tuple(len(m) for m in prepared.correspondences.query_matches)
-        inliers = inlier_counts or (0,) * len(prepared.references)
-        return shifted(Answer(outcome, scale, stage_seconds, matches, inliers), prepared.origin)
+        inliers = support.inliers_by_reference() if support else (0,) * len(prepared.references)
+        return shifted(Answer(outcome, scale, stage_seconds, matches, inliers, support), prepared.origin)
 
 
 def localize(
@@ -146,6 +152,7 @@ def localize(
     pipeline: Pipeline,
     options: LocalizeOptions,
     check: Check = _somebody_waits,
+    priors: Priors = NO_PRIORS,
 ) -> Answer:
     """Localizes a query among posed references.
 
@@ -155,11 +162,12 @@ def localize(
         pipeline: what to run on.
         options: see there.
         check: called between the steps.
+        priors: what is known of the query's pose, in the references' world.
 
     Returns:
         The answer; "no pose" is one, with the first stage that could not do its work.
     """
-    prepared = prepare(query, references, pipeline, options, check)
+    prepared = prepare(query, references, pipeline, options, check, priors=priors)
     if isinstance(prepared, Answer):
         return prepared
     (coarse,) = reconstruct([prepared], [check])
@@ -175,6 +183,7 @@ def prepare(
     options: LocalizeOptions,
     check: Check = _somebody_waits,
     query_matches: Sequence[Matches] | None = None,
+    priors: Priors = NO_PRIORS,
 ) -> Prepared | Answer:
     """The first of the three parts, with the arguments of `localize`; an answer if there is nothing to go on with.
 
@@ -195,7 +204,8 @@ def prepare(
     stage_seconds: dict[str, float] = {}
     with _stage("correspond", stage_seconds, check):
         correspondences = pipeline.matcher.correspond(query, nearby, False, check, query_matches)
-    return Prepared(query, nearby, origin, pipeline, options, correspondences, bucket, stage_seconds)
+    known = priors.shifted(-origin)
+    return Prepared(query, nearby, origin, pipeline, options, correspondences, bucket, stage_seconds, known)
 
 
 def reconstruct(batch: Sequence[Prepared], checks: Sequence[Check] = ()) -> list[Coarse | Answer | Exception]:
@@ -224,7 +234,7 @@ def reconstruct(batch: Sequence[Prepared], checks: Sequence[Check] = ()) -> list
     outcomes: list[Any] = _each(lambda check: check(), checks)
     wanted = [i for i, outcome in enumerate(outcomes) if outcome is None]
     with timed(seconds, "coarse"):
-        requests = [Request(p.query, p.references, p.correspondences) for p in (batch[i] for i in wanted)]
+        requests = [Request(p.query, p.references, p.correspondences, p.priors) for p in (batch[i] for i in wanted)]
         made = batch[0].pipeline.reconstructor.reconstruct_many(requests) if requests else []
     for i, outcome in zip(wanted, made, strict=True):
         outcomes[i] = outcome
@@ -322,13 +332,26 @@ def _pose(coarse: Coarse, check: Check) -> Answer:
         return coarse.answer(scale, seconds)
     query, references, options = prepared.query, prepared.references, prepared.options
     structure, matches = _structure_and_matches(coarse, scale, seconds, check)
+    support = Support(query, references, structure, matches, None, prepared.origin)
     with _stage("pnp", seconds, check):
-        estimate = solve_pose(query, structure, matches, scale.world_from_query, options.pnp)
+        estimate = solve_pose(query, structure, matches, scale.world_from_query, options.pnp, prepared.priors)
     if isinstance(estimate, Rejection):
-        return coarse.answer(estimate, seconds)
+        return coarse.answer(estimate, seconds, support)
+    pose, inliers = estimate.world_from_camera, estimate.inliers
+    chance = prepared.priors.consistent(estimate.prior_checks).log10_chance(pose)
+    doubt = doubts(query, structure, matches, pose, inliers, options.pnp.inlier_px, options.gate, chance)
+    if doubt:
+        rejection = Rejection(RejectionReason.GATE, doubt)
+        return coarse.answer(rejection, seconds, replace(support, estimate=estimate))
     if options.variant is Variant.BEST:
         with _stage("adjust", seconds, check):
-            estimate = adjust_pose(query, references, structure, matches, estimate, options.adjust)
+            estimate = adjust_pose(query, references, structure, matches, estimate, options.adjust, prepared.priors)
+    support = replace(support, estimate=estimate)
+    with _stage("judge", seconds, check):
+        query_matches = prepared.correspondences.query_matches
+        judged = judge(support, query_matches, options.pnp.inlier_px, options.coverage, options.judge, chance)
+    if judged.rejection:
+        return coarse.answer(judged.rejection, seconds, support)
     outcome = Localization(
         estimate.world_from_camera,
         estimate.covariance,
@@ -336,8 +359,10 @@ def _pose(coarse: Coarse, check: Check) -> Answer:
         int(estimate.inliers.sum()),
         len(matches),
         float(np.median(estimate.errors_px[estimate.inliers])),
+        estimate.prior_checks,
+        judged.trust,
     )
-    return coarse.answer(outcome, seconds, _inliers_by_reference(structure, matches, estimate, len(references)))
+    return coarse.answer(outcome, seconds, support)
 
 
 def _structure_and_matches(
@@ -353,7 +378,8 @@ def _structure_and_matches(
         structure = build_structure(reconstruction, scale, references, correspondences, prepared.options.structure)
     with _stage("match", stage_seconds, check):
         options, initial = _match_options(prepared), scale.world_from_query
-        matches = match_points(prepared.query, references, structure, correspondences, initial, options)
+        foreseen = prepared.priors.pose.world_from_camera if prepared.priors.pose else None
+        matches = match_points(prepared.query, references, structure, correspondences, initial, options, foreseen)
     return structure, matches
 
 
@@ -367,7 +393,9 @@ def _look_wider(coarse: Coarse, stage_seconds: dict[str, float], check: Check) -
     with _stage("coarse", seconds, check):
         reconstruction = coarse.reconstruction
         if pipeline.reconstructor.uses_correspondences:
-            reconstruction = reconstruct_one(pipeline.reconstructor, query, references, correspondences)
+            reconstruction = reconstruct_one(
+                pipeline.reconstructor, query, references, correspondences, prepared.priors
+            )
     return _launch_scale(replace(prepared, correspondences=correspondences), reconstruction, seconds, check)()
 
 
@@ -377,14 +405,5 @@ def _may_be_better(answer: Answer, prepared: Prepared) -> bool:
     if options.variant is not Variant.BEST or len(prepared.references) < 2:
         return False
     if isinstance(outcome, Rejection):
-        return outcome.reason is not RejectionReason.DEGENERATE_REFERENCES
+        return outcome.reason not in (RejectionReason.DEGENERATE_REFERENCES, RejectionReason.AMBIGUOUS)
     return outcome.inlier_count < options.weak_inliers
-
-
-def _inliers_by_reference(
-    structure: Structure, matches: PointMatches, estimate: PoseEstimate, reference_count: int
-) -> tuple[int, ...]:
-    agreeing = np.zeros(len(structure.x_in_world), bool)
-    agreeing[matches.point[estimate.inliers]] = True
-    seen = structure.tracks.view[agreeing[structure.tracks.point]]
-    return tuple(np.bincount(seen, minlength=reference_count).tolist())

@@ -73,6 +73,7 @@ def match_points(
     correspondences: Correspondences,
     world_from_query: RigidTransform,
     options: MatchOptions,
+    foreseen: RigidTransform | None = None,
 ) -> PointMatches:
     """Matches of the query with the points of a structure.
 
@@ -83,11 +84,17 @@ def match_points(
         correspondences: matches between query and references.
         world_from_query: the query's initial pose.
         options: `PAPER_MATCH` for the paper's form.
+        foreseen: its pose as it was known before; the search begins there if that explains more of the matches that
+            were found without either.
     """
     nothing = np.empty(0, np.intp)
     known = PointMatches(nothing, nothing, np.empty(0, bool), options.radius_px)
     if options.through_tracks:
         known = vote(structure, [len(r.view.features) for r in references], correspondences)
+    if foreseen is not None and _explained(query, structure, known, foreseen, options) > _explained(
+        query, structure, known, world_from_query, options
+    ):
+        world_from_query = foreseen
     found = search(query, references, structure, world_from_query, known, options)
     return PointMatches(
         np.concatenate([known.point, found.point]),
@@ -95,6 +102,15 @@ def match_points(
         np.concatenate([known.guided, found.guided]),
         options.radius_px,
     )
+
+
+def _explained(
+    query: View, structure: Structure, known: PointMatches, world_from_query: RigidTransform, options: MatchOptions
+) -> int:
+    """How many matches a guided search from this pose would have found where they are."""
+    x_in_camera = world_from_query.inverse().apply(structure.x_in_world[known.point])
+    away = query.camera.project(x_in_camera) - query.features.keypoints[known.keypoint]
+    return int((np.linalg.norm(away, axis=1) < options.radius_px).sum())
 
 
 def vote(structure: Structure, keypoint_counts: Sequence[int], correspondences: Correspondences) -> PointMatches:

@@ -23,7 +23,7 @@ from ..method.rejection import RejectionReason
 from ..scheduling.observer import Ending, Observer, Refusal
 from .scraped import CacheCounts, Scraped, TokenCacheCounts
 
-STAGES = ("prepare", "coarse", "refine", "describe", "retrieve", "audit", "coverage")
+STAGES = ("prepare", "coarse", "refine", "join", "describe", "retrieve", "audit", "coverage")
 """Stages of the queue."""
 
 LOCALIZED = "localized"

@@ -11,9 +11,14 @@ from .tokens import Tokens
 
 METHOD_ROLES: Mapping[str, Role] = {
     "/mapless.v1.LocalizationService/Localize": Role.LOCALIZE,
+    "/mapless.v1.LocalizationService/LocalizeRig": Role.LOCALIZE,
+    "/mapless.v1.LocalizationService/LocalizeSequence": Role.LOCALIZE,
+    # Other callers' photographs are shown.
+    "/mapless.v1.LocalizationService/WatchQueries": Role.WRITE,
     "/mapless.v1.ReferenceService/CreateScene": Role.WRITE,
     "/mapless.v1.ReferenceService/GetScene": Role.READ,
     "/mapless.v1.ReferenceService/ListScenes": Role.READ,
+    "/mapless.v1.ReferenceService/UpdateScene": Role.WRITE,
     "/mapless.v1.ReferenceService/DeleteScene": Role.WRITE,
     "/mapless.v1.ReferenceService/CreateReference": Role.WRITE,
     "/mapless.v1.ReferenceService/BatchCreateReferences": Role.WRITE,

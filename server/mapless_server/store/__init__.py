@@ -2,10 +2,12 @@
 
 from mapless_server.store.database import StoreError
 from mapless_server.store.records import (
+    ContradictingDown,
     DescribedReference,
     IndexedReference,
     NewReference,
     ReferenceRecord,
+    SceneAttributes,
     SceneChanges,
     SceneRecord,
     SceneSnapshot,
@@ -13,10 +15,12 @@ from mapless_server.store.records import (
 from mapless_server.store.store import Store
 
 __all__ = [
+    "ContradictingDown",
     "DescribedReference",
     "IndexedReference",
     "NewReference",
     "ReferenceRecord",
+    "SceneAttributes",
     "SceneChanges",
     "SceneRecord",
     "SceneSnapshot",

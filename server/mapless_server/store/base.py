@@ -11,7 +11,7 @@ from sqlalchemy import Connection
 from mapless_server.store.cache import LruCache
 from mapless_server.store.database import Database
 from mapless_server.store.observed import StoreObserver, Unobserved
-from mapless_server.store.records import DescribedReference
+from mapless_server.store.records import DescribedReference, SceneAttributes
 
 NAME_CACHE_BYTES = 16 * 2**20
 
@@ -31,6 +31,14 @@ class Resolved:
     keys: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class Attributes:
+    """What was known of a scene as a whole while the store was in a state, see `BaseStore`."""
+
+    state: object
+    attributes: SceneAttributes
+
+
 class BaseStore:
     """A database and what is remembered of it."""
 
@@ -42,6 +50,7 @@ class BaseStore:
         # What names meant, by scene and names. Where this process alone writes, it holds as long as nothing was written
         # since, and the database is not asked at all; where others write, as long as the generation is the same.
         self._resolved: LruCache[Resolved] = LruCache(NAME_CACHE_BYTES)
+        self._attributes: LruCache[Attributes] = LruCache(NAME_CACHE_BYTES)
         self._state = object()
 
     @contextmanager

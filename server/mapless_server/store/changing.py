@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import delete, insert, select, update
 
+from mapless.geodesy import Datum
+from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
 from mapless_server.errors import AlreadyExists
 from mapless_server.method.views import View
 from mapless_server.store import queries, removing, rows, tables
 from mapless_server.store.base import BaseStore
 from mapless_server.store.observed import observed
-from mapless_server.store.records import NewReference, ReferenceRecord, SceneRecord
+from mapless_server.store.records import NewReference, ReferenceRecord, SceneAttributes, SceneRecord
 from mapless_server.tenancy import SceneKey, scene_id_of
 
 REFERENCES_DELETED_AT_A_TIME = 100
@@ -23,13 +27,15 @@ REFERENCES_DELETED_AT_A_TIME = 100
 GENERATIONS_REMEMBERED = 100_000
 """How far back `list_changes` knows what was deleted: some 10 MB a scene; who asks less often may read it all."""
 
+NOTHING_KNOWN = SceneAttributes()
+
 
 class ChangingStore(BaseStore):
     """Each method is one transaction, in others' eyes at least: all of it happens or nothing."""
 
     @observed
-    def create_scene(self, scene_key: SceneKey) -> SceneRecord:
-        """Create an empty scene.
+    def create_scene(self, scene_key: SceneKey, attributes: SceneAttributes = NOTHING_KNOWN) -> SceneRecord:
+        """Create a scene without references.
 
         Raises:
             AlreadyExists: the id is taken.
@@ -40,7 +46,37 @@ class ChangingStore(BaseStore):
             if connection.scalar(select(scene.c.scene_id).where(scene.c.scene_id == scene_key)) is not None:
                 raise AlreadyExists(f"scene {scene_id_of(scene_key)!r} exists already", field="scene_id")
             row = {"scene_id": scene_key, "create_time_us": rows.time_us(now), "first_generation": generation}
-            connection.execute(insert(scene).values(row))
+            connection.execute(insert(scene).values(row | rows.attributes_row(scene_key, attributes)))
+            return rows.scene_record(queries.find_scene(connection, scene_key))
+
+    @observed
+    def update_scene(
+        self,
+        scene_key: SceneKey,
+        *,
+        datum: Datum | UnchangedType | None = UNCHANGED,
+        down_in_world: Vector | UnchangedType | None = UNCHANGED,
+        calibration: Calibration | UnchangedType | None = UNCHANGED,
+    ) -> SceneRecord:
+        """Change what is known of a scene as a whole; None forgets.
+
+        If all three are given it works on what is damaged, too.
+
+        Raises:
+            NotFound: there is no such scene.
+            DataLoss: what is to stay as it is is damaged.
+            ContradictingDown: datum and down_in_world do not belong to the same world.
+        """
+        if isinstance(calibration, Calibration):
+            calibration = replace(calibration, create_time=_now())
+        given: dict[str, Any] = {"datum": datum, "down_in_world": down_in_world, "calibration": calibration}
+        changes = {name: value for name, value in given.items() if value is not UNCHANGED}
+        with self._changing() as connection:
+            queries.begin_change(connection, scene_key)
+            is_new = len(changes) == len(given)
+            found = NOTHING_KNOWN if is_new else rows.scene_attributes(queries.find_attributes(connection, scene_key))
+            row = rows.attributes_row(scene_key, replace(found, **changes))
+            connection.execute(update(tables.scene).where(tables.scene.c.scene_id == scene_key).values(row))
             return rows.scene_record(queries.find_scene(connection, scene_key))
 
     @observed

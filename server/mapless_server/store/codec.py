@@ -1,6 +1,7 @@
-"""Cameras, poses and features as stored: exact to the bit, and never believed without their checksum.
+"""Cameras, poses, features and what is known of scenes as stored: exact to the bit, and never believed unchecked.
 
-Geometry is JSON text: Python writes the shortest decimal that reads back as the same float64. A view is one blob:
+Geometry, and what is known of a scene as a whole, is JSON text: Python writes the shortest decimal that reads back as
+the same float64. A view is one blob:
 
     byte 0       format version
     bytes 4..8   length of the header, uint32
@@ -19,13 +20,17 @@ import json
 import struct
 from collections.abc import Sequence
 from dataclasses import asdict
+from datetime import datetime
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform
+from mapless.geodesy import Datum
+from mapless.geometry import Camera, Distortion, Fisheye, Quaternion, RadialTangential, RigidTransform
+from mapless.scenes import Calibration
 from mapless_server.method.views import Features, View
+from mapless_server.store.records import SceneAttributes
 
 VIEW_FORMAT_VERSION = 1
 _PREFIX = struct.Struct("<B3xI")
@@ -73,6 +78,37 @@ def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, Rigid
     rotation.setflags(write=False)
     translation.setflags(write=False)
     return _camera_from_dict(content["camera"]), RigidTransform(rotation, translation)
+
+
+def encode_attributes(attributes: SceneAttributes) -> bytes | None:
+    """What is known of a scene as JSON; None where that is nothing."""
+    if attributes == SceneAttributes():
+        return None
+    content = asdict(attributes)
+    if attributes.calibration is not None and attributes.calibration.create_time is not None:
+        content["calibration"]["create_time"] = attributes.calibration.create_time.isoformat()
+    return _to_json(content)
+
+
+def decode_attributes(owner: str, data: bytes | None, sha256: str | None) -> SceneAttributes:
+    """What ``encode_attributes`` was given.
+
+    Raises:
+        Damaged: the checksum does not match.
+    """
+    if data is None and sha256 is None:
+        return SceneAttributes()
+    check(owner, data, sha256 or "", "datum, down and calibration")
+    assert data is not None
+    content = json.loads(data)
+    datum, down, calibration = content["datum"], content["down_in_world"], content["calibration"]
+    if calibration and calibration["create_time"]:
+        calibration["create_time"] = datetime.fromisoformat(calibration["create_time"])
+    return SceneAttributes(
+        Datum(**{**datum, "enu_from_world": Quaternion(**datum["enu_from_world"])}) if datum else None,
+        tuple(down) if down else None,
+        Calibration(**calibration) if calibration else None,
+    )
 
 
 def encode_view(view: View) -> bytes:

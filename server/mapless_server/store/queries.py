@@ -63,6 +63,16 @@ def read_generation(connection: Connection, scene_key: SceneKey) -> int:
     return generation
 
 
+def find_attributes(connection: Connection, scene_key: SceneKey) -> Row[Any]:
+    """Columns ``scene_id``, ``attributes`` and ``attributes_sha256`` of a scene. Raises NotFound."""
+    column = scene.c
+    statement: Select[Any] = select(column.scene_id, column.attributes, column.attributes_sha256)
+    row = connection.execute(statement.where(column.scene_id == scene_key)).one_or_none()
+    if row is None:
+        raise _scene_not_found(scene_key)
+    return row
+
+
 def read_generations(connection: Connection) -> dict[str, int]:
     """Generations by scene key, of all scenes that ever existed."""
     column = scene_generation.c

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from sqlalchemy import select
 
 from mapless_server.store import queries, rows, tables
-from mapless_server.store.base import BaseStore, Resolved
+from mapless_server.store.base import Attributes, BaseStore, Resolved
 from mapless_server.store.changes import read_changes
 from mapless_server.store.observed import observed
 from mapless_server.store.records import (
     DescribedReference,
     ReferenceRecord,
+    SceneAttributes,
     SceneChanges,
     SceneRecord,
     SceneSnapshot,
@@ -23,6 +24,8 @@ NAME_BYTES = 300
 """About the size of a reference's id and key in memory."""
 RECORD_BYTES = 700
 """About the size of a ReferenceRecord in memory, arrays and strings included."""
+ATTRIBUTES_BYTES = 2000
+"""The same of SceneAttributes."""
 
 
 class ReadingStore(BaseStore):
@@ -34,13 +37,47 @@ class ReadingStore(BaseStore):
 
         Raises:
             NotFound: there is no such scene.
+            DataLoss: its attributes are damaged.
         """
         with self._database.read() as connection:
             return rows.scene_record(queries.find_scene(connection, scene_key))
 
     @observed
+    def get_generation(self, scene_key: SceneKey) -> int:
+        """Generation of a scene, of one whose attributes are damaged, too.
+
+        Raises:
+            NotFound: there is no such scene.
+        """
+        with self._database.read() as connection:
+            return queries.read_generation(connection, scene_key)
+
+    @observed
+    def get_attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        """What is known of a scene as a whole: for every query, so from memory where this process alone writes.
+
+        Raises:
+            NotFound: there is no such scene.
+            DataLoss: it is damaged.
+        """
+        state = self._state
+        remembered = None if self._database.is_shared else self._attributes.get(scene_key)
+        if remembered is not None and remembered.state is state:
+            return remembered.attributes
+        with self._database.read() as connection:
+            row = queries.find_attributes(connection, scene_key)
+        attributes = rows.scene_attributes(row)
+        if not self._database.is_shared:
+            self._attributes.put(scene_key, Attributes(state, attributes), ATTRIBUTES_BYTES)
+        return attributes
+
+    @observed
     def list_scenes(self, tenant: str, limit: int, after: str = "") -> list[SceneRecord]:
-        """At most ``limit`` scenes of a tenant, by id, of those whose id is greater than ``after``."""
+        """At most ``limit`` scenes of a tenant, by id, of those whose id is greater than ``after``.
+
+        Raises:
+            DataLoss: the attributes of one of them are damaged.
+        """
         page = queries.select_scenes_of(tenant, after).limit(limit)
         with self._database.read() as connection:
             return [rows.scene_record(row) for row in connection.execute(page)]

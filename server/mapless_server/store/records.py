@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -9,9 +10,53 @@ from datetime import datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Camera, RigidTransform
+from mapless.geodesy import Datum
+from mapless.geometry import Array, Camera, RigidTransform
+from mapless.scenes import Calibration, Vector
 from mapless_server.method.views import View
 from mapless_server.tenancy import SceneKey, scene_id_of
+
+MAX_DOWN_DISAGREEMENT_DEG = 10.0
+"""Datums are turned by compass or by hand, so some degrees are no wonder; 90 are a world whose y is up, not its z."""
+
+
+class ContradictingDown(ValueError):
+    """A scene's datum says that another way is down than its own down."""
+
+
+@dataclass(frozen=True)
+class SceneAttributes:
+    """What is known of a scene as a whole; each may be unknown.
+
+    Attributes:
+        datum: where its world is on the Earth.
+        down_in_world: unit vector to where things fall; None: what the datum says, if there is one.
+        calibration: how far off answers were found to be.
+
+    Raises:
+        ContradictingDown: datum and down_in_world do not belong to the same world.
+    """
+
+    datum: Datum | None = None
+    down_in_world: Vector | None = None
+    calibration: Calibration | None = None
+
+    def __post_init__(self) -> None:
+        if self.datum is None or self.down_in_world is None:
+            return
+        cosine = float(self.datum.down_in_world() @ self.down_in_world)
+        angle_deg = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
+        if angle_deg > MAX_DOWN_DISAGREEMENT_DEG:
+            raise ContradictingDown(
+                f"is {angle_deg:.0f} degrees off what the datum says is down; its enu_from_world must turn the world's "
+                "axes to east, north and up"
+            )
+
+    def down(self) -> Array | None:
+        """Unit vector (3,) to where things fall, in the world; None if nobody has said."""
+        if self.down_in_world is not None:
+            return np.array(self.down_in_world)
+        return None if self.datum is None else self.datum.down_in_world()
 
 
 @dataclass(frozen=True)
@@ -26,12 +71,14 @@ class SceneRecord:
             more global descriptor is: which references are found depends on which of them have it.
         reference_count: number of references.
         create_time: UTC.
+        attributes: what is known of it as a whole.
     """
 
     scene_key: SceneKey
     generation: int
     reference_count: int
     create_time: datetime
+    attributes: SceneAttributes = SceneAttributes()
 
     @property
     def scene_id(self) -> str:

@@ -20,9 +20,10 @@ from mapless_server.store.records import (
     IndexedReference,
     NewReference,
     ReferenceRecord,
+    SceneAttributes,
     SceneRecord,
 )
-from mapless_server.tenancy import SceneKey
+from mapless_server.tenancy import SceneKey, scene_id_of
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _MICROSECOND = timedelta(microseconds=1)
@@ -39,8 +40,30 @@ def time_of(time_us: int) -> datetime:
 
 
 def scene_record(row: Row[Any]) -> SceneRecord:
-    """From a row of ``queries.select_scenes``."""
-    return SceneRecord(SceneKey(row.scene_id), row.generation, row.reference_count, time_of(row.create_time_us))
+    """From a row of ``queries.select_scenes``. Raises DataLoss if what is known of the scene as a whole is damaged."""
+    key, created = SceneKey(row.scene_id), time_of(row.create_time_us)
+    return SceneRecord(key, row.generation, row.reference_count, created, scene_attributes(row))
+
+
+def attributes_row(scene_key: SceneKey, attributes: SceneAttributes) -> dict[str, Any]:
+    """Columns of the table ``scene``."""
+    data = codec.encode_attributes(attributes)
+    sha256 = None if data is None else codec.sha256_for(attributes_owner(scene_key), data)
+    return {"attributes": data, "attributes_sha256": sha256}
+
+
+def scene_attributes(row: Row[Any]) -> SceneAttributes:
+    """From a row of the table ``scene``. Raises DataLoss if they are damaged."""
+    try:
+        return codec.decode_attributes(attributes_owner(row.scene_id), row.attributes, row.attributes_sha256)
+    except codec.Damaged as error:
+        scene_id = scene_id_of(SceneKey(row.scene_id))
+        raise DataLoss(f"scene {scene_id!r} is damaged in the store ({error}); set all three anew") from error
+
+
+def attributes_owner(scene_key: str) -> str:
+    """Whom the bytes of what is known of a scene belong to; no reference's key has a space."""
+    return f"scene {scene_key}"
 
 
 def new_record(scene_key: SceneKey, new: NewReference, create_time: datetime) -> ReferenceRecord:

@@ -17,7 +17,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 metadata = MetaData()
 
@@ -52,6 +52,9 @@ scene = Table(
     Column("reference_count", BigInteger, nullable=False, server_default=_NONE_YET),
     # Changes are known since this generation: who knows the scene as of an earlier one reads it as a whole.
     Column("first_generation", BigInteger, nullable=False, server_default=_NONE_YET),
+    # What is known of it as a whole, see codec.py; both are null where that is nothing.
+    Column("attributes", LargeBinary),
+    Column("attributes_sha256", _Sha256),
 )
 
 # Outlives the scene, so that a scene created again under the same id does not repeat generations of its former life.

@@ -62,6 +62,8 @@ def verify(connection: Connection, on_progress: Progress = ignore_progress) -> V
     if version >= 2:
         tables.append(global_descriptor)
         checks += [_check_descriptors, _check_counts]
+    if version >= 3:
+        checks.append(_check_attributes)
     counts = {table.name: connection.scalar(select(func.count()).select_from(table)) or 0 for table in tables}
     for check in checks:
         faults += check(connection, counts, on_progress)
@@ -83,8 +85,10 @@ def _check_references(connection: Connection, counts: dict[str, int], on_progres
     ).outerjoin(image, image.c.reference_key == column.key)
     statement = statement.where(~removing.is_set_apart(column.scene_id))
     for row in _stream(connection, statement, "references", counts[reference.name], on_progress):
-        yield from _fault(row, "camera and pose", codec.decode_geometry, row.key, row.geometry, row.geometry_sha256)
-        yield from _fault(row, "image", rows.image, row)
+        yield from _fault(
+            _name(row), "camera and pose", codec.decode_geometry, row.key, row.geometry, row.geometry_sha256
+        )
+        yield from _fault(_name(row), "image", rows.image, row)
         if not row.feature_sets:
             yield f"{_name(row)}: it has no features"
     yield from _orphans(connection, image)
@@ -97,7 +101,7 @@ def _check_features(connection: Connection, counts: dict[str, int], on_progress:
     statement = statement.where(~removing.is_set_apart(reference.c.scene_id))
     for row in _stream(connection, statement, "features", counts[features.name], on_progress):
         owner = rows.features_owner(row.key, row.extractor)
-        yield from _fault(row, f"features of {row.extractor}", codec.decode_view, owner, row.data, row.sha256)
+        yield from _fault(_name(row), f"features of {row.extractor}", codec.decode_view, owner, row.data, row.sha256)
     yield from _orphans(connection, features)
 
 
@@ -108,7 +112,7 @@ def _check_descriptors(connection: Connection, counts: dict[str, int], on_progre
     statement = statement.where(~removing.is_set_apart(reference.c.scene_id))
     for row in _stream(connection, statement, "descriptors", counts[global_descriptor.name], on_progress):
         owner, what = rows.descriptor_owner(row.key, row.name), f"global descriptor {row.name}"
-        yield from _fault(row, what, codec.check, owner, row.data, row.sha256, what)
+        yield from _fault(_name(row), what, codec.check, owner, row.data, row.sha256, what)
     yield from _orphans(connection, global_descriptor)
 
 
@@ -120,7 +124,11 @@ def _check_counts(connection: Connection, counts: dict[str, int], on_progress: P
         found[row.scene_id] += 1
         latest[row.scene_id] = max(row.generation, latest.get(row.scene_id, 0))
     generations = queries.read_generations(connection)
-    for row in connection.execute(select(scene).where(~removing.is_set_apart(scene.c.scene_id))):
+    column = scene.c
+    scenes: Select[Any] = select(
+        column.scene_id, column.reference_count, column.first_generation
+    )  # as older schemas have them
+    for row in connection.execute(scenes.where(~removing.is_set_apart(column.scene_id))):
         key, generation = row.scene_id, generations.get(row.scene_id)
         if row.reference_count != found.pop(key, 0):
             yield f"{_scene(key)}: its count of references is wrong"
@@ -130,11 +138,18 @@ def _check_counts(connection: Connection, counts: dict[str, int], on_progress: P
         yield f"{_scene(key)}: there are references but no scene"
 
 
-def _fault(row: Row[Any], what: str, check: Callable[..., object], *arguments: object) -> Iterator[str]:
+def _check_attributes(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:
+    column = scene.c
+    statement: Select[Any] = select(column.scene_id, column.attributes, column.attributes_sha256)
+    for row in _stream(connection, statement, "scenes", counts[scene.name], on_progress):
+        yield from _fault(_scene(row.scene_id), "its datum, down and calibration", rows.scene_attributes, row)
+
+
+def _fault(whose: str, what: str, check: Callable[..., object], *arguments: object) -> Iterator[str]:
     try:
         check(*arguments)
     except (codec.Damaged, DataLoss):
-        yield f"{_name(row)}: {what}"
+        yield f"{whose}: {what}"
 
 
 def _stream(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera, RigidTransform
 
 from ..correspond import Correspondences
+from ..priors import NO_PRIORS, Priors
 from ..rejection import Rejection
 from ..views import PosedView, View
 
@@ -108,11 +109,13 @@ class Request:
         query: the photograph to localize.
         references: with known poses.
         correspondences: between them all; a network looks at the images alone and needs none.
+        priors: what is known of the query's pose, in the world of the references; a network does not listen.
     """
 
     query: View
     references: Sequence[PosedView]
     correspondences: Correspondences | None = None
+    priors: Priors = NO_PRIORS
 
 
 class Reconstructor(Protocol):
@@ -171,9 +174,10 @@ def reconstruct_one(
     query: View,
     references: Sequence[PosedView],
     correspondences: Correspondences | None = None,
+    priors: Priors = NO_PRIORS,
 ) -> Outcome:
     """The outcome of a single request; raises the exception that it had."""
-    (outcome,) = reconstructor.reconstruct_many([Request(query, references, correspondences)])
+    (outcome,) = reconstructor.reconstruct_many([Request(query, references, correspondences, priors)])
     if isinstance(outcome, Exception):
         raise outcome
     return outcome

@@ -11,13 +11,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..correspond import Correspondences
-from ..match import vote
+from ..gate import GateOptions, log10_false_alarms, told_false_alarms
+from ..informed import informed_pose
+from ..match import PointMatches, vote
 from ..observations import FIRST_GUESS, adjust_points, triangulate, trustworthy
-from ..pnp import PnpOptions, log10_false_alarms, ransac, reprojection_errors_px
+from ..pnp import PnpOptions, ransac, reprojection_errors_px
+from ..priors import Priors
 from ..rejection import Rejection, RejectionReason
 from ..structure import Structure, StructureOptions, observe
 from ..tracks import build_tracks
@@ -32,12 +36,14 @@ class GeometricOptions:
     Attributes:
         structure: a few steps only, since the structure stage follows.
         pnp: of the query's pose.
+        gate: what chance could do as well is no pose.
         min_baseline_m: references that all stand closer together than this triangulate nothing.
         cell_px: side of a cell of the point maps, pixels of the view. Small enough that two keypoints seldom share one.
     """
 
     structure: StructureOptions = field(default_factory=lambda: StructureOptions(iterations=3))
     pnp: PnpOptions = field(default_factory=PnpOptions)
+    gate: GateOptions = field(default_factory=GateOptions)
     min_baseline_m: float = 0.02
     cell_px: int = 2
 
@@ -73,7 +79,7 @@ class GeometricReconstructor:
             return error
 
     def _reconstruct(self, request: Request) -> Reconstruction | Rejection:
-        query, references, correspondences = request.query, request.references, request.correspondences
+        references, correspondences = request.references, request.correspondences
         if correspondences is None:
             raise ValueError(f"{self.name} reconstructs from correspondences, and there are none")
         rejection = self._check(references)
@@ -84,25 +90,54 @@ class GeometricReconstructor:
             return Rejection(
                 RejectionReason.NO_USABLE_REFERENCES, "the references share no points that could be triangulated"
             )
+        return self._pose_and_scatter(request, structure, correspondences)
+
+    def _pose_and_scatter(
+        self, request: Request, structure: Structure, correspondences: Correspondences
+    ) -> Reconstruction | Rejection:
+        query, references = request.query, request.references
         matches = vote(structure, [len(r.view.features) for r in references], correspondences)
         x_in_world = structure.x_in_world[matches.point]
         pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
-        enough = len(matches) >= self.options.pnp.min_matches
-        pose = ransac(query.camera, x_in_world, pixels, None, self.options.pnp) if enough else None
-        if pose is None:
-            return Rejection(
-                RejectionReason.LOW_OVERLAP,
-                f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references",
-            )
-        inliers = reprojection_errors_px(query.camera, pose, x_in_world, pixels) < self.options.pnp.inlier_px
-        false_alarms = log10_false_alarms(query.camera, matches, inliers, self.options.pnp)
-        if false_alarms > self.options.pnp.max_log10_false_alarms:
-            return Rejection(
-                RejectionReason.LOW_OVERLAP,
-                f"{inliers.sum()} of {len(matches)} matches with the references' points agree on a pose, which chance"
-                f" could do (10^{false_alarms:.1f} expected)",
-            )
+        pose = self._pose(query, x_in_world, pixels, request.priors)
+        rejection, inliers = self._judge(query, structure, matches, pose, request.priors)
+        if rejection:
+            known = request.priors.pose
+            if known is None:
+                return rejection
+            # Where the photograph tells too little at first sight, what was known of its pose says where to look.
+            pose, inliers = known.world_from_camera, np.zeros(len(matches), bool)
+        assert pose is not None
         return self._scatter(query, references, structure, pose, x_in_world[inliers], pixels[inliers])
+
+    def _pose(self, query: View, x_in_world: Array, pixels: Array, priors: Priors) -> RigidTransform | None:
+        options = self.options.pnp
+        if len(pixels) < options.min_matches:
+            return None
+        pose = ransac(query.camera, x_in_world, pixels, None, options)
+        if not priors:
+            return pose
+        informed = informed_pose(query.camera, x_in_world, pixels, [pose] if pose else [], priors, options.informed)
+        return informed.world_from_camera if informed else None
+
+    def _judge(
+        self, query: View, structure: Structure, matches: PointMatches, pose: RigidTransform | None, priors: Priors
+    ) -> tuple[Rejection | None, NDArray[np.bool_]]:
+        """Why a pose is none, and which of the matches (M,) agree with it."""
+        inlier_px = self.options.pnp.inlier_px
+        if pose is None:
+            message = f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references"
+            return Rejection(RejectionReason.LOW_OVERLAP, message), np.zeros(len(matches), bool)
+        x_in_world, pixels = structure.x_in_world[matches.point], query.features.keypoints[matches.keypoint]
+        inliers = reprojection_errors_px(query.camera, pose, x_in_world, pixels.astype(np.float64)) < inlier_px
+        expected = log10_false_alarms(query.camera, matches, inliers, inlier_px) + priors.log10_chance(pose)
+        if expected <= self.options.gate.max_log10_false_alarms:
+            return None, inliers
+        message = (
+            f"{inliers.sum()} of {len(matches)} matches with the references' points agree on a pose, which chance"
+            f" could do ({told_false_alarms(expected)})"
+        )
+        return Rejection(RejectionReason.LOW_OVERLAP, message), inliers
 
     def _check(self, references: Sequence[PosedView]) -> Rejection | None:
         if len(references) < 2:

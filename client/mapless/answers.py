@@ -1,0 +1,382 @@
+"""What Localize answers, as values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import wire
+from .geodesy import GeoPose
+from .geometry import Array, Quaternion, RigidTransform
+from .v1 import localization_service_pb2 as localization_pb
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Errors not exceeded in 68 and 95 % of cases; `calibrated` on photographs with known poses or not."""
+
+    position_68_m: float
+    position_95_m: float
+    rotation_68_deg: float
+    rotation_95_deg: float
+    calibrated: bool
+
+
+@dataclass(frozen=True)
+class ReferenceUse:
+    """What one reference contributed: matches with the photograph, and inliers of the pose.
+
+    `similarity` to the photograph, -1 to 1, where the server chose it; else 0.
+    """
+
+    name: str
+    match_count: int
+    inlier_count: int
+    similarity: float = 0.0
+
+
+@dataclass(frozen=True)
+class ScaleEstimate:
+    """The reconstruction's metric scale.
+
+    Attributes:
+        metres_per_unit: the scale.
+        stage: what gave it, "TRIANGULATION" or "TRAJECTORY".
+        deviation: relative, of the scaled camera trajectory's radius from the true one.
+    """
+
+    metres_per_unit: float
+    stage: str
+    deviation: float
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """What was used for an answer and where the time went.
+
+    Attributes:
+        request_id: identifies the call in the server's log.
+        backend, weights_sha256, features, variant, store_generation, server_version: what computed it, from what.
+        references: those used, in the order they were given or chosen.
+        scale: None if that stage was not reached.
+        stage_s: seconds by stage, in order.
+        queue_s, total_s: seconds that the call waited and took, inside the server.
+        processed_width_px, processed_height_px: size of the image as it was processed.
+        retrieval: what the references were chosen by; empty if they were used as they were given.
+    """
+
+    request_id: str
+    backend: str
+    weights_sha256: str
+    features: str
+    variant: str
+    store_generation: int
+    references: tuple[ReferenceUse, ...]
+    scale: ScaleEstimate | None
+    stage_s: Mapping[str, float]
+    queue_s: float
+    total_s: float
+    processed_width_px: int
+    processed_height_px: int
+    server_version: str
+    retrieval: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class FramedPose:
+    """A pose in the axes that were asked for, "ARKIT" for instance; see `mapless.axes`.
+
+    Attributes:
+        axes: which.
+        world_from_camera: both frames in these axes.
+        covariance: (6, 6) in these axes, order x y z rx ry rz; None if not estimated.
+        world_from_session: puts whatever the device tracks into the world; None if no `session_from_camera` was sent.
+    """
+
+    axes: str
+    world_from_camera: RigidTransform
+    covariance: Array | None
+    world_from_session: RigidTransform | None
+
+
+@dataclass(frozen=True)
+class PriorCheck:
+    """How an answer compares with a soft prior.
+
+    Attributes:
+        kind: "POSITION", "HEADING", "GRAVITY" or "POSE".
+        mahalanobis: distance between the prior and the pose that the photograph alone gives, both uncertain.
+        degrees_of_freedom: numbers compared.
+        conflict: whether the prior contradicts the photograph.
+        used: whether it took part in finding the pose.
+    """
+
+    kind: str
+    mahalanobis: float
+    degrees_of_freedom: int
+    conflict: bool
+    used: bool
+
+
+@dataclass(frozen=True)
+class Hint:
+    """What would help to localize a photograph that was not.
+
+    Attributes:
+        stage: that could not do its work; empty where none began.
+        advice: for programs: the value of Advice without its prefix, "RETAKE_PHOTOGRAPH".
+        message: one sentence for a person: what to do.
+        best_reference: name of the one that shares most with the photograph; empty where none shares anything.
+    """
+
+    stage: str
+    advice: str
+    message: str
+    best_reference: str
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A pose that the photograph could have, its inliers, and the names of the references that support it."""
+
+    world_from_camera: RigidTransform
+    inlier_count: int
+    references: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Debug:
+    """The 2D-3D matches that a pose rests on; pixels are those of the photographs as they were sent.
+
+    Attributes:
+        query_px: (M, 2) where the photograph shows the points.
+        x_in_world: (M, 3) the points, metres.
+        is_inlier: (M,) whether the match agrees with the pose.
+        error_px: (M,) reprojection errors, pixels of the processed image; NaN where there is none.
+        reference: (M,) index into `Diagnostics.references` of one that shows the point.
+        reference_px: (M, 2) where it shows it.
+    """
+
+    query_px: Array
+    x_in_world: Array
+    is_inlier: NDArray[np.bool_]
+    error_px: Array
+    reference: NDArray[np.intp]
+    reference_px: Array
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizationResult:
+    """Where a photograph was taken.
+
+    Attributes:
+        world_from_camera: the camera's pose; its translation is the camera centre in the scene's world frame, metres.
+        covariance: (6, 6), order x y z rx ry rz, metres and radians about fixed world axes; None if not estimated.
+        accuracy: radii of the same; None if it is.
+        trust: share of right answers that look no better than this one, 0 to 1; None where nothing has checked it.
+        in_axes: the same pose in the axes that were asked for, and what puts the device's session into the world.
+        geo_pose: the same pose on the Earth; None unless the scene has a datum.
+        prior_checks: how the answer compares with each soft prior.
+        pose_stage: "REFINED" or "INITIAL"; "COARSE" for a pose that nothing has checked, because there was no time to,
+            which only a call that allows it is given.
+        inlier_count, match_count: 2D-3D matches that agree with the pose, and all that were tried.
+        reprojection_error_px: median of the inliers, pixels of the processed image.
+        debug: the matches it rests on, if they were asked for.
+        capture_time, session_from_camera: as they were sent.
+    """
+
+    world_from_camera: RigidTransform
+    covariance: Array | None
+    accuracy: Accuracy | None
+    pose_stage: str
+    inlier_count: int
+    match_count: int
+    reprojection_error_px: float
+    diagnostics: Diagnostics
+    capture_time: datetime | None = None
+    session_from_camera: RigidTransform | None = None
+    trust: float | None = None
+    in_axes: FramedPose | None = None
+    geo_pose: GeoPose | None = None
+    prior_checks: tuple[PriorCheck, ...] = ()
+    debug: Debug | None = None
+
+    @property
+    def world_from_session(self) -> RigidTransform | None:
+        """Puts whatever the device tracked since into the world; None if no `session_from_camera` was sent.
+
+        The answer is of the moment of capture, and the device has moved on: its pose now is `world_from_session` times
+        its own `session_from_camera` now. In the axes that were asked for, as these are.
+        """
+        return None if self.in_axes is None else self.in_axes.world_from_session
+
+
+@dataclass(frozen=True, eq=False)
+class Rejected:
+    """The server could not localize the photograph.
+
+    Attributes:
+        reason: for programs: the value of RejectionReason without its prefix, "LOW_OVERLAP".
+        message: one sentence for a person, with the numbers that decided.
+        hint: what would help.
+        hypotheses: poses that contradict each other, the better supported first, where the reason is "AMBIGUOUS".
+        debug: the matches, if they were asked for and there were any.
+        capture_time, session_from_camera: as they were sent.
+    """
+
+    reason: str
+    message: str
+    diagnostics: Diagnostics
+    capture_time: datetime | None = None
+    session_from_camera: RigidTransform | None = None
+    hint: Hint | None = None
+    hypotheses: tuple[Hypothesis, ...] = ()
+    debug: Debug | None = None
+
+
+def answer_from_message(message: localization_pb.LocalizeResponse) -> LocalizationResult | Rejected:
+    """Answer of a message."""
+    diagnostics = diagnostics_from_message(message.diagnostics)
+    capture_time = message.capture_time.ToDatetime(timezone.utc) if message.HasField("capture_time") else None
+    session_from_camera = (
+        wire.transform_from_message(message.session_from_camera, "session_from_camera")
+        if message.HasField("session_from_camera")
+        else None
+    )
+    debug = _debug_from_message(message.debug) if message.HasField("debug") else None
+    if message.WhichOneof("outcome") == "rejection":
+        return Rejected(
+            reason=wire.value_name(localization_pb.RejectionReason, message.rejection.reason),
+            message=message.rejection.message,
+            diagnostics=diagnostics,
+            capture_time=capture_time,
+            session_from_camera=session_from_camera,
+            hint=hint_from_message(message.rejection.hint) if message.rejection.HasField("hint") else None,
+            hypotheses=tuple(map(hypothesis_from_message, message.rejection.hypotheses)),
+            debug=debug,
+        )
+    found = message.localization
+    return LocalizationResult(
+        world_from_camera=wire.transform_from_message(found.world_from_camera, "localization.world_from_camera"),
+        covariance=covariance_from_message(found),
+        accuracy=accuracy_from_message(found.accuracy) if found.HasField("accuracy") else None,
+        pose_stage=wire.value_name(localization_pb.PoseStage, found.pose_stage),
+        inlier_count=found.inlier_count,
+        match_count=found.match_count,
+        reprojection_error_px=found.reprojection_error_px,
+        diagnostics=diagnostics,
+        capture_time=capture_time,
+        session_from_camera=session_from_camera,
+        trust=found.trust if found.HasField("trust") else None,
+        in_axes=_framed_from_message(found.in_axes) if found.HasField("in_axes") else None,
+        geo_pose=geo_pose_from_message(found.geo_pose) if found.HasField("geo_pose") else None,
+        prior_checks=tuple(map(_check_from_message, found.prior_checks)),
+        debug=debug,
+    )
+
+
+def covariance_from_message(message: Any) -> Array | None:
+    """(6, 6) of a message that may have a `covariance`."""
+    return np.array(message.covariance.row_major).reshape(6, 6) if message.HasField("covariance") else None
+
+
+def accuracy_from_message(message: localization_pb.Accuracy) -> Accuracy:
+    """Radii of a message."""
+    return Accuracy(
+        position_68_m=message.position_68_m,
+        position_95_m=message.position_95_m,
+        rotation_68_deg=message.rotation_68_deg,
+        rotation_95_deg=message.rotation_95_deg,
+        calibrated=message.calibrated,
+    )
+
+
+def geo_pose_from_message(message: localization_pb.GeoPose) -> GeoPose:
+    """GeoPose of a message."""
+    position, q = message.position, message.quaternion
+    return GeoPose(position.lat, position.lon, position.h, Quaternion(q.x, q.y, q.z, q.w))
+
+
+def _framed_from_message(message: localization_pb.FramedPose) -> FramedPose:
+    has_session = message.HasField("world_from_session")
+    return FramedPose(
+        axes=wire.value_name(localization_pb.Axes, message.axes),
+        world_from_camera=wire.transform_from_message(message.world_from_camera, "in_axes.world_from_camera"),
+        covariance=covariance_from_message(message),
+        world_from_session=wire.transform_from_message(message.world_from_session, "in_axes.world_from_session")
+        if has_session
+        else None,
+    )
+
+
+def _check_from_message(message: localization_pb.PriorCheck) -> PriorCheck:
+    return PriorCheck(
+        kind=wire.value_name(localization_pb.PriorKind, message.kind),
+        mahalanobis=message.mahalanobis,
+        degrees_of_freedom=message.degrees_of_freedom,
+        conflict=message.conflict,
+        used=message.used,
+    )
+
+
+def hint_from_message(message: localization_pb.Hint) -> Hint:
+    """Hint of a message."""
+    advice = wire.value_name(localization_pb.Advice, message.advice)
+    return Hint(message.stage, advice, message.message, message.best_reference)
+
+
+def hypothesis_from_message(message: localization_pb.Hypothesis) -> Hypothesis:
+    """Hypothesis of a message."""
+    pose = wire.transform_from_message(message.world_from_camera, "hypotheses.world_from_camera")
+    return Hypothesis(pose, message.inlier_count, tuple(message.references))
+
+
+def _debug_from_message(message: localization_pb.Debug) -> Debug:
+    def columns(*fields: str) -> Array:
+        return np.stack([np.array(getattr(message, field), float) for field in fields], axis=1)
+
+    return Debug(
+        query_px=columns("query_x_px", "query_y_px"),
+        x_in_world=columns("point_x_m", "point_y_m", "point_z_m"),
+        is_inlier=np.array(message.is_inlier, bool),
+        error_px=np.array(message.error_px, float),
+        reference=np.array(message.reference, np.intp),
+        reference_px=columns("reference_x_px", "reference_y_px"),
+    )
+
+
+def diagnostics_from_message(message: localization_pb.Diagnostics) -> Diagnostics:
+    """Diagnostics of a message."""
+    scale = message.scale
+    return Diagnostics(
+        request_id=message.request_id,
+        backend=message.backend,
+        weights_sha256=message.weights_sha256,
+        features=message.features,
+        variant=wire.value_name(localization_pb.Variant, message.variant),
+        store_generation=message.store_generation,
+        references=tuple(
+            ReferenceUse(use.name, use.match_count, use.inlier_count, use.similarity) for use in message.references
+        ),
+        scale=ScaleEstimate(
+            scale.metres_per_unit, wire.value_name(localization_pb.ScaleStage, scale.stage), scale.deviation
+        )
+        if message.HasField("scale")
+        else None,
+        stage_s={timing.stage: _seconds(timing.duration) for timing in message.stages},
+        queue_s=_seconds(message.queue_duration),
+        total_s=_seconds(message.total_duration),
+        processed_width_px=message.processed_width_px,
+        processed_height_px=message.processed_height_px,
+        server_version=message.server_version,
+        retrieval=message.retrieval,
+    )
+
+
+def _seconds(duration: Any) -> float:
+    return float(duration.ToNanoseconds()) / 1e9

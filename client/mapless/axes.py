@@ -1,0 +1,150 @@
+"""Poses in the axes of whoever uses them: OpenCV, ARKit, ARCore, Unity, ROS; both ways.
+
+mapless itself speaks OpenCV's: a camera's x points right, y down and z forward, in a right-handed world.
+
+=========  ==============================  =============================================================
+axes       a camera's x, y, z              the world
+=========  ==============================  =============================================================
+`OPENCV`   right, down, forward            as the scene has it
+`ARKIT`    right, up, backward             as the scene has it (ARKit's own has y up)
+`ARCORE`   right, up, backward (OpenGL)    as the scene has it (ARCore's own has y up)
+`UNITY`    right, up, forward              left-handed: the scene's with the sign of z changed (y up)
+`ROS`      forward, left, up (REP 103)     as the scene has it (REP 103's has z up)
+=========  ==============================  =============================================================
+
+World axes are never turned, only mirrored for Unity, since which way a scene's world points is its operator's choice:
+one for headsets and phones should have y up, one for robots z up. A scene with z up is answered to ARKit as a pose in a
+world with z up. The mirror leaves a world with y up one with y up.
+
+Right, down and forward are those of the pixel raster as it was sent, whatever the device's posture: the photograph of a
+phone that is held upright lies in the file, and is answered, as its landscape sensor saw it. That is what `ARFrame`'s
+`capturedImage` and `camera.transform`, and ARCore's `acquireCameraImage` and `getPose`, speak of, too. Who turns the
+raster before sending it, or is given poses that turn with the display (ARCore's `getDisplayOrientedPose`, Unity's
+camera), goes from one to the other with `turned_raster`.
+
+Quaternions need no rule of their own: in each of these, Unity included, (x, y, z, w) stands for the same matrix.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .geometry import Array, RigidTransform
+
+
+class Axes(Enum):
+    """Whose axes, see the module."""
+
+    OPENCV = "opencv"
+    ARKIT = "arkit"
+    ARCORE = "arcore"
+    UNITY = "unity"
+    ROS = "ros"
+
+
+def _constant(rows: ArrayLike) -> Array:
+    matrix = np.array(rows, float)
+    matrix.setflags(write=False)
+    return matrix
+
+
+_RIGHT_UP_BACKWARD = _constant(np.diag([1, -1, -1]))
+
+CV_FROM_CAMERA = {
+    Axes.OPENCV: _constant(np.eye(3)),
+    Axes.ARKIT: _RIGHT_UP_BACKWARD,
+    Axes.ARCORE: _RIGHT_UP_BACKWARD,
+    Axes.UNITY: _constant(np.diag([1, -1, 1])),
+    Axes.ROS: _constant([[0, -1, 0], [0, 0, -1], [1, 0, 0]]),
+}
+"""Each column is one of the camera's axes, in OpenCV's camera axes: ROS's x, forward, is OpenCV's (0, 0, 1)."""
+
+WORLD_FROM_RIGHT_HANDED = {axes: _constant(np.diag([1, 1, -1 if axes is Axes.UNITY else 1])) for axes in Axes}
+"""From the scene's world, or any other right-handed one, to the same in these axes. Its own inverse."""
+
+
+def pose_to(axes: Axes, world_from_camera: RigidTransform) -> RigidTransform:
+    """A camera's pose, its camera in OpenCV's axes and its world right-handed, in other axes.
+
+    The rotation is a proper one (determinant 1) for Unity, too, since world and camera are both mirrored.
+    """
+    world = WORLD_FROM_RIGHT_HANDED[axes]
+    rotation = world @ world_from_camera.rotation @ CV_FROM_CAMERA[axes]
+    return RigidTransform(rotation, world @ world_from_camera.translation)
+
+
+def pose_from(axes: Axes, world_from_camera: RigidTransform) -> RigidTransform:
+    """The inverse of `pose_to`: also for a device's `session_from_camera`, whose session is then right-handed."""
+    world = WORLD_FROM_RIGHT_HANDED[axes]
+    rotation = world @ world_from_camera.rotation @ CV_FROM_CAMERA[axes].T
+    return RigidTransform(rotation, world @ world_from_camera.translation)
+
+
+def world_from_session_in(
+    axes: Axes, world_from_camera: RigidTransform, session_from_camera: RigidTransform
+) -> RigidTransform:
+    """What puts whatever a device tracks into the world, both frames in these axes.
+
+    Times the device's `session_from_camera` of any later moment, in these axes, it is the camera in the world in them.
+
+    Args:
+        axes: the device's.
+        world_from_camera: the answer, OpenCV.
+        session_from_camera: of the moment of capture, as the device gives it, in these axes.
+    """
+    return pose_to(axes, world_from_camera).compose(session_from_camera.inverse())
+
+
+def points_to(axes: Axes, x_in_world: ArrayLike) -> Array:
+    """Points or directions (..., 3) of a right-handed world in these axes."""
+    return np.asarray(x_in_world, float) @ WORLD_FROM_RIGHT_HANDED[axes].T
+
+
+def points_from(axes: Axes, x_in_world: ArrayLike) -> Array:
+    """The inverse of `points_to`."""
+    return np.asarray(x_in_world, float) @ WORLD_FROM_RIGHT_HANDED[axes]
+
+
+def camera_points_to(axes: Axes, x_in_camera: ArrayLike) -> Array:
+    """Points or directions (..., 3) of OpenCV's camera frame in the camera frame of these axes."""
+    return np.asarray(x_in_camera, float) @ CV_FROM_CAMERA[axes]
+
+
+def camera_points_from(axes: Axes, x_in_camera: ArrayLike) -> Array:
+    """The inverse of `camera_points_to`."""
+    return np.asarray(x_in_camera, float) @ CV_FROM_CAMERA[axes].T
+
+
+def covariance_to(axes: Axes, covariance: ArrayLike) -> Array:
+    """The covariance of a pose in these axes, (6, 6), in ROS's order: x, y, z, then rotations about fixed world axes.
+
+    A rotation by the vector w, R' = Exp(w) R, is in a mirrored world M R' = Exp(det(M) M w) M R: a rotation vector does
+    not only change its place, but its sense. Its own inverse.
+    """
+    world = WORLD_FROM_RIGHT_HANDED[axes]
+    rotations = np.linalg.det(world) * world
+    both = np.concatenate([np.diag(world), np.diag(rotations)])
+    changed: Array = np.outer(both, both) * np.asarray(covariance, float)
+    return changed
+
+
+def covariance_from(axes: Axes, covariance: ArrayLike) -> Array:
+    """The inverse of `covariance_to`."""
+    return covariance_to(axes, covariance)
+
+
+def turned_raster(world_from_camera: RigidTransform, clockwise_quarter_turns: int) -> RigidTransform:
+    """The pose of the camera whose pixel raster is that of another, turned clockwise; both in OpenCV's axes.
+
+    Args:
+        world_from_camera: of the camera as it is.
+        clockwise_quarter_turns: how its raster is turned; negative numbers turn it back. 1 makes a raster of W x H
+            pixels one of H x W whose top is what was left.
+    """
+    turns = clockwise_quarter_turns % 4
+    # What was up is now right, and what was right is now down.
+    old_from_turned = np.linalg.matrix_power(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), turns)
+    return RigidTransform(world_from_camera.rotation @ old_from_turned, world_from_camera.translation)

@@ -1,0 +1,102 @@
+"""Cameras and poses from files: the interface's JSON, four numbers, or a folder's cameras.json."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any, TypeVar
+
+from google.protobuf import json_format
+from google.protobuf.message import Message
+
+from . import wire
+from .geometry import Camera, RadialTangential, RigidTransform
+from .pixels import size_of_image
+from .v1 import geometry_pb2
+
+M = TypeVar("M", bound=Message)
+
+FOLDER_FILE = "cameras.json"
+_FOUR_NUMBERS = re.compile(r"[-+0-9.eE]+(,[-+0-9.eE]+){3}")
+
+
+def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
+    """A camera: a JSON file or JSON text as the interface defines CameraIntrinsics, or "fx,fy,cx,cy" in pixels.
+
+    Args:
+        source: where from.
+        photo: a photograph that it took; four numbers take the size of the image from its header.
+
+    Raises:
+        OSError: a file cannot be read.
+        ValueError: it is no camera.
+    """
+    text = str(source)
+    if not _FOUR_NUMBERS.fullmatch(text):
+        return wire.camera_from_message(_read_json(text, geometry_pb2.CameraIntrinsics()), "camera")
+    if photo is None:
+        raise ValueError(f"{text}: four numbers are a camera only together with a photograph that it took")
+    try:
+        width_px, height_px = size_of_image(Path(photo).read_bytes())
+    except ValueError as error:
+        raise ValueError(f"{photo}: {error}") from None
+    focal_x_px, focal_y_px, principal_x_px, principal_y_px = map(float, text.split(","))
+    camera = Camera(width_px, height_px, focal_x_px, focal_y_px, principal_x_px, principal_y_px)
+    return wire.camera_from_message(wire.camera_to_message(camera), "camera")  # which checks the ranges
+
+
+def read_pose(source: str | Path) -> RigidTransform:
+    """A pose: a JSON file or JSON text as the interface defines RigidTransform.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no pose.
+    """
+    return wire.transform_from_message(_read_json(str(source), geometry_pb2.RigidTransform()), "pose")
+
+
+def read_cameras(file: str | Path) -> dict[Path, Camera]:
+    """The photographs of a cameras.json, and the camera of each, in the file's order.
+
+    The file has `frames`, each with `image` (path beside the file), `width`, `height`, `K` (3x3, pixels) and perhaps
+    `dist` (OpenCV's k1 k2 p1 p2 k3); poses in it are not looked at.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no such file; names the frame.
+    """
+    path = Path(file)
+    try:
+        frames = json.loads(path.read_text())["frames"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: no cameras: {error!r}") from None
+    return dict(_photograph(path, index, frame) for index, frame in enumerate(frames))
+
+
+def _photograph(path: Path, index: int, frame: Any) -> tuple[Path, Camera]:
+    try:
+        k = frame["K"]
+        camera = Camera(
+            frame["width"],
+            frame["height"],
+            float(k[0][0]),
+            float(k[1][1]),
+            float(k[0][2]),
+            float(k[1][2]),
+            RadialTangential(*map(float, frame["dist"])) if frame.get("dist") else None,
+        )
+        checked = wire.camera_from_message(wire.camera_to_message(camera), "camera")
+        return path.parent / frame["image"], checked
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise ValueError(f"{path}: frames[{index}] is no photograph with a camera: {error!r}") from None
+
+
+def _read_json(source: str, message: M) -> M:
+    """The message that a JSON file, or JSON text, holds."""
+    text = source if source.lstrip().startswith("{") else Path(source).read_text()
+    try:
+        json_format.Parse(text, message)
+    except json_format.ParseError as error:
+        raise ValueError(f"{source}: {error}") from None
+    return message

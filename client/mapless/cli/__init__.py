@@ -1,0 +1,1 @@
+"""The command `mapless`, in parts: its arguments, its commands, what they read and what they show."""

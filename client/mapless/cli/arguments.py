@@ -1,0 +1,208 @@
+"""The command line's arguments, and what of them says how to connect."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from importlib.metadata import version
+from pathlib import Path
+
+from ..options import ConnectOptions
+from ..shortcut import ADDRESS_VARIABLE, TOKEN_VARIABLE, default_address
+from . import commands, localize
+
+DESCRIPTION = """\
+The command `mapless`: what the client can do, from a shell.
+
+`localize` tells a person a few lines, and programs everything: JSON where standard output is no terminal, or with
+--json. All else is JSON. Exit codes: 0 done, 1 a call failed, 2 wrong usage, 3 a photograph was not localized (the
+answer says why).
+"""
+
+FILE_FORMATS = """\
+CAMERA is a JSON file (or JSON text) as the interface defines CameraIntrinsics:
+  {"width_px": 1600, "height_px": 1067, "focal_x_px": 1437.2, "focal_y_px": 1440.1,
+   "principal_x_px": 791.8, "principal_y_px": 524.3, "radial_tangential": {"k1": 0.1}}
+or focal lengths and principal point in pixels of the photograph, FX,FY,CX,CY,
+or a cameras.json that lists the photograph.
+POSE is a JSON file likewise, RigidTransform:
+  {"rotation": {"x": 0, "y": 0, "z": 0, "w": 1}, "translation_m": {"x": 0, "y": 0, "z": 1.5}}
+"""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The whole command line; `run` of what it parses is the command."""
+    parser = argparse.ArgumentParser(
+        prog="mapless",
+        description=DESCRIPTION,
+        epilog=FILE_FORMATS,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"mapless {version('mapless')}")
+    parser.add_argument(
+        "--address",
+        default=default_address(),
+        help=f"of the server (default: that in {ADDRESS_VARIABLE}, or localhost:50051)",
+    )
+    parser.add_argument("--timeout", type=float, default=30.0, help="of a call, seconds (default: %(default)s)")
+    _add_connection(parser.add_argument_group("connection"))
+    groups = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    groups.add_parser("health", help="whether the server takes calls").set_defaults(run=commands.health)
+    _add_scene(groups.add_parser("scene", help="create, update, get, list, delete"))
+    _add_reference(groups.add_parser("reference", help="add, list, delete"))
+    _add_localize(groups.add_parser("localize", help="where a photograph was taken, or a folder of them"))
+    _add_questions(groups)
+    return parser
+
+
+def connect_options(arguments: argparse.Namespace) -> ConnectOptions:
+    """How to connect; OSError or ValueError if the flags or their files do not fit."""
+    # Not a flag of its own: what stands on a command line, everybody on the machine can read.
+    token = arguments.token_file.read_text() if arguments.token_file else os.environ.get(TOKEN_VARIABLE)
+    return ConnectOptions(
+        timeout_s=arguments.timeout,
+        tls=bool(arguments.tls or arguments.ca or arguments.cert),
+        root_certificates=arguments.ca.read_bytes() if arguments.ca else None,
+        client_certificate=arguments.cert.read_bytes() if arguments.cert else None,
+        client_key=arguments.key.read_bytes() if arguments.key else None,
+        token=token.strip() if token else None,
+        client_id=arguments.client_id,
+    )
+
+
+def _add_connection(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--tls", action="store_true", help="encrypt; --ca and --cert imply it")
+    group.add_argument(
+        "--ca", type=Path, metavar="FILE", help="certificate that signed the server's, PEM (default: the system's)"
+    )
+    group.add_argument("--cert", type=Path, metavar="FILE", help="our own certificate, PEM, if the server asks")
+    group.add_argument("--key", type=Path, metavar="FILE", help="its key, PEM")
+    group.add_argument(
+        "--token-file", type=Path, metavar="FILE", help=f"holds the token to show (default: that in {TOKEN_VARIABLE})"
+    )
+    group.add_argument("--client-id", default="", help="which of the token's users this is")
+
+
+def _add_scene(scene: argparse.ArgumentParser) -> None:
+    actions = scene.add_subparsers(required=True, metavar="ACTION")
+    create = actions.add_parser("create", help="a new, empty one")
+    create.add_argument("scene")
+    _add_place(create)
+    create.set_defaults(run=commands.create_scene)
+    update = actions.add_parser("update", help="change what is known of it as a whole")
+    update.add_argument("scene")
+    _add_place(update)
+    update.add_argument(
+        "--forget",
+        action="append",
+        default=[],
+        choices=["datum", "down_in_world", "calibration"],
+        help="what is no longer known; may be repeated",
+    )
+    update.set_defaults(run=commands.update_scene)
+    for action, run in (("get", commands.get_scene), ("delete", commands.delete_scene)):
+        one = actions.add_parser(action)
+        one.add_argument("scene")
+        one.set_defaults(run=run)
+    actions.add_parser("list").set_defaults(run=commands.list_scenes)
+
+
+def _add_place(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--datum",
+        type=float,
+        nargs=3,
+        metavar=("LATITUDE", "LONGITUDE", "HEIGHT"),
+        help="of the world's origin: WGS84 degrees, and metres above the ellipsoid",
+    )
+    command.add_argument(
+        "--enu-from-world",
+        type=float,
+        nargs=4,
+        metavar=("X", "Y", "Z", "W"),
+        help="quaternion that turns the world's axes to east, north, up; default: they are these",
+    )
+    command.add_argument("--down", type=float, nargs=3, metavar=("X", "Y", "Z"), help="where things fall in the world")
+
+
+def _add_reference(reference: argparse.ArgumentParser) -> None:
+    actions = reference.add_subparsers(required=True, metavar="ACTION")
+    add = actions.add_parser("add", help="store a photograph with its camera and pose")
+    add.add_argument("scene")
+    add.add_argument("photo", type=Path)
+    add.add_argument("--id", help="of the reference (default: the file's name without its ending)")
+    add.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
+    add.add_argument("--pose", required=True, help="its world_from_camera, likewise")
+    add.set_defaults(run=commands.add_reference)
+    listing = actions.add_parser("list")
+    listing.add_argument("scene")
+    listing.set_defaults(run=commands.list_references)
+    delete = actions.add_parser("delete")
+    delete.add_argument("scene")
+    delete.add_argument("reference")
+    delete.set_defaults(run=commands.delete_reference)
+
+
+def _add_localize(command: argparse.ArgumentParser) -> None:
+    command.add_argument("scene")
+    command.add_argument("photo", type=Path, help="or a folder of photographs")
+    command.add_argument(
+        "--camera", help="that took it, or all, see `mapless --help`; a folder with a cameras.json needs none"
+    )
+    command.add_argument("--reference", action="append", default=[], help="compare with this one; may be repeated")
+    command.add_argument("--count", type=int, default=0, help="how many references the server chooses")
+    command.add_argument("--rerank", action="store_true", help="the server chooses among those given")
+    _add_priors(command)
+    command.add_argument(
+        "--gravity",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="gravity prior: down in the camera's axes (x right, y down, z forward), for scenes that know their down",
+    )
+    command.add_argument(
+        "--gravity-sigma", type=float, default=1.0, metavar="DEG", help="how well it is known (default: %(default)s)"
+    )
+    command.add_argument("--axes", default="", help="opencv, arkit, arcore, unity or ros: adds the pose in these")
+    command.add_argument(
+        "--coverage", type=float, default=0.0, help="share of the right answers to accept (default: the server's)"
+    )
+    command.add_argument("--variant", default="", help="best, full, no_structure or coarse")
+    command.add_argument("--scale-strategy", default="", help="two_stage, triangulation or trajectory")
+    command.add_argument("--allow-coarse", action="store_true", help="a coarse pose will do if time runs out")
+    command.add_argument("--parallel", type=int, default=2, help="calls at a time for a folder (default: %(default)s)")
+    shown = command.add_argument_group("output")
+    shown.add_argument("--json", action="store_true", help="JSON on a terminal, too; for a folder a line each")
+    shown.add_argument("--output", type=Path, metavar="FILE", help="write the JSON to a file")
+    shown.add_argument("--debug", action="store_true", help="the matches it rests on in the JSON, too")
+    shown.add_argument("--draw", type=Path, metavar="FOLDER", help="write a page for each photograph, to be looked at")
+    command.set_defaults(run=localize.run)
+
+
+def _add_questions(groups: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    retrieve = groups.add_parser("retrieve", help="the references that resemble a photograph most")
+    retrieve.add_argument("scene")
+    retrieve.add_argument("photo", type=Path)
+    retrieve.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
+    retrieve.add_argument("--count", type=int, default=0, help="how many")
+    _add_priors(retrieve)
+    retrieve.set_defaults(run=commands.retrieve)
+
+    coverage = groups.add_parser("coverage", help="whether a photograph taken somewhere would be localized")
+    coverage.add_argument("scene")
+    coverage.add_argument("--camera", required=True, help="the camera, see `mapless --help`")
+    coverage.add_argument("--pose", required=True, help="where it would be: its world_from_camera, likewise")
+    coverage.set_defaults(run=commands.coverage)
+
+
+def _add_priors(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--near", type=float, nargs=4, metavar=("X", "Y", "Z", "RADIUS"), help="position prior, metres"
+    )
+    command.add_argument(
+        "--looking",
+        type=float,
+        nargs=4,
+        metavar=("X", "Y", "Z", "ANGLE"),
+        help="heading prior: direction in the world, and degrees around it",
+    )

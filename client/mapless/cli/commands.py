@@ -1,0 +1,105 @@
+"""All commands but `localize`: a call each, and its answer as JSON."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from ..cameras import read_camera, read_pose
+from ..client import Client
+from ..geodesy import Datum
+from ..geometry import Quaternion
+from ..requests import NewReference
+from .exits import EXIT_FAILED, EXIT_REJECTED
+from .localize import priors
+from .output import print_json
+
+
+def health(client: Client, arguments: argparse.Namespace) -> int:
+    """Whether the server takes calls."""
+    serving = client.is_serving()
+    print("SERVING" if serving else "NOT_SERVING")
+    return 0 if serving else EXIT_FAILED
+
+
+def create_scene(client: Client, arguments: argparse.Namespace) -> int:
+    """A new scene."""
+    datum, down = _datum(arguments), arguments.down
+    return print_json(client.create_scene(arguments.scene, datum=datum, down_in_world=down))
+
+
+def update_scene(client: Client, arguments: argparse.Namespace) -> int:
+    """What is known of a scene as a whole."""
+    changes: dict[str, Any] = dict.fromkeys(arguments.forget)
+    if arguments.datum is not None:
+        changes["datum"] = _datum(arguments)
+    if arguments.down is not None:
+        changes["down_in_world"] = arguments.down
+    if not changes:
+        raise ValueError("say what to change: --datum, --down or --forget")
+    return print_json(client.update_scene(arguments.scene, **changes))
+
+
+def _datum(arguments: argparse.Namespace) -> Datum | None:
+    if arguments.datum is None:
+        if arguments.enu_from_world is not None:
+            raise ValueError("--enu-from-world is part of a --datum")
+        return None
+    latitude_deg, longitude_deg, height_m = arguments.datum
+    if arguments.enu_from_world is None:
+        return Datum(latitude_deg, longitude_deg, height_m)
+    return Datum(latitude_deg, longitude_deg, height_m, Quaternion(*arguments.enu_from_world))
+
+
+def get_scene(client: Client, arguments: argparse.Namespace) -> int:
+    """A scene, with its datum and its calibration if it has any."""
+    return print_json(client.get_scene(arguments.scene))
+
+
+def list_scenes(client: Client, arguments: argparse.Namespace) -> int:
+    """All scenes."""
+    return print_json(list(client.list_scenes()))
+
+
+def delete_scene(client: Client, arguments: argparse.Namespace) -> int:
+    """A scene and all that is in it."""
+    client.delete_scene(arguments.scene)
+    return 0
+
+
+def add_reference(client: Client, arguments: argparse.Namespace) -> int:
+    """A photograph with its camera and pose."""
+    reference = NewReference(
+        reference_id=arguments.id or arguments.photo.stem,
+        image=arguments.photo,
+        camera=read_camera(arguments.camera, arguments.photo),
+        world_from_camera=read_pose(arguments.pose),
+    )
+    return print_json(client.add_reference(arguments.scene, reference))
+
+
+def list_references(client: Client, arguments: argparse.Namespace) -> int:
+    """All references of a scene."""
+    return print_json(list(client.list_references(arguments.scene)))
+
+
+def delete_reference(client: Client, arguments: argparse.Namespace) -> int:
+    """A reference."""
+    client.delete_reference(arguments.scene, arguments.reference)
+    return 0
+
+
+def retrieve(client: Client, arguments: argparse.Namespace) -> int:
+    """What a photograph resembles."""
+    camera = read_camera(arguments.camera, arguments.photo)
+    return print_json(
+        client.retrieve_references(arguments.photo, camera, arguments.scene, arguments.count, priors=priors(arguments))
+    )
+
+
+def coverage(client: Client, arguments: argparse.Namespace) -> int:
+    """Whether a photograph taken somewhere would be localized."""
+    pose, camera = read_pose(arguments.pose), read_camera(arguments.camera)
+    found = client.check_coverage(arguments.scene, pose, camera)
+    print_json(found)
+    return EXIT_REJECTED if found.verdict == "NOT_LOCALIZABLE" else 0

@@ -1,0 +1,200 @@
+"""`mapless localize`: one photograph, or a folder of them."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from ..answers import LocalizationResult, Rejected
+from ..cameras import FOLDER_FILE, read_camera, read_cameras
+from ..client import Client
+from ..errors import MaplessError, NotFound
+from ..geometry import Camera
+from ..priors import GravityPrior, HeadingPrior, PositionPrior, Priors
+from ..report import write_report
+from ..results import Reference
+from . import output
+from .exits import EXIT_FAILED, EXIT_REJECTED
+from .progress import Progress
+
+ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".webp"})
+_DRAWN_REFERENCES, _SHOWN_REFERENCES = 16, 4
+Outcome = LocalizationResult | Rejected | MaplessError
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photograph to localize, and what to call it."""
+
+    path: Path
+    name: str
+    camera: Camera
+
+
+def run(client: Client, arguments: argparse.Namespace) -> int:
+    """The command."""
+    if arguments.rerank and not arguments.reference:
+        raise ValueError("--rerank chooses among references that --reference names")
+    if arguments.parallel < 1:
+        raise ValueError(f"--parallel is the number of calls at a time, at least 1, not {arguments.parallel}")
+    if arguments.draw is not None:
+        arguments.draw.mkdir(parents=True, exist_ok=True)
+    if not arguments.photo.is_dir():
+        return _one(client, arguments)
+    return _folder(client, arguments)
+
+
+def _one(client: Client, arguments: argparse.Namespace) -> int:
+    photo = Photo(arguments.photo, arguments.photo.name, _camera_of(arguments.photo, arguments.camera))
+    answer = _ask(client, photo, arguments)
+    with _opened(arguments.output) as file:
+        if arguments.json or arguments.output or not sys.stdout.isatty():
+            print(json.dumps(output.plain(_told(answer, arguments)), indent=2), file=file, flush=True)
+        else:
+            print("\n".join(output.lines(answer)), file=file, flush=True)
+    return EXIT_REJECTED if isinstance(answer, Rejected) else 0
+
+
+def _folder(client: Client, arguments: argparse.Namespace) -> int:
+    """One line for each photograph, in their order, as they come; a call that fails ends nothing but itself."""
+    photos = photos_of(arguments.photo, arguments.camera)
+    names = [photo.name for photo in photos]
+    width = max(map(len, names))
+    as_json = bool(arguments.json or arguments.output or not sys.stdout.isatty())
+    counts = {LocalizationResult: 0, Rejected: 0, MaplessError: 0}
+    with _opened(arguments.output) as file, Progress(len(photos)) as progress:
+        if not as_json:
+            print(output.heading(width), file=file)
+        for name, outcome in zip(names, _all(client, photos, arguments), strict=True):
+            progress.clear()
+            print(_row(name, width, outcome, as_json, arguments), file=file, flush=True)
+            progress.step(not isinstance(outcome, LocalizationResult))
+            counts[MaplessError if isinstance(outcome, MaplessError) else type(outcome)] += 1
+    failed = f", {counts[MaplessError]} failed" if counts[MaplessError] else ""
+    print(f"{counts[LocalizationResult]} of {len(photos)} localized{failed}", file=sys.stderr)
+    if counts[MaplessError]:
+        return EXIT_FAILED
+    return EXIT_REJECTED if counts[Rejected] else 0
+
+
+def photos_of(folder: Path, camera: str | None) -> list[Photo]:
+    """The photographs of a folder: those of its cameras.json, or all with one camera.
+
+    Raises:
+        ValueError: there are none, or no camera.
+    """
+    if camera is None:
+        if not (folder / FOLDER_FILE).is_file():
+            raise ValueError(f"{folder} has no {FOLDER_FILE}: say --camera, which then took all its photographs")
+        return [
+            Photo(path, path.relative_to(folder).as_posix(), its)
+            for path, its in read_cameras(folder / FOLDER_FILE).items()
+        ]
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDINGS)
+    if not paths:
+        raise ValueError(f"{folder} holds no photographs ({', '.join(sorted(ENDINGS))})")
+    return [Photo(path, path.name, _camera_of(path, camera)) for path in paths]
+
+
+def _camera_of(path: Path, camera: str | None) -> Camera:
+    if camera is None:
+        raise ValueError("say --camera: which camera took the photograph")
+    if Path(camera).name != FOLDER_FILE:
+        return read_camera(camera, path)
+    cameras = {known.resolve(): its for known, its in read_cameras(camera).items()}
+    if path.resolve() not in cameras:
+        raise ValueError(f"{camera} knows no {path}")
+    return cameras[path.resolve()]
+
+
+def _all(client: Client, photos: list[Photo], arguments: argparse.Namespace) -> Iterator[Outcome]:
+    """An outcome for each photograph, in their order, `parallel` calls at a time."""
+
+    def outcome(photo: Photo) -> Outcome:
+        try:
+            return _ask(client, photo, arguments)
+        except MaplessError as error:
+            return error
+
+    with ThreadPoolExecutor(arguments.parallel, "localize") as threads:
+        try:
+            yield from threads.map(outcome, photos)
+        except BaseException:
+            threads.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _ask(client: Client, photo: Photo, arguments: argparse.Namespace) -> LocalizationResult | Rejected:
+    answer = client.localize(
+        photo.path,
+        photo.camera,
+        arguments.scene,
+        arguments.reference,
+        priors=priors(arguments),
+        variant=arguments.variant,
+        allow_coarse=arguments.allow_coarse,
+        scale_strategy=arguments.scale_strategy,
+        reference_count=arguments.count,
+        rerank_references=arguments.rerank,
+        coverage=arguments.coverage,
+        axes=arguments.axes,
+        include_debug=arguments.debug or arguments.draw is not None,
+    )
+    if arguments.draw is not None:
+        page = arguments.draw / f"{photo.name.replace('/', '_')}.html"
+        shown = _references(client, arguments.scene, answer)
+        write_report(answer, photo.path, photo.camera, page, references=shown, title=photo.name)
+    return answer
+
+
+def _references(client: Client, scene: str, answer: LocalizationResult | Rejected) -> list[Reference]:
+    """Those that were used, as far as they are still there; the best with their photographs."""
+    uses = sorted(answer.diagnostics.references, key=lambda use: (-use.inlier_count, -use.match_count))
+    found = []
+    for rank, use in enumerate(uses[:_DRAWN_REFERENCES]):
+        with contextlib.suppress(NotFound):
+            found.append(client.get_reference(scene, use.name, include_image=rank < _SHOWN_REFERENCES))
+    return found
+
+
+def _row(name: str, width: int, outcome: Outcome, as_json: bool, arguments: argparse.Namespace) -> str:
+    if isinstance(outcome, MaplessError):
+        told = {"code": outcome.code, "reason": outcome.reason, "message": outcome.message, "field": outcome.field}
+        return json.dumps({"photo": name, "error": told}) if as_json else f"{name:{width}}  failed: {outcome}"
+    if as_json:
+        return json.dumps({"photo": name} | output.plain(_told(outcome, arguments)))
+    return output.line(f"{name:{width}}", outcome)
+
+
+def _told(answer: LocalizationResult | Rejected, arguments: argparse.Namespace) -> Any:
+    """What is printed of an answer: its matches only for those who asked for them by name."""
+    return answer if arguments.debug else replace(answer, debug=None)
+
+
+def priors(arguments: argparse.Namespace) -> Priors:
+    """What the command line knows of the camera."""
+    near, looking = arguments.near, arguments.looking
+    gravity = getattr(arguments, "gravity", None)
+    return Priors(
+        position=PositionPrior(np.array(near[:3]), near[3]) if near else None,
+        heading=HeadingPrior(np.array(looking[:3]), looking[3]) if looking else None,
+        gravity=GravityPrior(np.array(gravity), arguments.gravity_sigma) if gravity else None,
+    )
+
+
+@contextlib.contextmanager
+def _opened(path: Path | None) -> Iterator[TextIO]:
+    if path is None:
+        yield sys.stdout
+        return
+    with path.open("w", encoding="utf-8") as file:
+        yield file

@@ -1,0 +1,106 @@
+"""Answers as JSON for programs, and as a few lines for a person."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from datetime import datetime
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from google.protobuf import json_format
+from google.protobuf.message import Message
+
+from .. import wire
+from ..answers import Accuracy, LocalizationResult, Rejected
+from ..geometry import Camera, RigidTransform
+
+
+def print_json(value: object) -> int:
+    """Prints a value, and says that all went well."""
+    print(json.dumps(plain(value), indent=2), flush=True)
+    return 0
+
+
+def plain(value: Any) -> Any:
+    """What JSON can hold of a result; geometry in the form that --camera and --pose read."""
+    if isinstance(value, Camera):
+        return plain(wire.camera_to_message(value))
+    if isinstance(value, RigidTransform):
+        return plain(wire.transform_to_message(value))
+    if isinstance(value, Message):
+        return json_format.MessageToDict(value, preserving_proto_field_name=True)
+    if dataclasses.is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, float) and not math.isfinite(value):
+        return None  # JSON has no other word for it
+    return value
+
+
+def lines(answer: LocalizationResult | Rejected) -> list[str]:
+    """What a person wants to know first."""
+    if isinstance(answer, Rejected):
+        told = [f"not localized: {answer.reason}", f"  {answer.message}"]
+        if answer.hint is not None and answer.hint.message:
+            told.append(f"  {answer.hint.message}")
+        return told
+    pose = answer.world_from_camera if answer.in_axes is None else answer.in_axes.world_from_camera
+    frame = "" if answer.in_axes is None else f"   in {answer.in_axes.axes} axes"
+    x, y, z = pose.translation
+    q = pose.quaternion()
+    told = [
+        f"localized{'' if answer.trust is None else f', trust {answer.trust:.3f}'}{frame}",
+        f"  position  {x:.3f}  {y:.3f}  {z:.3f} m{_radius(answer.accuracy, 'position', 'm')}",
+        f"  rotation  x {q.x:.4f}  y {q.y:.4f}  z {q.z:.4f}  w {q.w:.4f}{_radius(answer.accuracy, 'rotation', 'deg')}",
+    ]
+    if answer.geo_pose is not None:
+        geo = answer.geo_pose
+        told.append(f"  on earth  {geo.lat:.7f}, {geo.lon:.7f}, {geo.h:.2f} m")
+    told += [
+        f"  prior     {check.kind} contradicts the photograph: {check.mahalanobis:.1f} standard deviations"
+        for check in answer.prior_checks
+        if check.conflict
+    ]
+    used = sum(use.inlier_count > 0 for use in answer.diagnostics.references)
+    return [
+        *told,
+        f"  support   {answer.inlier_count} of {answer.match_count} matches, {used} references, "
+        f"{answer.diagnostics.total_s:.2f} s",
+    ]
+
+
+def line(name: str, answer: LocalizationResult | Rejected) -> str:
+    """The same in one line of a table."""
+    if isinstance(answer, Rejected):
+        return f"{name}  not localized: {answer.reason}"
+    x, y, z = answer.world_from_camera.translation
+    radius = f"{100 * answer.accuracy.position_95_m:8.2f} cm" if answer.accuracy is not None else " " * 11
+    trust = f"{answer.trust:6.3f}" if answer.trust is not None else " " * 6
+    counts = f"{answer.inlier_count}/{answer.match_count}"
+    return f"{name}  {x:9.3f} {y:9.3f} {z:9.3f} m {radius} {trust}  {counts:>9}"
+
+
+def heading(width: int) -> str:
+    """Of the table whose names are so wide."""
+    return f"{'photograph':{width}}  {'x':>9} {'y':>9} {'z':>9}    {'95 % within':>10} {'trust':>6}  {'inliers':>9}"
+
+
+def _radius(accuracy: Accuracy | None, kind: str, unit: str) -> str:
+    if accuracy is None:
+        return ""
+    factor, shown = (100, "cm") if unit == "m" else (1, "deg")
+    radii = [factor * getattr(accuracy, f"{kind}_{share}_{unit}") for share in (68, 95)]
+    note = "" if accuracy.calibrated else ", uncalibrated"
+    return f"   within {radii[0]:.2g} {shown} (68 %), {radii[1]:.2g} {shown} (95 %{note})"

@@ -1,0 +1,165 @@
+"""Calls as data: what is asked and how the answer is read, apart from who waits for it.
+
+An exchange is a generator that yields calls, is sent their responses and returns what the caller wanted. The blocking
+and the asynchronous client drive the same exchanges, so each request is built and each answer read in one place.
+`attempts` puts retries and deadlines around an exchange; what is left to a client are two things: make an attempt, and
+pause.
+
+gRPC's own retries are not used. They know no RetryInfo, so they would take a server at its limit (come back in 3 s) for
+a message over the limit (never come back), and they repeat a creation without being able to tell whose it then was.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+from google.protobuf.message import Message
+
+from .errors import MaplessError
+from .options import ConnectOptions
+
+T = TypeVar("T")
+
+_JITTER = 0.2  # of a pause of ours, either way, as gRPC has it
+_LATENESS = 0.25  # at most so much longer than the server asked for, never earlier: it refused many, and all will come
+
+
+@dataclass(frozen=True)
+class Call:
+    """One unary call.
+
+    Attributes:
+        method: "package.Service/Method".
+        request: the message.
+        response_type: of which the answer is.
+        timeout_s: deadline, retries and pauses included; None for the options' own.
+        is_upload: whether that is then `upload_timeout_s`.
+        on_repeat: for calls that change something: an earlier try may have succeeded though its answer was lost, and
+            then the next one fails as if somebody else had done it. Given the error, it raises it, or yields the calls
+            that find out, and returns what the lost answer would have been.
+    """
+
+    method: str
+    request: Message
+    response_type: type[Message]
+    timeout_s: float | None = None
+    is_upload: bool = False
+    on_repeat: Callable[[MaplessError], Exchange[Any]] | None = None
+
+
+Exchange = Generator[Call, Any, T]
+"""Yields calls, is sent their responses (or thrown their errors), returns what the caller wanted."""
+
+
+@dataclass(frozen=True)
+class Pages(Generic[T]):
+    """A list fetched page by page: `fetch(token)` gives a page's items and the next token, "" after the last."""
+
+    fetch: Callable[[str], Exchange[tuple[list[T], str]]]
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Make this call once, within `timeout_s`; send back the response, or the error."""
+
+    call: Call
+    timeout_s: float
+
+
+@dataclass(frozen=True)
+class Pause:
+    """Wait; if there is to be no further attempt, `error` is how the call ended."""
+
+    duration_s: float
+    error: MaplessError
+
+
+class Methods:
+    """The methods of a channel, of either kind, by the calls that need them."""
+
+    def __init__(self, channel: Any) -> None:
+        self._channel = channel
+        self._by_name: dict[str, Callable[..., Any]] = {}
+
+    def of(self, call: Call) -> Callable[..., Any]:
+        """What makes the call: takes the request, `timeout` in seconds and `metadata`."""
+        if call.method not in self._by_name:
+            self._by_name[call.method] = self._channel.unary_unary(
+                f"/{call.method}",
+                request_serializer=type(call.request).SerializeToString,
+                response_deserializer=call.response_type.FromString,
+            )
+        return self._by_name[call.method]
+
+
+@dataclass
+class _Clock:
+    """What time it is and what the dice say; tests have their own."""
+
+    now_s: Callable[[], float] = time.monotonic
+    uniform: Callable[[float, float], float] = field(default=random.uniform)
+
+
+def attempts(
+    exchange: Exchange[T], options: ConnectOptions, clock: _Clock | None = None
+) -> Generator[Attempt | Pause, Any, T]:
+    """The exchange with retries: yields what is to be done, returns what the exchange does.
+
+    A call is tried again if the server is UNAVAILABLE, or RESOURCE_EXHAUSTED and says when to come back; never if
+    the pause before would outlast its deadline.
+    """
+    clock = clock or _Clock()
+    try:
+        call = next(exchange)
+        while True:
+            outcome = yield from _with_retries(call, options, clock)
+            call = exchange.throw(outcome) if isinstance(outcome, MaplessError) else exchange.send(outcome)
+    except StopIteration as end:
+        value: T = end.value
+        return value
+    finally:
+        exchange.close()
+
+
+def _with_retries(call: Call, options: ConnectOptions, clock: _Clock) -> Generator[Attempt | Pause, Any, Any]:
+    """One call until it succeeds, fails for good, or has no attempts or no time left; its response, or its error."""
+    timeout_s = call.timeout_s or (options.upload_timeout_s if call.is_upload else options.timeout_s)
+    deadline_s = clock.now_s() + timeout_s
+    may_be_done = False  # by a try whose answer never came
+    attempt = 0
+    while True:
+        outcome = yield Attempt(call, max(deadline_s - clock.now_s(), 0.0))
+        attempt += 1
+        if not isinstance(outcome, MaplessError):
+            return outcome
+        if may_be_done and call.on_repeat is not None and outcome.code in {"ALREADY_EXISTS", "NOT_FOUND"}:
+            return (yield from _found_out(call.on_repeat(outcome), options, clock))
+        pause_s = _pause_s(outcome, attempt, options, clock)
+        if pause_s is None or attempt == options.max_attempts or clock.now_s() + pause_s >= deadline_s:
+            return outcome
+        may_be_done |= outcome.code == "UNAVAILABLE"
+        yield Pause(pause_s, outcome)
+
+
+def _found_out(exchange: Exchange[Any], options: ConnectOptions, clock: _Clock) -> Generator[Attempt | Pause, Any, Any]:
+    try:
+        return (yield from attempts(exchange, options, clock))
+    except MaplessError as error:
+        return error
+
+
+def _pause_s(error: MaplessError, attempt: int, options: ConnectOptions, clock: _Clock) -> float | None:
+    """How long to wait after so many attempts, seconds; None if another would be of no use."""
+    asked_s = error.retry_after_s
+    backoff_s = min(options.initial_backoff_s * 2.0 ** (attempt - 1), options.max_backoff_s)
+    backoff_s *= clock.uniform(1 - _JITTER, 1 + _JITTER)
+    if error.code == "UNAVAILABLE":
+        # The first time soon, whatever it asks: behind one name there may be another server, which is not unavailable.
+        return backoff_s if attempt == 1 or asked_s is None else max(backoff_s, asked_s)
+    if error.code == "RESOURCE_EXHAUSTED" and asked_s is not None:
+        return max(backoff_s, asked_s * clock.uniform(1, 1 + _LATENESS))
+    return None

@@ -1,0 +1,148 @@
+"""The report of one answer, put together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..answers import LocalizationResult, Rejected
+from ..geometry import Camera, RigidTransform
+from ..results import Reference
+from . import sections
+from .markup import section, text
+from .overlay import define, histogram, overlay
+from .pairs import best_references, pairs
+from .pictures import Picture, picture
+from .plan import plan_view
+from .style import STYLE
+
+PHOTOGRAPH_BYTES = 1_800_000
+REFERENCE_BYTES = 450_000
+"""Of pictures in a page, before they become text, which adds a third: with three references, and what is drawn, less
+than 5 MB, which every mailbox takes."""
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+"""What the page may load: nothing from anywhere, and no scripts at all."""
+_REASONS = {
+    "NO_USABLE_REFERENCES": "there were no references to use",
+    "DEGENERATE_REFERENCES": "the references stand at one place",
+    "LOW_TEXTURE": "the photograph shows too little",
+    "LOW_OVERLAP": "it has nothing in common with the references",
+    "SCALE_UNRELIABLE": "the metric scale could not be established",
+    "TOO_FEW_MATCHES": "too few matches",
+    "PNP_FAILED": "no pose explains the matches",
+    "GATE": "a pose was found, but is not to be trusted",
+    "AMBIGUOUS": "it could have been taken at several places",
+    "PRIOR_CONFLICT": "the pose contradicts what was known beforehand",
+}
+
+
+def report_html(
+    answer: LocalizationResult | Rejected,
+    image: bytes,
+    camera: Camera,
+    references: Sequence[Reference] = (),
+    title: str = "",
+    down_in_world: ArrayLike | None = None,
+) -> str:
+    """The page; see `write_report`."""
+    by_name = {f"scenes/{it.scene_id}/references/{it.reference_id}": it for it in references}
+    photograph = picture(image, PHOTOGRAPH_BYTES)
+    pictures = _pictures(answer, by_name)
+    diagnostics = answer.diagnostics
+    if isinstance(answer, LocalizationResult):
+        first = [sections.pose_section(answer), sections.accuracy_section(answer)]
+        further = [sections.priors_section(answer.prior_checks)]
+    else:
+        first, further = [], [sections.hypotheses_section(answer)]
+    body = [
+        _header(answer, title),
+        define(photograph, camera),
+        _photograph_section(answer, camera, photograph),
+        section("Beside the references", pairs(answer.debug, diagnostics.references, camera, by_name, pictures)),
+        section("Where it is", _plan(answer, by_name, camera, down_in_world)),
+        *first,
+        *further,
+        '<div class="columns">',
+        sections.references_section(diagnostics),
+        sections.timings_section(diagnostics),
+        "</div>",
+        sections.provenance_section(diagnostics, camera),
+        f"<footer>Written {datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC. This page holds the photograph itself and "
+        "needs nothing else.</footer>",
+    ]
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{text(_POLICY)}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{text(_verdict(answer))}{': ' + text(title) if title else ''}</title><style>{STYLE}</style></head>"
+        f"<body>{''.join(body)}</body></html>\n"
+    )
+
+
+def _verdict(answer: LocalizationResult | Rejected) -> str:
+    return "Localized" if isinstance(answer, LocalizationResult) else "Not localized"
+
+
+def _header(answer: LocalizationResult | Rejected, title: str) -> str:
+    kind = "good" if isinstance(answer, LocalizationResult) else "bad"
+    told = [title] if title else []
+    if answer.capture_time is not None:
+        told.append(f"taken {answer.capture_time:%Y-%m-%d %H:%M:%S} UTC")
+    why = ""
+    headline = f'<span class="{kind}">{_verdict(answer)}</span>'
+    if isinstance(answer, Rejected):
+        known = _REASONS.get(answer.reason)
+        headline += f": {text(known)}" if known else ""
+        why = f'<p class="why">{text(answer.message)} <span class="note">({text(answer.reason)})</span></p>'
+    return (
+        f'<header><p class="kicker">{text(" · ".join(told) or "mapless")}</p><h1>{headline}</h1>{why}'
+        f"{sections.cards(answer)}{sections.notices(answer)}</header>"
+    )
+
+
+def _photograph_section(answer: LocalizationResult | Rejected, camera: Camera, photograph: Picture) -> str:
+    note = f'<p class="note">{text(photograph.note)}</p>' if photograph.note else ""
+    if answer.debug is not None and len(answer.debug.is_inlier):
+        pose = answer.world_from_camera if isinstance(answer, LocalizationResult) else None
+        return section(
+            "The photograph and its matches", note, overlay(answer.debug, camera, pose), histogram(answer.debug)
+        )
+    if answer.debug is None:
+        why = "The answer carries no matches: they come with include_debug, where the computation gets that far."
+    else:
+        why = "Nothing in it was matched."
+    shown = f'<svg viewBox="-0.5 -0.5 {camera.width_px} {camera.height_px}"><use href="#photograph"/></svg>'
+    return section("The photograph", note, f"<figure>{shown}<figcaption>{why}</figcaption></figure>")
+
+
+def _plan(
+    answer: LocalizationResult | Rejected,
+    references: Mapping[str, Reference],
+    camera: Camera,
+    down_in_world: ArrayLike | None,
+) -> str:
+    poses: list[tuple[str, RigidTransform]] = []
+    covariance, points = None, np.empty((0, 3))
+    if isinstance(answer, LocalizationResult):
+        poses, covariance = [("the photograph", answer.world_from_camera)], answer.covariance
+        if answer.debug is not None:
+            points = answer.debug.x_in_world[answer.debug.is_inlier]
+    else:
+        poses = [(letter, it.world_from_camera) for letter, it in zip("ABCDEFGH", answer.hypotheses, strict=False)]
+        if answer.debug is not None:
+            points = answer.debug.x_in_world
+    used = [use.name for use in answer.diagnostics.references]
+    return plan_view(references, used, poses, camera, covariance, points, down_in_world)
+
+
+def _pictures(answer: LocalizationResult | Rejected, references: Mapping[str, Reference]) -> dict[str, Picture]:
+    """Of the references that are shown beside the photograph, and have one."""
+    found = {}
+    for name in best_references(answer.debug, answer.diagnostics.references):
+        image = references[name].image if name in references else None
+        if image is not None:
+            found[name] = picture(image, REFERENCE_BYTES)
+    return found

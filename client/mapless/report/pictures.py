@@ -1,0 +1,130 @@
+"""Photographs inside a page: as they are where they are small, else reduced, and never with what cameras add to them.
+
+A viewer turns a picture as its EXIF orientation says, and then nothing would lie where it belongs: intrinsics and
+pixels are those of the raster in the file. So metadata are cut out; a page that is mailed does not tell where a phone
+was, either.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from dataclasses import dataclass
+
+REDUCED_SIDE_PX = 1600
+_SEGMENTS_WITHOUT_LENGTH = {0x01, *range(0xD0, 0xD9)}
+_KEPT_SEGMENTS = {0xE0, 0xE2, 0xEE}
+"""JFIF, colour profile, Adobe's colour transform: what a decoder needs of the application segments."""
+_PNG_METADATA = (b"eXIf", b"tEXt", b"zTXt", b"iTXt", b"tIME")
+_WEBP_METADATA = (b"EXIF", b"XMP ")
+_EXIF_AND_XMP = 0x0C
+"""Bits of a WebP's extended header."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A photograph as a page carries it; without a `uri` it is left out, and `note` says why."""
+
+    uri: str = ""
+    note: str = ""
+
+
+def picture(image: bytes, max_bytes: int) -> Picture:
+    """A JPEG, PNG or WebP for a page, of no more than so many bytes before its encoding as text."""
+    kind = _kind(image)
+    if not kind:
+        return Picture(note="The photograph is not a JPEG, PNG or WebP file, and is left out.")
+    data = _without_metadata(image, kind)
+    if data is None:
+        return Picture(note="The photograph's file is damaged, and is left out.")
+    if len(data) > max_bytes:
+        reduced = _reduced(data)
+        if reduced is None or len(reduced) > max_bytes:
+            return Picture(
+                note=f"The photograph has {len(data) / 1e6:.1f} MB, too much for a page that is to be mailed, and is "
+                "left out; with the Python package pillow installed it is reduced."
+            )
+        kind, data = "jpeg", reduced
+    return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}")
+
+
+def _kind(image: bytes) -> str:
+    if image.startswith(b"\xff\xd8\xff"):
+        return "jpeg"
+    if image.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "png"
+    return "webp" if image.startswith(b"RIFF") and image[8:12] == b"WEBP" else ""
+
+
+def _without_metadata(image: bytes, kind: str) -> bytes | None:
+    """The file without them; None if it cannot be followed."""
+    cut = {"jpeg": _clean_jpeg, "png": _clean_png, "webp": _clean_webp}[kind]
+    try:
+        return cut(image)
+    except IndexError:
+        return None
+
+
+def _clean_jpeg(image: bytes) -> bytes:
+    """Without application segments and comments but for those that a decoder needs."""
+    parts, position = [image[:2]], 2
+    while True:
+        if image[position] != 0xFF:
+            raise IndexError
+        marker = image[position + 1]
+        if marker == 0xDA:  # what follows is the picture
+            return b"".join([*parts, image[position:]])
+        size = 2 if marker in _SEGMENTS_WITHOUT_LENGTH else 2 + int.from_bytes(_take(image, position + 2, 2), "big")
+        segment = b"\xff" if marker == 0xFF else _take(image, position, size)
+        if not (0xE0 <= marker <= 0xEF or marker == 0xFE) or marker in _KEPT_SEGMENTS:
+            parts.append(segment)
+        position += len(segment)
+
+
+def _clean_png(image: bytes) -> bytes:
+    parts, position = [image[:8]], 8
+    while position < len(image):
+        chunk = _take(image, position, 12 + int.from_bytes(_take(image, position, 4), "big"))
+        if chunk[4:8] not in _PNG_METADATA:
+            parts.append(chunk)
+        position += len(chunk)
+    return b"".join(parts)
+
+
+def _clean_webp(image: bytes) -> bytes:
+    parts, position = [], 12
+    end = min(len(image), 8 + int.from_bytes(image[4:8], "little"))
+    while position < end:
+        size = int.from_bytes(_take(image, position + 4, 4), "little")
+        chunk = _take(image, position, 8 + size) + b"\0" * (size % 2)
+        if chunk[:4] == b"VP8X":
+            chunk = chunk[:8] + bytes([chunk[8] & ~_EXIF_AND_XMP]) + chunk[9:]
+        if chunk[:4] not in _WEBP_METADATA:
+            parts.append(chunk)
+        position += len(chunk)
+    body = b"WEBP" + b"".join(parts)
+    return b"RIFF" + len(body).to_bytes(4, "little") + body
+
+
+def _take(data: bytes, position: int, size: int) -> bytes:
+    if size <= 0 or position + size > len(data):
+        raise IndexError
+    return data[position : position + size]
+
+
+def _reduced(image: bytes) -> bytes | None:
+    """A smaller JPEG of it; None where nothing is installed that could make one, or it cannot be read."""
+    try:
+        from PIL import Image
+    except ImportError:
+        return None
+    out = io.BytesIO()
+    try:
+        with Image.open(io.BytesIO(image)) as opened:
+            opened.draft("RGB", (REDUCED_SIDE_PX, REDUCED_SIDE_PX))
+            small = opened.convert("RGB")
+            small.thumbnail((REDUCED_SIDE_PX, REDUCED_SIDE_PX))
+            small.save(out, "JPEG", quality=85)
+    except (OSError, ValueError, Image.DecompressionBombError):
+        return None
+    return out.getvalue()

@@ -1,0 +1,197 @@
+"""Dispersion: how far a pose moves when one of its references is left out.
+
+The errors of a reference, of its pose, its lens model and its shutter, are shared by all points that it shows. A sum
+over residuals takes them for independent, and says that a thousand matches are as good as a thousand measurements. The
+jackknife over references (Quenouille; Efron and Tibshirani 1993, chapter 11) does not: from the poses q_(i) without
+reference i, i = 1 ... K,
+
+    C = (K - 1) / K sum_i (q_(i) - mean) (q_(i) - mean)^T
+
+is the covariance of the pose due to its references, whatever goes together within each of them.
+
+Solving K times would cost K times the adjustment, so each q_(i) is one Gauss-Newton step away. Let point p be seen by
+the query with weight w, derivatives A by the point and J by the pose, and residual r; and by the references with
+information C_p = sum_o w_o A_o^T A_o and gradient h_p = sum_o w_o A_o^T r_o. Eliminating the point leaves to the pose
+
+    W = w - w^2 A T^-1 A^T,    u = w (r - A T^-1 (h_p + w A^T r)),    T = C_p + w A^T A,
+
+the information J^T W J and the gradient J^T u. Leaving out reference i takes its share away from C_p and h_p, which
+changes W and u of the points that it shows and of no others; so each (point, reference) pair costs the inverse of one
+3 x 3 matrix and the K steps one product of matrices.
+
+Residuals of the references are those with their poses as given: an adjustment that moves references to where they agree
+would otherwise hide what is looked for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array
+
+MIN_DETERMINANT = 1e-10
+"""Of a point's information, by the cube of its largest diagonal element: below, the point is unknown in some direction
+and tells nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Observations of points, linearized; residuals and derivatives in standard deviations.
+
+    Attributes:
+        point: (N,) which of the points; any numbers that are the same for query and references.
+        by_point: (N, 2, 3) derivative of the residual by the point, per metre.
+        residual: (N, 2).
+        weight: (N,) of the squared residual.
+    """
+
+    point: NDArray[np.intp]
+    by_point: Array
+    residual: Array
+    weight: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What a pose, or poses that are solved for together, rest on.
+
+    Attributes:
+        query: what the photograph, or photographs, to be posed see. A point seen twice counts as two points.
+        by_pose: (N, 2, U) derivative of its residuals by the U unknowns.
+        references: what the references see of the same points, with their poses as given.
+        reference: (M,) which of the references, from 0.
+        reference_count: K.
+    """
+
+    query: Sightings
+    by_pose: Array
+    references: Sightings
+    reference: NDArray[np.intp]
+    reference_count: int
+
+
+@dataclass(frozen=True, eq=False)
+class Dispersion:
+    """How poses without one reference differ.
+
+    Attributes:
+        information: (U, U) of the pose, points eliminated and the references held where they are.
+        motions: (K, U) from the pose with all references to the one without the i-th.
+    """
+
+    information: Array
+    motions: Array
+
+    @property
+    def covariance(self) -> Array:
+        """(U, U) by the jackknife; zero with one reference, which has nothing to differ from."""
+        count = len(self.motions)
+        centred = self.motions - self.motions.mean(axis=0)
+        return np.asarray((count - 1) / count * centred.T @ centred)
+
+
+def disperse(evidence: Evidence) -> Dispersion | None:
+    """Leaves out one reference at a time; None where what is left without one of them determines no pose."""
+    seen, query = evidence.references, evidence.query
+    size = 1 + int(max(query.point.max(initial=0), seen.point.max(initial=0)))
+    of_seen, pull = _information(seen), _gradient(seen)
+    of_point = np.stack([np.bincount(seen.point, row, size) for row in of_seen])
+    pull_of_point = np.stack([np.bincount(seen.point, row, size) for row in pull])
+
+    everything = _eliminate(query, of_point[:, query.point], pull_of_point[:, query.point])
+    row, other = _pairs(query.point, seen.point, size)
+    point = query.point[row]
+    some = Sightings(point, query.by_point[row], query.residual[row], query.weight[row])
+    without = _eliminate(some, of_point[:, point] - of_seen[:, other], pull_of_point[:, point] - pull[:, other])
+    change = np.zeros((evidence.reference_count, 5, len(query.point)))
+    # A point is seen once by a reference: no pair falls upon another.
+    change[evidence.reference[other], :, row] = (without - everything[:, row]).T
+    return _steps(evidence.by_pose, everything, change)
+
+
+def _steps(by_pose: Array, everything: Array, change: Array) -> Dispersion | None:
+    """From each observation's W and u (5, N), and their change (K, 5, N) without each reference."""
+    unknowns = by_pose.shape[2]
+    x, y = by_pose[:, 0], by_pose[:, 1]
+    mixed = x[:, :, None] * y[:, None, :]
+    squares = np.concatenate([x[:, :, None] * x[:, None, :], mixed + np.swapaxes(mixed, 1, 2), y[:, :, None] * y[:, None, :]])
+    squares = squares.reshape(-1, unknowns**2)
+    slopes = np.concatenate([x, y])
+    information = (everything[:3].reshape(1, -1) @ squares).reshape(unknowns, unknowns)
+    gradient = everything[3:].reshape(1, -1) @ slopes
+    count = len(change)
+    informations = information + (change[:, :3].reshape(count, -1) @ squares).reshape(count, unknowns, unknowns)
+    gradients = gradient + change[:, 3:].reshape(count, -1) @ slopes
+    try:
+        motions = np.linalg.solve(information, gradient[0]) - np.linalg.solve(informations, gradients[:, :, None])[..., 0]
+    except np.linalg.LinAlgError:
+        return None
+    return Dispersion(information, motions) if np.isfinite(motions).all() else None
+
+
+def _pairs(query_point: NDArray[np.intp], seen_point: NDArray[np.intp], size: int) -> tuple[NDArray[np.intp], ...]:
+    """Rows of the query and rows of the references that show the same point."""
+    order = np.argsort(seen_point, kind="stable")
+    counts = np.bincount(seen_point, minlength=size)
+    starts = np.cumsum(counts) - counts
+    times = counts[query_point]
+    row = np.repeat(np.arange(len(query_point)), times)
+    first = np.repeat(starts[query_point] - (np.cumsum(times) - times), times)
+    return row, order[first + np.arange(len(row))]
+
+
+def _eliminate(query: Sightings, information: Array, gradient: Array) -> Array:
+    """W_xx, W_xy, W_yy, u_x, u_y (5, N) of observations whose points have this information (6, N) and gradient (3, N).
+
+    Zero where a point is not determined even with the query's own observation.
+    """
+    weight = query.weight
+    inverse = _inverse(information + _information(query))
+    pull = gradient + _gradient(query)
+    a, b = query.by_point[:, 0].T, query.by_point[:, 1].T
+    inverse_a, inverse_b = _times(inverse, a), _times(inverse, b)
+    squared = weight**2
+    result = np.stack(
+        [
+            weight - squared * (a * inverse_a).sum(axis=0),
+            -squared * (b * inverse_a).sum(axis=0),
+            weight - squared * (b * inverse_b).sum(axis=0),
+            weight * (query.residual[:, 0] - (inverse_a * pull).sum(axis=0)),
+            weight * (query.residual[:, 1] - (inverse_b * pull).sum(axis=0)),
+        ]
+    )
+    return np.where(np.isfinite(result).all(axis=0), result, 0.0)
+
+
+def _information(sightings: Sightings) -> Array:
+    """W A^T A of each, its elements xx, yy, zz, xy, xz, yz (6, N)."""
+    x, y, z = np.moveaxis(sightings.by_point, 2, 0)  # (N, 2) each
+    pairs = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
+    return np.stack([sightings.weight * (p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1]) for p, q in pairs])
+
+
+def _gradient(sightings: Sightings) -> Array:
+    """W A^T r of each, (3, N)."""
+    weighted = sightings.residual * sightings.weight[:, None]
+    return np.asarray((sightings.by_point * weighted[:, :, None]).sum(axis=1).T)
+
+
+def _inverse(matrices: Array) -> Array:
+    """Of symmetric matrices, elements as in `_information`; NaN where singular. One array an element: it is faster."""
+    xx, yy, zz, xy, xz, yz = matrices
+    adjugate = np.stack(
+        [yy * zz - yz**2, xx * zz - xz**2, xx * yy - xy**2, xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz]
+    )
+    determinant = xx * adjugate[0] + xy * adjugate[3] + xz * adjugate[4]
+    solvable = determinant > MIN_DETERMINANT * np.maximum(np.maximum(xx, yy), zz) ** 3
+    return np.asarray(adjugate / np.where(solvable, determinant, np.nan))
+
+
+def _times(matrices: Array, vectors: Array) -> Array:
+    """Symmetric matrices (6, N) by vectors (3, N)."""
+    xx, yy, zz, xy, xz, yz = matrices
+    x, y, z = vectors
+    return np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])

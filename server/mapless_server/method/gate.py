@@ -1,0 +1,137 @@
+"""Whether a pose is one at all: what wrong matches alone could support as well is not.
+
+Wrong matches must not be expected to support a pose so well (a-contrario model estimation, Moisan and Stival 2004), and
+repeated texture, whose wrong matches do agree with each other, is told by two things that a true pose has and it has
+not: what should be seen is found, and not in one corner only.
+
+This is the coarse sieve, before anything dear is computed; how far to trust what passes it is the judge's (`judge`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+from scipy.special import gammaln
+
+from mapless.geometry import Camera, RigidTransform
+
+from .match import PointMatches
+from .structure import Structure
+from .views import View
+
+
+@dataclass(frozen=True)
+class GateOptions:
+    """Options of the gate.
+
+    Attributes:
+        max_log10_false_alarms: a pose is one when fewer than 10 to this power poses supported as well are expected
+            from wrong matches.
+        min_found_share: least share of the points inside the image that are inliers. Of 200 photographs posed rightly,
+            hard ones among them, the worst had 0.10; of those posed wrongly by chance or repetition most had 0.01.
+        enough_inliers: so many are believed whatever else should be visible: with many references the structure reaches
+            far beyond what one photograph can show. Repetition has fooled no more than 23.
+        min_hull_share: least share of the image that the inliers' convex hull covers. On the same photographs the worst
+            right one had 0.08; a repeated floor tile that fooled 16 matches had 0.03.
+    """
+
+    max_log10_false_alarms: float = -3.0
+    min_found_share: float = 0.08
+    enough_inliers: int = 100
+    min_hull_share: float = 0.04
+
+    def __post_init__(self) -> None:
+        shares = (self.min_found_share, self.min_hull_share)
+        if np.isnan(self.max_log10_false_alarms) or not 0 <= min(shares) <= max(shares) < 1:
+            raise ValueError(f"senseless options: {self}")
+
+
+def doubts(
+    query: View,
+    structure: Structure,
+    matches: PointMatches,
+    world_from_camera: RigidTransform,
+    inliers: NDArray[np.bool_],
+    inlier_px: float,
+    options: GateOptions,
+    log10_chance: float = 0.0,
+) -> str | None:
+    """What speaks against a pose, in one sentence; None if nothing does.
+
+    Args:
+        query: the photograph.
+        structure: metric points.
+        matches: of the query with them.
+        world_from_camera: the pose.
+        inliers: (M,) which of the matches agree with it; at least four.
+        inlier_px: within which they do.
+        options: see there.
+        log10_chance: how improbable it is that a pose found by chance agrees with what is known of it (see `priors`).
+    """
+    expected = log10_false_alarms(query.camera, matches, inliers, inlier_px) + log10_chance
+    count = f"{inliers.sum()} of {len(matches)} matches agree on a pose"
+    if expected > options.max_log10_false_alarms:
+        return f"{count}, which chance could do ({told_false_alarms(expected)})"
+    visible = visible_count(query.camera, structure, world_from_camera)
+    if inliers.sum() < min(options.min_found_share * visible, options.enough_inliers):
+        return f"{count}, but it should show {visible} points: repeated structure somewhere else, most likely"
+    covered = hull_share(query, matches, inliers)
+    if covered < options.min_hull_share:
+        return f"{count}, but they cover only {100 * covered:.1f} % of the image"
+    return None
+
+
+def visible_count(camera: Camera, structure: Structure, world_from_camera: RigidTransform) -> int:
+    """Points of the structure that lie inside the image; behind what, nobody knows."""
+    size = np.array([camera.width_px, camera.height_px])
+    projected = camera.project(world_from_camera.inverse().apply(structure.x_in_world))
+    return int(((projected >= -0.5) & (projected < size - 0.5)).all(axis=1).sum())
+
+
+def hull_share(query: View, matches: PointMatches, inliers: NDArray[np.bool_]) -> float:
+    """Share of the image that the convex hull of the inliers (M,), three or more, covers."""
+    pixels = query.features.keypoints[matches.keypoint[inliers]]
+    return float(ConvexHull(pixels, qhull_options="QJ").volume) / (query.camera.width_px * query.camera.height_px)
+
+
+def log10_false_alarms(camera: Camera, matches: PointMatches, inliers: NDArray[np.bool_], inlier_px: float) -> float:
+    """Expected number, as a power of ten, of poses that random matches would support as well.
+
+    Matches found in the whole image hit an inlier's disc by chance with its share of the image; matches searched within
+    a radius with its share of that circle. The stronger of the two groups decides.
+    """
+    disc = inlier_px**2
+    area = camera.width_px * camera.height_px / np.pi
+    guided = matches.guided
+    return min(
+        false_alarms(int((~guided).sum()), int((inliers & ~guided).sum()), disc / area),
+        false_alarms(int(guided.sum()), int((inliers & guided).sum()), disc / max(matches.radius_px**2, disc)),
+    )
+
+
+def false_alarms(match_count: int, inlier_count: int, chance: float) -> float:
+    """log10 of (n - 3) C(n, k) C(k, 3) p^(k - 3), at least k of n matches agreeing with a pose through three of them.
+
+    Args:
+        match_count: n.
+        inlier_count: k.
+        chance: p, the probability that a wrong match agrees.
+    """
+    n, k = match_count, inlier_count
+    if k <= 3 or chance >= 1:
+        return np.inf
+    return float((np.log(n - 3) + _log_choose(n, k) + _log_choose(k, 3) + (k - 3) * np.log(chance)) / np.log(10))
+
+
+def told_false_alarms(log10_expected: float) -> str:
+    """The number for a person; three matches agree with a pose by construction, which no number tells."""
+    if log10_expected == np.inf:
+        return "any number of such poses expected"
+    return f"10^{log10_expected:.1f} such poses expected"
+
+
+def _log_choose(n: int, k: int) -> float:
+    return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))

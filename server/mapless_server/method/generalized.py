@@ -1,0 +1,175 @@
+"""Poses of several cameras as one: generalized PnP, by PoseLib.
+
+A generalized camera is a bundle of rays that do not meet: those of all cameras, in the frame that they are fixed to.
+Its pose is found from three 2D-3D matches (gp3p), wherever they come from, and with the unit of that frame from four
+(gp4ps):
+
+    lambda_i d_i + s p_i = rig_from_world x_i
+
+for a match's ray from p_i in the direction d_i, in the frame's unit, and its point x_i in metres; s is metres per unit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, Camera, RigidTransform, Similarity
+
+from .pnp import PnpOptions, reprojection_errors_px
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMatches:
+    """One camera of several, and its matches.
+
+    Attributes:
+        camera: pinhole.
+        rig_from_camera: where it is fixed; metres, or units of the frame that it is fixed to.
+        pixels: (M, 2) seen there.
+        x_in_world: (M, 3) metres.
+    """
+
+    camera: Camera
+    rig_from_camera: RigidTransform
+    pixels: Array
+    x_in_world: Array
+
+    def inliers(self, world_from_rig: RigidTransform | Similarity, inlier_px: float) -> NDArray[np.bool_]:
+        """Which of the matches (M,) agree with a pose."""
+        pose = camera_in_world(world_from_rig, self.rig_from_camera)
+        return reprojection_errors_px(self.camera, pose, self.x_in_world, self.pixels) < inlier_px
+
+    def thinned(self, step: int) -> CameraMatches:
+        """Every so manieth match."""
+        return CameraMatches(self.camera, self.rig_from_camera, self.pixels[::step], self.x_in_world[::step])
+
+
+def camera_in_world(world_from_rig: RigidTransform | Similarity, rig_from_camera: RigidTransform) -> RigidTransform:
+    """``world_from_camera``, metric."""
+    if isinstance(world_from_rig, Similarity):
+        return world_from_rig.transform_pose(rig_from_camera)
+    return world_from_rig.compose(rig_from_camera)
+
+
+def inlier_count(
+    cameras: Sequence[CameraMatches], world_from_rig: RigidTransform | Similarity, inlier_px: float
+) -> int:
+    """Matches of all cameras that agree with a pose."""
+    return sum(int(camera.inliers(world_from_rig, inlier_px).sum()) for camera in cameras)
+
+
+def rig_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> RigidTransform | None:
+    """``world_from_rig`` by gp3p in RANSAC with a final Cauchy refinement; None without a finite pose.
+
+    The same matches give the same pose.
+    """
+    cameras = _bounded(cameras, options.max_matches)
+    if sum(len(camera.pixels) for camera in cameras) < 3:
+        return None
+    pose, _ = poselib.estimate_generalized_absolute_pose(
+        [camera.pixels for camera in cameras],
+        [camera.x_in_world for camera in cameras],
+        [_poselib_pose(camera.rig_from_camera.inverse()) for camera in cameras],
+        [_poselib_camera(camera.camera) for camera in cameras],
+        {
+            "max_reproj_error": options.inlier_px,
+            "min_iterations": options.min_iterations,
+            "max_iterations": options.max_iterations,
+            "seed": 0,
+        },
+        {"loss_type": "CAUCHY", "loss_scale": options.loss_scale_px},
+    )
+    return _world_from_rig(pose)
+
+
+def scaled_ransac(
+    cameras: Sequence[CameraMatches], options: PnpOptions, max_iterations: int, max_matches: int
+) -> Similarity | None:
+    """The similarity ``world_from_rig`` by gp4ps in a RANSAC of our own: PoseLib has the solver, but no estimator.
+
+    Args:
+        cameras: with `rig_from_camera` in a unit of its own.
+        options: what agrees.
+        max_iterations: samples at the most; a good pose found early ends it sooner.
+        max_matches: that poses are tried on; evenly thinned.
+
+    Returns:
+        The pose with the most inliers among those of the samples; None where there is none. A scale below or equal to
+        zero, or one that no camera's motion tells (they all stand at one place), is no pose.
+    """
+    cameras = _bounded(cameras, max_matches)
+    rays = np.concatenate([_rays(camera) for camera in cameras])
+    starts = np.concatenate(
+        [np.broadcast_to(camera.rig_from_camera.translation, (len(camera.pixels), 3)) for camera in cameras]
+    )
+    points = np.concatenate([camera.x_in_world for camera in cameras])
+    owner = np.repeat(np.arange(len(cameras)), [len(camera.pixels) for camera in cameras])
+    if len(points) < 4 or len(np.unique(owner)) < 2:
+        return None
+    random, best, best_count, needed = np.random.default_rng(0), None, 3, max_iterations
+    for iteration in range(max_iterations):
+        if iteration >= needed:
+            break
+        sample = random.choice(len(points), 4, replace=False)
+        if len(np.unique(owner[sample])) < 2:
+            continue
+        for pose, scale in zip(*poselib.gp4ps(starts[sample], rays[sample], points[sample], True), strict=True):
+            world_from_rig = _similarity(pose, scale)
+            count = inlier_count(cameras, world_from_rig, options.inlier_px) if world_from_rig else 0
+            if count > best_count:
+                best, best_count = world_from_rig, count
+                needed = _iterations_needed(count / len(points))
+    return best
+
+
+def _iterations_needed(inlier_share: float) -> int:
+    """Until four of four are inliers with a probability of 99.9 %, and half of the samples are of one camera alone."""
+    good = inlier_share**4 / 2
+    return 2 if good >= 1 else math.ceil(math.log(1e-3) / math.log1p(-good))
+
+
+def _bounded(cameras: Sequence[CameraMatches], max_matches: int) -> list[CameraMatches]:
+    step = -(-sum(len(camera.pixels) for camera in cameras) // max_matches)
+    return [camera.thinned(max(1, step)) for camera in cameras]
+
+
+def _rays(camera: CameraMatches) -> Array:
+    """Unit directions (M, 3) in the rig's axes."""
+    rays = camera.camera.rays(camera.pixels) @ camera.rig_from_camera.rotation.T
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def _similarity(pose: poselib.CameraPose, scale: float) -> Similarity | None:
+    world_from_rig = _world_from_rig(pose)
+    if world_from_rig is None or not (math.isfinite(scale) and scale > 0):
+        return None
+    return Similarity(scale, world_from_rig.rotation, world_from_rig.translation)
+
+
+def _world_from_rig(pose: poselib.CameraPose) -> RigidTransform | None:
+    rotation, translation = np.asarray(pose.R), np.asarray(pose.t)
+    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+        return None
+    return RigidTransform(rotation, translation).inverse()
+
+
+def _poselib_pose(target_from_source: RigidTransform) -> poselib.CameraPose:
+    q = target_from_source.quaternion()
+    pose = poselib.CameraPose()
+    pose.q, pose.t = np.array([q.w, q.x, q.y, q.z]), target_from_source.translation
+    return pose
+
+
+def _poselib_camera(camera: Camera) -> dict[str, object]:
+    return {
+        "model": "PINHOLE",
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "params": [camera.focal_x_px, camera.focal_y_px, camera.principal_x_px, camera.principal_y_px],
+    }

@@ -1,0 +1,181 @@
+"""Several photographs that are to be posed together: what each of them knows, in one common world.
+
+A photograph that could not be localized by itself has matches all the same, and together they may be enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform
+
+from .answer import Answer, Localization
+from .gate import GateOptions, false_alarms, hull_share, told_false_alarms, visible_count
+from .generalized import CameraMatches
+from .match import MatchOptions, PointMatches, search
+from .rejection import Rejection, RejectionReason
+from .structure import Structure
+from .support import Support
+from .views import PosedView, View
+
+
+@dataclass(frozen=True, eq=False)
+class GroupImage:
+    """A photograph of a group and what the method says of it alone.
+
+    Attributes:
+        answer: its own; `support` is what counts, where there is any.
+        match: how it is matched with points near where they should be.
+    """
+
+    answer: Answer
+    match: MatchOptions
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """A photograph with matches, in the world of its group.
+
+    Attributes:
+        image: which of the group's.
+        query: the photograph.
+        references: in the order that the structure's tracks number them.
+        structure: metric points.
+        tracked: matches that do not rest on a pose of the photograph.
+        own_pose: world_from_camera that the photograph alone is answered with; None if it is rejected.
+        match: see GroupImage.
+    """
+
+    image: int
+    query: View
+    references: tuple[PosedView, ...]
+    structure: Structure
+    tracked: PointMatches
+    own_pose: RigidTransform | None
+    match: MatchOptions
+
+    def camera_matches(self, rig_from_camera: RigidTransform) -> CameraMatches:
+        """The tracked matches as pixels and points, of a camera that is fixed there."""
+        pixels = self.query.features.keypoints[self.tracked.keypoint].astype(np.float64)
+        return CameraMatches(self.query.camera, rig_from_camera, pixels, self.structure.x_in_world[self.tracked.point])
+
+    def matches_at(self, world_from_camera: RigidTransform) -> PointMatches:
+        """The tracked matches, and those that are found near where a pose says."""
+        found = search(self.query, self.references, self.structure, world_from_camera, self.tracked, self.match)
+        return PointMatches(
+            np.concatenate([self.tracked.point, found.point]),
+            np.concatenate([self.tracked.keypoint, found.keypoint]),
+            np.concatenate([self.tracked.guided, found.guided]),
+            self.match.radius_px,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedSighting:
+    """A sighting, its matches under the pose of the group, and which of them agree.
+
+    Attributes:
+        sighting: see there.
+        world_from_camera: where the group's pose puts it.
+        matches: of the photograph with the points.
+        inliers: (M,) which agree.
+        errors_px: (M,) reprojection errors; NaN for points behind the camera.
+    """
+
+    sighting: Sighting
+    world_from_camera: RigidTransform
+    matches: PointMatches
+    inliers: NDArray[np.bool_]
+    errors_px: Array
+
+    def inliers_by_reference(self) -> tuple[int, ...]:
+        """Per reference, inliers on points that it observes."""
+        structure, count = self.sighting.structure, len(self.sighting.references)
+        agreeing = np.zeros(len(structure.x_in_world), bool)
+        agreeing[self.matches.point[self.inliers]] = True
+        seen = structure.tracks.view[agreeing[structure.tracks.point]]
+        return tuple(np.bincount(seen, minlength=count).tolist())
+
+
+def sightings_of(images: Sequence[GroupImage]) -> tuple[Array, list[Sighting]]:
+    """The photographs that have matches, and the origin (3,) of their common world, metres, in the caller's."""
+    with_matches = [
+        (i, image, image.answer.support)
+        for i, image in enumerate(images)
+        if image.answer.support is not None and len(image.answer.support.matches)
+    ]
+    if not with_matches:
+        return np.zeros(3), []
+    origin = with_matches[0][2].origin
+    return origin, [_sighting(i, image, support, origin) for i, image, support in with_matches]
+
+
+def _sighting(index: int, image: GroupImage, support: Support, origin: Array) -> Sighting:
+    offset = support.origin - origin
+    outcome = image.answer.outcome
+    structure = replace(support.structure, x_in_world=support.structure.x_in_world + offset)
+    references = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(offset)) for r in support.references)
+    # Found near where a pose that was not believed put them, they would speak for that pose.
+    guided = support.matches.guided
+    kept = np.flatnonzero(~guided) if not guided.all() or isinstance(outcome, Rejection) else np.arange(len(guided))
+    tracked = PointMatches(
+        support.matches.point[kept], support.matches.keypoint[kept], guided[kept], support.matches.radius_px
+    )
+    own_pose = outcome.world_from_camera.shifted(-origin) if isinstance(outcome, Localization) else None
+    return Sighting(index, support.query, references, structure, tracked, own_pose, image.match)
+
+
+def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
+    """Of a group none of whose photographs has matches: that of the one that came furthest."""
+    order = list(RejectionReason)
+    told = [(i, image.answer.outcome) for i, image in enumerate(images)]
+    rejected = [(order.index(outcome.reason), i, outcome) for i, outcome in told if isinstance(outcome, Rejection)]
+    if not rejected:
+        return Rejection(RejectionReason.TOO_FEW_MATCHES, "no image has 2D-3D matches")
+    _, i, furthest = max(rejected, key=lambda it: (it[0], -it[1]))
+    return Rejection(furthest.reason, f"no image has 2D-3D matches; image {i}: {furthest.message}")
+
+
+def group_doubts(matched: Sequence[MatchedSighting], inlier_px: float, options: GateOptions) -> str | None:
+    """What speaks against the pose of a group, in one sentence; None if nothing does. `gate.doubts` of the sums."""
+    inlier_total = sum(int(it.inliers.sum()) for it in matched)
+    count = (
+        f"{inlier_total} of {sum(len(it.matches) for it in matched)} matches in {len(matched)} images agree on a pose"
+    )
+    expected = group_log10_false_alarms(matched, inlier_px)
+    if expected > options.max_log10_false_alarms:
+        return f"{count}, which chance could do ({told_false_alarms(expected)})"
+    visible = sum(
+        visible_count(it.sighting.query.camera, it.sighting.structure, it.world_from_camera) for it in matched
+    )
+    if inlier_total < min(options.min_found_share * visible, options.enough_inliers):
+        return f"{count}, but they should show {visible} points: repeated structure somewhere else, most likely"
+    shares = (hull_share(it.sighting.query, it.matches, it.inliers) for it in matched if it.inliers.sum() >= 3)
+    covered = sum(shares)
+    if covered < options.min_hull_share:
+        return f"{count}, but they cover only {100 * covered:.1f} % of an image"
+    return None
+
+
+def group_log10_false_alarms(matched: Sequence[MatchedSighting], inlier_px: float) -> float:
+    """`gate.log10_false_alarms` of all matches together, each taken to hit by chance as easily as the easiest."""
+    disc = inlier_px**2
+    expected = []
+    for guided in (False, True):
+        total = sum(int((it.matches.guided == guided).sum()) for it in matched)
+        agreeing = sum(int((it.inliers & (it.matches.guided == guided)).sum()) for it in matched)
+        areas = [_searched_area(it, guided) for it in matched]
+        expected.append(false_alarms(total, agreeing, disc / max(min(areas), disc)))
+    return min(expected)
+
+
+def _searched_area(matched: MatchedSighting, guided: bool) -> float:
+    """In which a match was searched, square pixels over pi."""
+    if guided:
+        return matched.matches.radius_px**2
+    camera = matched.sighting.query.camera
+    return camera.width_px * camera.height_px / np.pi

@@ -1,0 +1,177 @@
+"""What to do about a rejection: which stage could not do its work, what it lacked, and where to look.
+
+A hint is read off the answer's own numbers: how many features the photograph has, how many of them each reference
+shares, how many of these agree on a pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .answer import Answer
+from .rejection import Advice, Hint, Rejection, RejectionReason
+from .views import PosedView, View
+
+_STAGES = {
+    RejectionReason.NO_USABLE_REFERENCES: "coarse",
+    RejectionReason.DEGENERATE_REFERENCES: "coarse",
+    RejectionReason.LOW_TEXTURE: "",
+    RejectionReason.LOW_OVERLAP: "coarse",
+    RejectionReason.SCALE_UNRELIABLE: "scale",
+    RejectionReason.TOO_FEW_MATCHES: "match",
+    RejectionReason.PNP_FAILED: "pnp",
+    RejectionReason.GATE: "judge",
+    RejectionReason.AMBIGUOUS: "judge",
+    RejectionReason.PRIOR_CONFLICT: "judge",
+}
+
+
+@dataclass(frozen=True)
+class HintOptions:
+    """Options of the hints.
+
+    Attributes:
+        few_features: a photograph with fewer is dark, blurred or shows nothing; sharp ones have 500 to 2048.
+        few_matches: references of another place share fewer features with a photograph by chance.
+        many_matches: so many with one reference are no chance; if they still agree on no pose, numbers are wrong.
+    """
+
+    few_features: int = 200
+    few_matches: int = 30
+    many_matches: int = 100
+
+    def __post_init__(self) -> None:
+        if not self.few_features >= 0 or not 0 < self.few_matches <= self.many_matches:
+            raise ValueError(f"senseless options: {self}")
+
+
+@dataclass(frozen=True)
+class _Case:
+    """What a hint is read off.
+
+    Attributes:
+        rejection: what was answered.
+        features: of the photograph.
+        matches: of the best reference with it.
+        inliers: of all its matches with points, those that agree on a pose.
+        tried: matches with points.
+        best: the best reference's name; None if none shares anything.
+        reference_count: how many were used.
+        has_prior: whether the caller said where the camera is.
+    """
+
+    rejection: Rejection
+    features: int
+    matches: int
+    inliers: int
+    tried: int
+    best: str | None
+    reference_count: int
+    has_prior: bool
+
+
+def hinted(
+    answer: Answer,
+    query: View,
+    references: Sequence[PosedView],
+    has_prior: bool = False,
+    options: HintOptions | None = None,
+) -> Answer:
+    """The answer, with a hint if it is a rejection that has none yet.
+
+    Args:
+        answer: of the method.
+        query: the photograph.
+        references: that were used, in the order of the answer's counts.
+        has_prior: whether the caller said where the camera is, or which way it looks.
+        options: see there.
+    """
+    rejection = answer.outcome
+    if not isinstance(rejection, Rejection) or rejection.hint is not None:
+        return answer
+    estimate = answer.support.estimate if answer.support else None
+    counts = [answer.reference_inlier_counts, answer.reference_match_counts]
+    best = next((int(np.argmax(c)) for c in counts if any(c) and len(c) == len(references)), None)
+    case = _Case(
+        rejection,
+        len(query.features),
+        max(answer.reference_match_counts, default=0),
+        0 if estimate is None else int(estimate.inliers.sum()),
+        0 if answer.support is None else len(answer.support.matches),
+        None if best is None else references[best].name,
+        len(references),
+        has_prior,
+    )
+    advice, message = _advice(case, options or HintOptions())
+    hint = Hint(_stage(case), advice, message, case.best)
+    return replace(answer, outcome=replace(rejection, hint=hint))
+
+
+def _stage(case: _Case) -> str:
+    return _STAGES[case.rejection.reason] if case.reference_count else ""
+
+
+def _advice(case: _Case, options: HintOptions) -> tuple[Advice, str]:
+    reason = case.rejection.reason
+    if reason is RejectionReason.PRIOR_CONFLICT:
+        return Advice.CHECK_PRIOR, "Check the prior: the photograph itself says that the camera is elsewhere."
+    if reason is RejectionReason.AMBIGUOUS:
+        return (
+            Advice.TELL_PLACES_APART,
+            "Say where the camera is, or take a photograph that shows what tells the two places apart; if there is one "
+            "place only, check the references' poses.",
+        )
+    if reason is RejectionReason.LOW_TEXTURE:
+        return Advice.RETAKE_PHOTOGRAPH, _retake(case)
+    if reason is RejectionReason.DEGENERATE_REFERENCES:
+        return (
+            Advice.SPREAD_REFERENCES,
+            f"The {case.reference_count} references stand at one place: use some that stand apart from one another.",
+        )
+    if case.reference_count == 0 and case.has_prior:
+        return Advice.CHECK_PRIOR, "Check the prior: it leaves no reference."
+    if case.reference_count < 2:
+        return (
+            Advice.ADD_REFERENCES,
+            f"There {'is one reference' if case.reference_count else 'are no references'}: two at least are needed, "
+            "taken from different places.",
+        )
+    return _of_overlap(case, options)
+
+
+def _of_overlap(case: _Case, options: HintOptions) -> tuple[Advice, str]:
+    """The photograph and the references are usable by themselves, but do not come together."""
+    shared = f"the best reference shares {case.matches} of the photograph's {case.features} features"
+    if case.features < options.few_features:
+        return Advice.RETAKE_PHOTOGRAPH, _retake(case)
+    if case.rejection.reason in (RejectionReason.NO_USABLE_REFERENCES, RejectionReason.SCALE_UNRELIABLE):
+        return (
+            Advice.SPREAD_REFERENCES,
+            f"The {case.reference_count} references do not give depth together: use some that show the same things from "
+            "different places, and check their poses.",
+        )
+    if case.matches < options.few_matches:
+        return (
+            Advice.CHOOSE_OTHER_REFERENCES,
+            f"Use references that show what the photograph shows: {shared}, as chance does for another place.",
+        )
+    if case.matches >= options.many_matches and case.inliers < case.matches / 4:
+        agreeing = f"{case.inliers} of {case.tried} matches with points agree on a pose" if case.tried else "few agree"
+        return (
+            Advice.CHECK_CALIBRATION,
+            f"Check the photograph's intrinsics and the references' poses: {shared}, but {agreeing}.",
+        )
+    return (
+        Advice.LOOK_AT_REFERENCE,
+        f"Point the camera at what the best reference shows, or add references from nearer: {shared}.",
+    )
+
+
+def _retake(case: _Case) -> str:
+    return (
+        f"Take the photograph again, with more light, a still hand and something with texture in it: it has "
+        f"{case.features} local features."
+    )

@@ -1,0 +1,135 @@
+"""Accept or reject, at a stated share of right answers: never by a raw count alone.
+
+What speaks for a pose (`evidence`) makes a score, s = w . ln(evidence), monotone in each piece of evidence. From it
+follows the answer's *trust*: the share of right answers to photographs with known poses (the calibration's: off by no
+more than 10 cm and 5 degrees) that score at most as high. So accepting poses whose trust is at least 1 - c accepts the
+share c of right answers, whatever the score's own unit: trust is the p-value of "this is a right answer", as in
+conformal prediction (Vovk, Gammerman and Shafer 2005). It is no probability of being right, which would depend on how
+many of a caller's photographs show the place at all.
+
+Weights and quantiles come from `calibration.trust_fit`, which tells wrong poses (of other places, mirrored photographs,
+references with wrong poses, hardly any overlap) from right ones by logistic regression with weights of one sign.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .ambiguity import AmbiguityOptions, find_rival
+from .correspond import Matches
+from .evidence import FEATURES, Evidence, evidence_of
+from .rejection import Hypothesis, Rejection, RejectionReason
+from .support import Support
+
+LEVELS = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+LEVELS += (1.0,)
+"""Shares of the right answers, of which `JudgeOptions.scores` are the quantiles."""
+
+
+@dataclass(frozen=True)
+class JudgeOptions:
+    """Options of the judge.
+
+    Attributes:
+        weights: of each of `FEATURES`. Fitted; see the module.
+        scores: that the shares `LEVELS` of the right answers do not exceed.
+        ambiguity: of the search for a second place.
+    """
+
+    weights: tuple[float, ...] = (1.0,) * len(FEATURES)
+    scores: tuple[float, ...] = tuple(np.linspace(-2.0, 20.0, len(LEVELS)).tolist())
+    ambiguity: AmbiguityOptions = field(default_factory=AmbiguityOptions)
+
+    def __post_init__(self) -> None:
+        rising = all(a <= b for a, b in zip(self.scores, self.scores[1:], strict=False))
+        sizes = len(self.weights) == len(FEATURES) and len(self.scores) == len(LEVELS)
+        if not (sizes and rising and all(weight >= 0 for weight in self.weights)):
+            raise ValueError(f"senseless options: {self}")
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the judge says of a pose.
+
+    Attributes:
+        trust: 0 to 1; share of right answers that look at most as good.
+        evidence: what it rests on.
+        rejection: why the pose is not accepted; None if it is.
+    """
+
+    trust: float
+    evidence: Evidence
+    rejection: Rejection | None
+
+
+def judge(
+    support: Support,
+    query_matches: Sequence[Matches],
+    inlier_px: float,
+    coverage: float,
+    options: JudgeOptions,
+    log10_chance: float = 0.0,
+) -> Judgement:
+    """Judges the estimate of a support.
+
+    Args:
+        support: with an estimate that passed the gate.
+        query_matches: of the query with each reference.
+        inlier_px: within which matches agree with a pose.
+        coverage: share of right answers to accept, above 0 and at most 1.
+        options: see there.
+        log10_chance: how improbable it is that a pose found by chance agrees with what is known of it.
+
+    Returns:
+        The judgement. Rejections, in the support's world: AMBIGUOUS with both hypotheses where another place is
+        supported about as well, GATE where the trust is less than 1 - coverage.
+    """
+    evidence = evidence_of(support, inlier_px, log10_chance)
+    trust = trust_of(evidence, options)
+    hypotheses = find_rival(support, query_matches, options.ambiguity)
+    if hypotheses:
+        return Judgement(trust, evidence, _ambiguous(hypotheses))
+    if trust < 1 - coverage:
+        return Judgement(trust, evidence, _distrusted(evidence, trust, coverage))
+    return Judgement(trust, evidence, None)
+
+
+def score_of(evidence: Evidence, options: JudgeOptions) -> float:
+    """The larger, the more a pose looks like a right one."""
+    return float(evidence.features() @ np.array(options.weights))
+
+
+def trust_of(evidence: Evidence, options: JudgeOptions) -> float:
+    """Share of right answers whose score is at most this evidence's."""
+    return float(np.interp(score_of(evidence, options), options.scores, LEVELS))
+
+
+def _distrusted(evidence: Evidence, trust: float, coverage: float) -> Rejection:
+    message = (
+        f"of right answers {100 * trust:.1f} % look at most as good, less than the {100 * (1 - coverage):.3g} % that may "
+        f"be lost: {told(evidence)}"
+    )
+    return Rejection(RejectionReason.GATE, message)
+
+
+def told(evidence: Evidence) -> str:
+    """The evidence for a person."""
+    return (
+        f"{evidence.inlier_count} of {evidence.match_count} matches agree, {100 * evidence.found_share:.0f} % of the "
+        f"points that should be seen, over {100 * evidence.hull_share:.0f} % of the image, the position within "
+        f"{100 * evidence.relative_radius:.1f} % of the distance of what is seen"
+    )
+
+
+def _ambiguous(hypotheses: tuple[Hypothesis, Hypothesis]) -> Rejection:
+    first, second = sorted(hypotheses, key=lambda it: -it.inlier_count)
+    apart_m = math.dist(first.world_from_camera.translation, second.world_from_camera.translation)
+    message = (
+        f"two poses {apart_m:.2f} m apart explain the photograph: {first.inlier_count} keypoints agree with one by "
+        f"{len(first.references)} references, {second.inlier_count} with the other by {len(second.references)}"
+    )
+    return Rejection(RejectionReason.AMBIGUOUS, message, hypotheses=(first, second))

@@ -1,0 +1,140 @@
+"""Pose from 2D-3D matches whose points stay where they are, together with what is known of the pose beforehand.
+
+    min  sum_i rho(|u_i - pi(P, X_i)|^2 / sigma^2) + w sum_k r_k^T C_k^-1 r_k,    rho(s) = c^2 log(1 + s / c^2)
+
+(Cauchy's loss) over the pose alone, six unknowns, by Levenberg-Marquardt. PoseLib's own refinement knows no priors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian, rotation_from_vector
+
+from .priors import NO_PRIORS, Priors
+
+
+@dataclass(frozen=True)
+class PoseOnlyOptions:
+    """Options of the refinement.
+
+    Attributes:
+        sigma_px: standard deviation of a right match.
+        loss_scale_sigma: of the Cauchy loss.
+        prior_weight: w, how much less the matches know than they would if their errors were independent.
+        iterations: at most so many steps.
+        min_decrease: stop when a step lowers the cost by a smaller share.
+    """
+
+    sigma_px: float = 1.0
+    loss_scale_sigma: float = 1.4
+    prior_weight: float = 4.0
+    iterations: int = 10
+    min_decrease: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if not min(self.sigma_px, self.loss_scale_sigma, self.prior_weight, self.iterations, self.min_decrease) > 0:
+            raise ValueError(f"senseless options: {self}")
+
+
+def refine_pose(
+    camera: Camera,
+    x_in_world: Array,
+    pixels: Array,
+    world_from_camera: RigidTransform,
+    priors: Priors,
+    options: PoseOnlyOptions,
+) -> RigidTransform:
+    """The pose nearby with the least cost.
+
+    Args:
+        camera: pinhole.
+        x_in_world: (N, 3) points; those behind the camera to begin with take no part.
+        pixels: (N, 2) where they are seen.
+        world_from_camera: where to begin.
+        priors: those that are to pull.
+        options: see there.
+    """
+    in_front = world_from_camera.inverse().apply(x_in_world)[:, 2] > 0
+    problem = _Problem(camera, x_in_world[in_front], pixels[in_front], priors, options)
+    pose, cost, damping = world_from_camera, problem.cost(world_from_camera), 1e-4
+    gradient, hessian = problem.linearize(pose)
+    for _ in range(options.iterations):
+        damped = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
+        try:
+            step = -np.linalg.solve(damped, gradient)
+        except np.linalg.LinAlgError:  # fewer than three matches, and priors that leave something open
+            break
+        candidate = moved(pose, step)
+        candidate_cost = problem.cost(candidate)
+        if not candidate_cost < cost:
+            damping *= 10
+            continue
+        converged = cost - candidate_cost < options.min_decrease * cost
+        pose, cost, damping = candidate, candidate_cost, damping * 0.1
+        if converged:
+            break
+        gradient, hessian = problem.linearize(pose)
+    return pose
+
+
+def information(
+    camera: Camera, x_in_world: Array, pixels: Array, world_from_camera: RigidTransform, options: PoseOnlyOptions
+) -> Array:
+    """What the matches alone say of a pose, (6, 6): the inverse covariance of its error, were they independent."""
+    in_front = world_from_camera.inverse().apply(x_in_world)[:, 2] > 0
+    problem = _Problem(camera, x_in_world[in_front], pixels[in_front], NO_PRIORS, options)
+    return problem.linearize(world_from_camera)[1]
+
+
+def reprojection_errors_px(
+    camera: Camera, world_from_camera: RigidTransform, x_in_world: Array, pixels: Array
+) -> Array:
+    """Distances (M,) between pixels (M, 2) and where the points (M, 3) project; NaN behind the camera."""
+    projected = camera.project(world_from_camera.inverse().apply(x_in_world))
+    return np.asarray(np.linalg.norm(projected - pixels, axis=1))
+
+
+def moved(world_from_camera: RigidTransform, error: Array) -> RigidTransform:
+    """The pose after a shift and a turn (6,), x y z rx ry rz about fixed world axes."""
+    return RigidTransform(
+        rotation_from_vector(error[3:]) @ world_from_camera.rotation, world_from_camera.translation + error[:3]
+    )
+
+
+class _Problem:
+    """The cost and its derivatives by an error of the pose."""
+
+    def __init__(
+        self, camera: Camera, x_in_world: Array, pixels: Array, priors: Priors, options: PoseOnlyOptions
+    ) -> None:
+        self.camera, self.x_in_world, self.pixels = camera, x_in_world, pixels
+        self.priors, self.options = priors, options
+        self.focal = np.array([camera.focal_x_px, camera.focal_y_px])
+
+    def residuals(self, pose: RigidTransform) -> tuple[Array, Array]:
+        """Points in the camera (N, 3), and reprojection errors (N, 2) in standard deviations."""
+        x_in_camera = (self.x_in_world - pose.translation) @ pose.rotation
+        return x_in_camera, (self.camera.project(x_in_camera) - self.pixels) / self.options.sigma_px
+
+    def cost(self, pose: RigidTransform) -> float:
+        """NaN for a point behind the camera, which is no decrease."""
+        _, residual = self.residuals(pose)
+        scale = self.options.loss_scale_sigma**2
+        matched = scale * np.log1p((residual**2).sum(axis=1) / scale).sum()
+        return float(matched) + self.options.prior_weight * self.priors.cost(pose)
+
+    def linearize(self, pose: RigidTransform) -> tuple[Array, Array]:
+        x_in_camera, residual = self.residuals(pose)
+        weight = 1 / (1 + (residual**2).sum(axis=1) / self.options.loss_scale_sigma**2)
+        # x_in_camera = R^T (X - t): a shift of the camera moves it by -R^T, a turn w by R^T [X - t]x w.
+        by_camera_point = normalize_jacobian(x_in_camera) * (self.focal / self.options.sigma_px)[:, None]
+        by_point = by_camera_point @ pose.rotation.T  # (N, 2, 3)
+        lever = (self.x_in_world - pose.translation)[:, None, :]
+        jacobian = np.concatenate([-by_point, np.cross(by_point, lever)], axis=2).reshape(-1, 6)
+        weighted = jacobian * np.repeat(weight, 2)[:, None]
+        gradient, information = self.priors.gradient_and_information(pose)
+        w = self.options.prior_weight
+        return weighted.T @ residual.ravel() + w * gradient, weighted.T @ jacobian + w * information

@@ -1,0 +1,349 @@
+"""What is known of a pose before its photograph is looked at: position, gravity, heading, a previous pose.
+
+Each prior compares a pose with what was said of it: a residual r, its covariance C, and the derivative J of r by the
+pose's error, an error being a shift (x, y, z) and a turn (rx, ry, rz) about fixed world axes, as in the covariances of
+poses (ROS's order). Everything about priors is made of these three:
+
+    distance        m^2 = r^T (C + J Sigma J^T)^-1 r,    Sigma the covariance of a pose that was found without the prior
+    cost            r^T C^-1 r,                          which `adjust` and `pose_only` add to the reprojection errors
+    information     J^T C^-1 J,                          which sharpens the covariance of the answer.
+
+m^2 of a consistent prior follows a chi-square distribution. One further out than `CONFLICT_PROBABILITY` allows is in
+conflict with the photograph, and is not used: photographs lie less often than compasses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import TypeAlias
+
+import numpy as np
+from scipy.special import chdtri
+
+from mapless.geometry import Array, RigidTransform, cross_matrix
+
+CONFLICT_PROBABILITY = 1e-4
+"""A prior is in conflict if so few consistent ones are as far from the photograph's pose."""
+
+LEAST_NEWS = 0.1
+"""A prior that knows less than this share of what the photograph knows of the same is not used: it could lower no standard
+deviation by more than 5 %, and may be off by what its own does not say."""
+
+UNIT_TOLERANCE = 1e-6
+"""How far from one the length of a direction may be."""
+
+
+class PriorKind(str, Enum):
+    """What a prior says."""
+
+    POSITION = "position"
+    HEADING = "heading"
+    GRAVITY = "gravity"
+    POSE = "pose"
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """A prior compared with a pose.
+
+    Attributes:
+        residual: r, (n,).
+        jacobian: J, (n, 6): the derivative of r by an error of the pose.
+        covariance: C, (n, n), of r if the pose were the true one.
+    """
+
+    residual: Array
+    jacobian: Array
+    covariance: Array
+
+    @property
+    def cost(self) -> float:
+        """r^T C^-1 r."""
+        return float(self.residual @ np.linalg.solve(self.covariance, self.residual))
+
+    def gradient_and_information(self) -> tuple[Array, Array]:
+        """J^T C^-1 r (6,) and J^T C^-1 J (6, 6): half the cost's derivatives, Gauss-Newton's."""
+        weighted = np.linalg.solve(self.covariance, self.jacobian).T
+        return weighted @ self.residual, weighted @ self.jacobian
+
+    def squared_distance(self, pose_covariance: Array) -> float:
+        """m^2 with a pose's covariance (6, 6)."""
+        covariance = self.covariance + self.jacobian @ pose_covariance @ self.jacobian.T
+        return float(self.residual @ np.linalg.solve(covariance, self.residual))
+
+    def news(self, pose_covariance: Array) -> float:
+        """How much the prior knows of what it knows best, as a multiple of what a pose of covariance (6, 6) knows."""
+        known = self.jacobian @ pose_covariance @ self.jacobian.T
+        return float(np.abs(np.linalg.eigvals(np.linalg.solve(self.covariance, known))).max())
+
+
+@dataclass(frozen=True, eq=False)
+class PositionPrior:
+    """The camera's centre.
+
+    Attributes:
+        position: (3,) world, metres.
+        covariance: (3, 3) square metres.
+    """
+
+    position: Array
+    covariance: Array
+    kind = PriorKind.POSITION
+    degrees_of_freedom = 3
+
+    def __post_init__(self) -> None:
+        if not (np.shape(self.position) == (3,) and np.isfinite(self.position).all()):
+            raise ValueError(f"position must be three finite numbers, is {self.position}")
+        check_covariance(self.covariance, 3)
+
+    def term(self, world_from_camera: RigidTransform) -> Term:
+        """The shift from the prior: r = t - position."""
+        return Term(world_from_camera.translation - self.position, np.eye(3, 6), self.covariance)
+
+    def shifted(self, offset: Array) -> PositionPrior:
+        """The same in a world in which everything lies `offset` (3,) further."""
+        return replace(self, position=self.position + offset)
+
+
+@dataclass(frozen=True, eq=False)
+class DirectionPrior:
+    """A direction known both in the camera and in the world; the camera's turn about it stays unknown.
+
+    Attributes:
+        in_camera: (3,) unit length.
+        in_world: (3,) unit length.
+        sigma_deg: standard deviation about each of the two axes across it.
+    """
+
+    in_camera: Array
+    in_world: Array
+    sigma_deg: float
+    kind = PriorKind.GRAVITY
+    degrees_of_freedom = 2
+
+    def __post_init__(self) -> None:
+        for direction in (self.in_camera, self.in_world):
+            if not (np.shape(direction) == (3,) and abs(float(np.linalg.norm(direction)) - 1) < UNIT_TOLERANCE):
+                raise ValueError(f"a direction must have unit length, is {direction}")
+        if not 0 < self.sigma_deg <= 180:
+            raise ValueError(f"sigma must be above 0 and at most 180 degrees, is {self.sigma_deg}")
+
+    @property
+    def sigma(self) -> float:
+        """In radians."""
+        return math.radians(self.sigma_deg)
+
+    def term(self, world_from_camera: RigidTransform) -> Term:
+        """The chord r = R in_camera - in_world: as long as the angle while that is small, and longest where opposite.
+
+        It has three numbers, but none along the direction itself, so two degrees of freedom.
+        """
+        turned = world_from_camera.rotation @ self.in_camera
+        jacobian = np.concatenate([np.zeros((3, 3)), -cross_matrix(turned)], axis=1)
+        return Term(turned - self.in_world, jacobian, self.sigma**2 * np.eye(3))
+
+    def shifted(self, offset: Array) -> DirectionPrior:
+        """Directions do not shift."""
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class GravityPrior(DirectionPrior):
+    """Down, the way things fall."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeadingPrior(DirectionPrior):
+    """Where the optical axis points.
+
+    Attributes:
+        in_camera: (0, 0, 1).
+    """
+
+    kind = PriorKind.HEADING
+
+    @staticmethod
+    def looking(in_world: Array, sigma_deg: float) -> HeadingPrior:
+        """The optical axis points along `in_world` (3,), unit length."""
+        return HeadingPrior(np.array([0.0, 0.0, 1.0]), in_world, sigma_deg)
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """The whole pose: a previous answer, carried on by what the device tracked.
+
+    Attributes:
+        world_from_camera: metric.
+        covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians.
+    """
+
+    world_from_camera: RigidTransform
+    covariance: Array
+    kind = PriorKind.POSE
+    degrees_of_freedom = 6
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.world_from_camera.matrix()).all():
+            raise ValueError("the pose must be finite")
+        check_covariance(self.covariance, 6)
+
+    def term(self, world_from_camera: RigidTransform) -> Term:
+        """The motion from the prior: r = (t - t_prior, Log(R R_prior^T))."""
+        turn = rotation_vector(world_from_camera.rotation @ self.world_from_camera.rotation.T)
+        shift = world_from_camera.translation - self.world_from_camera.translation
+        jacobian = np.eye(6)
+        jacobian[3:, 3:] = _log_jacobian(turn)
+        return Term(np.concatenate([shift, turn]), jacobian, self.covariance)
+
+    def shifted(self, offset: Array) -> PosePrior:
+        """The same in a world in which everything lies `offset` (3,) further."""
+        return replace(self, world_from_camera=self.world_from_camera.shifted(offset))
+
+
+Prior: TypeAlias = PositionPrior | HeadingPrior | GravityPrior | PosePrior
+
+
+@dataclass(frozen=True, eq=False)
+class PriorCheck:
+    """How the pose that the photograph alone gives compares with a prior.
+
+    Attributes:
+        kind: which prior.
+        mahalanobis: m, 0 and above.
+        degrees_of_freedom: of m^2.
+        conflict: whether the two contradict each other.
+        used: whether the prior took part in finding the pose: those in conflict do not, nor those that could add next to
+            nothing (`LEAST_NEWS`).
+    """
+
+    kind: PriorKind
+    mahalanobis: float
+    degrees_of_freedom: int
+    conflict: bool
+    used: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """All that is known of one pose; iterates over those that are there."""
+
+    position: PositionPrior | None = None
+    heading: HeadingPrior | None = None
+    gravity: GravityPrior | None = None
+    pose: PosePrior | None = None
+
+    def __iter__(self) -> Iterator[Prior]:
+        return iter([p for p in (self.position, self.heading, self.gravity, self.pose) if p is not None])
+
+    def __bool__(self) -> bool:
+        return any(True for _ in self)
+
+    def shifted(self, offset: Array) -> Priors:
+        """The same in a world in which everything lies `offset` (3,) further."""
+        return Priors(**{prior.kind.value: prior.shifted(offset) for prior in self})  # type: ignore[arg-type]
+
+    def without(self, kinds: frozenset[PriorKind]) -> Priors:
+        """All but those of these kinds."""
+        return Priors(**{prior.kind.value: prior for prior in self if prior.kind not in kinds})  # type: ignore[arg-type]
+
+    def check(self, world_from_camera: RigidTransform, covariance: Array) -> tuple[PriorCheck, ...]:
+        """Each prior against a pose that was found without any, and its covariance (6, 6)."""
+        checks = []
+        for prior in self:
+            term = prior.term(world_from_camera)
+            squared = term.squared_distance(covariance)
+            conflict = not squared <= conflict_threshold(prior.degrees_of_freedom)
+            used = not conflict and term.news(covariance) >= LEAST_NEWS
+            checks.append(PriorCheck(prior.kind, math.sqrt(squared), prior.degrees_of_freedom, conflict, used))
+        return tuple(checks)
+
+    def consistent(self, checks: tuple[PriorCheck, ...]) -> Priors:
+        """Those that are used."""
+        return self.without(frozenset(check.kind for check in checks if not check.used))
+
+    def penalty(self, world_from_camera: RigidTransform) -> float:
+        """What the priors say against a pose: their costs, none counted for more than a conflict.
+
+        A prior may be wrong altogether, so that it weighs as much as a conflict and no more: what one good match does.
+        """
+        return sum(min(p.term(world_from_camera).cost, conflict_threshold(p.degrees_of_freedom)) for p in self)
+
+    def cost(self, world_from_camera: RigidTransform) -> float:
+        """The sum of their costs."""
+        return sum(prior.term(world_from_camera).cost for prior in self)
+
+    def gradient_and_information(self, world_from_camera: RigidTransform) -> tuple[Array, Array]:
+        """Sums (6,) and (6, 6) of `Term.gradient_and_information`."""
+        gradient, information = np.zeros(6), np.zeros((6, 6))
+        for prior in self:
+            g, h = prior.term(world_from_camera).gradient_and_information()
+            gradient += g
+            information += h
+        return gradient, information
+
+    def log10_chance(self, world_from_camera: RigidTransform) -> float:
+        """How improbable, as a power of ten, it is that a pose found by chance agrees with gravity and heading.
+
+        That a random direction comes within an angle a of the right one has probability (1 - cos a) / 2. Both may be of
+        one source, so the one that says more counts alone. Positions and poses say nothing: wrong matches are
+        searched among the references that they chose, and near the pose that they foresee. 0 if a prior disagrees.
+        """
+        directions = [prior for prior in (self.gravity, self.heading) if prior is not None]
+        threshold = conflict_threshold(DirectionPrior.degrees_of_freedom)
+        if not directions or max(prior.term(world_from_camera).cost for prior in directions) > threshold:
+            return 0.0
+        angle = min(math.pi, math.sqrt(threshold) * min(prior.sigma for prior in directions))
+        return math.log10((1 - math.cos(angle)) / 2)
+
+    def sharpened(self, covariance: Array, world_from_camera: RigidTransform) -> Array:
+        """The covariance (6, 6) of a pose that these priors pull, of one (6, 6) that knows nothing of them."""
+        if not self:
+            return covariance
+        _, information = self.gradient_and_information(world_from_camera)
+        # (S^-1 + J)^-1 = S (I + J S)^-1, which needs no inverse of S: some directions may be certain in it.
+        sharper = np.linalg.solve((np.eye(6) + information @ covariance).T, covariance.T).T
+        return np.asarray((sharper + sharper.T) / 2)
+
+
+NO_PRIORS = Priors()
+"""Nothing is known."""
+
+
+def conflict_threshold(degrees_of_freedom: int) -> float:
+    """m^2 beyond which a prior is in conflict."""
+    return float(chdtri(degrees_of_freedom, CONFLICT_PROBABILITY))
+
+
+def check_covariance(covariance: Array, size: int) -> None:
+    """ValueError unless it is symmetric and positive definite, (size, size)."""
+    c = np.asarray(covariance)
+    if c.shape != (size, size) or not np.isfinite(c).all():
+        raise ValueError(f"a covariance must be {size}x{size} finite numbers")
+    deviations = np.sqrt(np.diag(c).clip(min=0))
+    if not deviations.min() > 0:
+        raise ValueError("a covariance must have positive variances")
+    # Compared as correlations: metres and radians, or a height that nobody knows, differ by orders of magnitude.
+    correlation = c / np.outer(deviations, deviations)
+    if np.abs(correlation - correlation.T).max() > 1e-6:
+        raise ValueError("a covariance must be symmetric")
+    if not np.linalg.eigvalsh((correlation + correlation.T) / 2).min() > 1e-12:
+        raise ValueError("a covariance must be positive definite")
+
+
+def rotation_vector(rotation: Array) -> Array:
+    """The logarithm of a rotation matrix (3, 3): axis times angle (3,), radians; the inverse of Rodrigues' formula."""
+    q = RigidTransform(rotation, np.zeros(3)).quaternion()
+    sine = math.hypot(q.x, q.y, q.z)
+    scale = 2 * math.atan2(sine, q.w) / sine if sine > 1e-12 else 2.0
+    return scale * np.array([q.x, q.y, q.z])
+
+
+def _log_jacobian(vector: Array) -> Array:
+    """Derivative (3, 3) of Log(Exp(w) Exp(vector)) by w at zero: the inverse left Jacobian of SO(3)."""
+    angle, k = float(np.linalg.norm(vector)), cross_matrix(vector)
+    # (1 - (a / 2) cot(a / 2)) / a^2, which is 1 / 12 where the angle vanishes.
+    factor = (1 - angle / 2 / math.tan(angle / 2)) / angle**2 if angle > 1e-4 else 1 / 12
+    return np.asarray(np.eye(3) - k / 2 + factor * k @ k)

@@ -1,0 +1,154 @@
+"""The pose of a rig: several cameras that are fixed to each other, each with a photograph of the same moment.
+
+Together they see more than each of them: a pose is found from the matches of all (generalized PnP), also where none of
+the photographs could be localized alone; then matches are searched for near where it puts them, and everything is
+adjusted at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mapless.geometry import Array, RigidTransform, cross_matrix
+
+from .gate import GateOptions
+from .generalized import inlier_count, rig_ransac
+from .group import (
+    GroupImage,
+    MatchedSighting,
+    Sighting,
+    group_doubts,
+    rejection_without_matches,
+    sightings_of,
+)
+from .joint import JointOptions, adjust_in_rounds, covariance_in_world
+from .pnp import PnpOptions
+from .rejection import Rejection, RejectionReason
+from .rigid import perturbed
+
+
+@dataclass(frozen=True)
+class RigOptions:
+    """Options of posing a rig.
+
+    Attributes:
+        pnp: of the pose solver; `min_matches` of all cameras together.
+        gate: what is no pose, by the sums over the cameras.
+        joint: of the adjustment.
+        rounds: of searching for matches and adjusting; the second begins with a better pose.
+    """
+
+    pnp: PnpOptions = field(default_factory=PnpOptions)
+    gate: GateOptions = field(default_factory=GateOptions)
+    joint: JointOptions = field(default_factory=JointOptions)
+    rounds: int = 2
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1:
+            raise ValueError(f"senseless options: {self}")
+
+
+@dataclass(frozen=True, eq=False)
+class RigEstimate:
+    """Where a rig is.
+
+    Attributes:
+        world_from_rig: metric.
+        covariance: (6, 6) of it, order x y z rx ry rz, fixed world axes, metres and radians.
+        matched: the images that have matches, in order.
+        origin: (3,) of the world in which these are, metres; the pose is in the caller's.
+    """
+
+    world_from_rig: RigidTransform
+    covariance: Array
+    matched: tuple[MatchedSighting, ...]
+    origin: Array
+
+
+@dataclass(frozen=True, eq=False)
+class RigFreedom:
+    """A rig moves as a whole; see `joint.Freedom`. Its parameters are a left perturbation (v, w) of rig_from_world."""
+
+    rig_from_world: RigidTransform
+    rig_from_camera: tuple[RigidTransform, ...]
+
+    size = 6
+
+    def camera_from_world(self, image: int) -> RigidTransform:
+        """See Freedom."""
+        return self.rig_from_camera[image].inverse().compose(self.rig_from_world)
+
+    def jacobian(self, image: int) -> Array:
+        """The adjoint of camera_from_rig."""
+        camera_from_rig = self.rig_from_camera[image].inverse()
+        rotation = camera_from_rig.rotation
+        lever = cross_matrix(camera_from_rig.translation) @ rotation
+        return np.block([[rotation, lever], [np.zeros((3, 3)), rotation]])
+
+    def moved(self, step: Array) -> RigFreedom:
+        """See Freedom."""
+        return RigFreedom(perturbed(self.rig_from_world, step), self.rig_from_camera)
+
+    def cost(self) -> float:
+        """Nothing is left to hold."""
+        return 0.0
+
+    def equations(self) -> tuple[Array, Array]:
+        """See Freedom."""
+        return np.zeros((6, 6)), np.zeros(6)
+
+
+def solve_rig(
+    images: Sequence[GroupImage], rig_from_camera: Sequence[RigidTransform], options: RigOptions
+) -> RigEstimate | Rejection:
+    """The pose of a rig.
+
+    Args:
+        images: one of each camera, and what is known of it alone.
+        rig_from_camera: where each camera is fixed, metric.
+        options: see there.
+
+    Returns:
+        The estimate. Rejections: of the image that came furthest where none has matches; TOO_FEW_MATCHES; PNP_FAILED
+        when no pose explains any four; GATE when chance could have done as well.
+    """
+    origin, sightings = sightings_of(images)
+    if not sightings:
+        return rejection_without_matches(images)
+    start = _start(sightings, rig_from_camera, options)
+    if isinstance(start, Rejection):
+        return start
+    freedom = RigFreedom(start.inverse(), tuple(rig_from_camera))
+    estimate = adjust_in_rounds(sightings, freedom, options.joint, options.rounds)
+    if estimate.inlier_count < 4:
+        return Rejection(RejectionReason.PNP_FAILED, "no pose of the rig explains four matches")
+    doubt = group_doubts(estimate.matched, options.pnp.inlier_px, options.gate)
+    if doubt:
+        return Rejection(RejectionReason.GATE, doubt)
+    world_from_rig = estimate.freedom.rig_from_world.inverse()
+    covariance = covariance_in_world(estimate.covariance, world_from_rig)
+    return RigEstimate(world_from_rig.shifted(origin), covariance, estimate.matched, origin)
+
+
+def _start(
+    sightings: Sequence[Sighting], rig_from_camera: Sequence[RigidTransform], options: RigOptions
+) -> RigidTransform | Rejection:
+    """The pose that explains most matches: of the solver, or one that an image is answered with alone."""
+    cameras = [it.camera_matches(rig_from_camera[it.image]) for it in sightings]
+    total = sum(len(camera.pixels) for camera in cameras)
+    if total < options.pnp.min_matches:
+        message = f"{total} 2D-3D matches in {len(cameras)} images, {options.pnp.min_matches} needed"
+        return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
+    found = rig_ransac(cameras, options.pnp)
+    candidates = [] if found is None else [found]
+    candidates += [
+        it.own_pose.compose(rig_from_camera[it.image].inverse()) for it in sightings if it.own_pose is not None
+    ]
+    counts = [inlier_count(cameras, pose, options.pnp.inlier_px) for pose in candidates]
+    if max(counts, default=0) < 4:
+        message = f"no pose of the rig explains more than {max(counts, default=0)} of {total} matches"
+        return Rejection(RejectionReason.PNP_FAILED, message)
+    return candidates[int(np.argmax(counts))]

@@ -1,0 +1,267 @@
+"""The poses of a short sequence: photographs of one camera, and where the device believed it to be at each of them.
+
+Three steps: a first guess of how the session lies in the world, from the photographs that were localized alone, or
+from the matches of all (generalized PnP, the whole sequence one camera); from that a pose of every frame, begun at the
+frames that are sure and carried on by the session; and an adjustment in which frames move freely, but are held to each
+other by what the device says of its steps, as far as that can be believed (see `drift`).
+
+So a session that drifts does not spoil what single photographs say, and one that does not makes up for those that say
+nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from mapless.geometry import Array, RigidTransform, Similarity, rotation_angle_deg
+
+from .drift import DriftOptions, SequenceFreedom, world_from_session_at
+from .gate import GateOptions
+from .generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
+from .group import GroupImage, MatchedSighting, Sighting, group_doubts, rejection_without_matches, sightings_of
+from .joint import JointEstimate, JointOptions, adjust_in_rounds, covariance_in_world
+from .pnp import PnpOptions
+from .rejection import Rejection, RejectionReason
+
+
+@dataclass(frozen=True)
+class SequenceOptions:
+    """Options of posing a sequence.
+
+    Attributes:
+        pnp: of the pose solvers; `min_matches` of all frames together.
+        gate: what is no pose, by the sums over the frames.
+        joint: of the adjustment.
+        drift: of the session.
+        rounds: of searching for matches and adjusting; the second begins with better poses.
+        loose_px: error at which a match agrees with a session that drifts, when first guesses are compared.
+        enough_share: of the matches, with which a guess from single frames is not tried to be bettered.
+        same_position_m, same_rotation_deg: two frames' own poses contradict the session by more than this, beyond three
+            times what drift explains, if one of them is wrong.
+        min_motion: least extent of a session whose unit is unknown, as a share of its distance from its own origin:
+            what is less is rounding.
+        max_scale_sigma: a scale less sure than this, relative, is none.
+        scale_iterations: samples of the search for pose and scale at once.
+        scale_matches: that they are tried on.
+    """
+
+    pnp: PnpOptions = field(default_factory=PnpOptions)
+    gate: GateOptions = field(default_factory=GateOptions)
+    joint: JointOptions = field(default_factory=JointOptions)
+    drift: DriftOptions = field(default_factory=DriftOptions)
+    rounds: int = 2
+    loose_px: float = 12.0
+    enough_share: float = 0.5
+    same_position_m: float = 0.1
+    same_rotation_deg: float = 2.0
+    min_motion: float = 1e-6
+    max_scale_sigma: float = 0.15
+    scale_iterations: int = 1000
+    scale_matches: int = 600
+
+    def __post_init__(self) -> None:
+        counts = (self.rounds, self.scale_iterations, self.scale_matches)
+        lengths = (
+            self.loose_px,
+            self.enough_share,
+            self.same_position_m,
+            self.same_rotation_deg,
+            self.min_motion,
+            self.max_scale_sigma,
+        )
+        if not (min(counts) >= 1 and min(lengths) > 0):
+            raise ValueError(f"senseless options: {self}")
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceEstimate:
+    """Where the frames of a sequence were taken.
+
+    Attributes:
+        world_from_session: as it is at the last frame, metres from the session's unit.
+        scale_sigma: relative standard deviation of its scale; 0 where the session is metric.
+        world_from_camera: of every frame, metric, drift taken out.
+        covariances: (F, 6, 6) of the same, order x y z rx ry rz, fixed world axes, metres and radians.
+        step_weights: (F - 1,) how much of the session's step to the next frame was believed, 0 to 1.
+        matched: the frames that have matches, in order.
+        origin: (3,) of the world in which these are, metres; the poses are in the caller's.
+    """
+
+    world_from_session: Similarity
+    scale_sigma: float
+    world_from_camera: tuple[RigidTransform, ...]
+    covariances: Array
+    step_weights: Array
+    matched: tuple[MatchedSighting, ...]
+    origin: Array
+
+
+def solve_sequence(
+    images: Sequence[GroupImage],
+    session_from_camera: Sequence[RigidTransform],
+    estimate_scale: bool,
+    options: SequenceOptions,
+) -> SequenceEstimate | Rejection:
+    """The poses of a sequence.
+
+    Args:
+        images: the frames in the order they were taken, and what is known of each alone.
+        session_from_camera: where the device believed its camera to be at each.
+        estimate_scale: whether the unit of the session is unknown; else it is the metre.
+        options: see there.
+
+    Returns:
+        The estimate. Rejections: of the frame that came furthest where none has matches; TOO_FEW_MATCHES; PNP_FAILED
+        when nothing explains any four; SCALE_UNRELIABLE when the scale is to be found and the session does not move
+        enough to tell it; GATE when chance could have done as well.
+    """
+    origin, sightings = sightings_of(images)
+    if not sightings:
+        return rejection_without_matches(images)
+    session = _Session(tuple(session_from_camera), estimate_scale, options)
+    if estimate_scale and not session.moves:
+        return Rejection(RejectionReason.SCALE_UNRELIABLE, "the session does not move: nothing tells its unit")
+    total = sum(len(it.tracked) for it in sightings)
+    if total < options.pnp.min_matches:
+        message = f"{total} 2D-3D matches in {len(sightings)} frames, {options.pnp.min_matches} needed"
+        return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
+    guess = session.first_guess(sightings)
+    if guess is None:
+        return Rejection(RejectionReason.PNP_FAILED, f"nothing explains more than a few of {total} matches")
+    poses = session.poses(sightings, guess)
+    freedom = SequenceFreedom.of(poses, session_from_camera, guess.scale, estimate_scale, options.drift)
+    estimate = adjust_in_rounds(sightings, freedom, options.joint, options.rounds)
+    return _rejection(estimate, options) or _result(estimate, session.frames, origin)
+
+
+def _rejection(estimate: JointEstimate[SequenceFreedom], options: SequenceOptions) -> Rejection | None:
+    if estimate.inlier_count < 4:
+        return Rejection(RejectionReason.PNP_FAILED, "no poses of the sequence explain four matches")
+    doubt = group_doubts(estimate.matched, options.pnp.inlier_px, options.gate)
+    if doubt:
+        return Rejection(RejectionReason.GATE, doubt)
+    sigma = _scale_sigma(estimate)
+    if not sigma <= options.max_scale_sigma:
+        message = f"the session moves too little for its unit: the scale is known to {100 * sigma:.0f} % only"
+        return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
+    return None
+
+
+def _scale_sigma(estimate: JointEstimate[SequenceFreedom]) -> float:
+    return math.sqrt(estimate.covariance[-1, -1]) if estimate.freedom.scale_is_free else 0.0
+
+
+def _result(
+    estimate: JointEstimate[SequenceFreedom], session: Sequence[RigidTransform], origin: Array
+) -> SequenceEstimate:
+    freedom = estimate.freedom
+    poses = [frame.inverse() for frame in freedom.frames]
+    blocks = (estimate.covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(poses)))
+    last = world_from_session_at(poses[-1], session[-1], freedom.scale)
+    return SequenceEstimate(
+        replace(last, translation=last.translation + origin),
+        _scale_sigma(estimate),
+        tuple(pose.shifted(origin) for pose in poses),
+        np.array([covariance_in_world(block, pose) for block, pose in zip(blocks, poses, strict=True)]),
+        freedom.weights(),
+        estimate.matched,
+        origin,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Session:
+    """What the device says, and what that means for the first guess.
+
+    Attributes:
+        frames: session_from_camera.
+        scale_is_free: whether its unit is unknown.
+        options: see there.
+    """
+
+    frames: tuple[RigidTransform, ...]
+    scale_is_free: bool
+    options: SequenceOptions
+
+    @property
+    def moves(self) -> bool:
+        """Whether there is any motion that could tell the unit."""
+        centres = np.array([frame.translation for frame in self.frames])
+        extent = float(np.ptp(centres, axis=0).max())
+        return extent > self.options.min_motion * float(np.abs(centres).max())
+
+    def first_guess(self, sightings: Sequence[Sighting]) -> Similarity | None:
+        """How the session lies in the world, the guess that explains most matches; None if none explains four."""
+        cameras = [it.camera_matches(self.frames[it.image]) for it in sightings]
+        total = sum(len(camera.pixels) for camera in cameras)
+        candidates = self._of_single_frames(sightings)
+        counts = [inlier_count(cameras, it, self.options.loose_px) for it in candidates]
+        if max(counts, default=0) < self.options.enough_share * total:
+            candidates += self._of_all_matches(cameras)
+            counts = [inlier_count(cameras, it, self.options.loose_px) for it in candidates]
+        return candidates[int(np.argmax(counts))] if max(counts, default=0) >= 4 else None
+
+    def _of_single_frames(self, sightings: Sequence[Sighting]) -> list[Similarity]:
+        posed = [(it.own_pose, self.frames[it.image]) for it in sightings if it.own_pose is not None]
+        if not self.scale_is_free:
+            return [world_from_session_at(pose, frame, 1.0) for pose, frame in posed]
+        guesses = []
+        for (pose, frame), (other_pose, other_frame) in itertools.combinations(posed, 2):
+            travelled = float(np.linalg.norm(other_frame.translation - frame.translation))
+            moved_m = float(np.linalg.norm(other_pose.translation - pose.translation))
+            if travelled > 0 and moved_m > 0:
+                guesses.append(world_from_session_at(pose, frame, moved_m / travelled))
+        return guesses
+
+    def _of_all_matches(self, cameras: Sequence[CameraMatches]) -> list[Similarity]:
+        options = self.options
+        if self.scale_is_free:
+            scaled = scaled_ransac(cameras, options.pnp, options.scale_iterations, options.scale_matches)
+            return [] if scaled is None else [scaled]
+        rigid = rig_ransac(cameras, options.pnp)
+        return [] if rigid is None else [Similarity(1.0, rigid.rotation, rigid.translation)]
+
+    def poses(self, sightings: Sequence[Sighting], guess: Similarity) -> list[RigidTransform]:
+        """world_from_camera of every frame: its own if it can be believed, else carried on from the nearest such."""
+        own = {it.image: it.own_pose for it in sightings if it.own_pose is not None}
+        believed = self._believed(own, guess)
+        poses = []
+        for i, frame in enumerate(self.frames):
+            if not believed:
+                poses.append(guess.transform_pose(frame))
+                continue
+            nearest = min(believed, key=lambda j: abs(i - j))
+            there = world_from_session_at(own[nearest], self.frames[nearest], guess.scale)
+            poses.append(there.transform_pose(frame))
+        return poses
+
+    def _believed(self, own: dict[int, RigidTransform], guess: Similarity) -> list[int]:
+        """Frames whose own poses agree with one another, or one at least with the guess, as the session says."""
+        freedom = SequenceFreedom.of((), self.frames, guess.scale, False, self.options.drift)
+        drift = np.concatenate([np.zeros((1, 6)), np.cumsum(freedom.sigma, axis=0)])  # to each frame at the most
+
+        def agree(i: int, j: int) -> bool:
+            said = world_from_session_at(own[i], self.frames[i], guess.scale).transform_pose(self.frames[j])
+            return self._is_near(own[j], said, np.abs(drift[j] - drift[i]))
+
+        indices = sorted(own)
+        links = np.array([[agree(i, j) for j in indices] for i in indices], bool).reshape(len(own), len(own))
+        _, group = connected_components(links, directed=False)
+        largest = [indices[k] for k in np.flatnonzero(group == np.bincount(group).argmax())] if indices else []
+        if len(largest) > 1:
+            return largest
+        return [i for i in indices if self._is_near(own[i], guess.transform_pose(self.frames[i]), drift[-1])]
+
+    def _is_near(self, pose: RigidTransform, said: RigidTransform, drift: Array) -> bool:
+        """Whether a pose may be what is said of it after so much drift (6,)."""
+        apart_m = float(np.linalg.norm(pose.translation - said.translation))
+        apart_deg = rotation_angle_deg(pose.rotation.T @ said.rotation)
+        return apart_m <= self.options.same_position_m + 3 * drift[
+            0
+        ] and apart_deg <= self.options.same_rotation_deg + 3 * math.degrees(drift[3])

@@ -1,0 +1,18 @@
+"""Expand: what is known of a scene as a whole."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+from alembic import op
+
+from mapless_server.store.migrations import write_version
+
+revision = "3"
+down_revision = "2"
+
+
+def upgrade() -> None:
+    """Columns that are null where nothing is known, as servers of revision 2 leave them."""
+    op.add_column("scene", sa.Column("attributes", sa.LargeBinary(), nullable=True))
+    op.add_column("scene", sa.Column("attributes_sha256", sa.String(64), nullable=True))
+    write_version(op.get_bind(), 3)

@@ -1,0 +1,122 @@
+"""Queries as they are answered, from WatchQueries: for as long as somebody looks, however often the connection ends."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections.abc import Callable, Sequence
+
+import grpc
+
+from mapless import ConnectOptions, MaplessError, wire
+from mapless.answers import LocalizationResult, Rejected, answer_from_message
+from mapless.errors import from_rpc_error
+from mapless.geometry import Camera
+from mapless.names import scene_name
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+
+from .queries import Query
+
+RETRY_S = 3.0
+"""Between two tries to watch: servers end a connection now and then, so that it moves on to another."""
+_HOPELESS = ("FAILED_PRECONDITION", "PERMISSION_DENIED", "UNAUTHENTICATED", "UNIMPLEMENTED", "NOT_FOUND")
+"""What another try does not change."""
+
+
+class Feed:
+    """Watches a scene in a thread of its own, until it is closed."""
+
+    def __init__(
+        self,
+        address: str,
+        options: ConnectOptions,
+        scene: str,
+        show: Callable[[Query], None],
+        say: Callable[[str], None],
+    ) -> None:
+        """Begins at once.
+
+        Args:
+            address: of the server.
+            options: how to connect.
+            scene: its id.
+            show: given each query; called in the feed's thread.
+            say: told how the watching goes, in a few words.
+        """
+        self._channel = options.channel(address)
+        self._metadata = options.metadata()
+        self._timeout_s = options.timeout_s
+        self._request = pb.WatchQueriesRequest(scene=scene_name(scene))
+        self._stub = LocalizationServiceStub(self._channel)
+        self._show, self._say = show, say
+        # So that what is asked here is known among what is watched.
+        self._own = f"view-{uuid.uuid4().hex[:12]}"
+        self._count = 0
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
+        self._thread.start()
+
+    def localize(self, image: bytes, camera: Camera, references: Sequence[str]) -> LocalizationResult | Rejected:
+        """What the server says of a photograph against some references, with the matches; it is not shown.
+
+        Raises:
+            MaplessError: the call failed.
+        """
+        scene = self._request.scene
+        request = pb.LocalizeRequest(
+            scene=scene,
+            references=[f"{scene}/references/{it}" for it in references],
+            image=image,
+            intrinsics=wire.camera_to_message(camera),
+            options=pb.LocalizeOptions(include_debug=True),
+        )
+        metadata = (*self._metadata, ("x-request-id", f"{self._own}-{uuid.uuid4().hex[:8]}"))
+        try:
+            return answer_from_message(self._stub.Localize(request, timeout=self._timeout_s, metadata=metadata))
+        except grpc.RpcError as error:
+            raise from_rpc_error(error) from error
+
+    def close(self) -> None:
+        """Ends the watching."""
+        self._closing.set()
+        self._channel.close()
+        self._thread.join(5.0)
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._watch()
+            except grpc.RpcError as error:
+                failure = from_rpc_error(error)
+                if self._closing.is_set():
+                    return
+                self._say(_words(failure))
+                if failure.code in _HOPELESS:
+                    return
+            except ValueError:  # grpc's own word for a channel that was closed meanwhile
+                return
+            self._closing.wait(RETRY_S)
+
+    def _watch(self) -> None:
+        call = self._stub.WatchQueries(self._request, metadata=self._metadata)
+        call.initial_metadata()
+        if call.is_active():
+            self._say("live")
+        for message in call:
+            answer = answer_from_message(message.answer)
+            if answer.diagnostics.request_id.startswith(self._own):
+                continue
+            self._count += 1 + message.missed_count
+            camera = wire.camera_from_message(message.intrinsics, "intrinsics")
+            self._show(Query(self._count, message.image, camera, answer))
+
+
+def _words(failure: MaplessError) -> str:
+    if failure.reason == "WATCHING_NOT_ALLOWED":
+        return "queries are not shown: the server's setting allow_watching is off"
+    if failure.code == "PERMISSION_DENIED":
+        return "queries are not shown: that takes a token of the role write"
+    if failure.code in _HOPELESS:
+        return f"queries are not shown: {failure.message}"
+    return "waiting for the server"

@@ -1,0 +1,74 @@
+"""viser's server as we want it: on this machine alone, and for nobody's web pages but its own.
+
+A web page that is open in the same browser may connect to any WebSocket of the machine; browsers do not keep it from
+that, but they say whose page it is (`Origin`), and by which name it reached the server (`Host`), which tells pages
+whose name has been pointed at this machine. viser asks neither, and can be told to publish itself through a tunnel; so
+it gets a check before each request, and no tunnel.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from http import HTTPStatus
+from typing import Any
+from unittest.mock import patch
+
+import viser
+import websockets.asyncio.server
+
+_LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
+
+
+class GuardedViser(viser.ViserServer):
+    """A viser server that serves its own pages only."""
+
+    def __init__(self, host: str, port: int, label: str) -> None:
+        """Listens on a loopback address; where the port is taken, on the next that is free.
+
+        Raises:
+            RuntimeError: viser does not serve as it used to, so that it could not be guarded.
+        """
+        # It prints its address, which is ours to tell.
+        with _guarded_connections() as guarded, redirect_stdout(io.StringIO()):
+            super().__init__(host=host, port=port, label=label, verbose=False)
+        if not guarded:
+            self.stop()
+            raise RuntimeError(
+                f"viser {viser.__version__} listens in a way that cannot be guarded; take another version"
+            )
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """There is none: what the viewer shows is not for everybody."""
+        return None
+
+
+def is_own(host: str | None, origin: str | None) -> bool:
+    """Whether a request comes from a page of the server that it is made to, or from no page at all.
+
+    Args:
+        host: its header `Host`, "127.0.0.1:8080".
+        origin: its header `Origin`, "http://127.0.0.1:8080"; None where it comes from no page.
+    """
+    name = (host or "").rpartition(":")[0] or (host or "")
+    return name in _LOOPBACK_NAMES and origin in (None, f"http://{host}")
+
+
+@contextmanager
+def _guarded_connections() -> Iterator[list[bool]]:
+    """Whatever begins to listen meanwhile checks its requests; the list says whether something did."""
+    serve, guarded = websockets.asyncio.server.serve, []
+
+    def guarded_serve(*arguments: Any, process_request: Callable[..., Any] | None = None, **options: Any) -> Any:
+        guarded.append(True)
+
+        def check(connection: Any, request: Any) -> Any:
+            if not is_own(request.headers.get("Host"), request.headers.get("Origin")):
+                return connection.respond(HTTPStatus.FORBIDDEN, "This page is for itself alone.\n")
+            return None if process_request is None else process_request(connection, request)
+
+        return serve(*arguments, process_request=check, **options)
+
+    with patch.object(websockets.asyncio.server, "serve", guarded_serve):
+        yield guarded

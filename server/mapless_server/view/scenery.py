@@ -1,0 +1,104 @@
+"""What there is to see before anybody asks anything: references, how they lie, and which are worth a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless import Reference, Scene
+from mapless.geometry import Array, RigidTransform
+
+_TURN_WEIGHT = 0.4
+"""How far apart two cameras count that stand at one place and look opposite ways, in spreads of the scene."""
+_ALIKE = 0.5
+"""Length of the mean of the cameras' downward axes from which on it tells which way is down."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scenery:
+    """References as they are laid out.
+
+    Attributes:
+        references: all of the scene.
+        pictured: indices of those that are drawn as frustums; each is far from those before it.
+        origin: (3,) world position that is drawn at zero, since browsers compute in single precision.
+        down: (3,) unit vector.
+        size_m: length of a frustum that does not hide its neighbours.
+        extent_m: how far the references reach.
+    """
+
+    references: tuple[Reference, ...]
+    pictured: NDArray[np.intp]
+    origin: Array
+    down: Array
+    size_m: float
+    extent_m: float
+
+    def placed(self, pose: RigidTransform) -> RigidTransform:
+        """A pose as it is drawn."""
+        return pose.shifted(-self.origin)
+
+    def neighbours(self, index: int, count: int) -> list[Reference]:
+        """References that see about what one sees: near it, and looking the same way."""
+        apart = np.linalg.norm(_spots(self.references) - _spots(self.references)[index], axis=1)
+        return [self.references[i] for i in np.argsort(apart, kind="stable") if i != index][:count]
+
+
+def lay_out(scene: Scene, references: Sequence[Reference], max_pictured: int) -> Scenery:
+    """The scenery of a scene.
+
+    Raises:
+        ValueError: there are no references.
+    """
+    if not references:
+        raise ValueError(f"scene {scene.scene_id} has no references to show")
+    centres = np.stack([it.world_from_camera.translation for it in references])
+    origin = np.median(centres, axis=0)
+    pictured = spread_out(_spots(references), max_pictured)
+    extent_m = max(float(np.linalg.norm(np.quantile(centres, 0.95, axis=0) - np.quantile(centres, 0.05, axis=0))), 0.1)
+    return Scenery(tuple(references), pictured, origin, _down(scene, references), _size_m(centres[pictured]), extent_m)
+
+
+def spread_out(spots: Array, count: int) -> NDArray[np.intp]:
+    """Indices of at most so many rows of (N, D), each the furthest from all before it; the first is the middlemost."""
+    first = int(np.argmin(np.linalg.norm(spots - np.median(spots, axis=0), axis=1)))
+    chosen, apart = [first], np.linalg.norm(spots - spots[first], axis=1)
+    while len(chosen) < min(count, len(spots)):
+        chosen.append(int(np.argmax(apart)))
+        apart = np.minimum(apart, np.linalg.norm(spots - spots[chosen[-1]], axis=1))
+        apart[chosen] = -1.0  # several may stand at one place
+    return np.array(chosen, np.intp)
+
+
+def _spots(references: Sequence[Reference]) -> Array:
+    """(N, 6) where cameras stand, in spreads of the scene, and which way they look."""
+    centres = np.stack([it.world_from_camera.translation for it in references])
+    spread = max(float(np.linalg.norm(centres.std(axis=0))), 1e-6)
+    ahead = np.stack([it.world_from_camera.rotation[:, 2] for it in references])
+    return np.concatenate([(centres - np.median(centres, axis=0)) / spread, 0.5 * _TURN_WEIGHT * ahead], axis=1)
+
+
+def _down(scene: Scene, references: Sequence[Reference]) -> Array:
+    """What the scene says, or its datum; else what most cameras call down."""
+    if scene.down_in_world is not None:
+        return np.asarray(scene.down_in_world, float)
+    if scene.datum is not None:
+        return np.asarray(-scene.datum.enu_from_world.matrix()[2])
+    mean = np.mean([it.world_from_camera.rotation[:, 1] for it in references], axis=0)
+    length = float(np.linalg.norm(mean))
+    return np.asarray(mean / length) if length > _ALIKE else np.array([0.0, 0.0, -1.0])
+
+
+def _size_m(centres: Array) -> float:
+    """A third of how far neighbours usually stand apart."""
+    if len(centres) < 2:
+        return 0.3
+    some = centres[:200]
+    apart = np.linalg.norm(some[:, None] - centres[None], axis=2)
+    apart[apart < 1e-6] = np.inf
+    nearest = apart.min(axis=1)
+    nearest = nearest[np.isfinite(nearest)]
+    return float(np.clip(0.35 * np.median(nearest), 0.01, 3.0)) if len(nearest) else 0.3

@@ -1,0 +1,152 @@
+"""The asynchronous client as the blocking one, so that one test asks both; and a server that fails as it is told."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent import futures
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Any, TypeAlias, cast
+
+import grpc
+from google.protobuf.message import Message
+from google.rpc import error_details_pb2, status_pb2
+
+from mapless import Client, ConnectOptions, aio
+
+Connect: TypeAlias = Callable[..., Client]
+
+
+class Awaiting:
+    """An `aio.Client` in an event loop of its own; its methods wait for their answers."""
+
+    def __init__(self, address: str, options: ConnectOptions | None = None) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever)
+        self._thread.start()
+        self.client = self.wait(self._made(address, options))
+
+    async def _made(self, address: str, options: ConnectOptions | None) -> aio.Client:
+        return aio.Client(address, options)
+
+    def wait(self, coroutine: Any) -> Any:
+        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result(60)
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        method = getattr(self.client, name)
+
+        async def listed(items: Any) -> list[Any]:
+            return [item async for item in items]
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            given = method(*arguments, **named)
+            return self.wait(given) if inspect.isawaitable(given) else iter(self.wait(listed(given)))
+
+        return call
+
+    def __enter__(self) -> Awaiting:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.wait(self.client.close())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(30)
+        self._loop.close()
+
+
+def awaiting(address: str, options: ConnectOptions | None = None) -> Client:
+    """The asynchronous client, to be used like the blocking one."""
+    return cast(Client, Awaiting(address, options))
+
+
+class Failing(grpc.GenericRpcHandler):
+    """Ends each call with the next of its statuses; when there are none left, as `answers` does.
+
+    Attributes:
+        tries: (method, seconds left to its deadline) of every call that came.
+        answers: the response to a method's request; may raise grpc.RpcError.
+        does_it: whether calls that are told a failure are done all the same.
+    """
+
+    def __init__(self, statuses: Sequence[grpc.Status], answers: Callable[[str, bytes], bytes], does_it: bool) -> None:
+        self.statuses = list(statuses)
+        self.tries: list[tuple[str, float]] = []
+        self.answers = answers
+        self.does_it = does_it
+        self._lock = threading.Lock()
+
+    def service(self, handler_call_details: Any) -> Any:
+        method = handler_call_details.method
+
+        def answer(data: bytes, context: grpc.ServicerContext) -> bytes:
+            with self._lock:
+                self.tries.append((method.rpartition("/")[2], context.time_remaining()))
+                status = self.statuses.pop(0) if self.statuses else None
+            try:
+                response = self.answers(method, data) if status is None or self.does_it else b""
+            except grpc.RpcError as failure:
+                error: Any = failure
+                context.set_trailing_metadata(error.trailing_metadata())
+                context.abort(error.code(), error.details())
+            if status is not None:
+                context.abort_with_status(status)
+            return response
+
+        return grpc.unary_unary_rpc_method_handler(answer)
+
+    @property
+    def methods(self) -> list[str]:
+        """Of the calls that came."""
+        return [method for method, _ in self.tries]
+
+
+class _Status(grpc.Status):
+    def __init__(self, code: grpc.StatusCode, details: Sequence[Message]) -> None:
+        self.code, self.details = code, "told to"
+        rich = status_pb2.Status(code=code.value[0], message=self.details)
+        for detail in details:
+            rich.details.add().Pack(detail)
+        self.trailing_metadata = (("grpc-status-details-bin", rich.SerializeToString()),)
+
+
+def status(code: str, retry_after_s: float | None = None) -> grpc.Status:
+    """A failure, with RetryInfo if a time is given."""
+    retry = error_details_pb2.RetryInfo()
+    if retry_after_s is not None:
+        retry.retry_delay.FromNanoseconds(round(1e9 * retry_after_s))
+    return _Status(grpc.StatusCode[code], [retry] if retry_after_s is not None else [])
+
+
+@contextmanager
+def failing(
+    statuses: Sequence[grpc.Status],
+    answers: Callable[[str, bytes], bytes] = lambda method, data: b"",
+    does_it: bool = True,
+) -> Iterator[tuple[str, Failing]]:
+    """Such a server and its address."""
+    handler = Failing(statuses, answers, does_it)
+    with futures.ThreadPoolExecutor(4) as pool:
+        server = grpc.server(pool, [handler], options=[("grpc.max_receive_message_length", -1)])
+        port = server.add_insecure_port("127.0.0.1:0")
+        server.start()
+        try:
+            yield f"127.0.0.1:{port}", handler
+        finally:
+            server.stop(None).wait()
+
+
+@contextmanager
+def losing(address: str, does_it: bool = True) -> Iterator[tuple[str, Failing]]:
+    """A way to a server on which the first answer is lost, after the call was done or before."""
+    with grpc.insecure_channel(address, [("grpc.max_send_message_length", -1)]) as channel:
+
+        def forward(method: str, data: bytes) -> bytes:
+            return bytes(channel.unary_unary(method)(data, timeout=30))
+
+        with failing([status("UNAVAILABLE")], forward, does_it) as made:
+            yield made

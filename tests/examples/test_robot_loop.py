@@ -1,0 +1,119 @@
+"""The robot's loop runs: a real video, a real server that goes away and comes back."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import threading
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from google.protobuf import json_format
+from images import textured
+from servers import CAMERA, PHOTO, pose, serving
+
+from mapless import Client, NewReference, wire
+
+RATE_HZ = 20.0
+
+
+@pytest.fixture
+def loop() -> Any:
+    return importlib.import_module("robot_loop")
+
+
+def write_video(path: Path, count: int) -> Path:
+    """Frames of which each is as bright as its number."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE_HZ, (96, 64))
+    assert writer.isOpened()
+    texture = textured() // 4
+    for number in range(count):
+        writer.write(np.asarray(texture + number, np.uint8))
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def camera_json(tmp_path: Path) -> str:
+    path = tmp_path / "camera.json"
+    path.write_text(json_format.MessageToJson(wire.camera_to_message(CAMERA)))
+    return str(path)
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def wait_until(condition: Any) -> None:
+    deadline_s = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+def test_poses_go_on_after_the_server_was_away(loop: Any, tmp_path: Path, camera_json: str) -> None:
+    video = write_video(tmp_path / "drive.avi", 120)
+    poses, tum, data = tmp_path / "poses.jsonl", tmp_path / "poses.tum", tmp_path / "data"
+    with serving(data) as server, Client(server.address) as client:
+        client.create_scene("hall")
+        client.add_references("hall", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)])
+        port = int(server.address.rpartition(":")[2])
+        flags = ["--camera", camera_json, "--scene", "hall", "--address", server.address]
+        given = [str(video), *flags, "--poses", str(poses), "--tum", str(tum)]
+        robot = threading.Thread(target=loop.main, args=(given,))
+        robot.start()
+        wait_until(lambda: len(lines(poses)) >= 5)
+    wait_until(lambda: any("reason" in line for line in lines(poses)))
+    away = len(lines(poses))
+    with serving(data, port=port):
+        wait_until(lambda: any("position_m" in line for line in lines(poses)[away:]))
+        robot.join(60)
+    seen = lines(poses)
+    numbers = [line["frame"] for line in seen]
+    assert numbers == sorted({*numbers})
+    assert numbers[-1] == 119
+    found = [line for line in seen if "position_m" in line]
+    assert {line["reason"] for line in seen if "reason" in line} <= {"UNAVAILABLE", "DRAINING", "STARTING", "CANCELLED"}
+    assert all(line["position_m"] == [0.0, 2.0, -1.0] and len(line["covariance"]) == 36 for line in found)
+    written = np.loadtxt(tum, ndmin=2)
+    assert written.shape == (len(found), 8)
+    times = [datetime.fromisoformat(line["capture_time"]).timestamp() for line in found]
+    np.testing.assert_allclose(written[:, 0], times, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(written[:, 4:], axis=1), 1.0, atol=1e-6)
+
+
+def test_who_is_slow_is_given_the_newest_frame(loop: Any, tmp_path: Path) -> None:
+    """Every frame that is given is the newest one then, so those between are skipped and never queued."""
+    frames = loop.LatestFrame(write_video(tmp_path / "drive.avi", 40), speed=2.0)
+    seen = []
+    for frame in frames:
+        seen.append(frame.number)
+        assert abs(frame.pixels.mean() - (textured() // 4).mean() - frame.number) < 3
+        time.sleep(0.1)  # four frames
+    assert len(seen) < 25
+    assert seen == sorted(seen)
+    assert seen[-1] == 39
+
+
+def test_the_last_pose_fades_as_a_prior(loop: Any) -> None:
+    """Its variance grows by the square of how far the robot may have moved, until it says nothing."""
+    import datetime as dt
+    from types import SimpleNamespace
+
+    begin = dt.datetime(2026, 1, 1, tzinfo=dt.timezone.utc)
+    robot = loop.Robot(None, CAMERA, "hall", None)
+    assert robot._prior(loop.Frame(0, begin, None)) is None
+    robot.last = (begin, SimpleNamespace(world_from_camera=pose(0), covariance=np.eye(6)))
+    later = robot._prior(loop.Frame(1, begin + dt.timedelta(seconds=2), None))
+    np.testing.assert_allclose(later.covariance, np.eye(6) * (1 + (1.5 * 2) ** 2))
+    assert robot._prior(loop.Frame(2, begin + dt.timedelta(seconds=6), None)) is None
+
+
+def test_what_is_no_video_is_said(loop: Any, tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="is no video"):
+        loop.LatestFrame(tmp_path / "absent.mp4")

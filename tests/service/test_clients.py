@@ -1,0 +1,260 @@
+"""The blocking client and the asynchronous one: the same tests, the same server, the same answers."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from clients import Connect, awaiting, failing, losing, status
+from servers import CAMERA, PHOTO, RunningServer, pose, serving
+
+from mapless import (
+    AlreadyExists,
+    Client,
+    ConnectOptions,
+    DeadlineExceeded,
+    InvalidArgument,
+    LocalizationResult,
+    NewReference,
+    NotFound,
+    Rejected,
+    ResourceExhausted,
+    Unavailable,
+    aio,
+)
+from mapless.v1 import localization_service_pb2 as localization_pb
+from mapless.v1 import reference_service_pb2 as reference_pb
+
+FAST = ConnectOptions(initial_backoff_s=0.01, max_backoff_s=0.02)
+
+both = pytest.mark.parametrize("connect", [Client, awaiting], ids=["blocking", "asyncio"])
+
+
+def methods(kind: type) -> dict[str, inspect.Signature]:
+    return {name: inspect.signature(it) for name, it in vars(kind).items() if callable(it) and name[0] != "_"}
+
+
+def test_both_have_the_same_methods_with_the_same_parameters() -> None:
+    blocking, asynchronous = methods(Client), methods(aio.Client)
+    assert len(blocking) >= 15
+    assert {name: [*it.parameters.values()] for name, it in blocking.items() if name != "run"} == {
+        name: [*it.parameters.values()] for name, it in asynchronous.items() if name != "run"
+    }
+    assert all(getattr(kind, name).__doc__ for kind in (Client, aio.Client) for name in blocking)
+
+
+def test_every_method_of_the_interface_is_there() -> None:
+    """But for the feed of others' queries, which viewers read."""
+    services = (
+        localization_pb.DESCRIPTOR.services_by_name["LocalizationService"],
+        reference_pb.DESCRIPTOR.services_by_name["ReferenceService"],
+    )
+    renamed = {"create_reference": "add_reference", "batch_create_references": "add_references"}
+    for service in services:
+        for method in service.methods:
+            name = "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in method.name)[1:]
+            if not method.server_streaming:
+                assert renamed.get(name, name) in methods(Client), method.name
+
+
+@both
+def test_the_life_of_a_scene(server: RunningServer, connect: Connect, tmp_path: Path) -> None:
+    path = tmp_path / "photo.png"
+    path.write_bytes(PHOTO)
+    name = f"life-{time.monotonic_ns()}"
+    with connect(server.address) as client:
+        assert client.is_serving()
+        assert client.create_scene(name).reference_count == 0
+        counts: list[int] = []
+        stored = client.add_references(
+            name, (NewReference(f"r{i}", path, CAMERA, pose(i)) for i in range(3)), on_progress=counts.append
+        )
+        assert ([it.reference_id for it in stored], counts[-1]) == (["r0", "r1", "r2"], 3)
+        client.add_reference(name, NewReference("r3", PHOTO, CAMERA, pose(3)))
+        assert client.get_scene(name).reference_count == 4
+        assert [it.reference_id for it in client.list_references(name, page_size=3)] == ["r0", "r1", "r2", "r3"]
+        assert name in [it.scene_id for it in client.list_scenes(page_size=1)]
+        assert client.get_reference(name, "r1", include_image=True).image == PHOTO
+        assert len(client.retrieve_references(path, CAMERA, name, 2)) == 2
+        assert [it.name[-2:] for it in client.audit_scene(name, page_size=2)] == ["r0", "r1", "r2", "r3"]
+        assert client.check_coverage(name, pose(0), CAMERA).verdict
+        answer = client.localize(path, CAMERA, name, ["r2"])
+        assert isinstance(answer, LocalizationResult)
+        assert answer.world_from_camera.translation[0] == 2.0
+        client.delete_reference(name, "r0")
+        client.delete_scene(name)
+        with pytest.raises(NotFound):
+            client.get_scene(name)
+        with pytest.raises(InvalidArgument) as caught:
+            client.localize(b"no photograph", CAMERA, "s")
+        assert caught.value.field == "image"
+        assert isinstance(caught.value.__cause__, grpc.RpcError)
+        with pytest.raises(FileNotFoundError):
+            client.localize(tmp_path / "absent.jpg", CAMERA, name)
+        with pytest.raises(ValueError, match="Variant is one of"):
+            client.localize(PHOTO, CAMERA, name, variant="worst")
+
+
+@both
+@pytest.mark.parametrize("code", ["RESOURCE_EXHAUSTED", "UNAVAILABLE"])
+def test_a_server_that_is_busy_twice_answers_the_third_time(connect: Connect, code: str) -> None:
+    rejected = localization_pb.LocalizeResponse()
+    rejected.rejection.reason = localization_pb.RejectionReason.REJECTION_REASON_LOW_TEXTURE
+    photo = bytes(3 * 2**20)  # larger than gRPC would repeat unasked
+    with (
+        failing([status(code, 0.15)] * 2, lambda method, data: rejected.SerializeToString()) as (address, server),
+        connect(address, FAST) as client,
+    ):
+        start_s = time.monotonic()
+        answer = client.localize(photo, CAMERA, "s", timeout_s=20.0)
+        took_s = time.monotonic() - start_s
+    assert getattr(answer, "reason", None) == "LOW_TEXTURE"
+    assert took_s >= (0.3 if code == "RESOURCE_EXHAUSTED" else 0.15)
+    assert len(server.tries) == 3
+    assert all(10 < left_s <= 20 for _, left_s in server.tries)
+
+
+@both
+@pytest.mark.parametrize("retry_after_s", [None, 60.0])
+def test_a_refusal_that_waiting_would_not_mend_is_told_at_once(connect: Connect, retry_after_s: float | None) -> None:
+    with (
+        failing([status("RESOURCE_EXHAUSTED", retry_after_s)] * 9) as (address, server),
+        connect(address, FAST) as client,
+        pytest.raises(ResourceExhausted) as caught,
+    ):
+        client.localize(PHOTO, CAMERA, "s", timeout_s=20.0)
+    assert caught.value.retry_after_s == retry_after_s
+    assert len(server.tries) == 1
+
+
+@both
+def test_a_change_whose_answer_was_lost_is_made_once(server: RunningServer, connect: Connect) -> None:
+    scene = f"lost-{time.monotonic_ns()}"
+    references = [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)]
+    changes: list[Callable[[Client], Any]] = [
+        lambda client: client.create_scene(scene),
+        lambda client: client.add_reference(scene, references[0]),
+        lambda client: client.add_references(scene, references[1:]),
+        lambda client: client.delete_reference(scene, "r0"),
+        lambda client: client.delete_scene(scene),
+    ]
+    seen = []
+    for change in changes:
+        with losing(server.address) as (address, between), connect(address, FAST) as client:
+            seen.append(change(client))
+            assert len(between.tries) in (2, 3)
+    assert [type(it).__name__ for it in seen] == ["Scene", "Reference", "list", "NoneType", "NoneType"]
+    assert (seen[1].reference_id, seen[1].feature_count, [it.reference_id for it in seen[2]]) == ("r0", 1, ["r1"])
+
+
+@both
+def test_what_somebody_else_created_is_not_taken_for_ours(server: RunningServer, connect: Connect, scene: str) -> None:
+    other = NewReference("r0", PHOTO, CAMERA, pose(0.001))  # a millimetre beside the one that is there
+    with losing(server.address, does_it=False) as (address, between), connect(address, FAST) as client:
+        with pytest.raises(AlreadyExists):
+            client.add_reference(scene, other)
+        assert between.methods == ["CreateReference", "CreateReference", "GetReference"]
+    with (
+        losing(server.address, does_it=False) as (address, _),
+        connect(address, FAST) as client,
+        pytest.raises(AlreadyExists),
+    ):
+        client.create_scene(scene)
+
+
+@both
+def test_calls_go_on_when_a_server_restarts(tmp_path: Path, connect: Connect) -> None:
+    with serving(tmp_path) as first, Client(first.address) as setup:
+        setup.create_scene("s")
+        setup.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)])
+        port = int(first.address.rpartition(":")[2])
+        client = connect(first.address, ConnectOptions(max_attempts=20, max_backoff_s=0.5))
+        client.localize(PHOTO, CAMERA, "s")
+    with client:
+        with pytest.raises(Unavailable):  # where nobody comes back it is told in time
+            client.get_scene("s", timeout_s=0.5)
+        came_back = threading.Event()
+        leave = threading.Event()
+
+        def restart() -> None:
+            time.sleep(0.5)
+            with serving(tmp_path, port=port):
+                came_back.set()
+                leave.wait(60)
+
+        thread = threading.Thread(target=restart)
+        thread.start()
+        try:
+            assert isinstance(client.localize(PHOTO, CAMERA, "s"), LocalizationResult)
+            assert came_back.is_set()
+        finally:
+            leave.set()
+            thread.join(60)
+
+
+@both
+def test_a_deadline_ends_a_call(server: RunningServer, connect: Connect, scene: str) -> None:
+    with connect(server.address) as client, server.method.held(), pytest.raises(DeadlineExceeded):
+        client.localize(PHOTO, CAMERA, scene, timeout_s=0.5)
+
+
+def test_who_closes_a_client_does_not_wait_for_its_pauses() -> None:
+    with failing([status("UNAVAILABLE", 30.0)] * 9) as (address, server):
+        client = Client(address, FAST)
+        failed: list[BaseException] = []
+
+        def call() -> None:
+            try:
+                client.localize(PHOTO, CAMERA, "s", timeout_s=120.0)
+            except Unavailable as error:
+                failed.append(error)
+
+        thread = threading.Thread(target=call)
+        thread.start()
+        while len(server.tries) < 2:
+            time.sleep(0.005)
+        time.sleep(0.1)
+        client.close()
+        thread.join(20)
+        assert [type(it) for it in failed] == [Unavailable]
+
+
+def test_a_cancelled_task_cancels_its_call(server: RunningServer, scene: str) -> None:
+    async def run() -> None:
+        async with aio.Client(server.address) as client:
+            with server.method.held():
+                task = asyncio.create_task(client.localize(PHOTO, CAMERA, scene))
+                while server.engine.queue.job_count == 0:
+                    await asyncio.sleep(0.005)
+                task.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await task
+                while server.engine.queue.job_count:
+                    await asyncio.sleep(0.005)
+
+    asyncio.run(asyncio.wait_for(run(), 30))
+
+
+def test_calls_of_one_loop_run_at_the_same_time(server: RunningServer, scene: str) -> None:
+    async def run() -> list[LocalizationResult | Rejected]:
+        async with aio.Client(server.address) as client:
+            with server.method.held():
+                tasks = [asyncio.create_task(client.localize(PHOTO, CAMERA, scene)) for _ in range(2)]
+                while server.engine.queue.job_count < 2:
+                    await asyncio.sleep(0.005)
+            return await asyncio.gather(*tasks)
+
+    answers = asyncio.run(asyncio.wait_for(run(), 30))
+    assert all(isinstance(answer, LocalizationResult) for answer in answers)
+
+
+def test_the_asynchronous_client_needs_a_loop() -> None:
+    with pytest.raises(RuntimeError, match="no running event loop"):
+        aio.Client("localhost:1")

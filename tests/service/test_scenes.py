@@ -1,0 +1,156 @@
+"""What is known of a scene as a whole, through a real server: said, changed, forgotten, and refused by its field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
+
+import numpy as np
+import pytest
+from servers import Stubs, failure_of
+
+from mapless import UNCHANGED, Calibration, Client, Datum, InvalidArgument, NotFound, Quaternion
+from mapless.geodesy import enu_from_y_up
+from mapless.v1 import localization_service_pb2 as localization_pb
+from mapless.v1 import reference_service_pb2 as pb
+from mapless.v1.geometry_pb2 import Vector3
+
+DATUM = Datum(47.5, 8.25, 400.0, enu_from_y_up(0))
+CALIBRATION = Calibration(1.5, 1.25, 2.0, 1.75, 40, "sift-2048", "geometric", "BEST", "0.1.0")
+
+
+def test_a_scene_is_created_with_what_is_known_of_it(client: Client) -> None:
+    created = client.create_scene("placed", datum=DATUM, down_in_world=(0, -9.81, 0))
+    assert (created.datum, created.down_in_world, created.calibration) == (DATUM, (0, -1, 0), None)
+    assert created.generation == 1
+    assert client.get_scene("placed") == created
+    assert created in list(client.list_scenes())
+    client.delete_scene("placed")
+    assert client.create_scene("placed").datum is None
+    client.delete_scene("placed")
+
+
+def test_what_is_not_given_stays_and_none_forgets(client: Client, scene: str) -> None:
+    generation = client.get_scene(scene).generation
+    assert client.update_scene(scene, datum=DATUM).datum == DATUM
+    assert client.update_scene(f"scenes/{scene}", down_in_world=(0.0, -2.0, 0.0)).datum == DATUM
+    updated = client.update_scene(scene, calibration=CALIBRATION)
+    assert (updated.datum, updated.down_in_world) == (DATUM, (0, -1, 0))
+    assert updated.calibration is not None
+    assert replace(updated.calibration, create_time=None) == CALIBRATION
+    assert updated.calibration.create_time is not None
+    assert abs(updated.calibration.create_time - datetime.now(timezone.utc)) < timedelta(minutes=1)
+    assert updated.generation == generation + 3
+    updated = client.update_scene(scene, datum=None, calibration=UNCHANGED)
+    assert (updated.datum, updated.down_in_world, updated.calibration is None) == (None, (0, -1, 0), False)
+    updated = client.update_scene(scene, down_in_world=None, calibration=None)
+    assert (updated.datum, updated.down_in_world, updated.calibration) == (None, None, None)
+    assert updated == client.get_scene(scene)
+    assert updated.reference_count == 3
+
+
+def test_an_update_says_what_it_changes_of_a_scene_that_is_there(client: Client, stubs: Stubs, scene: str) -> None:
+    with pytest.raises(InvalidArgument) as caught:
+        client.update_scene(scene)
+    assert caught.value.field == "update_mask"
+    with pytest.raises(NotFound):
+        client.update_scene("nowhere", datum=None)
+    for path in ("name", "datum.latitude_deg", "generation", "*", "", "x" * 10_000):
+        request = pb.UpdateSceneRequest(scene=pb.Scene(name=f"scenes/{scene}"))
+        request.update_mask.paths.extend(["datum", path])
+        error = failure_of(stubs.references.UpdateScene, request)
+        assert (error.code, error.field) == ("INVALID_ARGUMENT", "update_mask")
+        assert "datum, down_in_world, calibration" in str(error)
+        assert len(str(error)) < 500
+    request = pb.UpdateSceneRequest(update_mask={"paths": ["datum"]})
+    assert failure_of(stubs.references.UpdateScene, request).field == "scene.name"
+
+
+def message_of(datum: Datum) -> pb.Datum:
+    return pb.Datum(latitude_deg=datum.latitude_deg, longitude_deg=datum.longitude_deg, height_m=datum.height_m)
+
+
+def calibration() -> pb.SceneCalibration:
+    return pb.SceneCalibration(
+        position_factor_68=1,
+        position_factor_95=1,
+        rotation_factor_68=1,
+        rotation_factor_95=1,
+        query_count=1,
+        variant=localization_pb.VARIANT_BEST,
+    )
+
+
+def set_to(path: str, name: str, value: object) -> Callable[[pb.Scene], None]:
+    return lambda scene: setattr(getattr(scene, path), name, value)
+
+
+def turn(**quaternion: float) -> Callable[[pb.Scene], None]:
+    return lambda scene: scene.datum.enu_from_world.CopyFrom(type(scene.datum.enu_from_world)(**quaternion))
+
+
+NAN, INFINITY = float("nan"), float("inf")
+BAD: list[tuple[str, Callable[[pb.Scene], None], str]] = [
+    ("datum", set_to("datum", "latitude_deg", 90.001), "datum.latitude_deg"),
+    ("datum", set_to("datum", "latitude_deg", NAN), "datum.latitude_deg"),
+    ("datum", set_to("datum", "longitude_deg", -181), "datum.longitude_deg"),
+    ("datum", set_to("datum", "height_m", INFINITY), "datum.height_m"),
+    ("datum", set_to("datum", "height_m", -12_001), "datum.height_m"),
+    ("datum", turn(), "datum.enu_from_world"),
+    ("datum", turn(w=1.1), "datum.enu_from_world"),
+    ("datum", turn(w=NAN), "datum.enu_from_world"),
+    ("down_in_world", lambda scene: scene.down_in_world.CopyFrom(Vector3()), "down_in_world"),
+    ("down_in_world", lambda scene: scene.down_in_world.CopyFrom(Vector3(x=NAN, z=1)), "down_in_world"),
+    ("down_in_world", lambda scene: scene.down_in_world.CopyFrom(Vector3(x=INFINITY)), "down_in_world"),
+    ("calibration", lambda scene: scene.calibration.CopyFrom(pb.SceneCalibration()), "calibration.variant"),
+    ("calibration", set_to("calibration", "variant", 99), "calibration.variant"),
+    ("calibration", set_to("calibration", "position_factor_68", 0), "calibration.position_factor_68"),
+    ("calibration", set_to("calibration", "position_factor_95", NAN), "calibration.position_factor_95"),
+    ("calibration", set_to("calibration", "rotation_factor_68", 1001), "calibration.rotation_factor_68"),
+    ("calibration", set_to("calibration", "rotation_factor_95", -1), "calibration.rotation_factor_95"),
+    ("calibration", set_to("calibration", "query_count", 0), "calibration.query_count"),
+    ("calibration", set_to("calibration", "backend", "x" * 129), "calibration.backend"),
+]
+
+
+@pytest.mark.parametrize(("path", "spoil", "field"), BAD, ids=[f"{i}-{case[2]}" for i, case in enumerate(BAD)])
+def test_what_cannot_be_is_refused_by_its_field(
+    client: Client, stubs: Stubs, scene: str, path: str, spoil: Callable[[pb.Scene], None], field: str
+) -> None:
+    before = client.get_scene(scene)
+    values = pb.Scene(datum=message_of(DATUM), down_in_world=Vector3(z=-1), calibration=calibration())
+    request = pb.UpdateSceneRequest(scene=values, update_mask={"paths": [path]})
+    request.scene.name = f"scenes/{scene}"
+    spoil(request.scene)
+    error = failure_of(stubs.references.UpdateScene, request)
+    assert (error.code, error.field) == ("INVALID_ARGUMENT", f"scene.{field}")
+    assert client.get_scene(scene) == before
+    if path != "calibration":
+        create = pb.CreateSceneRequest(scene_id="never", **{path: getattr(request.scene, path)})
+        assert failure_of(stubs.references.CreateScene, create).field == field
+
+
+def test_a_datum_of_another_world_is_refused(client: Client, scene: str) -> None:
+    """One that leaves out that the world's y is up, not its z; whichever of the two comes later is the guilty one."""
+    upright = replace(DATUM, enu_from_world=Quaternion(0, 0, 0, 1))
+    client.update_scene(scene, down_in_world=(0, -1, 0))
+    with pytest.raises(InvalidArgument, match="90 degrees off") as caught:
+        client.update_scene(scene, datum=upright)
+    assert caught.value.field == "scene.datum"
+    client.update_scene(scene, datum=upright, down_in_world=None)
+    with pytest.raises(InvalidArgument, match="enu_from_world") as caught:
+        client.update_scene(scene, down_in_world=(0, -1, 0))
+    assert caught.value.field == "scene.down_in_world"
+    with pytest.raises(InvalidArgument) as caught:
+        client.create_scene("never", datum=upright, down_in_world=(0, -1, 0))
+    assert caught.value.field == "down_in_world"
+
+
+def test_a_quaternion_is_answered_normalized(client: Client, scene: str) -> None:
+    almost = Quaternion(0.0, 0.0, -0.6004, -0.8)
+    found = client.update_scene(scene, datum=replace(DATUM, enu_from_world=almost)).datum
+    assert found is not None
+    q = found.enu_from_world
+    assert np.linalg.norm([q.x, q.y, q.z, q.w]) == pytest.approx(1, abs=1e-12)
+    assert (q.z, q.w) == pytest.approx((0.6, 0.8), abs=1e-3)

@@ -1,0 +1,171 @@
+"""Watching a scene's queries through a real server: who sees what, who may, and how it ends."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from servers import CAMERA, PHOTO, RunningServer, localize_request, pose, serving
+
+from mapless import Client, ConnectOptions, LocalizationResult, NewReference
+from mapless.errors import from_rpc_error
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless_server.security.tokens import create_token, revoke_token
+from mapless_server.watching import MAX_WATCHERS_OF_TENANT
+
+LIMIT_S = 30.0
+REQUEST = pb.WatchQueriesRequest(scene="scenes/hall")
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
+    with serving(tmp_path_factory.mktemp("data"), allow_watching=True) as running:
+        with Client(running.address) as client:
+            fill(client, "hall")
+            fill(client, "cellar")
+        yield running
+
+
+def fill(client: Client, scene: str) -> None:
+    client.create_scene(scene)
+    client.add_references(scene, [NewReference("r", PHOTO, CAMERA, pose(1.0))])
+
+
+@pytest.fixture
+def stub(server: RunningServer) -> Iterator[LocalizationServiceStub]:
+    with grpc.insecure_channel(server.address) as channel:
+        yield LocalizationServiceStub(channel)
+
+
+def watching(stub: LocalizationServiceStub, scene: str = "hall", **arguments: Any) -> Any:
+    """A watch that has begun: whatever is answered from now on is seen."""
+    call = stub.WatchQueries(pb.WatchQueriesRequest(scene=f"scenes/{scene}"), timeout=LIMIT_S, **arguments)
+    call.initial_metadata()
+    return call
+
+
+def ending(call: Any) -> Any:
+    """The error that a watch ends with."""
+    with pytest.raises(grpc.RpcError) as caught:
+        list(call)
+    return from_rpc_error(caught.value)
+
+
+def test_answers_are_seen_as_they_come_and_those_of_other_scenes_are_not(
+    server: RunningServer, stub: LocalizationServiceStub
+) -> None:
+    seen = watching(stub)
+    stub.Localize(localize_request("cellar"), timeout=LIMIT_S)
+    own = stub.Localize(localize_request("hall"), timeout=LIMIT_S, metadata=(("x-request-id", "mine"),))
+    message = next(seen)
+    assert message.image == PHOTO
+    assert message.intrinsics == localize_request("hall").intrinsics
+    assert message.answer.localization == own.localization
+    assert message.answer.diagnostics.request_id == "mine"
+    assert not own.HasField("debug")
+    seen.cancel()
+
+
+def test_it_needs_to_be_allowed(tmp_path: Path) -> None:
+    with serving(tmp_path) as closed, grpc.insecure_channel(closed.address) as channel:
+        failure = ending(LocalizationServiceStub(channel).WatchQueries(REQUEST, timeout=LIMIT_S))
+    assert (failure.code, failure.reason) == ("FAILED_PRECONDITION", "WATCHING_NOT_ALLOWED")
+    assert failure.request_id
+
+
+def test_a_scene_that_is_not_there_and_a_name_that_is_none(stub: LocalizationServiceStub) -> None:
+    absent = ending(stub.WatchQueries(pb.WatchQueriesRequest(scene="scenes/absent"), timeout=LIMIT_S))
+    assert (absent.code, absent.field) == ("NOT_FOUND", "scene")
+    senseless = ending(stub.WatchQueries(pb.WatchQueriesRequest(scene="hall"), timeout=LIMIT_S))
+    assert (senseless.code, senseless.field) == ("INVALID_ARGUMENT", "scene")
+
+
+def test_too_many_are_sent_away_and_who_leaves_makes_room(stub: LocalizationServiceStub) -> None:
+    seen = [watching(stub) for _ in range(MAX_WATCHERS_OF_TENANT)]
+    failure = ending(stub.WatchQueries(REQUEST, timeout=LIMIT_S))
+    assert (failure.code, failure.reason) == ("RESOURCE_EXHAUSTED", "TOO_MANY_WATCHERS")
+    assert failure.retry_after_s is not None
+    seen.pop().cancel()
+    end_s = time.monotonic() + LIMIT_S
+    while True:  # the server hears of it a moment later
+        again = stub.WatchQueries(REQUEST, timeout=LIMIT_S)
+        try:
+            again.initial_metadata()
+            if again.is_active():
+                break
+            ending(again)
+        except grpc.RpcError:
+            pass
+        assert time.monotonic() < end_s
+    for call in (*seen, again):
+        call.cancel()
+
+
+def test_a_deadline_of_the_callers_own_ends_it(stub: LocalizationServiceStub) -> None:
+    failure = ending(stub.WatchQueries(REQUEST, timeout=0.3))
+    assert failure.code == "DEADLINE_EXCEEDED"
+
+
+def test_the_end_of_the_server_ends_it_at_once(tmp_path: Path) -> None:
+    with serving(tmp_path, allow_watching=True, drain_grace_s=60) as leaving:
+        with Client(leaving.address) as client:
+            fill(client, "hall")
+        with grpc.insecure_channel(leaving.address) as channel:
+            seen = watching(LocalizationServiceStub(channel))
+            leaving.stop()
+            failure = ending(seen)
+    assert (failure.code, failure.reason) == ("UNAVAILABLE", "DRAINING")
+
+
+def test_a_watcher_that_reads_nothing_does_not_keep_the_server_from_ending(tmp_path: Path) -> None:
+    """Leaving `serving` waits for the server's end, and for less than its calls would be given."""
+    with ExitStack() as stack:
+        leaving = stack.enter_context(serving(tmp_path, allow_watching=True, drain_grace_s=60))
+        client = Client(leaving.address)
+        fill(client, "hall")
+        channel = grpc.insecure_channel(leaving.address)
+        seen = watching(LocalizationServiceStub(channel))
+        for _ in range(30):
+            assert isinstance(client.localize(PHOTO, CAMERA, "hall"), LocalizationResult)
+        stack.close()
+        assert seen.is_active()  # for all it knows: it has not read what came before the end
+        client.close()
+        channel.close()
+
+
+def test_a_token_that_is_revoked_shows_nothing_more(tmp_path: Path) -> None:
+    tokens = tmp_path / "tokens.json"
+    token = create_token(tokens, "guard", "acme", "write", None)
+    metadata = (("authorization", f"Bearer {token}"),)
+    other = create_token(tokens, "robot", "acme", "write", None)
+    with (
+        serving(tmp_path / "data", allow_watching=True, tokens_file=tokens) as guarded,
+        grpc.insecure_channel(guarded.address) as channel,
+    ):
+        stub = LocalizationServiceStub(channel)
+        robot = (("authorization", f"Bearer {other}"),)
+        with Client(guarded.address, ConnectOptions(token=other)) as client:
+            fill(client, "hall")
+        seen = watching(stub, metadata=metadata)
+        stub.Localize(localize_request("hall"), timeout=LIMIT_S, metadata=robot)
+        assert next(seen).image == PHOTO
+        revoke_token(tokens, "guard")
+        done = threading.Event()
+        threading.Thread(target=lambda: (list_until_error(seen), done.set())).start()
+        end_s = time.monotonic() + LIMIT_S
+        while not done.wait(0.2):
+            stub.Localize(localize_request("hall"), timeout=LIMIT_S, metadata=robot)
+            assert time.monotonic() < end_s
+        assert seen.code() is grpc.StatusCode.UNAUTHENTICATED
+
+
+def list_until_error(call: Any) -> None:
+    with pytest.raises(grpc.RpcError):
+        list(call)

@@ -1,0 +1,173 @@
+"""When a call is tried again, and when not: decided without a server, by a clock that is told how late it is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from google.protobuf import empty_pb2
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapless.errors import AlreadyExists, InvalidArgument, MaplessError, NotFound, ResourceExhausted, Unavailable
+from mapless.exchange import Attempt, Call, Exchange, Pause, _Clock, attempts
+from mapless.options import ConnectOptions
+
+Empty: Any = empty_pb2.Empty  # type: ignore[attr-defined]
+UNAVAILABLE = Unavailable("UNAVAILABLE", "gone")
+
+
+def full(retry_after_s: float | None) -> MaplessError:
+    return ResourceExhausted("RESOURCE_EXHAUSTED", "full", retry_after_s=retry_after_s)
+
+
+def asking(**given: Any) -> Exchange[Any]:
+    """An exchange of one call, which returns what it is answered."""
+    return (yield Call("s/M", Empty(), Empty, **given))
+
+
+class Played:
+    """An exchange with scripted outcomes; the last is repeated.
+
+    Attributes:
+        tries: the time left to each attempt, seconds.
+        pauses: seconds.
+        took_s: all of them together with the attempts, which take a second each.
+        result: what it returned, or its error.
+    """
+
+    def __init__(
+        self, exchange: Exchange[Any], outcomes: list[Any], options: ConnectOptions, dice: float = 0.5
+    ) -> None:
+        self.tries: list[float] = []
+        self.calls: list[Call] = []
+        self.pauses: list[float] = []
+        self.took_s = 0.0
+        clock = _Clock(lambda: self.took_s, lambda low, high: low + dice * (high - low))
+        steps = attempts(exchange, options, clock)
+        outcomes = list(outcomes)
+        try:
+            step = next(steps)
+            while True:
+                if isinstance(step, Pause):
+                    self.pauses.append(step.duration_s)
+                    self.took_s += step.duration_s
+                    step = next(steps)
+                else:
+                    assert isinstance(step, Attempt)
+                    self.tries.append(step.timeout_s)
+                    self.calls.append(step.call)
+                    self.took_s += 1.0
+                    step = steps.send(outcomes.pop(0) if len(outcomes) > 1 else outcomes[0])
+        except StopIteration as end:
+            self.result: Any = end.value
+        except MaplessError as error:
+            self.result = error
+
+
+def test_what_succeeds_is_asked_once() -> None:
+    played = Played(asking(), [Empty()], ConnectOptions(timeout_s=7))
+    assert (played.result, played.tries, played.pauses) == (Empty(), [7.0], [])
+
+
+def test_pauses_double_up_to_the_longest_and_attempts_are_counted() -> None:
+    options = ConnectOptions(max_attempts=6, initial_backoff_s=0.2, max_backoff_s=1.0)
+    played = Played(asking(), [UNAVAILABLE], options)
+    assert played.result is UNAVAILABLE
+    assert len(played.tries) == 6
+    assert played.pauses == pytest.approx([0.2, 0.4, 0.8, 1.0, 1.0])
+
+
+def test_all_attempts_share_one_deadline() -> None:
+    played = Played(asking(timeout_s=10.0), [UNAVAILABLE, UNAVAILABLE, Empty()], ConnectOptions())
+    assert played.tries == pytest.approx([10.0, 10 - 1.2, 10 - 2.6])
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    outcomes=st.lists(st.sampled_from([None, 0.05, 0.7, 3.0, 40.0]), min_size=1, max_size=8),
+    code=st.sampled_from(["UNAVAILABLE", "RESOURCE_EXHAUSTED"]),
+    timeout_s=st.floats(0.5, 60),
+    dice=st.floats(0, 1),
+)
+def test_laws(outcomes: list[float | None], code: str, timeout_s: float, dice: float) -> None:
+    """No attempt begins after the deadline, none too many, none earlier than a server at its limit has asked for."""
+    kinds = {"UNAVAILABLE": Unavailable, "RESOURCE_EXHAUSTED": ResourceExhausted}
+    errors = [kinds[code](code, "", retry_after_s=after_s) for after_s in outcomes]
+    options = ConnectOptions(timeout_s=timeout_s)
+    played = Played(asking(), errors, options, dice)
+    assert played.result in errors
+    assert 1 <= len(played.tries) <= options.max_attempts
+    assert all(0 < left_s <= timeout_s for left_s in played.tries)
+    for pause_s, error in zip(played.pauses, errors + errors[-1:] * 8, strict=False):
+        asked_s = error.retry_after_s or 0.0
+        assert pause_s <= max(1.2 * options.max_backoff_s, 1.25 * asked_s)
+        assert code == "UNAVAILABLE" or pause_s >= asked_s > 0
+
+
+def test_a_message_over_the_limit_is_not_sent_again() -> None:
+    played = Played(asking(), [full(None)], ConnectOptions())
+    assert (len(played.tries), played.pauses) == (1, [])
+
+
+def test_who_would_come_back_after_its_deadline_is_told_at_once() -> None:
+    refused = full(3.0)
+    played = Played(asking(timeout_s=3.5), [refused], ConnectOptions())
+    assert (played.result, len(played.tries), played.pauses) == (refused, 1, [])
+
+
+def test_the_second_pause_is_what_a_starting_server_asks_for_and_the_first_leaves_it_to_another() -> None:
+    starting = Unavailable("UNAVAILABLE", "starting", retry_after_s=1.0)
+    assert Played(asking(), [starting, starting, Empty()], ConnectOptions()).pauses == pytest.approx([0.2, 1.0])
+
+
+def test_other_errors_are_final() -> None:
+    wrong = InvalidArgument("INVALID_ARGUMENT", "wrong")
+    played = Played(asking(), [wrong], ConnectOptions())
+    assert (played.result, len(played.tries)) == (wrong, 1)
+
+
+def test_every_upload_has_the_time_of_uploads() -> None:
+    options = ConnectOptions(timeout_s=5, upload_timeout_s=50)
+    assert Played(asking(is_upload=True), [Empty()], options).tries == [50.0]
+    assert Played(asking(is_upload=True, timeout_s=2.0), [Empty()], options).tries == [2.0]
+
+
+def found(error: MaplessError) -> Exchange[str]:
+    yield Call("s/Get", Empty(), Empty)
+    return f"found after {error.code}"
+
+
+TAKEN, ABSENT = AlreadyExists("ALREADY_EXISTS", "taken"), NotFound("NOT_FOUND", "absent")
+
+
+def test_what_was_done_though_its_answer_was_lost_is_looked_up() -> None:
+    played = Played(asking(on_repeat=found), [UNAVAILABLE, TAKEN, Empty()], ConnectOptions())
+    assert played.result == "found after ALREADY_EXISTS"
+    assert [call.method for call in played.calls] == ["s/M", "s/M", "s/Get"]
+
+
+@pytest.mark.parametrize("outcomes", [[TAKEN], [full(0.1), TAKEN]])
+def test_what_no_lost_try_can_have_done_is_an_error(outcomes: list[Any]) -> None:
+    """A server at its limit has done nothing, and says so."""
+    assert Played(asking(on_repeat=found), outcomes, ConnectOptions()).result is TAKEN
+
+
+def test_the_error_stays_if_what_is_found_is_not_ours() -> None:
+    def foreign(error: MaplessError) -> Exchange[str]:
+        yield Call("s/Get", Empty(), Empty)
+        raise error
+
+    assert Played(asking(on_repeat=foreign), [UNAVAILABLE, ABSENT, Empty()], ConnectOptions()).result is ABSENT
+
+
+def test_an_exchange_can_go_on_after_an_error() -> None:
+    def two() -> Exchange[str]:
+        try:
+            yield Call("s/A", Empty(), Empty)
+        except NotFound:
+            yield Call("s/B", Empty(), Empty)
+        return "done"
+
+    played = Played(two(), [ABSENT, Empty()], ConnectOptions())
+    assert (played.result, [call.method for call in played.calls]) == ("done", ["s/A", "s/B"])

@@ -1,0 +1,178 @@
+"""The gate: what chance could do is no pose, nor what repeated texture does; and the numbers it judges by."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import CAMERA, random_for
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.method.gate import (
+    GateOptions,
+    doubts,
+    false_alarms,
+    hull_share,
+    log10_false_alarms,
+    told_false_alarms,
+    visible_count,
+)
+from mapless_server.method.match import PointMatches
+from mapless_server.method.observations import ONE_PIXEL
+from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.structure import Structure
+from mapless_server.method.tracks import Tracks
+from mapless_server.method.views import Features, View
+
+POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
+INLIER_PX = PnpOptions().inlier_px
+
+Problem = tuple[View, Structure, PointMatches]
+
+
+def problem_of(x_in_world: Array, pixels: Array) -> Problem:
+    """Point i matched with keypoint i."""
+    n = len(x_in_world)
+    index = np.arange(n)
+    features = Features(pixels.astype(np.float32), np.ones((n, 1), np.float32), np.ones(n, np.float32))
+    structure = Structure(x_in_world, Tracks(index[:0], index[:0], index[:0]), ONE_PIXEL)
+    return View(CAMERA, features), structure, PointMatches(index, index, np.zeros(n, bool), 0.0)
+
+
+def planted(random: np.random.Generator, count: int, noise_px: float = 0.5, outlier_share: float = 0.0) -> Problem:
+    """Points all over the image of a camera at POSE; the first of their matches are wrong."""
+    pixels = random.uniform([0, 0], [959, 719], (count, 2))
+    x_in_world = POSE.apply(CAMERA.rays(pixels) * random.uniform(3, 6, (count, 1)))
+    pixels += random.normal(0, noise_px, pixels.shape)
+    wrong = np.arange(count) < outlier_share * count
+    return problem_of(x_in_world, np.where(wrong[:, None], random.uniform([0, 0], [959, 719], (count, 2)), pixels))
+
+
+def doubt_of(problem: Problem, initial: RigidTransform = POSE, options: GateOptions | None = None) -> str:
+    """What is said against the pose that the solver finds; empty if nothing, its own words if it finds none."""
+    estimate = solve_pose(*problem, initial, PnpOptions())
+    if isinstance(estimate, Rejection):
+        assert estimate.reason is RejectionReason.PNP_FAILED
+        return estimate.message
+    return said(problem, estimate, options or GateOptions())
+
+
+def said(problem: Problem, estimate: PoseEstimate, options: GateOptions) -> str:
+    return doubts(*problem, estimate.world_from_camera, estimate.inliers, INLIER_PX, options) or ""
+
+
+@pytest.mark.parametrize("outlier_share", [0.0, 0.5])
+def test_a_planted_pose_is_not_doubted(outlier_share: float) -> None:
+    for seed in range(5):
+        assert not doubt_of(planted(random_for("good", outlier_share, seed), 100, 0.5, outlier_share))
+
+
+@pytest.mark.parametrize("count", [6, 40, 400])
+def test_degenerate_points_are_doubted(count: int) -> None:
+    on_a_line = np.linspace(-1, 1, count)[:, None] * np.array([1.0, 0.3, 0.2])
+    for x_in_world in (on_a_line, np.zeros((count, 3))):
+        problem = problem_of(x_in_world, CAMERA.project(POSE.inverse().apply(x_in_world)))
+        for initial in (POSE, POSE.shifted(np.array([3.0, 1.0, 0.0]))):
+            assert doubt_of(problem, initial)
+
+
+def test_points_with_no_pose_at_all_are_gated() -> None:
+    """Random matches: no pose is true, and none may be believed."""
+    for seed in range(50):
+        random = random_for("no pose", seed)
+        assert doubt_of(planted(random, int(random.integers(6, 120)), outlier_share=1.0)), seed
+
+
+def test_guided_matches_around_a_wrong_pose_are_gated() -> None:
+    """A search of 20 px finds some keypoint near every projection; that they agree must not count."""
+    for seed in range(20):
+        random = random_for("guided", seed)
+        view, structure, matches = planted(random, 80, 0.0)
+        within = 20 * np.sqrt(random.random(80)) * np.exp(1j * random.uniform(0, 2 * np.pi, 80))
+        keypoints = view.features.keypoints + np.stack([within.real, within.imag], axis=1).astype(np.float32)
+        searched = PointMatches(matches.point, matches.keypoint, np.ones(80, bool), radius_px=20.0)
+        query = replace(view, features=replace(view.features, keypoints=keypoints))
+        assert doubt_of((query, structure, searched)), seed
+
+
+def test_agreement_in_one_corner_is_doubted() -> None:
+    random = random_for("corner")
+    pixels = random.uniform([100, 100], [180, 160], (60, 2))
+    x_in_world = POSE.apply(CAMERA.rays(pixels) * random.uniform(3, 6, (60, 1)))
+    problem = problem_of(x_in_world, pixels)
+    assert "cover only" in doubt_of(problem)
+    assert not doubt_of(problem, options=GateOptions(min_hull_share=0.0))
+
+
+def test_agreement_of_few_of_many_visible_points_is_doubted() -> None:
+    random = random_for("share")
+    view, structure, matches = planted(random, 1000)
+    few = PointMatches(matches.point[:30], matches.keypoint[:30], matches.guided[:30], 0.0)
+    assert "should show 1000 points" in doubt_of((view, structure, few))
+    behind = replace(structure, x_in_world=structure.x_in_world.copy())
+    behind.x_in_world[30:] = POSE.apply([0.0, 0.0, -5.0])  # what is not in front need not be found
+    assert not doubt_of((view, behind, few))
+
+
+def test_the_hull_is_that_of_a_known_rectangle() -> None:
+    corners = np.array([[0.0, 0.0], [480.0, 0.0], [480.0, 360.0], [0.0, 360.0], [100.0, 100.0]])
+    query, _, matches = problem_of(np.zeros((5, 3)), corners)
+    assert hull_share(query, matches, np.ones(5, bool)) == pytest.approx(0.25, rel=1e-4)
+
+
+def test_visible_is_what_lies_in_front_and_inside() -> None:
+    inside = POSE.apply(CAMERA.rays(np.array([[0.0, 0.0], [959.0, 719.0]])) * 3.0)
+    outside = POSE.apply(CAMERA.rays(np.array([[-2.0, 0.0], [959.0, 722.0]])) * 3.0)
+    behind = POSE.apply([0.0, 0.0, -2.0])[None]
+    _, structure, _ = problem_of(np.concatenate([inside, outside, behind]), np.zeros((5, 2)))
+    assert visible_count(CAMERA, structure, POSE) == 2
+
+
+# False alarms
+
+
+def test_false_alarms_are_the_formula() -> None:
+    for n in (4, 5, 10, 60):
+        for k in range(4, n + 1):
+            for p in (1e-4, 0.01, 0.3):
+                expected = math.log10((n - 3) * math.comb(n, k) * math.comb(k, 3) * p ** (k - 3))
+                assert false_alarms(n, k, p) == pytest.approx(expected, abs=1e-8)
+
+
+def test_three_matches_agree_with_a_pose_by_construction() -> None:
+    for k in range(4):
+        assert false_alarms(50, k, 1e-6) == math.inf
+    assert false_alarms(50, 20, 1.0) == math.inf
+    assert told_false_alarms(math.inf) == "any number of such poses expected"
+    assert told_false_alarms(2.34) == "10^2.3 such poses expected"
+
+
+def test_false_alarms_fall_with_inliers_and_rise_with_matches_and_chance() -> None:
+    of_inliers = [false_alarms(100, k, 1e-3) for k in range(4, 101)]
+    assert np.all(np.diff(of_inliers) < 0)
+    assert np.all(np.diff([false_alarms(n, 10, 1e-3) for n in range(10, 2000, 50)]) > 0)
+    assert np.all(np.diff([false_alarms(100, 10, p) for p in np.geomspace(1e-5, 0.9, 20)]) > 0)
+
+
+def test_each_group_of_matches_is_judged_by_its_own_chance() -> None:
+    inliers = np.arange(100) < 40
+    disc = INLIER_PX**2
+    index = np.arange(100)
+    free = PointMatches(index, index, np.zeros(100, bool), 0.0)
+    share = math.pi * disc / (CAMERA.width_px * CAMERA.height_px)
+    assert log10_false_alarms(CAMERA, free, inliers, INLIER_PX) == pytest.approx(false_alarms(100, 40, share))
+    guided = PointMatches(index, index, np.ones(100, bool), 20.0)
+    assert log10_false_alarms(CAMERA, guided, inliers, INLIER_PX) == pytest.approx(false_alarms(100, 40, disc / 400))
+    both = PointMatches(index, index, index % 2 == 0, 20.0)
+    assert log10_false_alarms(CAMERA, both, inliers, INLIER_PX) == pytest.approx(
+        min(false_alarms(50, 20, share), false_alarms(50, 20, disc / 400))
+    )
+
+
+def test_senseless_options_are_refused() -> None:
+    for options in ({"min_hull_share": 1.5}, {"min_found_share": -0.1}, {"max_log10_false_alarms": math.nan}):
+        with pytest.raises(ValueError, match="senseless"):
+            GateOptions(**options)  # type: ignore[arg-type]

@@ -1,0 +1,149 @@
+"""Trust is the share of right answers that look at most as good: monotone in each piece of evidence, and what is asked
+as coverage is the share of right answers that passes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from planted import true_structure
+from scenes import SceneOptions, make_scene, random_for
+
+from mapless_server.method.evidence import FEATURES, Evidence, evidence_of
+from mapless_server.method.judge import LEVELS, JudgeOptions, judge, score_of, trust_of
+from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.support import Support
+
+OPTIONS = JudgeOptions()
+INLIER_PX = PnpOptions().inlier_px
+GOOD = Evidence(
+    log10_false_alarms=-900.0,
+    inlier_count=300,
+    match_count=330,
+    visible_count=600,
+    hull_share=0.6,
+    reference_count=4.0,
+    error_sigma=1.0,
+    relative_radius=0.003,
+)
+POOR = Evidence(-11.0, 9, 31, 70, 0.05, 1.6, 1.5, 0.4)
+"""Such a pose was 89 cm off."""
+
+
+def support_of(outlier_share: float = 0.0, seen_share: float = 0.9) -> Support:
+    """A planted photograph, solved."""
+    options = SceneOptions(point_count=300, outlier_share=outlier_share, seen_share=seen_share)
+    scene = make_scene(random_for("judge", outlier_share, seen_share), options)
+    structure, matches = true_structure(scene)
+    estimate = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
+    assert isinstance(estimate, PoseEstimate)
+    return Support(scene.query, scene.references, structure, matches, estimate, np.zeros(3))
+
+
+def verdict(support: Support, coverage: float, options: JudgeOptions = OPTIONS) -> tuple[float, Rejection | None]:
+    judged = judge(support, [np.empty((0, 2), np.int32)] * len(support.references), INLIER_PX, coverage, options)
+    return judged.trust, judged.rejection
+
+
+def test_well_supported_is_trusted_and_poorly_supported_is_not() -> None:
+    assert trust_of(GOOD, OPTIONS) > 0.3
+    assert trust_of(POOR, OPTIONS) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "better"),
+    [
+        ("log10_false_alarms", -2000.0),
+        ("match_count", 305),
+        ("visible_count", 320),
+        ("hull_share", 0.9),
+        ("reference_count", 8.0),
+        ("relative_radius", 0.001),
+    ],
+)
+def test_more_evidence_never_lowers_the_trust(name: str, better: float) -> None:
+    poorer = replace(GOOD, error_sigma=2.0)
+    assert score_of(replace(poorer, **{name: better}), OPTIONS) >= score_of(poorer, OPTIONS)
+    assert score_of(poorer, OPTIONS) <= score_of(GOOD, OPTIONS)
+
+
+@given(features=st.lists(st.floats(-10, 10), min_size=7, max_size=7), which=st.integers(0, 6), more=st.floats(0, 5))
+def test_the_score_is_monotone(features: list[float], which: int, more: float) -> None:
+    weights = np.array(OPTIONS.weights)
+    raised = np.array(features)
+    raised[which] += more
+    assert raised @ weights >= np.array(features) @ weights - 1e-9
+    assert len(FEATURES) == len(weights)
+
+
+@given(share=st.floats(0, 1))
+def test_trust_is_the_quantile_among_right_answers(share: float) -> None:
+    """Scores drawn as those of right answers have a trust that is uniform: the share of them below t is t."""
+    drawn = np.interp(np.random.default_rng(3).random(4000), LEVELS, OPTIONS.scores)
+    trusts = np.interp(drawn, OPTIONS.scores, LEVELS)
+    assert abs((trusts <= share).mean() - share) < 0.03
+
+
+def test_coverage_is_what_trust_is_compared_with() -> None:
+    support = support_of()
+    trust, rejection = verdict(support, 1.0)
+    assert rejection is None
+    assert 0 < trust < 1
+    just_enough, too_little = min(1.0, 1 - trust + 1e-6), 1 - trust - 1e-6
+    assert verdict(support, just_enough) == (trust, None)
+    refused = verdict(support, too_little)[1]
+    assert refused is not None
+    assert refused.reason is RejectionReason.GATE
+    assert f"{100 * trust:.1f} %" in refused.message
+    assert "matches agree" in refused.message
+
+
+def test_worse_matches_and_fewer_points_are_trusted_less() -> None:
+    clean, noisy, sparse = (verdict(s, 1.0)[0] for s in (support_of(), support_of(0.5), support_of(0.0, 0.3)))
+    assert clean > noisy
+    assert clean > sparse
+
+
+def test_agreement_with_what_is_known_beforehand_is_evidence() -> None:
+    """A prior that a pose found by chance would meet once in ten thousand."""
+    support = support_of(0.0, 0.3)
+    before, after = evidence_of(support, INLIER_PX), evidence_of(support, INLIER_PX, -4.0)
+    assert after.log10_false_alarms == pytest.approx(before.log10_false_alarms - 4)
+    assert trust_of(after, OPTIONS) >= trust_of(before, OPTIONS)
+
+
+def test_evidence_counts_what_is_planted() -> None:
+    support = support_of(0.25)
+    evidence = evidence_of(support, INLIER_PX)
+    assert support.estimate is not None
+    assert evidence.inlier_count == support.estimate.inliers.sum()
+    assert evidence.match_count == len(support.matches)
+    assert evidence.inlier_share == pytest.approx(evidence.inlier_count / evidence.match_count)
+    assert 0 < evidence.found_share <= 1
+    assert 4.0 < evidence.reference_count <= 6.0  # all six see about as much of it
+    assert np.isfinite(evidence.features()).all()
+
+
+def test_degenerate_evidence_has_finite_features() -> None:
+    """Nothing that a solver answers may make a score of NaN, which no comparison rejects."""
+    worst = Evidence(np.inf, 4, 5000, 0, 0.0, 1.0, 1e6, 10.0)
+    assert np.isfinite(worst.features()).all()
+    assert trust_of(worst, OPTIONS) == 0.0
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"weights": (1.0,)},
+        {"weights": (-1.0,) * len(FEATURES)},
+        {"scores": (1.0, 0.0) * (len(LEVELS) // 2)},
+        {"scores": (0.0,)},
+    ],
+)
+def test_options_check_themselves(wrong: dict[str, tuple[float, ...]]) -> None:
+    with pytest.raises(ValueError, match="senseless"):
+        JudgeOptions(**wrong)  # type: ignore[arg-type]

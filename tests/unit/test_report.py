@@ -1,0 +1,298 @@
+"""The report of an answer: it needs nothing else, runs nothing, and what it draws lies where it belongs."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from images import encode, textured, with_exif_orientation
+
+from mapless.answers import (
+    Accuracy,
+    Debug,
+    Diagnostics,
+    Hint,
+    Hypothesis,
+    LocalizationResult,
+    PriorCheck,
+    ReferenceUse,
+    Rejected,
+)
+from mapless.geometry import Array, Camera, RadialTangential, RigidTransform, rotation_from_vector
+from mapless.report import pictures, report_html, write_report
+from mapless.report.overlay import magnification
+from mapless.report.plan import _fit, ellipse_in_plane
+from mapless.results import Reference
+
+CAMERA = Camera(640, 480, 500.0, 505.0, 321.0, 238.0, RadialTangential(-0.1, 0.02, 0.001, 0.0, 0.0))
+PHOTO = encode(".jpg", textured(640, 480))
+NOW = datetime(2026, 11, 21, 12, 0, 0, tzinfo=timezone.utc)
+VOID = {"meta", "input"}
+ALLOWED = re.findall(
+    r"\w+",
+    "html head meta title style body header p h1 h2 h3 b span div section figure figcaption svg defs "
+    "image use rect path g circle ellipse text table thead tbody tr th td input label footer ",
+)
+
+
+@dataclass
+class Page(HTMLParser):
+    """What a browser makes of a page: its elements and their attributes, its text, and whether all is closed."""
+
+    tags: Counter[str] = field(default_factory=Counter)
+    attributes: list[tuple[str, str, str]] = field(default_factory=list)
+    words: list[str] = field(default_factory=list)
+    open: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__init__()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags[tag] += 1
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags[tag] += 1
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+    @staticmethod
+    def of(html: str) -> Page:
+        page = Page()
+        page.feed(html)
+        page.close()
+        assert not page.open
+        return page
+
+
+def truth() -> RigidTransform:
+    return RigidTransform(rotation_from_vector([0.2, -0.1, 0.3]), np.array([1.0, 2.0, 3.0]))
+
+
+def debug(noise_px: float = 1.0, wrong: int = 20) -> Debug:
+    """Two hundred points of a planted scene, as the photograph and two references show them."""
+    random = np.random.default_rng(5)
+    x = truth().apply(random.uniform((-2, -1.5, 4), (2, 1.5, 8), (200, 3)))
+    pixels = CAMERA.project(truth().inverse().apply(x)) + random.normal(0, noise_px, (200, 2))
+    is_inlier = np.arange(200) >= wrong
+    pixels[~is_inlier] = random.uniform(0, 480, (wrong, 2))
+    shown = random.uniform(0, 480, (200, 2))
+    return Debug(pixels, x, is_inlier, np.where(is_inlier, 0.8, 30.0), np.arange(200) % 2, shown)
+
+
+def diagnostics(names: tuple[str, ...] = ("a", "b")) -> Diagnostics:
+    uses = tuple(ReferenceUse(f"scenes/hall/references/{name}", 90 - i, 70 - i, 0.4) for i, name in enumerate(names))
+    return Diagnostics("id-1", "geometric", "", "sift", "BEST", 3, uses, None, {"pnp": 0.02}, 0, 0.3, 640, 480, "0.1.0")
+
+
+def localized(**changes: object) -> LocalizationResult:
+    answer = LocalizationResult(
+        truth(),
+        np.diag([4e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6]),
+        Accuracy(0.02, 0.04, 0.1, 0.2, False),
+        "REFINED",
+        180,
+        200,
+        0.8,
+        diagnostics(),
+        capture_time=NOW,
+        trust=0.4,
+        prior_checks=(PriorCheck("GRAVITY", 0.7, 2, False, True), PriorCheck("POSITION", 8.0, 3, True, False)),
+        debug=debug(),
+    )
+    return replace(answer, **changes)  # type: ignore[arg-type]
+
+
+def rejected(**changes: object) -> Rejected:
+    hint = Hint("pnp", "LOOK_AT_REFERENCE", "Point the camera there.", "scenes/hall/references/a")
+    return replace(Rejected("LOW_OVERLAP", "only 3 matches", diagnostics(), hint=hint), **changes)  # type: ignore[arg-type]
+
+
+def reference(name: str, image: bytes | None = PHOTO) -> Reference:
+    return Reference("hall", name, CAMERA, truth().shifted([0.5, 0, 0]), "", 9, NOW, image)
+
+
+BOTH = (reference("a"), reference("b"))
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        localized(),
+        localized(debug=None, covariance=None, accuracy=None, trust=None, pose_stage="COARSE"),
+        rejected(),
+        rejected(reason="AMBIGUOUS", hypotheses=(Hypothesis(truth(), 30, ("a",)), Hypothesis(truth(), 28, ("b",)))),
+        rejected(hint=None, debug=debug(wrong=200), diagnostics=diagnostics(())),
+        rejected(reason="99"),
+    ],
+    ids=["localized", "coarse", "rejected", "ambiguous", "bare", "unknown reason"],
+)
+@pytest.mark.parametrize("references", [(), BOTH], ids=["alone", "with references"])
+def test_it_needs_nothing_else_and_runs_nothing(
+    answer: LocalizationResult | Rejected, references: tuple[Reference, ...]
+) -> None:
+    html = report_html(answer, PHOTO, CAMERA, references)
+    page = Page.of(html)
+    assert set(page.tags) <= set(ALLOWED)
+    for tag, name, value in page.attributes:
+        assert not name.startswith("on"), tag
+        if name in ("href", "src", "xlink:href"):
+            assert value.startswith(("#", "data:image/jpeg;base64,"))
+    outside = re.sub(r"data:image/\w+;base64,[\w+/=]+", "", html)
+    assert not re.search(r"https?:|//[a-z]|url\(|@import", outside)
+    assert ("meta", "content", "default-src 'none'; img-src data:; style-src 'unsafe-inline'") in page.attributes
+
+
+HOSTILE = "\"><img src=x onerror=alert(1)><script>alert(2)</script></style>'&amp;"
+
+
+def test_names_and_messages_are_text_whatever_they_hold() -> None:
+    names = (HOSTILE, "b")
+    uses = diagnostics(names)
+    references = (replace(BOTH[0], reference_id=HOSTILE), BOTH[1])
+    hostile = rejected(
+        reason=HOSTILE,
+        message=HOSTILE,
+        hint=Hint(HOSTILE, HOSTILE, HOSTILE, f"scenes/hall/references/{HOSTILE}"),
+        diagnostics=replace(uses, backend=HOSTILE, features=HOSTILE, stage_s={HOSTILE: 1.0}, request_id=HOSTILE),
+        hypotheses=(Hypothesis(truth(), 3, names),),
+        debug=debug(),
+    )
+    page = Page.of(report_html(hostile, PHOTO, CAMERA, references, HOSTILE))
+    harmless = replace(hostile, diagnostics=replace(uses, stage_s={"pnp": 1.0}))
+    assert page.tags == Page.of(report_html(harmless, PHOTO, CAMERA, references, "a")).tags
+    assert page.tags["script"] == page.tags["img"] == 0
+    assert sum("onerror=alert(1)" in words for words in page.words) >= 8
+    checks = (PriorCheck(HOSTILE, 1.0, 1, True, True),)
+    assert Page.of(report_html(localized(prior_checks=checks, pose_stage=HOSTILE), PHOTO, CAMERA)).tags["script"] == 0
+
+
+def numbers_of(html: str, kind: str) -> Array:
+    """Lines (N, 4) of a layer: where each begins, and how far it goes."""
+    (path,) = re.findall(rf'<path class="{kind}" d="([^"]*)"', html)
+    found = re.findall(r"M(-?[\d.]+) (-?[\d.]+)l(-?[\d.]+) (-?[\d.]+)", path)
+    return np.array(found, float)
+
+
+def test_residuals_lead_from_where_points_are_seen_to_where_the_pose_puts_them() -> None:
+    answer = localized()
+    assert answer.debug is not None
+    html = report_html(answer, PHOTO, CAMERA)
+    lines = numbers_of(html, "inlier residual")
+    factor = int(re.findall(r"drawn (\d+) times", html)[0]) if "drawn" in html else 1
+    good = answer.debug.is_inlier
+    np.testing.assert_allclose(lines[:, :2], answer.debug.query_px[good], atol=0.006)
+    projected = CAMERA.project(truth().inverse().apply(answer.debug.x_in_world[good]))
+    np.testing.assert_allclose(lines[:, :2] + lines[:, 2:] / factor, projected, atol=0.02)
+    far = numbers_of(html, "outlier far")
+    assert len(far) == (~good).sum()
+    assert (np.hypot(far[:, 2], far[:, 3]) <= 0.06 * CAMERA.width_px + 0.02).all()
+
+
+def test_small_residuals_are_drawn_longer_and_large_ones_as_they_are() -> None:
+    assert magnification(np.full((9, 2), 0.01), 1000) == 200
+    assert magnification(np.full((9, 2), 50.0), 1000) == 1
+    assert magnification(np.empty((0, 2)), 1000) == 1
+
+
+def test_from_above_east_is_to_the_right_and_north_is_up() -> None:
+    cameras = [truth(), truth().shifted([3.0, 1.0, 0.0])]
+    plan = _fit(cameras, np.empty((0, 3)), [0.0, 0.0, -1.0])
+    here, east, north, up = plan.place(truth().translation + np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]))
+    assert east[0] > here[0]
+    assert east[1] == pytest.approx(here[1])
+    assert north[1] < here[1]
+    assert up == pytest.approx(here)
+    y_down = _fit(cameras, np.empty((0, 3)), [0.0, 1.0, 0.0])
+    np.testing.assert_allclose(np.cross(*y_down.basis), [0.0, -1.0, 0.0], atol=1e-12)
+
+
+def test_the_ellipse_holds_95_percent() -> None:
+    random = np.random.default_rng(2)
+    root = random.normal(size=(6, 6))
+    covariance = root @ root.T
+    basis = _fit([truth()], np.empty((0, 3)), [0.3, -0.2, -1.0]).basis
+    radii, turn = ellipse_in_plane(basis, covariance)
+    errors = random.multivariate_normal(np.zeros(6), covariance, 100_000)[:, :3] @ basis.T
+    along = errors @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    assert ((along / radii) ** 2).sum(axis=1).__le__(1).mean() == pytest.approx(0.95, abs=0.004)
+
+
+def test_a_rejection_says_why_and_what_helps() -> None:
+    text = " ".join(Page.of(report_html(rejected(), PHOTO, CAMERA, BOTH)).words)
+    assert "Not localized" in text
+    assert "only 3 matches" in text
+    assert "LOW_OVERLAP" in text
+    assert "Point the camera there." in text
+    assert "drawn" not in text
+
+
+def embedded(html: str) -> bytes:
+    return base64.b64decode(re.findall(r"data:image/\w+;base64,([\w+/=]+)", html)[0])
+
+
+class TestPictures:
+    @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+    def test_no_viewer_turns_them(self, orientation: int) -> None:
+        turned = with_exif_orientation(PHOTO, orientation)
+        data = embedded(report_html(localized(), turned, CAMERA))
+        assert b"Exif" not in data
+        np.testing.assert_array_equal(pixels(data), pixels(PHOTO))
+
+    @pytest.mark.parametrize("extension", [".png", ".webp", ".jpg"])
+    def test_they_stay_what_they_are(self, extension: str) -> None:
+        image = encode(extension, textured(64, 48))
+        np.testing.assert_array_equal(pixels(embedded(report_html(localized(), image, CAMERA))), pixels(image))
+
+    def test_what_cameras_add_to_a_webp_is_cut_out(self) -> None:
+        simple = encode(".webp", textured(64, 48))
+        extended = b"VP8X" + (10).to_bytes(4, "little") + bytes([0x08, 0, 0, 0, 63, 0, 0, 47, 0, 0])
+        exif = b"EXIF" + (5).to_bytes(4, "little") + b"where\0"
+        body = b"WEBP" + extended + simple[12:] + exif
+        data = embedded(report_html(localized(), b"RIFF" + len(body).to_bytes(4, "little") + body, CAMERA))
+        assert b"where" not in data
+        assert int.from_bytes(data[4:8], "little") == len(data) - 8
+        np.testing.assert_array_equal(pixels(data), pixels(simple))
+
+    def test_the_page_can_be_mailed_however_large_they_are(self, tmp_path: Path) -> None:
+        noise = np.random.default_rng(1).integers(0, 256, (1800, 2400, 3)).astype(np.uint8)
+        large = encode(".jpg", noise)
+        assert len(large) > 5e6
+        references = [reference(name, large) for name in ("a", "b")]
+        file = write_report(localized(), large, CAMERA, tmp_path / "report.html", references=references)
+        assert file.stat().st_size < 5e6
+
+    def test_without_pillow_a_large_one_is_left_out_and_the_page_says_so(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(pictures, "_reduced", lambda image: None)
+        assert "pillow" in pictures.picture(PHOTO, 1000).note
+        assert not pictures.picture(PHOTO, 1000).uri
+
+    @pytest.mark.parametrize(
+        "image", [b"", b"<svg/>", PHOTO[:40], b"\x89PNG\r\n\x1a\n\xff\xff", b"RIFF\xff\xff\xff\x7fWEBPVP8 "]
+    )
+    def test_what_is_no_picture_is_left_out(self, image: bytes) -> None:
+        html = report_html(localized(), image, CAMERA)
+        assert "is left out" in html
+        assert "data:image" not in html
+
+
+def pixels(data: bytes) -> Array:
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    found = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    assert found is not None
+    return np.asarray(found)
