@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -44,7 +45,7 @@ def drifting(
     bias, axis = random.normal(size=3), random.normal(size=3)
     bias, axis = bias / np.linalg.norm(bias), axis / np.linalg.norm(axis)
     poses = [RigidTransform(rotation_from_vector(random.normal(0, 1, 3)), random.normal(0, 2, 3))]
-    for first, second in zip(world_from_camera[:-1], world_from_camera[1:], strict=True):
+    for first, second in itertools.pairwise(world_from_camera):
         step = first.inverse().compose(second)
         length_m = float(np.linalg.norm(step.translation))
         wrong = RigidTransform(
@@ -80,7 +81,7 @@ def images_of(
         alone: whether it was localized alone.
         own_noise_m: error of that.
     """
-    options = options or SceneOptions(noise_px=0.5)
+    options = options or SceneOptions(point_count=250, noise_px=0.5)
     scene = make_scene(random, options)
     keeps = [keep] * len(world_from_camera) if isinstance(keep, int) else list(keep)
     alones = [alone] * len(world_from_camera) if isinstance(alone, bool) else list(alone)
@@ -94,7 +95,7 @@ def images_of(
         chosen = np.sort(random.permutation(len(matches))[:most])
         point, keypoint = matches.point[chosen], matches.keypoint[chosen]
         wrong = random.permutation(len(chosen))[: round(wrong_share * len(chosen))]
-        point[wrong] = random.permutation(np.setdiff1d(np.arange(len(structure.x_in_world)), point))[: len(wrong)]
+        point[wrong] = np.roll(point[wrong], 1)
         matches = PointMatches(point, keypoint, np.zeros(len(point), bool), 6.0)
         support = Support(view, scene.references, structure, matches, None, ORIGIN)
         outcome: Localization | Rejection = NOT_ALONE

@@ -60,14 +60,19 @@ class LatestFrame:
     def __iter__(self) -> Iterator[Frame]:
         """Each frame that is new when it is asked for; ends with the video."""
         seen = -1
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._is_over or (self._frame is not None and self._frame.number > seen))
-                frame = self._frame
-            if frame is None or frame.number <= seen:
-                return
+        while (frame := self._newer_than(seen)) is not None:
             seen = frame.number
             yield frame
+
+    def _newer_than(self, number: int) -> Frame | None:
+        """The newest frame, as soon as it is another than that; None after the last."""
+
+        def new() -> Frame | None:
+            return self._frame if self._frame is not None and self._frame.number > number else None
+
+        with self._changed:
+            self._changed.wait_for(lambda: self._is_over or new() is not None)
+            return new()
 
     def _play(self) -> None:
         begin, begin_s = datetime.now(timezone.utc), time.monotonic()

@@ -61,9 +61,7 @@ def camera_from_info(message: Any) -> mapless.Camera:
     if not message.k[0] > 0:
         raise ValueError("the camera is not calibrated: CameraInfo.k is zero")
     if message.binning_x > 1 or message.binning_y > 1 or message.roi.width or message.roi.height:
-        raise ValueError(
-            "the image is binned, or a part of the sensor's: give mapless a CameraInfo of the image itself"
-        )
+        raise ValueError("the image is binned, or a part of the sensor's: CameraInfo is not its own")
     return mapless.Camera(
         message.width,
         message.height,

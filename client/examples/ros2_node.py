@@ -1,6 +1,6 @@
-"""A ROS 2 node: images in, geometry_msgs/PoseWithCovarianceStamped out, for robot_localization and its like.
+r"""A ROS 2 node: images in, geometry_msgs/PoseWithCovarianceStamped out, for robot_localization and its like.
 
-    python ros2_node.py --ros-args -p scene:=hall -p address:=server:50051 -p compressed:=true \\
+    python ros2_node.py --ros-args -p scene:=hall -p address:=server:50051 -p compressed:=true \
         -r image:=/camera/image_raw/compressed -r camera_info:=/camera/camera_info
 
 It publishes `pose`: of the body in `map_frame`, stamped with the time of the image, with the covariance that mapless
@@ -14,6 +14,7 @@ from __future__ import annotations
 import threading
 from typing import Any
 
+import numpy as np
 import rclpy
 import rclpy.node
 import ros2_messages
@@ -41,7 +42,7 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
         given = {name: self.declare_parameter(name, value).value for name, value in PARAMETERS.items()}
         self._scene, self._map_frame = given["scene"], given["map_frame"]
         x, y, z, *quaternion = given["body_from_camera"]
-        self._body_from_camera = mapless.RigidTransform(mapless.Quaternion(*quaternion).matrix(), [x, y, z])
+        self._body_from_camera = mapless.RigidTransform(mapless.Quaternion(*quaternion).matrix(), np.array([x, y, z]))
         # One attempt: for an image that failed there is a newer one.
         options = mapless.ConnectOptions(timeout_s=given["timeout_s"], max_attempts=1, client_id=self.get_name())
         self._client = mapless.Client(given["address"], options)

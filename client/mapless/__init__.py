@@ -16,7 +16,6 @@ from .answers import (
     Debug,
     Diagnostics,
     FramedPose,
-    GeoPose,
     Hint,
     Hypothesis,
     LocalizationResult,
@@ -40,7 +39,7 @@ from .errors import (
     Unauthenticated,
     Unavailable,
 )
-from .geodesy import Datum
+from .geodesy import Datum, GeoPose
 from .geometry import Camera, Fisheye, Quaternion, RadialTangential, RigidTransform, Similarity
 from .groups import GroupRejected, ImageReport, RigImage, RigLocalization, SequenceFrame, SequenceLocalization
 from .options import ConnectOptions

@@ -68,7 +68,7 @@ def read_cameras(file: str | Path) -> dict[Path, Camera]:
     """
     path = Path(file)
     try:
-        frames = json.loads(path.read_text())["frames"]
+        frames = list(json.loads(path.read_text())["frames"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: no cameras: {error!r}") from None
     return dict(_photograph(path, index, frame) for index, frame in enumerate(frames))

@@ -110,7 +110,8 @@ def attempts(
     """The exchange with retries: yields what is to be done, returns what the exchange does.
 
     A call is tried again if the server is UNAVAILABLE, or RESOURCE_EXHAUSTED and says when to come back; never if
-    the pause before would outlast its deadline.
+    the pause before would outlast its deadline. A server that says when to come back is taken at its word until then;
+    other attempts are counted.
     """
     clock = clock or _Clock()
     try:
@@ -139,7 +140,8 @@ def _with_retries(call: Call, options: ConnectOptions, clock: _Clock) -> Generat
         if may_be_done and call.on_repeat is not None and outcome.code in {"ALREADY_EXISTS", "NOT_FOUND"}:
             return (yield from _found_out(call.on_repeat(outcome), options, clock))
         pause_s = _pause_s(outcome, attempt, options, clock)
-        if pause_s is None or attempt == options.max_attempts or clock.now_s() + pause_s >= deadline_s:
+        is_last = attempt >= options.max_attempts and (outcome.retry_after_s is None or options.max_attempts == 1)
+        if pause_s is None or is_last or clock.now_s() + pause_s >= deadline_s:
             return outcome
         may_be_done |= outcome.code == "UNAVAILABLE"
         yield Pause(pause_s, outcome)
@@ -155,11 +157,10 @@ def _found_out(exchange: Exchange[Any], options: ConnectOptions, clock: _Clock) 
 def _pause_s(error: MaplessError, attempt: int, options: ConnectOptions, clock: _Clock) -> float | None:
     """How long to wait after so many attempts, seconds; None if another would be of no use."""
     asked_s = error.retry_after_s
-    backoff_s = min(options.initial_backoff_s * 2.0 ** (attempt - 1), options.max_backoff_s)
+    backoff_s = min(options.initial_backoff_s * 2.0 ** min(attempt - 1, 30), options.max_backoff_s)
     backoff_s *= clock.uniform(1 - _JITTER, 1 + _JITTER)
-    if error.code == "UNAVAILABLE":
-        # The first time soon, whatever it asks: behind one name there may be another server, which is not unavailable.
-        return backoff_s if attempt == 1 or asked_s is None else max(backoff_s, asked_s)
-    if error.code == "RESOURCE_EXHAUSTED" and asked_s is not None:
-        return max(backoff_s, asked_s * clock.uniform(1, 1 + _LATENESS))
+    if error.code == "UNAVAILABLE" and (asked_s is None or attempt == 1):
+        return backoff_s  # the first time soon: behind one name there may be another server, which is not unavailable
+    if error.code in {"UNAVAILABLE", "RESOURCE_EXHAUSTED"} and asked_s is not None:
+        return max(options.initial_backoff_s, asked_s * clock.uniform(1, 1 + _LATENESS))
     return None

@@ -44,9 +44,8 @@ def enu_from_y_up(heading_deg: float) -> Quaternion:
         heading_deg: where its -z, ahead of a headset at its session's start, points: clockwise from north.
     """
     half = math.radians(heading_deg) / 2
-    x, w = math.sqrt(0.5) * math.cos(half), math.sqrt(0.5) * math.cos(half)
-    y, z = -math.sqrt(0.5) * math.sin(half), -math.sqrt(0.5) * math.sin(half)
-    return _canonical(x, y, z, w)
+    cosine, sine = math.sqrt(0.5) * math.cos(half), math.sqrt(0.5) * math.sin(half)
+    return Quaternion(cosine, -sine, -sine, cosine).normalized()
 
 
 def enu_from_z_up(heading_deg: float) -> Quaternion:
@@ -56,12 +55,7 @@ def enu_from_z_up(heading_deg: float) -> Quaternion:
         heading_deg: where its x points: clockwise from north, so 90 where x is east, as REP 103 would have it.
     """
     half = math.radians(90 - heading_deg) / 2
-    return _canonical(0.0, 0.0, math.sin(half), math.cos(half))
-
-
-def _canonical(x: float, y: float, z: float, w: float) -> Quaternion:
-    sign = math.copysign(1.0, w)
-    return Quaternion(*(sign * it + 0.0 for it in (x, y, z, w)))  # without the sign of a negative zero
+    return Quaternion(0.0, 0.0, math.sin(half), math.cos(half)).normalized()
 
 
 @dataclass(frozen=True)
@@ -125,11 +119,12 @@ class Datum:
         Raises:
             ValueError: it is none: a member is missing, is no number or out of range.
         """
-        numbers = [_number(content, name) for name in _DATUM_NUMBERS]
-        if isinstance(content, dict) and content.get("enu_from_world") is not None:
-            x, y, z, w = (_number(content["enu_from_world"], name, "enu_from_world.") for name in "xyzw")
-            return Datum(*numbers, Quaternion(x, y, z, w))
-        return Datum(*numbers)
+        latitude_deg, longitude_deg, height_m = (_number(content, name) for name in _DATUM_NUMBERS)
+        turned = content.get("enu_from_world") if isinstance(content, dict) else None
+        if turned is None:
+            return Datum(latitude_deg, longitude_deg, height_m)
+        x, y, z, w = (_number(turned, name, "enu_from_world.") for name in "xyzw")
+        return Datum(latitude_deg, longitude_deg, height_m, Quaternion(x, y, z, w))
 
     def down_in_world(self) -> Array:
         """Unit vector (3,) to below, along the ellipsoid's normal: some hundredths of a degree from a plumb line."""

@@ -56,6 +56,18 @@ class Quaternion:
             ]
         )
 
+    def normalized(self) -> Quaternion:
+        """The same rotation with norm 1 and w >= 0; one that has both keeps its bits.
+
+        Raises:
+            ValueError: as `matrix`.
+        """
+        self.matrix()
+        norm = math.hypot(self.x, self.y, self.z, self.w)
+        factor = math.copysign(1.0, self.w) / (1.0 if abs(norm - 1) < 1e-12 else norm)
+        x, y, z, w = (factor * it + 0.0 for it in (self.x, self.y, self.z, self.w))  # + 0.0: no negative zeros
+        return Quaternion(x, y, z, w)
+
     @staticmethod
     def from_matrix(rotation: ArrayLike) -> Quaternion:
         """The quaternion of a rotation matrix (3, 3), with w >= 0."""

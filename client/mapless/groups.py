@@ -1,4 +1,4 @@
-"""Several photographs that are posed together, a rig's or a sequence's: what is sent and what is answered, as values."""
+"""Photographs that are posed together, a rig's or a sequence's: what is sent and what is answered, as values."""
 
 from __future__ import annotations
 

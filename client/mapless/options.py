@@ -29,8 +29,8 @@ class ConnectOptions:
         batch_mib: a bulk upload sends messages of about this size at most; must fit the server's limit. Large ones take
             the server longer to receive, which its other callers feel.
         batch_count: and of so many references at most, so that progress shows.
-        max_attempts: tries, within its deadline, of a call that finds the server UNAVAILABLE, or at its limit
-            (RESOURCE_EXHAUSTED) but able to say when to come back.
+        max_attempts: tries of a call that finds the server UNAVAILABLE; 1: nothing is ever tried again. A server that
+            says when to come back, because it starts or is at its limit, is asked again until the call's deadline.
         initial_backoff_s, max_backoff_s: pause before the second try, doubled for each further one up to the maximum; a
             longer one if the server asks for it.
         max_reconnect_s: a server that went away is looked for again at least so often, where gRPC would leave up to two

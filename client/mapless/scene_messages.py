@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from datetime import timezone
 
 from . import wire
@@ -16,7 +15,6 @@ from .wire import FieldError, joined
 
 FACTORS = ("position_factor_68", "position_factor_95", "rotation_factor_68", "rotation_factor_95")
 TEXTS = ("features", "backend", "server_version")
-_ROUNDING = 1e-12
 _VARIANT: wire.ProtoEnum = localization_pb.Variant
 
 
@@ -48,20 +46,12 @@ def datum_from_message(message: pb.Datum, field: str) -> Datum:
             raise FieldError(joined(field, name), f"must be {least:g} to {most:g}, is {value:g}")
     if not message.HasField("enu_from_world"):
         return Datum(message.latitude_deg, message.longitude_deg, message.height_m)
-    rotation = _rotation_from_message(message.enu_from_world, joined(field, "enu_from_world"))
-    return Datum(message.latitude_deg, message.longitude_deg, message.height_m, rotation)
-
-
-def _rotation_from_message(message: geometry_pb2.Quaternion, field: str) -> Quaternion:
-    """Normalized, with w >= 0; one that is so already is kept bit by bit, unlike on a way through its matrix."""
-    q = Quaternion(message.x, message.y, message.z, message.w)
+    q = message.enu_from_world
     try:
-        q.matrix()
+        rotation = Quaternion(q.x, q.y, q.z, q.w).normalized()
     except ValueError as error:
-        raise FieldError(field, str(error)) from None
-    norm = math.hypot(q.x, q.y, q.z, q.w)
-    scale = math.copysign(1.0, q.w) / (1.0 if abs(norm - 1) < _ROUNDING else norm)
-    return Quaternion(*(scale * it + 0.0 for it in (q.x, q.y, q.z, q.w)))  # without the sign of a negative zero
+        raise FieldError(joined(field, "enu_from_world"), str(error)) from None
+    return Datum(message.latitude_deg, message.longitude_deg, message.height_m, rotation)
 
 
 def direction_to_message(direction: Vector) -> geometry_pb2.Vector3:

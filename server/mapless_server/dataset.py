@@ -4,8 +4,8 @@
 ``K`` (3x3, pixels, (0, 0) the centre of the top-left one), ``dist`` (OpenCV's k1 k2 p1 p2 [k3], or null) and
 ``world_from_camera`` (4x4, camera axes x right, y down, z forward), perhaps also ``split`` ("train" or "test") and
 ``lens`` ("fisheye": dist is then OpenCV's fisheye k1 k2 k3 k4); and beside them ``metric`` (false: the unit of length
-is arbitrary), ``source``, ``ground_truth``, ``datum`` (where the world is on the Earth, as `mapless.geodesy.Datum` has
-it: ``latitude_deg``, ``longitude_deg``, ``height_m``, ``enu_from_world`` with ``x y z w``) and ``down_in_world`` (x y z).
+is arbitrary), ``source``, ``ground_truth``, ``datum`` (where the world is on the Earth, `mapless.geodesy.Datum`:
+``latitude_deg``, ``longitude_deg``, ``height_m``, perhaps ``enu_from_world`` with ``x y z w``) and ``down_in_world``.
 """
 
 from __future__ import annotations

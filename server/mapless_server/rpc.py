@@ -192,8 +192,9 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             refusal = error
         # Not as a unary method, whose message grpc receives first: what is refused shall cost nothing, and who sends no
         # message shall not hold a place. Without a deserializer a malformed message is answered here, too.
-        serve = grpc.stream_stream_rpc_method_handler if streams else grpc.stream_unary_rpc_method_handler
-        return serve(answer, None, None)
+        if streams:
+            return grpc.stream_stream_rpc_method_handler(answer, None, None)
+        return grpc.stream_unary_rpc_method_handler(answer, None, None)
 
     async def wait_until_idle(self, limit_s: float) -> None:
         """Returns when no call is being answered, or the time is over."""

@@ -15,13 +15,14 @@ from .engine import Engine
 from .group_service import answer_rig, answer_sequence
 from .messages.answers import addressee_of, diagnostics_to_message, outcome_to_message
 from .messages.debug import debug_to_message
+from .messages.priors import needs_attributes
 from .messages.queries import query_from_message
 from .method.localize import Localization
 from .observability.metrics import LOCALIZED, Metrics
 from .query import Result
 from .rpc import Call
 from .scheduling.jobs import Visit
-from .store import Store
+from .store import SceneAttributes, Store
 from .tenancy import key_of
 from .watching import Watch, Watchers
 
@@ -40,7 +41,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         """Implements LocalizationService.Localize."""
         engine = self._engine()
         addressee = addressee_of(request)
-        query = query_from_message(request, call.principal.tenant, engine.options)
+        attributes = await self._attributes(request, call.principal.tenant)
+        query = query_from_message(request, call.principal.tenant, engine.options, attributes)
         call.note(scene=query.scene_key, references=len(query.reference_ids))
         visits: list[Visit] = []
         try:
@@ -82,6 +84,13 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._watchers.check(call.principal.tenant)
         await asyncio.to_thread(self._store.get_scene, scene_key)
         return self._watchers.watch(scene_key)
+
+    async def _attributes(self, request: pb.LocalizeRequest, tenant: str) -> SceneAttributes:
+        """What is known of the request's scene, if what it says of the camera cannot be understood without."""
+        if not needs_attributes(request):
+            return SceneAttributes()
+        scene_key = key_of(tenant, wire.scene_id_from_name(request.scene, "scene"))
+        return await asyncio.to_thread(self._store.get_attributes, scene_key)
 
     def _count(self, result: Result, response: pb.LocalizeResponse, call: Call) -> None:
         """Tells the log and the metrics how good the answer is."""

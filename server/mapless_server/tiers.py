@@ -45,9 +45,9 @@ class EscalationOptions:
     """Options of trying stronger features.
 
     Attributes:
-        doubtful_inliers: a pose with fewer inliers is doubtful. Of 159 photographs, most with few references, SIFT lost
-            16; trying stronger features for these alone left 14 lost or over 5 cm off, for those below 50 inliers as
-            well (53 in all) 10, and no more were mended by 75 (66) or by the strong features for all.
+        doubtful_trust: a pose that is trusted less is doubtful. Of 706 photographs, many with few references, SIFT posed
+            26 over 10 cm off; trying again below this trust tries 94, all of these among them, where fewer than 50
+            inliers or a large radius tried 96, with 23 of them.
         doubtful_radius_m: a pose whose claimed 68 % radius is larger is doubtful: what a robot needs to pass a door.
         same_position_m, same_rotation_deg: two poses closer than this never contradict each other, however small the
             claimed radii, which leave out the errors of the references' poses.
@@ -56,7 +56,7 @@ class EscalationOptions:
             doubtful one than none, and the rest is enough to send it.
     """
 
-    doubtful_inliers: int = 50
+    doubtful_trust: float = 0.1
     doubtful_radius_m: float = 0.2
     same_position_m: float = 0.1
     same_rotation_deg: float = 2.0
@@ -64,7 +64,7 @@ class EscalationOptions:
     time_share: float = 0.8
 
     def __post_init__(self) -> None:
-        bounds = (self.doubtful_inliers, self.doubtful_radius_m, self.same_position_m, self.same_rotation_deg)
+        bounds = (self.doubtful_trust, self.doubtful_radius_m, self.same_position_m, self.same_rotation_deg)
         if not (all(bound >= 0 for bound in bounds) and self.clearly_more >= 1 and 0 < self.time_share <= 1):
             raise ValueError(f"senseless options: {self}")
 
@@ -95,15 +95,15 @@ class Attempt:
 def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:
     """Whether stronger features could mend the answer.
 
-    A pose without covariance (`Variant.COARSE`) counts no inliers and claims nothing, so there is nothing to doubt.
+    A pose that nothing has checked (`Variant.COARSE`) has no trust and claims nothing, so there is nothing to doubt.
     """
     outcome = answer.outcome
     if isinstance(outcome, Rejection):
         return outcome.reason not in UNMENDABLE
-    if outcome.covariance is None:
+    if outcome.covariance is None or outcome.trust is None:
         return False
     radius_m = accuracy_from_covariance(outcome.covariance).position_68_m
-    return outcome.inlier_count < options.doubtful_inliers or not radius_m <= options.doubtful_radius_m
+    return outcome.trust < options.doubtful_trust or not radius_m <= options.doubtful_radius_m
 
 
 def better_of(cheaper: Attempt, stronger: Attempt, options: EscalationOptions) -> Attempt:

@@ -6,8 +6,9 @@ import importlib
 import json
 import threading
 import time
-from datetime import datetime
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -64,7 +65,7 @@ def test_poses_go_on_after_the_server_was_away(loop: Any, tmp_path: Path, camera
         client.add_references("hall", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)])
         port = int(server.address.rpartition(":")[2])
         flags = ["--camera", camera_json, "--scene", "hall", "--address", server.address]
-        given = [str(video), *flags, "--poses", str(poses), "--tum", str(tum)]
+        given = [str(video), *flags, "--poses", str(poses), "--tum", str(tum), "--speed", "2"]
         robot = threading.Thread(target=loop.main, args=(given,))
         robot.start()
         wait_until(lambda: len(lines(poses)) >= 5)
@@ -102,16 +103,13 @@ def test_who_is_slow_is_given_the_newest_frame(loop: Any, tmp_path: Path) -> Non
 
 def test_the_last_pose_fades_as_a_prior(loop: Any) -> None:
     """Its variance grows by the square of how far the robot may have moved, until it says nothing."""
-    import datetime as dt
-    from types import SimpleNamespace
-
-    begin = dt.datetime(2026, 1, 1, tzinfo=dt.timezone.utc)
+    begin = datetime(2026, 1, 1, tzinfo=timezone.utc)
     robot = loop.Robot(None, CAMERA, "hall", None)
     assert robot._prior(loop.Frame(0, begin, None)) is None
     robot.last = (begin, SimpleNamespace(world_from_camera=pose(0), covariance=np.eye(6)))
-    later = robot._prior(loop.Frame(1, begin + dt.timedelta(seconds=2), None))
+    later = robot._prior(loop.Frame(1, begin + timedelta(seconds=2), None))
     np.testing.assert_allclose(later.covariance, np.eye(6) * (1 + (1.5 * 2) ** 2))
-    assert robot._prior(loop.Frame(2, begin + dt.timedelta(seconds=6), None)) is None
+    assert robot._prior(loop.Frame(2, begin + timedelta(seconds=6), None)) is None
 
 
 def test_what_is_no_video_is_said(loop: Any, tmp_path: Path) -> None:

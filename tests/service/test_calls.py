@@ -47,12 +47,12 @@ def pool() -> Iterator[futures.ThreadPoolExecutor]:
 def test_a_full_queue_refuses_and_says_when_to_come_back(
     server: RunningServer, client: Client, scene: str, pool: futures.ThreadPoolExecutor
 ) -> None:
-    with server.method.held():
+    with server.method.held(), Client(server.address, ConnectOptions(max_attempts=1)) as impatient:
         admitted = [pool.submit(client.localize, PHOTO, CAMERA, scene) for _ in range(2)]
         for _ in range(2):
             assert server.method.started.acquire(timeout=20)
         while True:  # further calls wait, until there is no room
-            waiting = pool.submit(client.localize, PHOTO, CAMERA, scene)
+            waiting = pool.submit(impatient.localize, PHOTO, CAMERA, scene)
             admitted.append(waiting)
             before = len(admitted)
             wait_until(lambda: waiting.done() or server.engine.queue.job_count == before)  # noqa: B023
@@ -70,8 +70,9 @@ def test_a_full_queue_refuses_and_says_when_to_come_back(
         # The loop is free meanwhile: what needs no thread is answered.
         assert client.is_serving()
         assert client.get_scene(scene).reference_count == 3
-    assert len(admitted) > 2
-    assert all(isinstance(future.result(30), LocalizationResult) for future in admitted)
+        assert len(admitted) > 2
+        server.method.gate.set()
+        assert all(isinstance(future.result(30), LocalizationResult) for future in admitted)
     wait_until(lambda: server.engine.queue.job_count == 0)
 
 

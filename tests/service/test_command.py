@@ -211,10 +211,10 @@ def test_drawings_are_a_page_each_and_debug_is_what_was_asked_for_by_name(
 
 def test_a_scene_has_its_place_on_the_earth(server: RunningServer, capsys: pytest.CaptureFixture[str]) -> None:
     code, made, _ = run(
-        server, capsys, "scene", "create", "placed", "--datum", "47.5", "8.25", "-3", "--down", "0", "1", "0"
+        server, capsys, "scene", "create", "placed", "--datum", "47.5", "8.25", "-3", "--down", "0", "0", "-2"
     )
     assert (code, made["datum"]["latitude_deg"], made["datum"]["height_m"]) == (0, 47.5, -3.0)
-    assert made["down_in_world"] == [0.0, 1.0, 0.0]
+    assert made["down_in_world"] == [0.0, 0.0, -1.0]
     turned = ("--datum", "47.5", "8.25", "0", "--enu-from-world", "0", "0", "-1", "0")
     code, changed, _ = run(server, capsys, "scene", "update", "placed", *turned, "--forget", "down_in_world")
     assert (code, changed["datum"]["enu_from_world"]["z"]) == (0, -1.0)

@@ -168,7 +168,7 @@ def test_the_epipolar_error_of_rendered_photographs_is_printed(tmp_path: Path) -
         (("--stride", 0), "stride and max"),
         (("--intrinsics", "1,2,3"), "intrinsics must be fx,fy,cx,cy"),
         (("--id-prefix", "../"), "an id is"),
-        (("--parallel", 0), "parallel must be"),
+        (("--parallel", 0), "--parallel is the number of messages in flight, 1 to 64, not 0"),
         (("--report", "no/such/folder/report.json"), "cannot be written"),
         (("--token-file", "none"), "cannot be read"),
     ],

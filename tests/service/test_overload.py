@@ -175,7 +175,7 @@ def test_one_who_asks_little_is_served_while_another_floods(tmp_path: Path) -> N
 
     with (
         overloaded(tmp_path, slow(COST_S), max_queued_s=0.5) as server,
-        Client(server.address, ConnectOptions(client_id="heavy")) as heavy,
+        Client(server.address, ConnectOptions(client_id="heavy", max_attempts=1)) as heavy,
         Client(server.address, ConnectOptions(client_id="light")) as light,
         ThreadPoolExecutor(40) as pool,
     ):

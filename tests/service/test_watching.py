@@ -157,15 +157,16 @@ def test_a_token_that_is_revoked_shows_nothing_more(tmp_path: Path) -> None:
         stub.Localize(localize_request("hall"), timeout=LIMIT_S, metadata=robot)
         assert next(seen).image == PHOTO
         revoke_token(tokens, "guard")
-        done = threading.Event()
-        threading.Thread(target=lambda: (list_until_error(seen), done.set())).start()
+        reader = threading.Thread(target=read_to_the_end, args=(seen,))
+        reader.start()
         end_s = time.monotonic() + LIMIT_S
-        while not done.wait(0.2):
+        while reader.is_alive():
+            reader.join(0.2)
             stub.Localize(localize_request("hall"), timeout=LIMIT_S, metadata=robot)
             assert time.monotonic() < end_s
         assert seen.code() is grpc.StatusCode.UNAUTHENTICATED
 
 
-def list_until_error(call: Any) -> None:
+def read_to_the_end(call: Any) -> None:
     with pytest.raises(grpc.RpcError):
         list(call)

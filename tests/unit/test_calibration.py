@@ -6,15 +6,16 @@ import json
 import math
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import random_for
-from scipy.stats import binom, chi
+from scipy.special import bdtr, bdtrc, gammainc, gammaincinv
 
-from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless.scenes import Calibration
 from mapless_server.calibration.claims import Claim
 from mapless_server.calibration.factors import (
@@ -39,16 +40,26 @@ SIFT = Conditions("sift", "geometric", "BEST")
 SIGMA_M, SIGMA_DEG = 0.02, 0.1
 
 
+def length(share: Any) -> Any:
+    """What a normal vector of three directions, of deviation 1 in each, does not exceed with this probability."""
+    return np.sqrt(2 * gammaincinv(1.5, share))
+
+
+def share_below(at: float) -> float:
+    """How probable it is that it does not."""
+    return float(gammainc(1.5, at**2 / 2))
+
+
 def claim(error: float, sigma: float = 1.0) -> Claim:
     """A claim of normal errors with this deviation in each of three directions."""
     covariance = sigma**2 * np.eye(3)
-    return Claim.of(error, sigma * chi.ppf(0.68, 3), sigma * chi.ppf(0.95, 3), covariance)
+    return Claim.of(error, sigma * length(0.68), sigma * length(0.95), covariance)
 
 
 def planted(count: int, times: float, case: str) -> Sample:
     """Answers whose errors are `times` as large as they claim."""
     random = random_for("calibration", case, count, times)
-    lengths = chi.rvs(3, size=(2, count), random_state=random) * times
+    lengths = np.linalg.norm(random.standard_normal((2, count, 3)), axis=2) * times
     return Sample(
         tuple(claim(SIGMA_M * it, SIGMA_M) for it in lengths[0]),
         tuple(claim(SIGMA_DEG * it, SIGMA_DEG) for it in lengths[1]),
@@ -59,13 +70,13 @@ class TestClaims:
     def test_radii_are_the_stated_ones_and_those_of_the_distribution_between(self) -> None:
         it = claim(1.0, 2.0)
         for p in (0.05, 0.5, 0.68, 0.9, 0.95, 0.99):
-            just = 2 * chi.ppf(p, 3)
+            just = 2 * length(p)
             assert replace(it, error=0.999 * just).held(p)
             assert not replace(it, error=1.001 * just).held(p)
 
     def test_stated_radii_stand_above_the_covariance(self) -> None:
-        twice = Claim.of(1.0, 2 * chi.ppf(0.68, 3), 3 * chi.ppf(0.95, 3), np.eye(3))
-        assert twice.probability(np.array([2 * chi.ppf(0.68, 3), 3 * chi.ppf(0.95, 3)])) == pytest.approx(
+        twice = Claim.of(1.0, 2 * length(0.68), 3 * length(0.95), np.eye(3))
+        assert twice.probability(np.array([2 * length(0.68), 3 * length(0.95)])) == pytest.approx(
             [0.68, 0.95], abs=1e-3
         )
         assert twice.probability(np.array([0.0, 1e9])).tolist() == [0.0, 1.0]
@@ -79,18 +90,20 @@ class TestClaims:
 class TestFactors:
     @pytest.mark.parametrize("times", [0.4, 1.0, 2.5])
     def test_many_answers_give_the_planted_factor(self, times: float) -> None:
-        factors = fit_factors(planted(2000, times, "many"))
+        factors = fit_factors(planted(500, times, "many"))
         for factor in (factors.position_68, factors.position_95, factors.rotation_68, factors.rotation_95):
-            assert factor == pytest.approx(times, rel=0.05)
+            assert factor == pytest.approx(times, rel=0.08)
 
     def test_tails_have_a_factor_of_their_own(self) -> None:
         """A fifth of the errors is five times as large: the 95 % radius grows more than that for 68 %."""
         random = random_for("tails")
-        lengths = chi.rvs(3, size=2000, random_state=random) * np.where(random.random(2000) < 0.2, 5.0, 1.0)
+        lengths = np.linalg.norm(random.standard_normal((500, 3)), axis=1) * np.where(
+            random.random(500) < 0.2, 5.0, 1.0
+        )
         claims = [claim(it) for it in lengths]
         for p in (0.68, 0.95):
-            expected = np.quantile(lengths, p) / chi.ppf(p, 3)
-            assert factor_for(claims, p) == pytest.approx(expected, rel=0.03)
+            expected = np.quantile(lengths, p) / length(p)
+            assert factor_for(claims, p) == pytest.approx(expected, rel=0.08)
         assert factor_for(claims, 0.95) > 1.5 * factor_for(claims, 0.68) > 1.5
 
     @pytest.mark.parametrize("times", [1 / 3, 1.0, 3.0])
@@ -98,15 +111,15 @@ class TestFactors:
     def test_few_answers_still_hold_on_answers_not_seen(self, count: int, times: float) -> None:
         """On average over calibrations, and by the distribution the errors were planted with."""
         held = []
-        for trial in range(30):
+        for trial in range(12):
             claims = planted(count, times, f"few {trial}").position
-            held.append([chi.cdf(factor_for(claims, p) * chi.ppf(p, 3) / times, 3) for p in (0.68, 0.95)])
+            held.append([share_below(factor_for(claims, p) * length(p) / times) for p in (0.68, 0.95)])
         share_68, share_95 = np.mean(held, axis=0)
         assert share_95 >= 0.9
         assert (0.5 if count == MIN_QUERIES else 0.6) <= share_68 <= (0.95 if count == MIN_QUERIES else 0.8)
 
     def test_few_answers_that_are_as_claimed_change_little(self) -> None:
-        exact = [claim(float(chi.ppf((i + 0.5) / 12, 3))) for i in range(12)]
+        exact = [claim(float(length((i + 0.5) / 12))) for i in range(12)]
         assert factor_for(exact, 0.68) == pytest.approx(1.0, rel=0.05)
         assert 1.0 <= factor_for(exact, 0.95) < 1.4
 
@@ -114,7 +127,7 @@ class TestFactors:
         """All errors are the same, so the quantiles are too, and the radii would change places."""
         claims = tuple(claim(3.0) for _ in range(200))
         factors = fit_factors(Sample(claims, claims))
-        assert factors.position_68 * chi.ppf(0.68, 3) <= factors.position_95 * chi.ppf(0.95, 3) * (1 + 1e-9)
+        assert factors.position_68 * length(0.68) <= factors.position_95 * length(0.95) * (1 + 1e-9)
 
     def test_too_few_answers_are_refused(self) -> None:
         with pytest.raises(TooFewQueries, match=f"{MIN_QUERIES - 1} answers are too few"):
@@ -167,7 +180,7 @@ class TestApplying:
         assert np.linalg.eigvalsh(covariance).min() > -1e-12
 
     def test_the_covariance_keeps_its_correlations(self) -> None:
-        def correlation(covariance: np.ndarray) -> np.ndarray:
+        def correlation(covariance: Array) -> Any:
             sigma = np.sqrt(np.diag(covariance))
             return covariance / np.outer(sigma, sigma)
 
@@ -201,17 +214,17 @@ class TestShares:
     def test_the_ends_of_an_interval_are_as_rare_as_stated(self, part: int, whole: int) -> None:
         share = Share.of(part, whole)
         if part:
-            assert binom.sf(part - 1, whole, share.low) == pytest.approx(0.025)
+            assert bdtrc(part - 1, whole, share.low) == pytest.approx(0.025)
         else:
             assert share.low == 0
         if part < whole:
-            assert binom.cdf(part, whole, share.high) == pytest.approx(0.025)
+            assert bdtr(part, whole, share.high) == pytest.approx(0.025)
         else:
             assert share.high == 1
 
     def test_right_claims_lie_on_the_diagonal(self) -> None:
         count = 400
-        exact = [claim(float(chi.ppf((i + 0.5) / count, 3))) for i in range(count)]
+        exact = [claim(float(length((i + 0.5) / count))) for i in range(count)]
         points = reliability(exact)
         assert (points[0][0], points[-1][0]) == (0.05, 0.99)
         np.testing.assert_allclose([share for _, share in points], [p for p, _ in points], atol=0.006)
@@ -239,7 +252,8 @@ class TestSelective:
     def test_a_coverage_is_reached_by_as_few_as_it_takes(self) -> None:
         point = at_coverage(self.SCORES, self.RIGHT, 0.6)
         assert point is not None
-        assert (point.score, point.accepted, point.risk) == (0.8, 3, pytest.approx(1 / 3))
+        assert (point.score, point.accepted) == (0.8, 3)
+        assert point.risk == pytest.approx(1 / 3)
         assert at_coverage(self.SCORES, (False,) * 5, 0.9) is None
 
 
@@ -282,8 +296,8 @@ def rejected(name: str, reason: str) -> Outcome:
 class TestFindings:
     def outcomes(self, count: int = 40) -> list[Outcome]:
         """Twice as far off as claimed; those with little trust more than 10 cm."""
-        lengths = 2 * chi.ppf((np.arange(count) + 0.5) / count, 3)
-        answers = [outcome(f"a{i}", float(it), trust=1 - it / 20) for i, it in enumerate(lengths)]
+        lengths = (2 * length((np.arange(count) + 0.5) / count)).tolist()
+        answers = [outcome(f"a{i}", it, trust=1 - it / 20) for i, it in enumerate(lengths)]
         return [*answers, rejected("r0", "LOW_OVERLAP"), rejected("r1", "LOW_OVERLAP"), rejected("r2", "GATE")]
 
     def test_counts_factors_and_trust(self) -> None:
@@ -293,7 +307,7 @@ class TestFindings:
         assert found.rejections == {"LOW_OVERLAP": 2, "GATE": 1}
         by_row = {(it.claim, it.probability): it for it in found.held}
         first = by_row["position", 0.68]
-        assert first.before.part == sum(it <= chi.ppf(0.68, 3) for it in 2 * chi.ppf((np.arange(40) + 0.5) / 40, 3))
+        assert first.before.part == sum(it <= length(0.68) for it in 2 * length((np.arange(40) + 0.5) / 40))
         assert first.after is not None
         assert first.after.value == pytest.approx(0.68, abs=0.05)
         assert found.right.whole == 40

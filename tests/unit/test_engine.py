@@ -28,7 +28,7 @@ from mapless_server.method.views import Features, PosedView, View
 from mapless_server.query import Caller, Photo, Query, Result
 from mapless_server.query_stages import MAX_LISTINGS, Work
 from mapless_server.query_views import QueryViews
-from mapless_server.retrieval.narrowing import Narrowing, PositionPrior
+from mapless_server.retrieval.narrowing import Narrowing, Sphere
 from mapless_server.scheduling.costs import Costs
 from mapless_server.scheduling.fair import Flow
 from mapless_server.scheduling.jobs import Job, Over
@@ -38,7 +38,7 @@ from mapless_server.tenancy import SceneKey
 from mapless_server.tiers import EscalationOptions, Tier
 
 SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
-ESCALATION = EscalationOptions(doubtful_inliers=50, doubtful_radius_m=0.2)
+ESCALATION = EscalationOptions(doubtful_trust=0.1, doubtful_radius_m=0.2)
 SCENE = SceneKey("s")
 DESCRIPTOR = StandInDescriptor()
 PIXELS = decode_image(PHOTO, ImageLimits())
@@ -46,8 +46,8 @@ FEATURES = Features(np.zeros((1, 2), np.float32), np.full((1, 4), 0.5, np.float3
 
 
 def localized(inliers: int, at: RigidTransform | None = None) -> Answer:
-    covariance = np.diag([1e-4] * 3 + [1e-6] * 3)
-    found = Localization(at or pose(0.0), covariance, PoseStage.REFINED, inliers, 2 * inliers, 0.7)
+    covariance, trust = np.diag([1e-4] * 3 + [1e-6] * 3), 0.5 if inliers == SURE_INLIERS else 0.01
+    found = Localization(at or pose(0.0), covariance, PoseStage.REFINED, inliers, 2 * inliers, 0.7, trust=trust)
     return Answer(found, None, {"coarse": 0.25}, (1, 2), (3, 4))
 
 
@@ -183,7 +183,7 @@ class TestTiers:
 
     def test_a_pose_outside_the_prior_is_doubtful_too(self, setting: Setting) -> None:
         setting.replies = {"cheap": localized(SURE_INLIERS, at=pose(3.0)), "strong": localized(SURE_INLIERS)}
-        near = Narrowing(PositionPrior(pose(0.0).translation, 0.5))
+        near = Narrowing(Sphere(pose(0.0).translation, 0.5))
         result = setting.localize(narrowing=near)
         assert isinstance(result.attempt.answer.outcome, Localization)
         assert setting.asked == ["cheap", "strong"]

@@ -97,7 +97,8 @@ def test_laws(outcomes: list[float | None], code: str, timeout_s: float, dice: f
     options = ConnectOptions(timeout_s=timeout_s)
     played = Played(asking(), errors, options, dice)
     assert played.result in errors
-    assert 1 <= len(played.tries) <= options.max_attempts
+    unasked = [error for error in errors if error.retry_after_s is None]
+    assert 1 <= len(played.tries) <= (options.max_attempts if len(unasked) == len(errors) else timeout_s + 1)
     assert all(0 < left_s <= timeout_s for left_s in played.tries)
     for pause_s, error in zip(played.pauses, errors + errors[-1:] * 8, strict=False):
         asked_s = error.retry_after_s or 0.0
@@ -118,7 +119,15 @@ def test_who_would_come_back_after_its_deadline_is_told_at_once() -> None:
 
 def test_the_second_pause_is_what_a_starting_server_asks_for_and_the_first_leaves_it_to_another() -> None:
     starting = Unavailable("UNAVAILABLE", "starting", retry_after_s=1.0)
-    assert Played(asking(), [starting, starting, Empty()], ConnectOptions()).pauses == pytest.approx([0.2, 1.0])
+    assert Played(asking(), [starting, starting, Empty()], ConnectOptions()).pauses == pytest.approx([0.2, 1.125])
+
+
+def test_a_server_that_says_when_to_come_back_is_asked_until_the_deadline() -> None:
+    starting = Unavailable("UNAVAILABLE", "starting", retry_after_s=1.0)
+    played = Played(asking(timeout_s=30.0), [starting], ConnectOptions())
+    assert played.pauses == pytest.approx([0.2] + [1.125] * 13)
+    assert played.took_s <= 30
+    assert Played(asking(timeout_s=30.0), [starting], ConnectOptions(max_attempts=1)).pauses == []
 
 
 def test_other_errors_are_final() -> None:

@@ -14,10 +14,10 @@ from mapless_server.method.gate import (
     GateOptions,
     doubts,
     false_alarms,
+    findable_count,
     hull_share,
     log10_false_alarms,
     told_false_alarms,
-    visible_count,
 )
 from mapless_server.method.match import PointMatches
 from mapless_server.method.observations import ONE_PIXEL
@@ -111,7 +111,7 @@ def test_agreement_of_few_of_many_visible_points_is_doubted() -> None:
     random = random_for("share")
     view, structure, matches = planted(random, 1000)
     few = PointMatches(matches.point[:30], matches.keypoint[:30], matches.guided[:30], 0.0)
-    assert "should show 1000 points" in doubt_of((view, structure, few))
+    assert "1000 points should be found" in doubt_of((view, structure, few))
     behind = replace(structure, x_in_world=structure.x_in_world.copy())
     behind.x_in_world[30:] = POSE.apply([0.0, 0.0, -5.0])  # what is not in front need not be found
     assert not doubt_of((view, behind, few))
@@ -123,12 +123,14 @@ def test_the_hull_is_that_of_a_known_rectangle() -> None:
     assert hull_share(query, matches, np.ones(5, bool)) == pytest.approx(0.25, rel=1e-4)
 
 
-def test_visible_is_what_lies_in_front_and_inside() -> None:
+def test_findable_is_what_lies_in_front_and_inside_if_there_are_features_enough() -> None:
     inside = POSE.apply(CAMERA.rays(np.array([[0.0, 0.0], [959.0, 719.0]])) * 3.0)
     outside = POSE.apply(CAMERA.rays(np.array([[-2.0, 0.0], [959.0, 722.0]])) * 3.0)
     behind = POSE.apply([0.0, 0.0, -2.0])[None]
-    _, structure, _ = problem_of(np.concatenate([inside, outside, behind]), np.zeros((5, 2)))
-    assert visible_count(CAMERA, structure, POSE) == 2
+    query, structure, _ = problem_of(np.concatenate([inside, outside, behind]), np.zeros((5, 2)))
+    assert findable_count(query, structure, POSE) == 2
+    bare = problem_of(inside[:1], np.zeros((1, 2)))[0]
+    assert findable_count(bare, structure, POSE) == 1
 
 
 # False alarms

@@ -51,6 +51,18 @@ def test_rotation_from_vector_is_rodrigues(w: Array) -> None:
     np.testing.assert_allclose(rotation_from_vector(w), Rotation.from_rotvec(w).as_matrix(), atol=1e-12)
 
 
+@settings(deadline=None)
+@given(vector, st.floats(-9e-4, 9e-4), st.booleans())
+def test_a_normalized_quaternion_is_the_same_rotation(w: Array, excess: float, is_negative: bool) -> None:
+    q = Quaternion.from_matrix(rotation_from_vector(w))
+    factor = (1 + excess) * (-1 if is_negative else 1)
+    found = Quaternion(factor * q.x, factor * q.y, factor * q.z, factor * q.w).normalized()
+    np.testing.assert_allclose(found.matrix(), rotation_from_vector(w), atol=1e-12)
+    assert math.hypot(found.x, found.y, found.z, found.w) == pytest.approx(1, abs=1e-12)
+    assert found.w >= 0
+    assert found.normalized() == found
+
+
 @pytest.mark.parametrize("length", [0.0, 1e-12, 0.99e-8, 1.01e-8, 1e-5])
 def test_rotation_from_vector_has_no_step_near_zero(length: float) -> None:
     w = length * np.array([0.6, 0.0, -0.8])

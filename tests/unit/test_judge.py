@@ -1,5 +1,4 @@
-"""Trust is the share of right answers that look at most as good: monotone in each piece of evidence, and what is asked
-as coverage is the share of right answers that passes."""
+"""Trust is the share of right answers that look at most as good, and coverage the share of them that passes."""
 
 from __future__ import annotations
 
@@ -24,13 +23,13 @@ GOOD = Evidence(
     log10_false_alarms=-900.0,
     inlier_count=300,
     match_count=330,
-    visible_count=600,
+    findable_count=600,
     hull_share=0.6,
     reference_count=4.0,
     error_sigma=1.0,
-    relative_radius=0.003,
+    position_95_m=0.02,
 )
-POOR = Evidence(-11.0, 9, 31, 70, 0.05, 1.6, 1.5, 0.4)
+POOR = Evidence(-11.0, 11, 31, 70, 0.05, 1.6, 1.5, 0.4)
 """Such a pose was 89 cm off."""
 
 
@@ -59,10 +58,10 @@ def test_well_supported_is_trusted_and_poorly_supported_is_not() -> None:
     [
         ("log10_false_alarms", -2000.0),
         ("match_count", 305),
-        ("visible_count", 320),
+        ("findable_count", 320),
         ("hull_share", 0.9),
         ("reference_count", 8.0),
-        ("relative_radius", 0.001),
+        ("position_95_m", 0.01),
     ],
 )
 def test_more_evidence_never_lowers_the_trust(name: str, better: float) -> None:

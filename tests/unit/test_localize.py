@@ -43,6 +43,7 @@ from mapless_server.method.views import Features, PosedView, View
 SCENE = make_scene(random_for("localize"), SceneOptions(point_count=400, reference_count=5))
 MATCHER = Matcher()
 ROUGH = FakeNetworkOptions(depth_noise_m=0.03, pose_noise_m=0.01, pose_noise_deg=0.2)
+JUDGED = ["uncertainty", "judge"]
 LATER_STAGES = ["structure", "match", "pnp"]
 
 
@@ -128,8 +129,9 @@ def test_on_the_device_the_answer_is_the_hosts(variant: Variant, strategy: Scale
     assert_pose_close(found.world_from_camera, expected.world_from_camera, metres=1e-5, degrees=1e-4)
     assert (found.inlier_count, found.match_count) == (expected.inlier_count, expected.match_count)
     assert there.reference_inlier_counts == here.reference_inlier_counts
-    refined = ["refine"] if variant is Variant.COARSE else ["refine", "pnp"]
-    assert list(there.stage_seconds)[2:] == [*refined, *(["adjust"] if variant is Variant.BEST else [])]
+    adjusted = ["adjust"] if variant is Variant.BEST else []
+    later = [] if variant is Variant.COARSE else ["pnp", *adjusted, *JUDGED]
+    assert list(there.stage_seconds)[2:] == ["refine", *later]
 
 
 def test_refinement_makes_a_rough_pose_fine() -> None:
@@ -190,9 +192,9 @@ def test_stages_run_in_order_and_are_timed() -> None:
     before = ["correspond", "coarse", "scale"]
     for variant, after in (
         (Variant.COARSE, []),
-        (Variant.NO_STRUCTURE, LATER_STAGES),
-        (Variant.FULL, LATER_STAGES),
-        (Variant.BEST, [*LATER_STAGES, "adjust"]),
+        (Variant.NO_STRUCTURE, [*LATER_STAGES, *JUDGED]),
+        (Variant.FULL, [*LATER_STAGES, *JUDGED]),
+        (Variant.BEST, [*LATER_STAGES, "adjust", *JUDGED]),
     ):
         seconds = answer_of(pipeline_of("network"), LocalizeOptions(variant)).stage_seconds
         assert list(seconds) == before + after
@@ -246,7 +248,7 @@ def test_a_weak_answer_is_computed_again_from_wide_correspondences(monkeypatch: 
     again = answer_of(pipeline_of("geometric"), LocalizeOptions(weak_inliers=10**6))
     assert asked == [False, False, True]
     assert pose_of(again).inlier_count >= strong.inlier_count
-    assert list(again.stage_seconds) == ["correspond", "coarse", "scale", *LATER_STAGES, "adjust"]
+    assert list(again.stage_seconds) == ["correspond", "coarse", "scale", *LATER_STAGES, "adjust", *JUDGED]
     assert_pose_close(pose_of(again).world_from_camera, SCENE.world_from_query, metres=0.01, degrees=0.1)
 
     for variant in (Variant.COARSE, Variant.NO_STRUCTURE, Variant.FULL):  # the paper's forms stay the paper's

@@ -8,7 +8,6 @@ import numpy as np
 import poselib
 import pytest
 from compare import assert_pose_close
-from jacobians import assert_jacobian, finite_differences
 from planted import true_structure
 from scenes import CAMERA, SceneOptions, make_scene, random_for
 
@@ -20,12 +19,9 @@ from mapless_server.method.pnp import (
     PnpOptions,
     PoseEstimate,
     PoseStage,
-    motion_jacobian,
-    pose_hessian,
     ransac,
     reprojection_errors_px,
     solve_pose,
-    world_covariance,
 )
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.structure import Structure
@@ -166,31 +162,6 @@ def test_when_no_pose_explains_anything_the_solver_has_failed(monkeypatch: pytes
 def moved_in_world(pose: RigidTransform, error: Array) -> RigidTransform:
     """The pose after a shift (x, y, z) and a turn (rx, ry, rz) about fixed world axes."""
     return RigidTransform(rotation_from_vector(error[3:]) @ pose.rotation, pose.translation + error[:3])
-
-
-def test_motion_jacobian() -> None:
-    for x in random_for("motion").normal(size=(5, 3)):
-
-        def moved(motion: Array, x: Array = x) -> Array:
-            return np.asarray(rotation_from_vector(motion[3:]) @ x + motion[:3])
-
-        assert_jacobian(motion_jacobian(x), moved, np.zeros(6), tolerance=1e-7)
-
-
-def test_the_covariance_is_that_of_errors_in_the_world() -> None:
-    """The inverse of J^T J, where J is by differences in the very coordinates that the covariance is told in."""
-    view, structure, _ = planted(random_for("covariance"), 60)
-    x_in_world = structure.x_in_world
-
-    def projections(error: Array) -> Array:
-        return CAMERA.project(moved_in_world(POSE, error).inverse().apply(x_in_world)).ravel()
-
-    jacobian = finite_differences(projections, np.zeros(6))
-    covariance = world_covariance(pose_hessian(view.camera, POSE, x_in_world) / 0.5**2, POSE)
-    expected = 0.5**2 * np.linalg.inv(jacobian.T @ jacobian)
-    np.testing.assert_allclose(covariance, expected, atol=1e-5 * np.abs(expected).max())
-    np.testing.assert_array_equal(covariance, covariance.T)
-    assert np.linalg.eigvalsh(covariance).min() > 0
 
 
 def test_errors_are_as_large_as_the_covariance_says() -> None:

@@ -14,7 +14,7 @@ from scenes import random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.retrieval.index import Entries, SceneIndex
-from mapless_server.retrieval.narrowing import HeadingPrior, Narrowing, PositionPrior
+from mapless_server.retrieval.narrowing import Cone, Narrowing, Sphere
 from mapless_server.retrieval.ranking import RankedReference, RankOptions, rank_references, spread
 from mapless_server.store.records import IndexedReference, SceneChanges
 
@@ -72,14 +72,14 @@ class TestOrder:
 
     def test_those_without_descriptor_come_last_the_nearest_to_the_prior_first(self) -> None:
         entries = planted([None, -0.9, None, None], x_m=[9.0, 0.0, 1.0, 4.0])
-        near = Narrowing(PositionPrior(np.zeros(3), 1.0))
+        near = Narrowing(Sphere(np.zeros(3), 1.0))
         ranked = rank_references(entries, QUERY, 4, near)
         assert ids(ranked) == "1 2 3 0"
         assert [math.isnan(it.similarity) for it in ranked] == [False, True, True, True]
 
     def test_a_photograph_without_descriptor_ranks_by_place(self) -> None:
         entries = planted([0.9, 0.8, 0.7], x_m=[5.0, 1.0, 3.0])
-        assert ids(rank_references(entries, None, 3, Narrowing(PositionPrior(np.zeros(3), 1.0)))) == "1 2 0"
+        assert ids(rank_references(entries, None, 3, Narrowing(Sphere(np.zeros(3), 1.0)))) == "1 2 0"
         assert ids(rank_references(entries, None, 3)) == "0 1 2"
 
     def test_only_named_references_are_ranked_and_unknown_names_passed_over(self) -> None:
@@ -100,25 +100,25 @@ class TestOrder:
 class TestNarrowing:
     def test_a_position_prior_keeps_what_is_within_radius_and_margin(self) -> None:
         entries = planted([0.1, 0.2, 0.3, 0.4], x_m=[0.0, 11.9, 12.1, 50.0])
-        prior = Narrowing(PositionPrior(np.zeros(3), 2.0), margin_m=10.0)
+        prior = Narrowing(Sphere(np.zeros(3), 2.0), margin_m=10.0)
         assert ids(rank_references(entries, QUERY, 10, prior)) == "1 0"
 
     def test_a_heading_keeps_what_looks_the_same_way(self) -> None:
         entries = planted([0.1, 0.2, 0.3, 0.4], turned_deg=[0.0, 29.0, -31.0, 180.0])
-        heading = Narrowing(heading=HeadingPrior(AHEAD, 30.0), margin_deg=0.0)
+        heading = Narrowing(heading=Cone(AHEAD, 30.0), margin_deg=0.0)
         assert ids(rank_references(entries, QUERY, 10, heading)) == "1 0"
 
     def test_both_must_hold(self) -> None:
         entries = planted([0.1, 0.2, 0.3], x_m=[0.0, 0.0, 99.0], turned_deg=[0.0, 90.0, 0.0])
-        both = Narrowing(PositionPrior(np.zeros(3), 1.0), HeadingPrior(AHEAD, 20.0), margin_m=0.0, margin_deg=0.0)
+        both = Narrowing(Sphere(np.zeros(3), 1.0), Cone(AHEAD, 20.0), margin_m=0.0, margin_deg=0.0)
         assert ids(rank_references(entries, QUERY, 10, both)) == "0"
 
     def test_half_a_turn_keeps_all(self) -> None:
         entries = planted([0.1, 0.2, 0.3], turned_deg=[0.0, 90.0, 180.0])
-        assert len(rank_references(entries, QUERY, 10, Narrowing(heading=HeadingPrior(AHEAD, 180.0)))) == 3
+        assert len(rank_references(entries, QUERY, 10, Narrowing(heading=Cone(AHEAD, 180.0)))) == 3
 
     def test_nothing_left_is_an_empty_answer(self) -> None:
-        far = Narrowing(PositionPrior(np.array([1e6, 0.0, 0.0]), 1.0))
+        far = Narrowing(Sphere(np.array([1e6, 0.0, 0.0]), 1.0))
         assert rank_references(planted([0.9]), QUERY, 10, far) == []
 
 

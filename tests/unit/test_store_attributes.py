@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy import Connection, Row
 from stores import DATABASES, EXTRACTOR, Place, Shared, make_reference, place_on
@@ -205,6 +206,20 @@ def test_the_next_call_sees_what_another_server_changed() -> None:
             other.get_attributes(OFFICE)
 
 
+def test_changes_at_once_lose_none_of_each_other(store: Store) -> None:
+    store.create_scene(OFFICE)
+    values: list[dict[str, Any]] = [{"datum": DATUM}, {"down_in_world": DOWN}, {"calibration": CALIBRATION}]
+    rounds = 5
+    with ThreadPoolExecutor(3) as threads:
+        for _ in range(rounds):
+            list(threads.map(lambda value: store.update_scene(OFFICE, **dict.fromkeys(value)), values))
+            assert known_of(store, OFFICE) == SceneAttributes()
+            list(threads.map(lambda value: store.update_scene(OFFICE, **value), values))
+            found = known_of(store, OFFICE)
+            assert (found.datum, found.down_in_world, found.calibration is None) == (DATUM, DOWN, False)
+    assert store.get_scene(OFFICE).generation == 1 + 6 * rounds
+
+
 def test_a_store_that_nobody_else_changes_is_asked_once(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[SceneKey] = []
     find = queries.find_attributes
@@ -227,6 +242,7 @@ vector = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 quaternion = vector.map(lambda it: Quaternion.from_matrix(rotation_from_vector(it)))
 
 
+@settings(deadline=None)
 @given(
     st.none() | st.builds(Datum, st.floats(-90, 90), st.floats(-180, 180), st.floats(-12_000, 1e5), quaternion),
     st.none()
@@ -246,6 +262,7 @@ def test_every_bit_comes_back(datum: Datum | None, calibration: Calibration | No
         assert codec.decode_attributes("x", data, sha256) == attributes
 
 
+@settings(deadline=None)
 @given(st.tuples(finite, finite, finite))
 def test_directions_are_of_unit_length_whatever_they_were(vector: tuple[float, float, float]) -> None:
     """Also of vectors whose squares are no numbers."""

@@ -33,11 +33,13 @@ class Named:
 CHEAP, STRONG = (Tier(Named(name), Pipeline()) for name in ("cheap", "strong"))
 
 
-def localized(x_m: float = 0.0, sigma_m: float = 0.01, inliers: int = 100, turn_deg: float = 0.0) -> Answer:
+def localized(
+    x_m: float = 0.0, sigma_m: float = 0.01, inliers: int = 100, turn_deg: float = 0.0, trust: float = 0.5
+) -> Answer:
     """A pose at x with equal errors along all axes, and of so many degrees a metre of error."""
     pose = RigidTransform(rotation_from_vector([0.0, np.radians(turn_deg), 0.0]), np.array([x_m, 0.0, 0.0]))
     covariance = np.diag([sigma_m**2] * 3 + [np.radians(0.1) ** 2] * 3)
-    return Answer(Localization(pose, covariance, PoseStage.REFINED, inliers, 2 * inliers, 0.7))
+    return Answer(Localization(pose, covariance, PoseStage.REFINED, inliers, 2 * inliers, 0.7, (), trust))
 
 
 def rejected(reason: RejectionReason = RejectionReason.TOO_FEW_MATCHES) -> Answer:
@@ -54,13 +56,13 @@ class TestDoubt:
         assert is_doubtful(rejected(reason), OPTIONS) is (reason not in UNMENDABLE)
         assert {it.name for it in UNMENDABLE} == {"NO_USABLE_REFERENCES", "DEGENERATE_REFERENCES"}
 
-    @given(inliers=st.integers(0, 200), sigma_m=st.floats(1e-4, 1.0))
-    def test_a_pose_is_doubtful_with_few_inliers_or_a_large_radius_and_no_other_is(
-        self, inliers: int, sigma_m: float
+    @given(trust=st.floats(0, 1), sigma_m=st.floats(1e-4, 1.0))
+    def test_a_pose_is_doubtful_with_little_trust_or_a_large_radius_and_no_other_is(
+        self, trust: float, sigma_m: float
     ) -> None:
         radius_m = error_radius(np.eye(3) * sigma_m**2, 0.68)
-        expected = inliers < OPTIONS.doubtful_inliers or radius_m > OPTIONS.doubtful_radius_m
-        assert is_doubtful(localized(sigma_m=sigma_m, inliers=inliers), OPTIONS) is expected
+        expected = trust < OPTIONS.doubtful_trust or radius_m > OPTIONS.doubtful_radius_m
+        assert is_doubtful(localized(sigma_m=sigma_m, trust=trust), OPTIONS) is expected
 
     def test_a_pose_that_claims_nothing_is_not_doubtful(self) -> None:
         coarse = Localization(RigidTransform.identity(), None, PoseStage.INITIAL, 0, 0, 0.0)
@@ -115,7 +117,7 @@ class TestBetter:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"doubtful_inliers": -1}, {"doubtful_radius_m": -1.0}, {"clearly_more": 0.5}, {"time_share": 0.0}]
+    [{"doubtful_trust": -1.0}, {"doubtful_radius_m": -1.0}, {"clearly_more": 0.5}, {"time_share": 0.0}]
     + [{"time_share": 1.5}, {"same_position_m": float("nan")}, {"same_rotation_deg": -1.0}],
 )
 def test_options_check_themselves(wrong: dict[str, float]) -> None:

@@ -95,10 +95,10 @@ def photos_of(folder: Path, camera: str | None) -> list[Photo]:
     if camera is None:
         if not (folder / FOLDER_FILE).is_file():
             raise ValueError(f"{folder} has no {FOLDER_FILE}: say --camera, which then took all its photographs")
-        return [
-            Photo(path, path.relative_to(folder).as_posix(), its)
-            for path, its in read_cameras(folder / FOLDER_FILE).items()
-        ]
+        cameras = read_cameras(folder / FOLDER_FILE)
+        if not cameras:
+            raise ValueError(f"{folder / FOLDER_FILE} lists no photographs")
+        return [Photo(path, path.relative_to(folder).as_posix(), its) for path, its in cameras.items()]
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDINGS)
     if not paths:
         raise ValueError(f"{folder} holds no photographs ({', '.join(sorted(ENDINGS))})")

@@ -44,6 +44,7 @@ class Progress:
     def clear(self) -> None:
         """Makes room for other output; the next step draws it again."""
         if self._is_shown:
+            self._drawn_s = 0.0
             self._stream.write("\r\x1b[K")
             self._stream.flush()
 

@@ -18,7 +18,7 @@ import numpy as np
 from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
 
 from ..method.accuracy import accuracy_from_covariance
-from ..method.pnp import motion_jacobian, world_covariance
+from ..method.perturbation import motion_jacobian, world_covariance
 from ..method.structure import StructureOptions
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood
 from .surroundings import Surroundings

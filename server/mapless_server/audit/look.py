@@ -11,7 +11,8 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 
 from ..method.gate import false_alarms
-from ..method.pnp import PnpOptions, ransac, world_covariance
+from ..method.perturbation import world_covariance
+from ..method.pnp import PnpOptions, ransac
 from ..method.views import PosedView
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood, sight
 from .options import AuditOptions

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from scipy.stats import binom
+import numpy as np
+from scipy.special import bdtr
 
 from ..evaluation.svg import Axis, Chart, Curve, log_range
 from .claims import Claim
@@ -34,9 +35,8 @@ def _reliability(kind: str, claims: Sequence[Claim], after: Sequence[Claim]) -> 
     if after:
         curves.append(Curve("with factors, left out", _per_cent(reliability(after))))
     curves.append(Curve("exactly right", ((0.0, 0.0), (100.0, 100.0)), from_paper=True))
-    for name, tail in (("right, but for chance: least", 0.025), ("most (95 %)", 0.975)):
-        counts = binom.ppf(tail, len(claims), DIAGRAM)
-        shares = tuple((100 * p, 100 * k / len(claims)) for p, k in zip(DIAGRAM, counts, strict=True))
+    for name, tail in (("by chance, at least", 0.025), ("by chance, at most", 0.975)):
+        shares = tuple((100 * p, 100 * _chance(len(claims), p, tail)) for p in DIAGRAM)
         curves.append(Curve(name, shares, from_paper=True))
     return Chart(
         f"Reliability of the {kind}'s radii",
@@ -44,6 +44,11 @@ def _reliability(kind: str, claims: Sequence[Claim], after: Sequence[Claim]) -> 
         Axis("it was, % of answers", 0, 100),
         tuple(curves),
     )
+
+
+def _chance(count: int, probability: float, tail: float) -> float:
+    """Quantile of the share of claims that hold if each does with a probability."""
+    return float(np.searchsorted(bdtr(np.arange(count + 1), count, probability), tail)) / count
 
 
 def _beside(kind: str, claims: Sequence[Claim], unit: str, factor: float, smallest: float) -> Chart:

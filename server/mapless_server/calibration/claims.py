@@ -8,7 +8,7 @@ import numpy as np
 
 from mapless.geometry import Array
 
-from ..method.accuracy import error_radius
+from ..method.accuracy import error_radii
 
 LEVELS = np.concatenate([[0.005], np.arange(1, 100) / 100, [0.995, 0.999]])
 """Probabilities for which radii are known; between them they are interpolated."""
@@ -34,7 +34,7 @@ class Claim:
         """From what an answer says.
 
         An answer states two radii and a covariance. The radius for another probability p is the covariance's
-        (`error_radius`) times what the stated ones are of the covariance's own: exactly at 68 and 95 %, linear in p
+        (`error_radii`) times what the stated ones are of the covariance's own: exactly at 68 and 95 %, linear in p
         between, constant beyond.
 
         Args:
@@ -43,12 +43,10 @@ class Claim:
             radius_95: likewise.
             covariance: (3, 3), the unit of `error`, squared.
         """
-        own = np.array([error_radius(covariance, float(p)) for p in LEVELS])
-        stated = [
-            radius / max(error_radius(covariance, p), np.finfo(float).tiny)
-            for radius, p in ((radius_68, 0.68), (radius_95, 0.95))
-        ]
-        return cls(error, radius_68, radius_95, np.maximum.accumulate(own * np.interp(LEVELS, (0.68, 0.95), stated)))
+        at = (0.68, 0.95)
+        own = error_radii(covariance, LEVELS)
+        stated = np.array([radius_68, radius_95]) / np.maximum(np.interp(at, LEVELS, own), np.finfo(float).tiny)
+        return cls(error, radius_68, radius_95, np.maximum.accumulate(own * np.interp(LEVELS, at, stated)))
 
     def held(self, probability: float) -> bool:
         """Whether the truth lies within the radius for a probability, one of `LEVELS`' range."""

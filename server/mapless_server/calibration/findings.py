@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from scipy.special import betaincinv
 
 from .claims import Claim
@@ -145,7 +146,7 @@ def find(outcomes: Sequence[Outcome], right: RightRule) -> Findings:
 
 def reliability(claims: Sequence[Claim]) -> list[tuple[float, float]]:
     """The reliability diagram: claimed probability against the share of claims (at least one) that hold at it."""
-    return [(p, sum(claim.held(p) for claim in claims) / len(claims)) for p in DIAGRAM]
+    return [(p, float(np.mean([claim.held(p) for claim in claims]))) for p in DIAGRAM]
 
 
 def _held(sample: Sample, factors: Factors | None, after: Sample | None) -> list[Held]:
@@ -160,4 +161,5 @@ def _held(sample: Sample, factors: Factors | None, after: Sample | None) -> list
 
 def _share(claims: Sequence[Claim], percent: int) -> Share:
     radii = [claim.radius_68 if percent == 68 else claim.radius_95 for claim in claims]
-    return Share.of(sum(claim.error <= radius for claim, radius in zip(claims, radii, strict=True)), len(claims))
+    held = [claim.error <= radius for claim, radius in zip(claims, radii, strict=True)]
+    return Share.of(int(np.sum(held)), len(claims))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from mapless import Scene
 from mapless.geometry import Fisheye
@@ -38,23 +38,37 @@ def write_file(file: Path, content: bytes) -> None:
         raise
 
 
-def cameras_files(images: Sequence[PosedImage], source: str, scene: Scene) -> dict[str, str]:
+def cameras_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
     """Contents of `cameras.json` by its path, with the scene's datum and down; images lie in the folder IMAGES."""
     content: dict[str, Any] = {"source": source, "metric": True, "units": "metre"}
-    if scene.datum is not None:
+    if scene is not None and scene.datum is not None:
         content["datum"] = scene.datum.to_json()
-    if scene.down_in_world is not None:
+    if scene is not None and scene.down_in_world is not None:
         content["down_in_world"] = scene.down_in_world
     content["frames"] = [_entry(image) for image in images]
     return {FILE_NAME: json.dumps(content, indent=1, allow_nan=False) + "\n"}
 
 
-def colmap_files(images: Sequence[PosedImage], source: str, _scene: Scene) -> dict[str, str]:
+def colmap_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
     """Contents of a COLMAP text model's files by their paths; images lie in the folder IMAGES."""
     return {f"sparse/0/{name}": f"# {source}\n{text}" for name, text in model_texts(images).items()}
 
 
-LAYOUTS: Mapping[str, Callable[[Sequence[PosedImage], str, Scene], dict[str, str]]] = {
+class Layout(Protocol):
+    """How a scene is written."""
+
+    def __call__(self, images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
+        """Contents of files by their paths.
+
+        Args:
+            images: what is described; they lie in the folder IMAGES.
+            source: where they come from, for a person.
+            scene: what is known of it as a whole, for layouts that have a place for it.
+        """
+        ...
+
+
+LAYOUTS: Mapping[str, Layout] = {
     "cameras": cameras_files,
     "colmap": colmap_files,
 }

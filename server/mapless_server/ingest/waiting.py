@@ -22,8 +22,10 @@ class UploadOptions:
     away_patience_s: float = 60.0
 
     def __post_init__(self) -> None:
-        if not (1 <= self.parallel <= 64 and self.busy_patience_s > 0 and self.away_patience_s > 0):
-            raise ValueError("parallel must be 1 to 64 and times above 0")
+        if not 1 <= self.parallel <= 64:
+            raise ValueError(f"--parallel is the number of messages in flight, 1 to 64, not {self.parallel}")
+        if not (self.busy_patience_s > 0 and self.away_patience_s > 0):
+            raise ValueError("times must be above 0")
 
 
 class Waiting:

@@ -9,30 +9,38 @@ from mapless.wire import FieldError
 from ..engine import EngineOptions
 from ..method.localize import LocalizeOptions
 from ..query import DEFAULT_REFERENCE_COUNT, Query
+from ..store import SceneAttributes
 from ..tenancy import key_of
 from .enums import enum_from_message
 from .naming import reference_ids_from_names
 from .photos import photo_from_message
-from .priors import narrowing_from_message
+from .priors import priors_from_message
 
 MAX_REFERENCES = 64
 MAX_CANDIDATES = 1000
 """References that a request may name when the server is to choose among them."""
 
 
-def query_from_message(request: pb.LocalizeRequest, tenant: str, engine: EngineOptions) -> Query:
-    """The query of a request; FieldError or InvalidArgument names the field that is wrong."""
+def query_from_message(
+    request: pb.LocalizeRequest, tenant: str, engine: EngineOptions, attributes: SceneAttributes
+) -> Query:
+    """The query of a request; FieldError or InvalidArgument names the field that is wrong.
+
+    `attributes` are the scene's, of which only what `needs_attributes` says is looked at.
+    """
     scene_id = wire.scene_id_from_name(request.scene, "scene")
     most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
+    narrowing, priors = priors_from_message(request, attributes)
     return Query(
         scene_key=key_of(tenant, scene_id),
         reference_ids=reference_ids_from_names(request.references, scene_id, most),
         photo=photo_from_message(request, "", engine.image_limits),
-        narrowing=narrowing_from_message(request),
+        narrowing=narrowing,
         reference_count=reference_count_from_message(request.options),
         options=options_from_message(request.options, engine.coverage),
         allow_coarse=request.options.allow_coarse,
         rerank=request.options.rerank_references and bool(request.references),
+        priors=priors,
     )
 
 

@@ -15,19 +15,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 
+from .linearization import Linearization, grounds_of, linearize, tracks_with_query
 from .match import PointMatches
 from .observations import Observations, invert_symmetric
-from .pnp import PoseEstimate, PoseStage, motion_jacobian, reprojection_errors_px, world_covariance
+from .pnp import PoseEstimate, PoseStage, reprojection_errors_px
 from .priors import NO_PRIORS, Priors
 from .structure import Structure, observe
-from .tracks import Tracks
+from .uncertainty import Uncertainty, UncertaintyOptions, one_match_covariance, uncertainty_of
 from .views import PosedView, View
 
 
@@ -39,14 +40,14 @@ class AdjustOptions:
         loss_scale_sigma: of the Cauchy loss, which forgets gross errors rather than merely bounding them.
         prior_share: how far references may move: the standard deviation of the prior, in image pixels, as a share of
             the noise level found in the structure. What the residuals show is an upper bound of what poses are off.
-        error_inflation: factor on the standard deviations of the answer. Errors of neighbouring keypoints and of one
-            reference's points go together, which the sum over residuals does not know; on scenes with known poses true
-            errors were 1.5 to 2.8 times what it says.
+        error_inflation: by how much standard deviations that are told from the sum over residuals are too small, as a
+            rule: it decides what priors weigh. The answer's covariance does not rest on it (see `uncertainty`).
         inlier_px: as of the pose solver; the inliers of the answer are those of its own pose.
         min_kept_share: an adjustment that loses more of the inliers has run off, and is not answered.
         max_error_px: matches further from the pose found so far take no part.
         iterations: at most so many Levenberg-Marquardt steps.
         min_decrease: stop when a step lowers the cost by a smaller share.
+        uncertainty: of the answer's covariance.
     """
 
     loss_scale_sigma: float = 1.4
@@ -57,6 +58,7 @@ class AdjustOptions:
     max_error_px: float = 8.0
     iterations: int = 8
     min_decrease: float = 1e-5
+    uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
 
     def __post_init__(self) -> None:
         positive = (
@@ -148,15 +150,11 @@ class _Problem:
 
     def linearize(self, state: _State) -> _NormalEquations:
         observations = self.at(state)
-        residual = observations.residuals(state.points)
-        weight = 1 / (1 + (residual**2).sum(axis=1) / self.options.loss_scale_sigma**2)
-        x_in_camera = observations.in_camera(state.points)
-        by_camera_point = observations.camera_jacobians(x_in_camera)
-        by_point = by_camera_point @ observations.rotation  # (O, 2, 3)
-        by_pose = by_camera_point @ motion_jacobian(x_in_camera)  # (O, 2, 6)
+        rows = linearize(observations, state.points, self.options.loss_scale_sigma)
+        weight, by_point, by_pose = rows.weight, rows.by_point, rows.by_pose
         weighted_point = np.swapaxes(by_point * weight[:, None, None], 1, 2)
         weighted_pose = np.swapaxes(by_pose * weight[:, None, None], 1, 2)
-        error = residual[:, :, None]
+        error = rows.residual[:, :, None]
 
         pose_block = (self.pick @ (weighted_pose @ by_pose).reshape(-1, 36)).reshape(-1, 6, 6)
         pose_gradient = self.pick @ (weighted_pose @ error)[..., 0]
@@ -174,7 +172,14 @@ class _Problem:
             observations.sum_by_point(weighted_point @ by_point),
             observations.sum_by_point((weighted_point @ error)[..., 0]),
             cross.reshape(len(state.points), -1, 3),
+            rows,
         )
+
+    def uncertainty(self, state: _State, rows: Linearization, one_match: Array) -> Uncertainty | None:
+        """Of the query's pose at an optimum, linearized there, without what priors say of it."""
+        motions = np.concatenate([self.prior_error(state), np.zeros((1, 6))])
+        grounds = grounds_of(rows, self.observations.point, self.view, motions)
+        return uncertainty_of(grounds, state.world_from_query, one_match, self.options.uncertainty)
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +192,7 @@ class _NormalEquations:
         point_block: C, (P, 3, 3).
         point_gradient: h, (P, 3).
         cross: E, (P, 6 V, 3).
+        rows: of the observations, from which all this is summed.
     """
 
     pose_block: Array
@@ -194,6 +200,7 @@ class _NormalEquations:
     point_block: Array
     point_gradient: Array
     cross: Array
+    rows: Linearization
 
     def reduced(self, damping: float) -> tuple[Array, Array, Array]:
         """B - E C^-1 E^T (6 V, 6 V), g - E C^-1 h (6 V,) and C^-1 (P, 3, 3), diagonals enlarged by `damping`."""
@@ -246,7 +253,10 @@ def adjust_pose(
 
     def adjusted(pulling: Priors) -> PoseEstimate | None:
         state, equations = _minimize(problem.with_priors(pulling), start, options)
-        return _conclude(query, structure, matches, used, estimate, state, equations, options)
+        found = _conclude(query, structure, matches, used, estimate, problem, state, equations)
+        if found is None:
+            return None
+        return replace(found, covariance=pulling.sharpened(found.covariance, found.world_from_camera))
 
     alone = adjusted(NO_PRIORS)
     if not priors:
@@ -263,27 +273,26 @@ def _conclude(
     matches: PointMatches,
     used: NDArray[np.intp],
     estimate: PoseEstimate,
+    problem: _Problem,
     state: _State,
     equations: _NormalEquations,
-    options: AdjustOptions,
 ) -> PoseEstimate | None:
-    """The estimate at the optimum; None if it has run off."""
-    matrix, _, _ = equations.reduced(0.0)
-    if not np.isfinite(matrix).all():
-        return None
-    pose = state.world_from_query
-    # The query's block of the inverse is the inverse of what is left when the references are eliminated too.
-    references_block, coupling = matrix[:-6, :-6], matrix[:-6, -6:]
-    hessian = matrix[-6:, -6:] - coupling.T @ np.linalg.solve(references_block, coupling)
+    """The estimate at the optimum, its covariance without priors; None if it has run off."""
+    pose, options = state.world_from_query, problem.options
     pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
     points = structure.x_in_world.copy()
     points[np.unique(matches.point[used])] = state.points
     errors_px = reprojection_errors_px(query.camera, pose, points[matches.point], pixels)
-    covariance = options.error_inflation**2 * world_covariance(hessian, pose)
     inliers = errors_px < options.inlier_px
-    if inliers.sum() < options.min_kept_share * estimate.inliers.sum():
+    if inliers.sum() < max(1, options.min_kept_share * estimate.inliers.sum()):
         return None
-    return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, covariance)
+    x_in_world = points[matches.point[inliers]]
+    one_match = one_match_covariance(query.camera, pose, x_in_world, structure.noise.level_px)
+    uncertainty = problem.uncertainty(state, equations.rows, one_match)
+    if uncertainty is None:
+        return None
+    covariance = uncertainty.covariance
+    return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, covariance, uncertainty=uncertainty)
 
 
 def _minimize(problem: _Problem, state: _State, options: AdjustOptions) -> tuple[_State, _NormalEquations]:
@@ -312,15 +321,8 @@ def _pose_problem(
     world_from_query: RigidTransform,
     options: AdjustOptions,
 ) -> tuple[_Problem, _State]:
-    chosen = np.zeros(len(structure.x_in_world), bool)
-    chosen[matches.point[used]] = True
-    seen = structure.tracks.select(chosen)
     views = [*references, PosedView("", "", query, world_from_query)]
-    point = np.concatenate([seen.point, np.cumsum(chosen)[matches.point[used]] - 1])
-    view = np.concatenate([seen.view, np.full(len(used), len(references))])
-    keypoint = np.concatenate([seen.keypoint, matches.keypoint[used]])
-    order = np.lexsort((view, point))
-    tracks = Tracks(point[order], view[order], keypoint[order])
+    tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(references))
     observations = observe(tracks, views, structure.noise)
 
     camera_from_world = [v.world_from_camera.inverse() for v in views]

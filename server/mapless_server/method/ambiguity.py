@@ -1,8 +1,8 @@
 """Two places that look the same: a second pose, elsewhere, that other references support about as well.
 
-Repeated corridors and floors, the same furniture twice, references of which some are posed wrongly: then references vote
-in two clusters, and whichever pose has a few votes more wins. So the matches with which the winner disagrees are asked
-again for a pose. It is a rival if
+Repeated corridors and floors, the same furniture twice, references of which some are posed wrongly: then references
+vote in two clusters, and whichever pose has a few votes more wins. So the matches with which the winner disagrees are
+asked again for a pose. It is a rival if
 
     its own matches are no chance (the a-contrario test of `gate`, over the matches asked),
     it explains at least a stated share of as many keypoints as the winner does, counted alike,
@@ -26,7 +26,8 @@ from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from .accuracy import Accuracy, accuracy_from_covariance
 from .correspond import Matches
 from .gate import false_alarms
-from .pnp import PnpOptions, pose_hessian, ransac, reprojection_errors_px, world_covariance
+from .perturbation import pose_hessian, world_covariance
+from .pnp import PnpOptions, ransac, reprojection_errors_px
 from .rejection import Hypothesis
 from .support import Support
 

@@ -7,7 +7,10 @@ reference i, i = 1 ... K,
 
     C = (K - 1) / K sum_i (q_(i) - mean) (q_(i) - mean)^T
 
-is the covariance of the pose due to its references, whatever goes together within each of them.
+is the covariance of the pose due to its references, whatever goes together within each of them. That holds if leaving
+out one of K takes away 1 / K of what is known, and here it takes away more: points come from pairs of photographs, and
+of the K (K + 1) / 2 pairs that K references and the query make K (K - 1) / 2 are left. The steps are longer than they
+should be by the ratio of the two, (K + 1) / (K - 1), and C is divided by its square.
 
 Solving K times would cost K times the adjustment, so each q_(i) is one Gauss-Newton step away. Let point p be seen by
 the query with weight w, derivatives A by the point and J by the pose, and residual r; and by the references with
@@ -18,6 +21,14 @@ information C_p = sum_o w_o A_o^T A_o and gradient h_p = sum_o w_o A_o^T r_o. El
 the information J^T W J and the gradient J^T u. Leaving out reference i takes its share away from C_p and h_p, which
 changes W and u of the points that it shows and of no others; so each (point, reference) pair costs the inverse of one
 3 x 3 matrix and the K steps one product of matrices.
+
+The photograph's own pixels have errors of their own, which no other choice of references shows. They are independent
+from match to match, so that their part of the pose's covariance is
+
+    Q = s^2 H^-1 (sum J^T W w^-1 W J) H^-1,    H = sum J^T W J,
+
+with s the size of the residuals by the expected one: the median of |r|^2 is 2 ln 2 times the variance of a coordinate,
+and of a residual only the share W / w of the noise is left once the point has been fitted to it too.
 
 Residuals of the references are those with their poses as given: an adjustment that moves references to where they agree
 would otherwise hide what is looked for.
@@ -35,6 +46,9 @@ from mapless.geometry import Array
 MIN_DETERMINANT = 1e-10
 """Of a point's information, by the cube of its largest diagonal element: below, the point is unknown in some direction
 and tells nothing."""
+
+LEAST_LEFT = 0.01
+"""Share of the information that is taken to be left without a reference, at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +69,7 @@ class Sightings:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class Grounds:
     """What a pose, or poses that are solved for together, rest on.
 
     Attributes:
@@ -78,24 +92,33 @@ class Dispersion:
     """How poses without one reference differ.
 
     Attributes:
-        information: (U, U) of the pose, points eliminated and the references held where they are.
-        motions: (K, U) from the pose with all references to the one without the i-th.
+        information: H, (U, U) of the pose, points eliminated and the references held at their given poses.
+        offset: (U,) the Gauss-Newton step from the pose to the optimum with all references.
+        motions: (K, U) from that optimum to the one without the i-th reference.
+        photograph: Q, (U, U) covariance by the errors of the photograph's own pixels.
     """
 
     information: Array
+    offset: Array
     motions: Array
+    photograph: Array
 
     @property
     def covariance(self) -> Array:
-        """(U, U) by the jackknife; zero with one reference, which has nothing to differ from."""
+        """C, (U, U), by the jackknife; zero with one reference, which has nothing to differ from."""
         count = len(self.motions)
         centred = self.motions - self.motions.mean(axis=0)
-        return np.asarray((count - 1) / count * centred.T @ centred)
+        return np.asarray((count - 1) / count * ((count - 1) / (count + 1)) ** 2 * centred.T @ centred)
+
+    @property
+    def inflation(self) -> float:
+        """i, by how much errors exceed those of independent matches: i^2 = trace(H C) / U."""
+        return float(np.sqrt(np.trace(self.information @ self.covariance) / len(self.information)))
 
 
-def disperse(evidence: Evidence) -> Dispersion | None:
-    """Leaves out one reference at a time; None where what is left without one of them determines no pose."""
-    seen, query = evidence.references, evidence.query
+def disperse(grounds: Grounds) -> Dispersion | None:
+    """Leaves out one reference at a time; None where all together determine no pose."""
+    seen, query = grounds.references, grounds.query
     size = 1 + int(max(query.point.max(initial=0), seen.point.max(initial=0)))
     of_seen, pull = _information(seen), _gradient(seen)
     of_point = np.stack([np.bincount(seen.point, row, size) for row in of_seen])
@@ -106,18 +129,20 @@ def disperse(evidence: Evidence) -> Dispersion | None:
     point = query.point[row]
     some = Sightings(point, query.by_point[row], query.residual[row], query.weight[row])
     without = _eliminate(some, of_point[:, point] - of_seen[:, other], pull_of_point[:, point] - pull[:, other])
-    change = np.zeros((evidence.reference_count, 5, len(query.point)))
+    change = np.zeros((grounds.reference_count, 5, len(query.point)))
     # A point is seen once by a reference: no pair falls upon another.
-    change[evidence.reference[other], :, row] = (without - everything[:, row]).T
-    return _steps(evidence.by_pose, everything, change)
+    change[grounds.reference[other], :, row] = (without - everything[:, row]).T
+    return _steps(query, grounds.by_pose, everything, change)
 
 
-def _steps(by_pose: Array, everything: Array, change: Array) -> Dispersion | None:
+def _steps(query: Sightings, by_pose: Array, everything: Array, change: Array) -> Dispersion | None:
     """From each observation's W and u (5, N), and their change (K, 5, N) without each reference."""
     unknowns = by_pose.shape[2]
     x, y = by_pose[:, 0], by_pose[:, 1]
     mixed = x[:, :, None] * y[:, None, :]
-    squares = np.concatenate([x[:, :, None] * x[:, None, :], mixed + np.swapaxes(mixed, 1, 2), y[:, :, None] * y[:, None, :]])
+    squares = np.concatenate(
+        [x[:, :, None] * x[:, None, :], mixed + np.swapaxes(mixed, 1, 2), y[:, :, None] * y[:, None, :]]
+    )
     squares = squares.reshape(-1, unknowns**2)
     slopes = np.concatenate([x, y])
     information = (everything[:3].reshape(1, -1) @ squares).reshape(unknowns, unknowns)
@@ -126,10 +151,25 @@ def _steps(by_pose: Array, everything: Array, change: Array) -> Dispersion | Non
     informations = information + (change[:, :3].reshape(count, -1) @ squares).reshape(count, unknowns, unknowns)
     gradients = gradient + change[:, 3:].reshape(count, -1) @ slopes
     try:
-        motions = np.linalg.solve(information, gradient[0]) - np.linalg.solve(informations, gradients[:, :, None])[..., 0]
+        offset = -np.linalg.solve(information, gradient[0])
+        # Without its only reference a point says nothing, and what is left may determine no pose.
+        without = -np.linalg.solve(informations + LEAST_LEFT * information, gradients[:, :, None])[..., 0]
     except np.linalg.LinAlgError:
         return None
-    return Dispersion(information, motions) if np.isfinite(motions).all() else None
+    if not (np.isfinite(offset).all() and np.isfinite(without).all()):
+        return None
+    inverse = np.linalg.inv(information)
+    spread = (_pixel_noise(query, everything[:3]).reshape(1, -1) @ squares).reshape(unknowns, unknowns)
+    return Dispersion(information, offset, without - offset, inverse @ spread @ inverse)
+
+
+def _pixel_noise(query: Sightings, marginal: Array) -> Array:
+    """s^2 W w^-1 W of each observation, its elements xx, xy, yy (3, N), from those of W."""
+    xx, xy, yy = marginal
+    left = (xx + yy) / (2 * query.weight)
+    squared = (query.residual**2).sum(axis=1) / np.maximum(left, LEAST_LEFT)
+    size = np.median(squared) / (2 * np.log(2))
+    return np.asarray(size / query.weight * np.stack([xx**2 + xy**2, xy * (xx + yy), xy**2 + yy**2]))
 
 
 def _pairs(query_point: NDArray[np.intp], seen_point: NDArray[np.intp], size: int) -> tuple[NDArray[np.intp], ...]:

@@ -21,6 +21,9 @@ from mapless.geometry import Array, RigidTransform, Similarity, cross_matrix
 
 from .rigid import perturbed, rotation_vector
 
+_MEDIAN_SQUARE = 5.35
+"""Median of a chi-square of six degrees of freedom."""
+
 
 @dataclass(frozen=True)
 class DriftOptions:
@@ -116,6 +119,16 @@ class SequenceFreedom:
         frames = tuple(perturbed(frame, motion) for frame, motion in zip(self.frames, motions, strict=True))
         scale = self.scale * math.exp(step[-1]) if self.scale_is_free else self.scale
         return replace(self, frames=frames, scale=scale)
+
+    def relaxed(self) -> SequenceFreedom:
+        """With steps as uncertain as they have turned out to be, if that is more than before.
+
+        A session is good or bad as a whole: its median step tells, which some that jump do not spoil.
+        """
+        if not self.steps:
+            return self
+        found = float(np.median((self.residuals() ** 2).sum(axis=1)))
+        return replace(self, sigma=self.sigma * math.sqrt(max(1.0, found / _MEDIAN_SQUARE)))
 
     def cost(self) -> float:
         """See Freedom."""

@@ -9,14 +9,15 @@ import numpy as np
 from mapless.geometry import Array
 
 from .accuracy import accuracy_from_covariance
-from .gate import hull_share, log10_false_alarms, visible_count
+from .gate import findable_count, hull_share, log10_false_alarms
 from .support import Support
 
 FEATURES = ("significance", "inlier share", "found share", "hull share", "references", "fit", "precision")
 """What `Evidence.features` holds; more is better in each."""
 
-MAX_RELATIVE_RADIUS = 10.0
-"""A pose whose position is claimed to ten times the distance of what is seen is known no worse than any."""
+LEAST_RADIUS_M, LARGEST_RADIUS_M = 0.005, 1.0
+"""Between them a smaller claimed radius is evidence: right is what is off by 10 cm at most. Beyond a metre it does not
+matter any more how much beyond, and a few millimetres more or less prove nothing."""
 
 
 @dataclass(frozen=True)
@@ -27,22 +28,22 @@ class Evidence:
         log10_false_alarms: expected number, as a power of ten, of poses that wrong matches would support as well.
         inlier_count: matches that agree with it.
         match_count: matches tried.
-        visible_count: points of the structure that it has inside the image.
+        findable_count: points of the structure that it has inside the image; no more than the photograph has features.
         hull_share: of the image that the inliers' convex hull covers.
         reference_count: effective number of references that support it, (sum n_i)^2 / sum n_i^2 over the inliers n_i
             on points of each: 1 if one has them all, K if all have as many.
         error_sigma: median error of the inliers, in standard deviations of their keypoints, where it exceeds one.
-        relative_radius: of the position, claimed for 95 %, as a share of the median distance of what is seen.
+        position_95_m: radius claimed for the position.
     """
 
     log10_false_alarms: float
     inlier_count: int
     match_count: int
-    visible_count: int
+    findable_count: int
     hull_share: float
     reference_count: float
     error_sigma: float
-    relative_radius: float
+    position_95_m: float
 
     @property
     def inlier_share(self) -> float:
@@ -51,8 +52,8 @@ class Evidence:
 
     @property
     def found_share(self) -> float:
-        """Inliers over what should be seen."""
-        return min(1.0, self.inlier_count / max(1, self.visible_count))
+        """Inliers over what should be found."""
+        return min(1.0, self.inlier_count / max(1, self.findable_count))
 
     def features(self) -> Array:
         """Logarithms (7,) in the order of `FEATURES`, each the larger the better."""
@@ -64,7 +65,7 @@ class Evidence:
                 max(1e-4, self.hull_share),
                 self.reference_count,
                 1 / self.error_sigma,
-                1 / self.relative_radius,
+                1 / min(max(self.position_95_m, LEAST_RADIUS_M), LARGEST_RADIUS_M),
             ]
         )
 
@@ -83,15 +84,13 @@ def evidence_of(support: Support, inlier_px: float, log10_chance: float = 0.0) -
     inliers, pose = estimate.inliers, estimate.world_from_camera
     by_reference = np.array(support.inliers_by_reference(), float)
     sigma_px = structure.noise.sigma_px(query.features.sizes_px[matches.keypoint[inliers]].astype(np.float64))
-    distances = np.linalg.norm(structure.x_in_world[matches.point[inliers]] - pose.translation, axis=1)
-    radius_m = accuracy_from_covariance(estimate.covariance).position_95_m
     return Evidence(
         log10_false_alarms(query.camera, matches, inliers, inlier_px) + log10_chance,
         int(inliers.sum()),
         len(matches),
-        visible_count(query.camera, structure, pose),
+        findable_count(query, structure, pose),
         hull_share(query, matches, inliers),
         float(by_reference.sum() ** 2 / max(1.0, (by_reference**2).sum())) or 1.0,
         max(1.0, float(np.median(estimate.errors_px[inliers] / sigma_px))),
-        float(np.clip(radius_m / max(1e-9, float(np.median(distances))), 1e-6, MAX_RELATIVE_RADIUS)),
+        accuracy_from_covariance(estimate.covariance).position_95_m,
     )

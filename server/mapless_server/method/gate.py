@@ -30,7 +30,8 @@ class GateOptions:
     Attributes:
         max_log10_false_alarms: a pose is one when fewer than 10 to this power poses supported as well are expected
             from wrong matches.
-        min_found_share: least share of the points inside the image that are inliers. Of 200 photographs posed rightly,
+        min_found_share: least share of the points inside the image that are inliers; a photograph with fewer features
+            than that has points can show no more of them than it has features. Of 200 photographs posed rightly,
             hard ones among them, the worst had 0.10; of those posed wrongly by chance or repetition most had 0.01.
         enough_inliers: so many are believed whatever else should be visible: with many references the structure reaches
             far beyond what one photograph can show. Repetition has fooled no more than 23.
@@ -75,20 +76,21 @@ def doubts(
     count = f"{inliers.sum()} of {len(matches)} matches agree on a pose"
     if expected > options.max_log10_false_alarms:
         return f"{count}, which chance could do ({told_false_alarms(expected)})"
-    visible = visible_count(query.camera, structure, world_from_camera)
-    if inliers.sum() < min(options.min_found_share * visible, options.enough_inliers):
-        return f"{count}, but it should show {visible} points: repeated structure somewhere else, most likely"
+    findable = findable_count(query, structure, world_from_camera)
+    if inliers.sum() < min(options.min_found_share * findable, options.enough_inliers):
+        return f"{count}, but {findable} points should be found: repeated structure somewhere else, most likely"
     covered = hull_share(query, matches, inliers)
     if covered < options.min_hull_share:
         return f"{count}, but they cover only {100 * covered:.1f} % of the image"
     return None
 
 
-def visible_count(camera: Camera, structure: Structure, world_from_camera: RigidTransform) -> int:
-    """Points of the structure that lie inside the image; behind what, nobody knows."""
-    size = np.array([camera.width_px, camera.height_px])
-    projected = camera.project(world_from_camera.inverse().apply(structure.x_in_world))
-    return int(((projected >= -0.5) & (projected < size - 0.5)).all(axis=1).sum())
+def findable_count(query: View, structure: Structure, world_from_camera: RigidTransform) -> int:
+    """Points of the structure that lie inside the image, hidden or not; at most as many as it has features."""
+    size = np.array([query.camera.width_px, query.camera.height_px])
+    projected = query.camera.project(world_from_camera.inverse().apply(structure.x_in_world))
+    inside = int(((projected >= -0.5) & (projected < size - 0.5)).all(axis=1).sum())
+    return min(inside, len(query.features))
 
 
 def hull_share(query: View, matches: PointMatches, inliers: NDArray[np.bool_]) -> float:

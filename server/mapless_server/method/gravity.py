@@ -27,16 +27,16 @@ class GravityOptions:
     Attributes:
         max_matches: a larger, evenly thinned number is not better for choosing, and scoring is linear in it.
         batch: samples that are scored in one go.
-        max_samples: two right matches are drawn with 99 % by then if 7 % are right.
+        max_samples: by then two right matches have been drawn with 99.4 % if 10 % are right.
         confidence: stop when two right matches have been drawn with this probability.
         refined: so many of the best guesses are refined, the others forgotten.
     """
 
-    max_matches: int = 400
+    max_matches: int = 300
     batch: int = 64
-    max_samples: int = 1024
+    max_samples: int = 512
     confidence: float = 0.999
-    refined: int = 4
+    refined: int = 3
 
     def __post_init__(self) -> None:
         counts = (self.max_matches, self.batch, self.max_samples, self.refined)

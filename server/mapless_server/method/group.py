@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from .answer import Answer, Localization
-from .gate import GateOptions, false_alarms, hull_share, told_false_alarms, visible_count
+from .gate import GateOptions, false_alarms, findable_count, hull_share, told_false_alarms
 from .generalized import CameraMatches
 from .match import MatchOptions, PointMatches, search
 from .rejection import Rejection, RejectionReason
@@ -149,9 +149,7 @@ def group_doubts(matched: Sequence[MatchedSighting], inlier_px: float, options: 
     expected = group_log10_false_alarms(matched, inlier_px)
     if expected > options.max_log10_false_alarms:
         return f"{count}, which chance could do ({told_false_alarms(expected)})"
-    visible = sum(
-        visible_count(it.sighting.query.camera, it.sighting.structure, it.world_from_camera) for it in matched
-    )
+    visible = sum(findable_count(it.sighting.query, it.sighting.structure, it.world_from_camera) for it in matched)
     if inlier_total < min(options.min_found_share * visible, options.enough_inliers):
         return f"{count}, but they should show {visible} points: repeated structure somewhere else, most likely"
     shares = (hull_share(it.sighting.query, it.matches, it.inliers) for it in matched if it.inliers.sum() >= 3)

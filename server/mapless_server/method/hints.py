@@ -150,8 +150,8 @@ def _of_overlap(case: _Case, options: HintOptions) -> tuple[Advice, str]:
     if case.rejection.reason in (RejectionReason.NO_USABLE_REFERENCES, RejectionReason.SCALE_UNRELIABLE):
         return (
             Advice.SPREAD_REFERENCES,
-            f"The {case.reference_count} references do not give depth together: use some that show the same things from "
-            "different places, and check their poses.",
+            f"The {case.reference_count} references do not give depth together: use some that show the same things "
+            "from different places, and check their poses.",
         )
     if case.matches < options.few_matches:
         return (

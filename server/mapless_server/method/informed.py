@@ -1,13 +1,14 @@
-"""Candidates for a pose that what is known of it brings, which one is best, and how far priors pull it.
+"""Poses that what is known beforehand finds, whether one of them is better, and how far priors pull the best one.
 
-Priors have a say in which candidate wins, but never more than about one good match has. The winner is compared with
-each prior by the pose that the photograph alone gives in its place, and pulled by those that are consistent with it. So
-a wrong prior costs nothing: it is found to be one, and is not used.
+A pose that priors bring must explain more than the one that the photograph gave; what priors say against a pose counts
+like one match and no more. The winner is compared with each prior by the pose that the photograph alone gives in its
+place, and pulled by those that are consistent with it. So a wrong prior costs nothing: it is found to be one and not
+used, and then the answer is, to the last bit, the one without it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,8 +31,8 @@ class InformedOptions:
         inlier_px: largest reprojection error of a right match.
         refine: how poses are refined.
         min_inliers: fewer give no pose.
-        enough_inliers: gravity is not asked for poses of its own if one has been found with so many: nothing that it
-            finds could win. Repeated structure has fooled no more than 23 matches.
+        enough_inliers: priors are not asked for poses of their own if one has been found with so many: nothing that
+            they bring could win. Repeated structure has fooled no more than 23 matches.
         min_kept_share: a refinement without priors that loses more of the inliers has run off: then the photograph
             alone gives no pose here, and priors are compared with the one that they helped to find.
     """
@@ -45,6 +46,11 @@ class InformedOptions:
     def __post_init__(self) -> None:
         if not (self.inlier_px > 0 and self.min_inliers >= 3 and 0 < self.min_kept_share <= 1):
             raise ValueError(f"senseless options: {self}")
+
+    @property
+    def worst_cost(self) -> float:
+        """What a match that does not agree with a pose counts against it."""
+        return (self.inlier_px / self.refine.sigma_px) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,66 +72,59 @@ def informed_pose(
     camera: Camera,
     x_in_world: Array,
     pixels: Array,
-    found: Sequence[RigidTransform],
+    found: RigidTransform | None,
     priors: Priors,
     options: InformedOptions,
 ) -> Pulled | None:
-    """The best of the poses found so far and of those that priors bring, pulled by the consistent ones; None if none.
+    """The best pose that the photograph and the priors find together; None if neither finds any.
 
     Args:
         camera: pinhole.
         x_in_world: (N, 3) points.
         pixels: (N, 2) where they are seen.
-        found: world_from_camera of the candidates so far, possibly none.
+        found: world_from_camera that the photograph gave alone; None if it gave none.
         priors: what is known.
         options: see there.
     """
-    candidates = [*found, *more_candidates(camera, x_in_world, pixels, found, priors, options)]
-    if not candidates:
-        return None
-    best = candidates[least_contradicted(camera, x_in_world, pixels, candidates, priors, options)]
-    return pull(camera, x_in_world, pixels, best, priors, options)
+    support = 0 if found is None else supporting(camera, x_in_world, pixels, found, options)
+    others = [] if support >= options.enough_inliers else _from_priors(camera, x_in_world, pixels, priors, options)
+    best = found
+    if others:
+        costs = [_cost(camera, x_in_world, pixels, pose, priors, options) for pose in others]
+        # One match more, or it is the same pose found in another way.
+        least = math.inf if found is None else _cost(camera, x_in_world, pixels, found, priors, options)
+        if min(costs) < least - options.worst_cost:
+            best = others[int(np.argmin(costs))]
+    return None if best is None else pull(camera, x_in_world, pixels, best, priors, options)
 
 
-def more_candidates(
-    camera: Camera,
-    x_in_world: Array,
-    pixels: Array,
-    found: Sequence[RigidTransform],
-    priors: Priors,
-    options: InformedOptions,
+def _from_priors(
+    camera: Camera, x_in_world: Array, pixels: Array, priors: Priors, options: InformedOptions
 ) -> list[RigidTransform]:
-    """What else the pose may be: gravity finds some, a prior on the whole pose is one, and those found may be pulled.
-
-    For the arguments see `informed_pose`.
-    """
-    starts = [*found, priors.pose.world_from_camera] if priors.pose else found
-    poses = [refine_pose(camera, x_in_world, pixels, start, priors, options.refine) for start in starts]
-    most = max((supporting(camera, x_in_world, pixels, pose, options) for pose in found), default=0)
-    if priors.gravity and most < options.enough_inliers:
+    """Gravity finds poses; a prior on the whole pose is one."""
+    poses = []
+    if priors.pose:
+        poses.append(refine_pose(camera, x_in_world, pixels, priors.pose.world_from_camera, priors, options.refine))
+    if priors.gravity:
         poses += ransac_with_gravity(camera, x_in_world, pixels, priors, options.inlier_px)
     return poses
 
 
-def least_contradicted(
+def _cost(
     camera: Camera,
     x_in_world: Array,
     pixels: Array,
-    candidates: Sequence[RigidTransform],
+    world_from_camera: RigidTransform,
     priors: Priors,
     options: InformedOptions,
-) -> int:
-    """Index of the candidate that matches and priors say least against; the first of several.
+) -> float:
+    """What matches and priors say against a pose: squared errors in units of a keypoint's, and `Priors.penalty`.
 
-    That is the sum of squared errors in units of a keypoint's, none counted for more than an outlier's, and of what
-    `Priors.penalty` counts.
+    No match counts for more than an outlier does.
     """
-    costs = []
-    for pose in candidates:
-        errors_px = reprojection_errors_px(camera, pose, x_in_world, pixels)
-        limited = np.where(errors_px < options.inlier_px, errors_px, options.inlier_px) / options.refine.sigma_px
-        costs.append(float((limited**2).sum()) + priors.penalty(pose))
-    return int(np.argmin(costs))
+    errors_px = reprojection_errors_px(camera, world_from_camera, x_in_world, pixels)
+    squared = (np.where(errors_px < options.inlier_px, errors_px, options.inlier_px) / options.refine.sigma_px) ** 2
+    return float(squared.sum()) + priors.penalty(world_from_camera)
 
 
 def pull(
@@ -142,11 +141,12 @@ def pull(
     if after < max(options.min_inliers, options.min_kept_share * before):
         alone = world_from_camera
     found = information(camera, x_in_world, pixels, alone, options.refine)
-    checks = priors.check(alone, np.linalg.inv(found / options.refine.prior_weight + SOMEWHERE))
+    covariance = np.linalg.inv(found / options.refine.prior_weight + SOMEWHERE)
+    checks = priors.check(alone, np.asarray(covariance, np.float64))
     used = priors.consistent(checks)
     if used:
-        alone = refine_pose(camera, x_in_world, pixels, world_from_camera, used, options.refine)
-    return Pulled(alone, checks, used)
+        world_from_camera = refine_pose(camera, x_in_world, pixels, world_from_camera, used, options.refine)
+    return Pulled(world_from_camera, checks, used)
 
 
 def supporting(

@@ -78,6 +78,10 @@ class Freedom(Protocol):
         """After a step (N,) of the parameters."""
         ...
 
+    def relaxed(self: F) -> F:
+        """The same point, with what holds the photographs together believed as far as it has turned out to be true."""
+        ...
+
     def cost(self) -> float:
         """Of what holds the photographs together."""
         ...
@@ -156,7 +160,7 @@ def adjust_in_rounds(sightings: Sequence[Sighting], freedom: F, options: JointOp
         poses = [freedom.camera_from_world(it.image).inverse() for it in sightings]
         matches = [it.matches_at(pose) for it, pose in zip(sightings, poses, strict=True)]
         estimate = adjust_jointly(sightings, matches, freedom, options)
-        freedom = estimate.freedom
+        freedom = estimate.freedom.relaxed()
     return estimate
 
 
@@ -369,7 +373,7 @@ def _stepped(points: Array, steps: Array, centre: Array) -> Array:
 def covariance_in_world(covariance: Array, world_from_body: RigidTransform) -> Array:
     """Covariance (6, 6) of world_from_body, order x y z rx ry rz about fixed world axes.
 
-    Takes that of a left perturbation (v, w) of body_from_world; see `pnp.world_covariance`.
+    Takes that of a left perturbation (v, w) of body_from_world; see `perturbation.world_covariance`.
     """
     rotate = np.kron(np.eye(2), world_from_body.rotation)
     turned = rotate @ covariance @ rotate.T

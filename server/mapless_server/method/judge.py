@@ -40,8 +40,11 @@ class JudgeOptions:
         ambiguity: of the search for a second place.
     """
 
-    weights: tuple[float, ...] = (1.0,) * len(FEATURES)
-    scores: tuple[float, ...] = tuple(np.linspace(-2.0, 20.0, len(LEVELS)).tolist())
+    weights: tuple[float, ...] = (0.683, 3.495, 0.584, 0.303, 0.84, 3.423, 1.072)
+    scores: tuple[float, ...] = (
+        -2.047, -1.906, -1.734, -0.347, 0.158, 0.884, 1.71, 3.284, 4.788, 5.739,
+        6.596, 7.268, 8.296, 8.937, 9.455, 9.817, 10.129, 10.584, 11.191, 12.39,
+    )  # fmt: skip
     ambiguity: AmbiguityOptions = field(default_factory=AmbiguityOptions)
 
     def __post_init__(self) -> None:
@@ -110,8 +113,8 @@ def trust_of(evidence: Evidence, options: JudgeOptions) -> float:
 
 def _distrusted(evidence: Evidence, trust: float, coverage: float) -> Rejection:
     message = (
-        f"of right answers {100 * trust:.1f} % look at most as good, less than the {100 * (1 - coverage):.3g} % that may "
-        f"be lost: {told(evidence)}"
+        f"{100 * trust:.1f} % of right answers look at most as good, and {100 * (1 - coverage):.3g} % may be lost: "
+        f"{told(evidence)}"
     )
     return Rejection(RejectionReason.GATE, message)
 
@@ -120,8 +123,8 @@ def told(evidence: Evidence) -> str:
     """The evidence for a person."""
     return (
         f"{evidence.inlier_count} of {evidence.match_count} matches agree, {100 * evidence.found_share:.0f} % of the "
-        f"points that should be seen, over {100 * evidence.hull_share:.0f} % of the image, the position within "
-        f"{100 * evidence.relative_radius:.1f} % of the distance of what is seen"
+        f"points that should be found, over {100 * evidence.hull_share:.0f} % of the image, the position within "
+        f"{evidence.position_95_m:.2g} m"
     )
 
 

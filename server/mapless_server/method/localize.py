@@ -35,6 +35,7 @@ from .gate import doubts
 from .judge import judge
 from .match import MatchOptions, PointMatches, match_points
 from .pnp import PoseStage, solve_pose
+from .pose_covariance import pose_covariance
 from .priors import NO_PRIORS, Priors
 from .rejection import Rejection, RejectionReason
 from .scale import MetricScale, ScaleOptions, estimate_scale
@@ -346,6 +347,11 @@ def _pose(coarse: Coarse, check: Check) -> Answer:
     if options.variant is Variant.BEST:
         with _stage("adjust", seconds, check):
             estimate = adjust_pose(query, references, structure, matches, estimate, options.adjust, prepared.priors)
+    support = replace(support, estimate=estimate)
+    with _stage("uncertainty", seconds, check):
+        predicted = not options.structure.optimize
+        covariance = pose_covariance(support, scale, options.adjust.uncertainty, prepared.priors, predicted)
+    estimate = replace(estimate, covariance=covariance)
     support = replace(support, estimate=estimate)
     with _stage("judge", seconds, check):
         query_matches = prepared.correspondences.query_matches

@@ -24,7 +24,7 @@ from enum import Enum
 
 import numpy as np
 
-from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
+from mapless.geometry import Array, Camera, RigidTransform, cross_matrix, normalize_jacobian
 
 
 class Perturbation(str, Enum):
@@ -63,12 +63,6 @@ def world_covariance(
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def cross_matrix(vector: Array) -> Array:
-    """[v]x, (3, 3): [v]x u is the cross product of v and u."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
 def motion_jacobian(x_in_camera: Array) -> Array:
     """Derivative (..., 3, 6) of Exp(v, w) x by the perturbation at zero: [I | -[x]x]."""
     jacobian = np.zeros((*x_in_camera.shape, 6))
@@ -80,7 +74,7 @@ def motion_jacobian(x_in_camera: Array) -> Array:
     return jacobian
 
 
-def pose_information(camera: Camera, world_from_camera: RigidTransform, x_in_world: Array) -> Array:
+def pose_hessian(camera: Camera, world_from_camera: RigidTransform, x_in_world: Array) -> Array:
     """J^T J (6, 6) of the projections in pixels by a left perturbation (v, w) of camera_from_world."""
     x_in_camera = world_from_camera.inverse().apply(x_in_world)
     focal = np.array([camera.focal_x_px, camera.focal_y_px])

@@ -14,15 +14,17 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
+from mapless.geometry import Array, Camera, RigidTransform
 
 from .informed import InformedOptions, informed_pose
 from .match import PointMatches
+from .perturbation import pose_hessian, world_covariance
 from .pose_only import PoseOnlyOptions
 from .pose_only import reprojection_errors_px as reprojection_errors_px
 from .priors import NO_PRIORS, PriorCheck, Priors
 from .rejection import Rejection, RejectionReason
 from .structure import Structure
+from .uncertainty import Uncertainty
 from .views import View
 
 
@@ -82,6 +84,8 @@ class PoseEstimate:
         errors_px: (M,) reprojection errors; NaN for points behind the camera.
         covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians.
         prior_checks: of each prior.
+        uncertainty: what the covariance was told from, before priors sharpened it; None where it was told from the
+            residuals alone, and errors that go together are not in it yet (see `pose_covariance`).
     """
 
     world_from_camera: RigidTransform
@@ -90,6 +94,7 @@ class PoseEstimate:
     errors_px: Array
     covariance: Array
     prior_checks: tuple[PriorCheck, ...] = ()
+    uncertainty: Uncertainty | None = None
 
 
 def solve_pose(
@@ -103,9 +108,9 @@ def solve_pose(
     """The query's pose from its matches with the structure.
 
     Returns:
-        The refined or the initial pose, whichever has more inliers (the refined one on a tie); with priors, the one of
-        more candidates that they and the matches say least against, pulled by those that are consistent with it.
-        Rejections: TOO_FEW_MATCHES, PNP_FAILED when no pose explains any four.
+        The refined or the initial pose, whichever has more inliers (the refined one on a tie); with priors, a pose that
+        they bring if that is better, pulled by those that are consistent with it. Rejections: TOO_FEW_MATCHES,
+        PNP_FAILED when no pose explains any four.
     """
     if len(matches) < options.min_matches:
         return Rejection(RejectionReason.TOO_FEW_MATCHES, f"{len(matches)} 2D-3D matches, {options.min_matches} needed")
@@ -114,13 +119,11 @@ def solve_pose(
     refined = ransac(camera, x_in_world, pixels, world_from_query_initial, options)
     candidates = [(PoseStage.REFINED, refined)] if refined else []
     candidates.append((PoseStage.INITIAL, world_from_query_initial))
-    poses = [pose for _, pose in candidates]
-    pulled = informed_pose(camera, x_in_world, pixels, poses, priors, options.informed) if priors else None
-    if pulled:
+    errors = [reprojection_errors_px(camera, pose, x_in_world, pixels) for _, pose in candidates]
+    stage, pose = candidates[int(np.argmax([(e < options.inlier_px).sum() for e in errors]))]
+    pulled = informed_pose(camera, x_in_world, pixels, pose, priors, options.informed) if priors else None
+    if pulled and pulled.world_from_camera is not pose:
         stage, pose = PoseStage.REFINED, pulled.world_from_camera
-    else:
-        errors = [reprojection_errors_px(camera, pose, x_in_world, pixels) for pose in poses]
-        stage, pose = candidates[int(np.argmax([(e < options.inlier_px).sum() for e in errors]))]
     errors_px = reprojection_errors_px(camera, pose, x_in_world, pixels)
     inliers = errors_px < options.inlier_px
     if inliers.sum() < 4:
@@ -172,34 +175,3 @@ def _poselib_pose(world_from_camera: RigidTransform) -> poselib.CameraPose:
     pose = poselib.CameraPose()
     pose.q, pose.t = np.array([q.w, q.x, q.y, q.z]), camera_from_world.translation
     return pose
-
-
-def pose_hessian(camera: Camera, world_from_camera: RigidTransform, x_in_world: Array) -> Array:
-    """J^T J (6, 6) of the projections in pixels by a left perturbation (v, w) of camera_from_world."""
-    x_in_camera = world_from_camera.inverse().apply(x_in_world)
-    focal = np.array([camera.focal_x_px, camera.focal_y_px])
-    jacobian = (normalize_jacobian(x_in_camera) * focal[:, None]) @ motion_jacobian(x_in_camera)
-    return np.asarray(np.einsum("mia,mib->ab", jacobian, jacobian))
-
-
-def motion_jacobian(x_in_camera: Array) -> Array:
-    """Derivative (..., 3, 6) of Exp(v, w) x by the perturbation at zero: [I | -[x]x]."""
-    jacobian = np.zeros((*x_in_camera.shape, 6))
-    x, y, z = np.moveaxis(x_in_camera, -1, 0)
-    jacobian[..., 0, 0] = jacobian[..., 1, 1] = jacobian[..., 2, 2] = 1
-    jacobian[..., 0, 4], jacobian[..., 0, 5] = z, -y
-    jacobian[..., 1, 3], jacobian[..., 1, 5] = -z, x
-    jacobian[..., 2, 3], jacobian[..., 2, 4] = y, -x
-    return jacobian
-
-
-def world_covariance(hessian: Array, world_from_camera: RigidTransform) -> Array:
-    """Covariance (6, 6) of world_from_camera, order x y z rx ry rz about fixed world axes.
-
-    Takes the inverse covariance of a left perturbation (v, w) of camera_from_world:
-    camera_from_world -> Exp(v, w) camera_from_world moves the centre by -R v and turns the camera by -R w, where R is
-    the rotation of world_from_camera; the sign cancels.
-    """
-    rotate = np.kron(np.eye(2), world_from_camera.rotation)
-    covariance = rotate @ np.linalg.pinv(hessian, hermitian=True) @ rotate.T
-    return np.asarray((covariance + covariance.T) / 2)

@@ -64,7 +64,7 @@ def refine_pose(
     for _ in range(options.iterations):
         damped = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
         try:
-            step = -np.linalg.solve(damped, gradient)
+            step = -np.asarray(np.linalg.solve(damped, gradient), np.float64)
         except np.linalg.LinAlgError:  # fewer than three matches, and priors that leave something open
             break
         candidate = moved(pose, step)

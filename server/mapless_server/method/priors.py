@@ -29,8 +29,8 @@ CONFLICT_PROBABILITY = 1e-4
 """A prior is in conflict if so few consistent ones are as far from the photograph's pose."""
 
 LEAST_NEWS = 0.1
-"""A prior that knows less than this share of what the photograph knows of the same is not used: it could lower no standard
-deviation by more than 5 %, and may be off by what its own does not say."""
+"""A prior that knows less than this share of what the photograph knows of the same is not used: it could lower no
+standard deviation by more than 5 %, and may be off by what its own does not say."""
 
 UNIT_TOLERANCE = 1e-6
 """How far from one the length of a direction may be."""
@@ -215,8 +215,8 @@ class PriorCheck:
         mahalanobis: m, 0 and above.
         degrees_of_freedom: of m^2.
         conflict: whether the two contradict each other.
-        used: whether the prior took part in finding the pose: those in conflict do not, nor those that could add next to
-            nothing (`LEAST_NEWS`).
+        used: whether the prior took part in finding the pose: those in conflict do not, nor those that could add next
+            to nothing (`LEAST_NEWS`).
     """
 
     kind: PriorKind

@@ -92,6 +92,10 @@ class RigFreedom:
         """See Freedom."""
         return RigFreedom(perturbed(self.rig_from_world, step), self.rig_from_camera)
 
+    def relaxed(self) -> RigFreedom:
+        """It is rigid."""
+        return self
+
     def cost(self) -> float:
         """Nothing is left to hold."""
         return 0.0

@@ -242,7 +242,7 @@ class _Session:
         return poses
 
     def _believed(self, own: dict[int, RigidTransform], guess: Similarity) -> list[int]:
-        """Frames whose own poses agree with one another, or one at least with the guess, as the session says."""
+        """Frames whose own poses agree with another's, as the session says; or, if none do, with the guess."""
         freedom = SequenceFreedom.of((), self.frames, guess.scale, False, self.options.drift)
         drift = np.concatenate([np.zeros((1, 6)), np.cumsum(freedom.sigma, axis=0)])  # to each frame at the most
 
@@ -253,10 +253,13 @@ class _Session:
         indices = sorted(own)
         links = np.array([[agree(i, j) for j in indices] for i in indices], bool).reshape(len(own), len(own))
         _, group = connected_components(links, directed=False)
-        largest = [indices[k] for k in np.flatnonzero(group == np.bincount(group).argmax())] if indices else []
-        if len(largest) > 1:
-            return largest
-        return [i for i in indices if self._is_near(own[i], guess.transform_pose(self.frames[i]), drift[-1])]
+        # After a jump of the device there are two such groups, and both are right.
+        in_company = [indices[k] for k in range(len(indices)) if (group == group[k]).sum() > 1]
+        if in_company:
+            return in_company
+        as_guessed = [i for i in indices if self._is_near(own[i], guess.transform_pose(self.frames[i]), drift[-1])]
+        # Photographs that were believed alone, all of which contradict the session: it is the session that is wrong.
+        return as_guessed if 2 * len(as_guessed) >= len(indices) else indices
 
     def _is_near(self, pose: RigidTransform, said: RigidTransform, drift: Array) -> bool:
         """Whether a pose may be what is said of it after so much drift (6,)."""

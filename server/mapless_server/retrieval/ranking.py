@@ -77,7 +77,7 @@ def rank_references(
     """At most `count` references in the order of choice; fewer where fewer come into question.
 
     References without a descriptor come last; these, and all where the photograph has none, are ordered by how near
-    they are to the position prior, or as they were stored.
+    they are to where the camera is thought to be, or as they were stored.
 
     Args:
         entries: of the scene.
@@ -141,9 +141,9 @@ def _scores(similarity: NDArray[np.float32], entries: Entries, rows: Rows, narro
     scores = similarity.astype(np.float64)
     unknown = np.flatnonzero(np.isnan(similarity))
     scores[unknown] = -2.0
-    if narrowing.position is not None and len(unknown):
+    if narrowing.centre is not None and len(unknown):
         centres = entries.centres(rows[unknown])
-        scores[unknown] -= np.linalg.norm(centres - narrowing.position.position, axis=1)
+        scores[unknown] -= np.linalg.norm(centres - narrowing.centre, axis=1)
     return scores
 
 

@@ -41,9 +41,11 @@ def enlargement(covariance: Array, size_m: float) -> int:
     return max((factor for factor in _FACTORS if factor * largest <= size_m), default=1)
 
 
-def rays(centre: Array, points: Array, count: int) -> Array:
-    """Lines (N, 2, 3) from a camera's centre to points (M, 3), evenly thinned to at most so many."""
+def rays(centre: Array, points: Array, count: int, longest_m: float) -> Array:
+    """Lines (N, 2, 3) from a camera's centre to points (M, 3), at most so many, evenly thinned, and none longer."""
     chosen = points
     if len(points) > count:
         chosen = points[np.linspace(0, len(points) - 1, count).round().astype(int)]
-    return np.stack([np.broadcast_to(centre, chosen.shape), chosen], axis=1)
+    length = np.linalg.norm(chosen - centre, axis=1, keepdims=True)
+    end = centre + (chosen - centre) * np.minimum(1.0, longest_m / np.maximum(length, 1e-9))
+    return np.stack([np.broadcast_to(centre, end.shape), end], axis=1)

@@ -40,7 +40,7 @@ def colours_at(picture: Picture, camera: Camera, pixels: Array) -> NDArray[np.ui
 
 def overlay(query: Query) -> Picture:
     """The photograph with its matches: where points are seen, and lines to where the pose puts them."""
-    picture = read_picture(query.image, OVERLAY_PX)
+    picture = _enlarged(read_picture(query.image, OVERLAY_PX))
     debug = query.answer.debug
     if debug is None:
         return picture
@@ -55,6 +55,14 @@ def overlay(query: Query) -> Picture:
             cv2.circle(picture, centre, size + 1, (12, 20, 24), -1, cv2.LINE_AA)
             cv2.circle(picture, centre, size, colour, -1, cv2.LINE_AA)
     return picture
+
+
+def _enlarged(picture: Picture) -> Picture:
+    """A small photograph made larger, so that what is drawn in it does not hide it."""
+    factor = OVERLAY_PX // max(picture.shape[:2])
+    if factor < 2:
+        return picture
+    return np.asarray(cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
 def _projected(camera: Camera, world_from_camera: RigidTransform, x_in_world: Array) -> Array:

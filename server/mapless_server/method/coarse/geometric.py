@@ -117,7 +117,7 @@ class GeometricReconstructor:
         pose = ransac(query.camera, x_in_world, pixels, None, options)
         if not priors:
             return pose
-        informed = informed_pose(query.camera, x_in_world, pixels, [pose] if pose else [], priors, options.informed)
+        informed = informed_pose(query.camera, x_in_world, pixels, pose, priors, options.informed)
         return informed.world_from_camera if informed else None
 
     def _judge(

@@ -1,0 +1,135 @@
+"""Drawing on viser's scene: cameras, points, ellipsoids and lines, in the scenery's place and size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.answers import LocalizationResult
+from mapless.geometry import Array, Camera, RigidTransform
+
+from .guarded import GuardedViser
+from .meshes import ellipsoid, enlargement, rays
+from .pictures import INLIER, OUTLIER, Picture
+from .scenery import Scenery
+
+Colour = tuple[int, int, int]
+
+REFERENCE, OTHER, QUERY, SELECTED, DOUBT = (
+    (96, 122, 168),
+    (120, 128, 140),
+    (46, 200, 150),
+    (255, 190, 60),
+    (230, 90, 40),
+)
+"""Of references, of those drawn as dots, of queries, of the selected one, and of poses that contradict each other."""
+MAX_RAYS = 90
+"""Lines from a query to its points; more hide what they lead to."""
+
+
+class Drawing:
+    """Draws; what it gives is a handle of viser's, to change or remove what was drawn."""
+
+    def __init__(self, server: GuardedViser, scenery: Scenery) -> None:
+        self._scene, self._scenery = server.scene, scenery
+        self._set_the_view(server)
+
+    def camera(
+        self,
+        name: str,
+        camera: Camera,
+        world_from_camera: RigidTransform,
+        colour: Colour,
+        size: float,
+        picture: Picture | None = None,
+    ) -> Any:
+        """A frustum with its photograph, `size` times as large as the scenery has them."""
+        pose = self._scenery.placed(world_from_camera)
+        q = pose.quaternion()
+        return self._scene.add_camera_frustum(
+            name,
+            fov=float(2 * np.arctan2(camera.height_px / 2, camera.focal_y_px)),
+            aspect=(camera.width_px / camera.focal_x_px) / (camera.height_px / camera.focal_y_px),
+            scale=size * self._scenery.size_m,
+            thickness=1.6 if colour == REFERENCE else 2.6,
+            thickness_units="screen",
+            color=colour,
+            image=picture,
+            format="jpeg",
+            wxyz=(q.w, q.x, q.y, q.z),
+            position=tuple(pose.translation.tolist()),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def points(self, name: str, placed: Array, colours: NDArray[np.uint8], size_m: float, visible: bool) -> Any:
+        """Points (N, 3), already in the scenery's place, with one colour or one each."""
+        return self._scene.add_point_cloud(
+            name,
+            placed,
+            colours,
+            point_size=size_m,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",
+            visible=visible,
+        )
+
+    def support(self, name: str, answer: LocalizationResult) -> list[Any]:
+        """What a pose rests on: its ellipsoid of 95 %, and lines to the matched points."""
+        return self._ellipsoid(name, answer) + self._rays(name, answer)
+
+    def _ellipsoid(self, name: str, answer: LocalizationResult) -> list[Any]:
+        covariance, centre = answer.covariance, self._scenery.placed(answer.world_from_camera).translation
+        if covariance is None or not np.isfinite(covariance).all():
+            return []
+        factor = enlargement(covariance, 0.6 * self._scenery.size_m)
+        vertices, faces = ellipsoid(covariance)
+        position = tuple(centre.tolist())
+        mesh = self._scene.add_mesh_simple(
+            f"{name}/ellipsoid",
+            factor * vertices,
+            faces,
+            color=SELECTED,
+            opacity=0.45,
+            side="double",
+            position=position,
+            cast_shadow=False,
+        )
+        if factor == 1:
+            return [mesh]
+        return [mesh, self._scene.add_label(f"{name}/label", f"95 %, {factor} times as large", position=position)]
+
+    def _rays(self, name: str, answer: LocalizationResult) -> list[Any]:
+        if answer.debug is None:
+            return []
+        centre, longest_m = self._scenery.placed(answer.world_from_camera).translation, 1.5 * self._scenery.extent_m
+        points, right = answer.debug.x_in_world - self._scenery.origin, answer.debug.is_inlier
+        drawn = []
+        for kind, rows, colour, count in (
+            ("right", right, INLIER, MAX_RAYS),
+            ("wrong", ~right, OUTLIER, MAX_RAYS // 4),
+        ):
+            lines = rays(centre, points[rows], count, longest_m)
+            if len(lines):
+                shown = self._scene.add_line_segments(
+                    f"{name}/{kind}", lines, colour, thickness=1.2, thickness_units="screen"
+                )
+                drawn.append(shown)
+        return drawn
+
+    def _set_the_view(self, server: GuardedViser) -> None:
+        """From behind and above the references, looking where they look."""
+        scenery = self._scenery
+        up = -scenery.down
+        server.scene.set_up_direction(tuple(up.tolist()))
+        ahead = np.mean([it.world_from_camera.rotation[:, 2] for it in scenery.references], axis=0)
+        ahead = ahead - (ahead @ up) * up
+        if np.linalg.norm(ahead) < 0.2:  # they look all around
+            ahead = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+        ahead = ahead / np.linalg.norm(ahead)
+        reach = max(scenery.extent_m, 4 * scenery.size_m)
+        server.initial_camera.position = tuple((-0.5 * reach * ahead + 0.45 * reach * up).tolist())
+        server.initial_camera.look_at = tuple((0.4 * reach * ahead).tolist())

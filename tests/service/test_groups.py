@@ -1,0 +1,253 @@
+"""LocalizeRig and LocalizeSequence through a real server: what is asked, what comes back, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from datetime import datetime, timezone
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from compare import assert_pose_close
+from images import encode
+from servers import CAMERA, PHOTO, Stubs, failure_of, pose
+
+from mapless import (
+    Camera,
+    Client,
+    GroupRejected,
+    NewReference,
+    NotFound,
+    RigidTransform,
+    RigImage,
+    RigLocalization,
+    SequenceFrame,
+    SequenceLocalization,
+    wire,
+)
+from mapless.axes import Axes, pose_to
+from mapless.geometry import rotation_from_vector
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.child import child_server
+from mapless_server.demo.raycast import Quad, Surface
+from mapless_server.demo.room import Photo, Station, look_at, take
+from mapless_server.demo.textures import painting
+
+CORNER = Camera(320, 240, 280.0, 280.0, 160.3, 118.9)
+WALK = [look_at([0.25 + 0.12 * i, 0.15, 1.02 + 0.01 * i], [1.5, 1.6, 1]) for i in range(4)]
+BLANK = encode(".png", np.full((240, 320, 3), 90, np.uint8))
+
+
+@pytest.fixture(scope="module")
+def photos() -> list[Photo]:
+    """Six photographs of two painted walls that meet in a corner, and four from a walk."""
+    random = np.random.default_rng(5)
+    walls = [
+        Quad(np.array([0.0, 2, 2]), np.array([2.0, 0, 0]), np.array([0, 0, -2.0]), painting(random, (700, 700))),
+        Quad(np.array([2.0, 2, 2]), np.array([0.0, -2, 0]), np.array([0, 0, -2.0]), painting(random, (700, 700))),
+    ]
+    surfaces = [Surface.of(wall, wall.texture) for wall in walls]
+    poses = [look_at([0.2 + 0.15 * i, 0.1, 1 + 0.05 * (i % 2)], [1.5, 1.6, 1]) for i in range(6)]
+    return [take(surfaces, Station(f"p{i}", CORNER, at)) for i, at in enumerate([*poses, *WALK])]
+
+
+def png(photo: Photo) -> bytes:
+    return encode(".png", cv2.cvtColor(photo.image, cv2.COLOR_RGB2BGR))
+
+
+@pytest.fixture(scope="module")
+def corner(photos: list[Photo], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
+    with (
+        child_server(tmp_path_factory.mktemp("corner"), {"--workers": "1"}) as server,
+        Client(server.address) as client,
+    ):
+        client.create_scene("corner")
+        client.add_references(
+            "corner", [NewReference(it.name, png(it), CORNER, it.world_from_camera) for it in photos[:6]]
+        )
+        yield client
+
+
+@pytest.fixture(scope="module")
+def queries(photos: list[Photo]) -> list[bytes]:
+    return [png(it) for it in photos[6:]]
+
+
+WORLD_FROM_RIG = RigidTransform(rotation_from_vector([0.4, 0.2, -1.0]), np.array([0.5, 0.3, 0.9]))
+RIG_FROM_CAMERA = [WORLD_FROM_RIG.inverse().compose(it) for it in WALK]
+
+
+def as_rig(images: list[bytes]) -> list[RigImage]:
+    return [RigImage(image, CORNER, fixed) for image, fixed in zip(images, RIG_FROM_CAMERA, strict=True)]
+
+
+def test_a_rig(corner: Client, queries: list[bytes]) -> None:
+    """Its answer in full; one of its photographs is blank."""
+    taken = datetime(2026, 1, 2, 3, 4, 5, tzinfo=timezone.utc)
+    images = as_rig([queries[0], BLANK, queries[2], queries[3]])
+    answer = corner.localize_rig(images, "corner", capture_time=taken, session_from_rig=pose(7.0))
+    assert isinstance(answer, RigLocalization), answer
+    assert_pose_close(answer.world_from_rig, WORLD_FROM_RIG, metres=0.01, degrees=0.5)
+    assert answer.world_from_session is not None
+    assert_pose_close(answer.world_from_session.compose(pose(7.0)), answer.world_from_rig, metres=1e-9, degrees=1e-6)
+    assert answer.capture_time == taken
+    assert answer.geo_pose is None
+    assert 0 < answer.accuracy.position_68_m < answer.accuracy.position_95_m < 0.2
+    assert (np.linalg.eigvalsh(answer.covariance) > 0).all()
+    assert [report.rejected_alone for report in answer.images] == [None, "LOW_TEXTURE", None, None]
+    assert sum(report.inlier_count for report in answer.images) == answer.inlier_count <= answer.match_count
+    assert answer.images[1].match_count == 0
+    for report in (answer.images[0], answer.images[2]):
+        assert max(use.inlier_count for use in report.diagnostics.references) > 10
+        assert {"features", "pnp"} <= set(report.diagnostics.stage_s)
+        assert 0 <= report.diagnostics.queue_s <= report.diagnostics.total_s
+
+
+@pytest.mark.parametrize("axes", ["", "unity"])
+def test_a_sequence(corner: Client, queries: list[bytes], axes: str) -> None:
+    """What the device tracks after it is put into the world, in its own axes and its own unit."""
+    name = Axes(axes or "opencv")
+    session_from_world = RigidTransform(rotation_from_vector([0.1, -0.3, 0.2]), np.array([3.0, 1.0, -2.0]))
+
+    def tracked(world_from_camera: RigidTransform) -> RigidTransform:
+        metric = session_from_world.compose(world_from_camera)
+        return pose_to(name, RigidTransform(metric.rotation, metric.translation / 0.5))
+
+    taken = datetime(2026, 1, 2, tzinfo=timezone.utc)
+    frames = [
+        SequenceFrame(image, CORNER, tracked(at), taken if i == 2 else None)
+        for i, (image, at) in enumerate(zip(queries, WALK, strict=True))
+    ]
+    answer = corner.localize_sequence(frames, "corner", estimate_scale=True, axes=axes)
+    assert isinstance(answer, SequenceLocalization), answer
+    for found, truth in zip(answer.world_from_camera, WALK, strict=True):
+        assert_pose_close(found, truth, metres=0.01, degrees=0.5)
+    assert answer.axes == name.name
+    assert answer.world_from_session.scale == pytest.approx(0.5, rel=0.1)
+    assert 0 < answer.scale_sigma < 0.05
+    now = answer.world_from_session.transform_pose(tracked(WALK[-1]))
+    assert_pose_close(now, pose_to(name, answer.world_from_camera[-1]), metres=1e-6, degrees=1e-4)
+    assert [report.rejected_alone for report in answer.images] == [None] * 4
+
+
+def test_what_shows_nothing_is_rejected_with_each_images_reason(corner: Client) -> None:
+    answer = corner.localize_rig(as_rig([BLANK] * 4)[:2], "corner")
+    assert isinstance(answer, GroupRejected)
+    assert answer.reason == "LOW_TEXTURE"
+    assert [report.rejected_alone for report in answer.images] == ["LOW_TEXTURE"] * 2
+
+
+def test_a_session_without_motion_has_no_scale(corner: Client, queries: list[bytes]) -> None:
+    frames = [SequenceFrame(queries[0], CORNER, pose(1.0))] * 2
+    answer = corner.localize_sequence(frames, "corner", estimate_scale=True)
+    assert isinstance(answer, GroupRejected)
+    assert answer.reason == "SCALE_UNRELIABLE"
+
+
+def test_references_may_be_named_for_each_image(corner: Client, queries: list[bytes]) -> None:
+    image = RigImage(queries[0], CORNER, RIG_FROM_CAMERA[0], ("p0", "p1", "p2"))
+    answer = corner.localize_rig([image, image], "corner")
+    assert isinstance(answer, RigLocalization)
+    names = [[use.name for use in report.diagnostics.references] for report in answer.images]
+    assert names == [[f"scenes/corner/references/p{i}" for i in range(3)]] * 2
+    with pytest.raises(NotFound) as caught:
+        corner.localize_rig([image, RigImage(queries[0], CORNER, RIG_FROM_CAMERA[0], ("p0", "absent"))], "corner")
+    assert caught.value.field == "images[1].references[1]"
+
+
+# What is refused, before anything is computed
+
+
+def rig_request(scene: str) -> pb.LocalizeRigRequest:
+    image = pb.RigImage(
+        image=PHOTO, intrinsics=wire.camera_to_message(CAMERA), rig_from_camera=wire.transform_to_message(pose(0.1))
+    )
+    return pb.LocalizeRigRequest(scene=f"scenes/{scene}", images=[image] * 3)
+
+
+def sequence_request(scene: str) -> pb.LocalizeSequenceRequest:
+    frame = pb.SequenceFrame(
+        image=PHOTO, intrinsics=wire.camera_to_message(CAMERA), session_from_camera=wire.transform_to_message(pose(0.1))
+    )
+    return pb.LocalizeSequenceRequest(scene=f"scenes/{scene}", frames=[frame] * 3)
+
+
+Change = Callable[[Any], object]
+
+BAD_RIGS: dict[str, tuple[Change, str]] = {
+    "no image": (lambda request: request.ClearField("images"), "images"),
+    "9 images": (lambda request: request.images.extend([request.images[0]] * 6), "images"),
+    "no pose": (lambda request: request.images[1].ClearField("rig_from_camera"), "images[1].rig_from_camera"),
+    "pose at NaN": (
+        lambda request: setattr(request.images[2].rig_from_camera.translation_m, "y", math.nan),
+        "images[2].rig_from_camera.translation_m.y",
+    ),
+    "pose far away": (
+        lambda request: setattr(request.images[2].rig_from_camera.translation_m, "y", 1e8),
+        "images[2].rig_from_camera.translation_m.y",
+    ),
+    "zero rotation": (
+        lambda request: request.images[0].rig_from_camera.rotation.Clear(),
+        "images[0].rig_from_camera.rotation",
+    ),
+    "infinite focal length": (
+        lambda request: setattr(request.images[2].intrinsics, "focal_x_px", math.inf),
+        "images[2].intrinsics.focal_x_px",
+    ),
+    "no intrinsics": (lambda request: request.images[2].ClearField("intrinsics"), "images[2].intrinsics"),
+    "not an image": (lambda request: setattr(request.images[1], "image", b"<svg/>"), "images[1].image"),
+    "truncated": (lambda request: setattr(request.images[1], "image", PHOTO[:-100]), "images[1].image"),
+    "reference of another scene": (
+        lambda request: request.images[1].references.append("scenes/other/references/r1"),
+        "images[1].references[0]",
+    ),
+    "another variant": (lambda request: setattr(request.options, "variant", pb.VARIANT_FULL), "options.variant"),
+    "65 chosen": (lambda request: setattr(request.options, "reference_count", 65), "options.reference_count"),
+    "no scene": (lambda request: request.ClearField("scene"), "scene"),
+    "session at NaN": (
+        lambda request: request.session_from_rig.CopyFrom(
+            wire.transform_to_message(RigidTransform(np.eye(3), np.array([0, math.nan, 0])))
+        ),
+        "session_from_rig.translation_m.y",
+    ),
+}
+
+BAD_SEQUENCES: dict[str, tuple[Change, str]] = {
+    "one frame": (lambda request: request.frames.__delitem__(slice(1, None)), "frames"),
+    "17 frames": (lambda request: request.frames.extend([request.frames[0]] * 14), "frames"),
+    "no pose": (lambda request: request.frames[1].ClearField("session_from_camera"), "frames[1].session_from_camera"),
+    "NaN rotation": (
+        lambda request: setattr(request.frames[1].session_from_camera.rotation, "w", math.nan),
+        "frames[1].session_from_camera.rotation",
+    ),
+    "unknown axes": (lambda request: setattr(request.options, "axes", 77), "options.axes"),
+    "other size": (
+        lambda request: setattr(request.frames[2].intrinsics, "width_px", 97),
+        "frames[2].intrinsics.width_px",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_RIGS)
+def test_bad_rigs_are_refused_by_field(stubs: Stubs, scene: str, name: str) -> None:
+    change, field = BAD_RIGS[name]
+    request = rig_request(scene)
+    change(request)
+    error = failure_of(stubs.localization.LocalizeRig, request)
+    assert (error.code, error.field) == ("INVALID_ARGUMENT", field), error
+
+
+@pytest.mark.parametrize("name", BAD_SEQUENCES)
+def test_bad_sequences_are_refused_by_field(stubs: Stubs, scene: str, name: str) -> None:
+    change, field = BAD_SEQUENCES[name]
+    request = sequence_request(scene)
+    change(request)
+    error = failure_of(stubs.localization.LocalizeSequence, request)
+    assert (error.code, error.field) == ("INVALID_ARGUMENT", field), error
+
+
+def test_an_unknown_scene_is_not_found(stubs: Stubs) -> None:
+    error = failure_of(stubs.localization.LocalizeRig, rig_request("nowhere"))
+    assert (error.code, error.field) == ("NOT_FOUND", "scene")

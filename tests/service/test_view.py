@@ -1,0 +1,136 @@
+"""A scene in a real browser: references, points and a query are drawn, and a click on it opens its photograph."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from chromium import Page, browsing, needs_chromium
+from corner import CAMERA, photograph, pose
+from numpy.typing import NDArray
+
+from mapless import Client, ConnectOptions, LocalizationResult, NewReference
+from mapless_server.child import child_server
+
+pytest.importorskip("viser", reason="needs the extra view")
+
+REFERENCES = [f"reference-{i}" for i in range(6)]
+YELLOW, GREEN = (255, 190, 60), (46, 230, 166)
+TOP_PX = 220
+ANNOUNCEMENT = "mapless-server view is on "
+
+
+@contextmanager
+def view(address: str, scene: str) -> Iterator[str]:
+    """The address of a viewer of its own."""
+    arguments = ["view", scene, "--address", address, "--no-open", "--port", "0", "--seeds", "2"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mapless_server", *arguments], stdout=subprocess.PIPE, text=True, env=dict(os.environ)
+    )
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()
+        assert line.startswith(ANNOUNCEMENT), line
+        yield line.removeprefix(ANNOUNCEMENT).strip()
+    finally:
+        process.terminate()
+        assert process.wait(30) == 128 + 15
+        process.stdout.close()
+
+
+def like(picture: NDArray[np.uint8], colour: tuple[int, int, int], within: int = 60) -> NDArray[np.bool_]:
+    """Which pixels have about a colour."""
+    return np.asarray(np.abs(picture.astype(int) - colour).max(axis=-1) < within)
+
+
+def canvas(page: Page) -> NDArray[np.uint8]:
+    """What is drawn, without the panel to the right and viser's messages above."""
+    return page.screenshot()[TOP_PX:, :830]
+
+
+def drawn(page: Page) -> int:
+    """How many pixels are not the background's."""
+    picture = canvas(page)
+    return int((~like(picture, tuple(picture[-1, 0].tolist()), within=12)).sum())
+
+
+def switch(page: Page, label: str) -> None:
+    """Clicks the box with a label."""
+    script = f"""(() => {{
+        const label = [...document.querySelectorAll("label")].find(it => it.innerText === {json.dumps(label)});
+        (document.getElementById(label.htmlFor) || label).click();
+    }})()"""
+    page.evaluate(script)
+
+
+@pytest.mark.slow
+@needs_chromium()
+def test_what_is_seen_in_a_browser(tmp_path: Path) -> None:
+    poses = dict(zip(REFERENCES, map(pose, (-25, -15, -5, 5, 15, 25)), strict=True))
+    with (
+        child_server(tmp_path / "data", environment={"MAPLESS_ALLOW_WATCHING": "true"}) as server,
+        Client(server.address, ConnectOptions(timeout_s=120)) as client,
+    ):
+        client.create_scene("corner")
+        client.add_references("corner", [NewReference(it, photograph(at), CAMERA, at) for it, at in poses.items()])
+        with view(server.address, "corner") as url, browsing(url) as page:
+            look(page, client, tmp_path)
+
+
+def look(page: Page, client: Client, folder: Path) -> None:
+    page.until(lambda: "6 references" in page.text and "Queries: live" in page.text)
+    page.until(lambda: drawn(page) > 5000)
+    page.until(lambda: page.evaluate("[...document.querySelectorAll('*')].some(it => it.innerText === '/points')"))
+    save(page, folder / "references.png")
+    assert like(canvas(page), YELLOW).sum() < 20
+    everything = drawn(page)
+
+    switch(page, "References")
+    page.until(lambda: 300 < drawn(page) < 0.5 * everything)
+    switch(page, "Points")
+    page.until(lambda: drawn(page) < 100)
+
+    true = pose(2.0, height_m=-1.4, distance_m=3.0)
+    answer = client.localize(photograph(true), CAMERA, "corner")
+    assert isinstance(answer, LocalizationResult)
+    assert np.linalg.norm(answer.world_from_camera.translation - true.translation) < 0.02
+    assert answer.debug is None
+    page.until(lambda: "#1 localized" in page.text)
+    page.until(lambda: like(canvas(page), YELLOW).sum() > 150)
+    assert page.evaluate("[...document.querySelectorAll('button')].some(it => it.innerText.startsWith('#1'))")
+
+    switch(page, "Matches of the selected query")
+    page.until(lambda: like(canvas(page), (110, 200, 170), within=40).sum() < 200)
+    rows, columns = np.nonzero(like(canvas(page), YELLOW))
+    page.until(lambda: opened(page, float(np.median(columns)), TOP_PX + float(np.median(rows))))
+    page.until(lambda: "agree with the pose" in page.text)
+    size = page.evaluate(
+        "(() => { const it = document.querySelector('.mantine-Modal-content img').getBoundingClientRect();"
+        "return [it.x, it.y, it.width, it.height]; })()"
+    )
+    x, y, width, height = (round(value) for value in size)
+    assert width > 450
+    page.until(lambda: like(page.screenshot()[y : y + height, x : x + width], GREEN).sum() > 500)
+    save(page, folder / "query.png")
+    page.evaluate("[...document.querySelectorAll('button')].find(it => it.innerText === 'Close').click()")
+    page.until(lambda: "agree with the pose" not in page.text)
+
+
+def opened(page: Page, x: float, y: float) -> bool:
+    """Clicks until the picture is open: the first click may come before the frustum is ready for it."""
+    page.click(x, y)
+    return any(page.evaluate("!!document.querySelector('.mantine-Modal-content img')?.complete") for _ in range(20))
+
+
+def save(page: Page, file: Path) -> None:
+    """For who wants to see what the test saw."""
+    cv2.imwrite(str(file), page.screenshot()[..., ::-1])
+    print(f"screenshot: {file}")

@@ -1,0 +1,82 @@
+"""The adapter of PoseLib's generalized solvers: conventions and determinism, by planted poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from compare import assert_pose_close
+from scenes import CAMERA, random_for
+
+from mapless.geometry import RigidTransform, Similarity, rotation_from_vector
+from mapless_server.method.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
+from mapless_server.method.pnp import PnpOptions
+
+OPTIONS = PnpOptions()
+WORLD_FROM_RIG = RigidTransform(rotation_from_vector([0.3, -0.2, 0.5]), np.array([1.0, -2.0, 3.0]))
+
+
+def planted(
+    random: np.random.Generator, counts: tuple[int, ...], wrong_share: float = 0.0, unit: float = 1.0
+) -> list[CameraMatches]:
+    """Cameras that look all ways, with so many matches each; `unit` of the rig's frame in metres."""
+    cameras = []
+    for count in counts:
+        rig_from_camera = RigidTransform(rotation_from_vector(random.normal(0, 1, 3)), random.normal(0, 0.3, 3))
+        pixels = random.uniform([0, 0], [CAMERA.width_px, CAMERA.height_px], (count, 2))
+        x_in_camera = CAMERA.rays(pixels) * random.uniform(3, 8, (count, 1))
+        x_in_world = WORLD_FROM_RIG.compose(rig_from_camera).apply(x_in_camera)
+        pixels = pixels + random.normal(0, 0.3, pixels.shape)
+        wrong = random.permutation(count)[: round(wrong_share * count)]
+        pixels[wrong] = random.uniform([0, 0], [CAMERA.width_px, CAMERA.height_px], (len(wrong), 2))
+        fixed = RigidTransform(rig_from_camera.rotation, rig_from_camera.translation / unit)
+        cameras.append(CameraMatches(CAMERA, fixed, pixels, x_in_world))
+    return cameras
+
+
+@pytest.mark.parametrize("wrong_share", [0.0, 0.5])
+def test_a_rig_is_posed(wrong_share: float) -> None:
+    cameras = planted(random_for("rig", wrong_share), (60, 40, 80), wrong_share)
+    found = rig_ransac(cameras, OPTIONS)
+    assert found is not None
+    assert_pose_close(found, WORLD_FROM_RIG, metres=0.005, degrees=0.05)
+    assert inlier_count(cameras, found, OPTIONS.inlier_px) >= round(180 * (1 - wrong_share))
+
+
+def test_three_matches_of_three_cameras_are_enough() -> None:
+    cameras = planted(random_for("three"), (1, 1, 1))
+    found = rig_ransac(cameras, OPTIONS)
+    assert found is not None
+    assert inlier_count(cameras, found, OPTIONS.inlier_px) == 3
+
+
+@pytest.mark.parametrize("unit", [0.37, 1.0, 25.0])
+def test_a_scale_is_found_with_the_pose(unit: float) -> None:
+    """Metres per unit, not units per metre."""
+    cameras = planted(random_for("scaled", unit), (60, 60, 60), 0.5, unit)
+    found = scaled_ransac(cameras, OPTIONS, 2000, 600)
+    assert found is not None
+    assert found.scale == pytest.approx(unit, rel=0.03)
+    assert_pose_close(RigidTransform(found.rotation, found.translation), WORLD_FROM_RIG, metres=0.05, degrees=0.5)
+
+
+def test_the_same_matches_give_the_same_pose() -> None:
+    """Up to rounding, which depends on where arrays lie in memory."""
+    cameras = planted(random_for("again"), (60, 40, 80), 0.5, 0.5)
+    first, second = (scaled_ransac(cameras, OPTIONS, 500, 600) for _ in range(2))
+    assert isinstance(first, Similarity)
+    assert isinstance(second, Similarity)
+    assert first.scale == pytest.approx(second.scale, rel=1e-9)
+    metric = planted(random_for("again"), (60, 40, 80), 0.5)
+    poses = [rig_ransac(metric, OPTIONS) for _ in range(2)]
+    np.testing.assert_allclose(*[pose.matrix() for pose in poses if pose is not None], atol=1e-9)
+
+
+@pytest.mark.parametrize("counts", [(), (2,), (1, 1)])
+def test_too_few_matches_give_none(counts: tuple[int, ...]) -> None:
+    cameras = planted(random_for("few"), counts)
+    assert rig_ransac(cameras, OPTIONS) is None
+    assert not cameras or scaled_ransac(cameras, OPTIONS, 100, 600) is None
+
+
+def test_one_camera_alone_tells_no_scale() -> None:
+    assert scaled_ransac(planted(random_for("one"), (50,)), OPTIONS, 100, 600) is None

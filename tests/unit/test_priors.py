@@ -1,0 +1,238 @@
+"""Priors: derivatives against differences, distances against the chi-square they must follow, and what conflicts do."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from jacobians import assert_jacobian
+from scenes import random_for
+from scipy.stats import chi2
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.method.pose_only import moved
+from mapless_server.method.priors import (
+    NO_PRIORS,
+    GravityPrior,
+    HeadingPrior,
+    PosePrior,
+    PositionPrior,
+    Prior,
+    PriorKind,
+    Priors,
+    conflict_threshold,
+    rotation_vector,
+)
+
+POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def unit(vector: Array) -> Array:
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def random_covariance(rng: np.random.Generator, *deviations: float) -> Array:
+    """A covariance with these standard deviations and random correlations."""
+    root = rng.normal(size=(len(deviations), len(deviations)))
+    covariance = root @ root.T
+    scale = np.array(deviations) / np.sqrt(np.diag(covariance))
+    return np.asarray(covariance * np.outer(scale, scale))
+
+
+def turned_by_chance(rng: np.random.Generator, direction: Array, sigma: float) -> Array:
+    """A direction of unit length, turned by noise about the two axes across it."""
+    across = rng.normal(0, sigma, 3)
+    across -= direction * (direction @ across)
+    return np.asarray(rotation_from_vector(across) @ direction)
+
+
+def gravity_at(pose: RigidTransform, sigma_deg: float = 1.0) -> GravityPrior:
+    return GravityPrior(unit(pose.rotation.T @ DOWN), DOWN, sigma_deg)
+
+
+def planted(kind: str, pose: RigidTransform, rng: np.random.Generator) -> Prior:
+    """A prior of the pose that is off by what it says."""
+    if kind == "position":
+        covariance = random_covariance(rng, 0.1, 0.3, 1.0)
+        return PositionPrior(pose.translation + rng.multivariate_normal(np.zeros(3), covariance), covariance)
+    if kind == "gravity":
+        return GravityPrior(turned_by_chance(rng, unit(pose.rotation.T @ DOWN), math.radians(2)), DOWN, 2.0)
+    if kind == "heading":
+        return HeadingPrior.looking(turned_by_chance(rng, pose.rotation[:, 2], math.radians(5)), 5.0)
+    covariance = random_covariance(rng, 0.1, 0.3, 1.0, 0.02, 0.05, 0.03)
+    return PosePrior(moved(pose, rng.multivariate_normal(np.zeros(6), covariance)), covariance)
+
+
+KINDS = ("position", "gravity", "heading", "pose")
+
+
+# Equations
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_jacobian_is_the_derivative_by_an_error_about_fixed_world_axes(kind: str) -> None:
+    rng = random_for("jacobian", kind)
+    for _ in range(5):
+        prior = planted(kind, POSE, rng)
+        at = moved(POSE, rng.normal(0, 0.3, 6))
+        jacobian = prior.term(at).jacobian
+
+        def residual(error: Array, prior: Prior = prior, at: RigidTransform = at) -> Array:
+            return prior.term(moved(at, error)).residual
+
+        assert_jacobian(jacobian, residual, np.zeros(6), tolerance=1e-7)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradient_and_information_are_half_the_cost_s_derivatives(kind: str) -> None:
+    prior = planted(kind, POSE, random_for("gradient", kind))
+    at = moved(POSE, np.full(6, 0.02))
+    gradient, information = Priors(**{kind: prior}).gradient_and_information(at)  # type: ignore[arg-type]
+    cost = Priors(**{kind: prior}).cost  # type: ignore[arg-type]
+    assert_jacobian(2 * gradient[None], lambda error: cost(moved(at, error)), np.zeros(6), tolerance=1e-5)
+    assert np.linalg.matrix_rank(information) == prior.degrees_of_freedom
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.0, 3.0, math.pi])
+def test_the_rotation_vector_is_the_inverse_of_rodrigues(angle: float) -> None:
+    axis = unit(np.array([0.3, -0.5, 0.8]))
+    found = rotation_vector(rotation_from_vector(angle * axis))
+    np.testing.assert_allclose(rotation_from_vector(found), rotation_from_vector(angle * axis), atol=1e-12)
+    assert np.linalg.norm(found) == pytest.approx(angle, abs=1e-12)
+
+
+# Distances
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_squared_distances_of_consistent_priors_follow_chi_square(kind: str) -> None:
+    """Monte Carlo over both uncertainties: the pose found is off by its covariance, the prior by its own."""
+    rng = random_for("chi square", kind)
+    covariance = random_covariance(rng, 0.05, 0.1, 0.2, 0.02, 0.01, 0.03)
+    squares = []
+    for _ in range(4000):
+        prior = planted(kind, POSE, rng)
+        found = moved(POSE, rng.multivariate_normal(np.zeros(6), covariance))
+        (check,) = Priors(**{kind: prior}).check(found, covariance)  # type: ignore[arg-type]
+        squares.append(check.mahalanobis**2)
+    freedom = check.degrees_of_freedom
+    assert np.mean(squares) == pytest.approx(freedom, rel=0.05)
+    assert np.quantile(squares, 0.95) == pytest.approx(chi2.ppf(0.95, freedom), rel=0.07)
+
+
+@pytest.mark.parametrize("freedom", [2, 3, 6])
+def test_one_consistent_prior_of_10_000_is_called_a_conflict(freedom: int) -> None:
+    assert chi2.sf(conflict_threshold(freedom), freedom) == pytest.approx(1e-4, rel=1e-6)
+
+
+def test_a_certain_pose_makes_the_distance_the_prior_s_own() -> None:
+    tilted = moved(POSE, np.array([0, 0, 0, math.radians(3), 0, 0]))
+    (check,) = Priors(gravity=gravity_at(POSE)).check(tilted, 1e-12 * np.eye(6))
+    assert check.mahalanobis == pytest.approx(3.0, rel=1e-3)
+    assert not check.conflict
+    assert not check.used  # the pose knows all of it better
+
+
+@pytest.mark.parametrize("sigma_deg", [0.5, 1.0, 5.0, 20.0])
+def test_gravity_of_the_wrong_sign_is_a_conflict_however_uncertain_the_pose(sigma_deg: float) -> None:
+    prior = gravity_at(POSE, sigma_deg)
+    flipped = GravityPrior(-prior.in_camera, DOWN, sigma_deg)
+    (check,) = Priors(gravity=flipped).check(POSE, np.diag([1.0, 1.0, 1.0, 2.0, 2.0, 2.0]) ** 2)
+    assert check.conflict
+    assert not check.used
+
+
+def test_a_prior_that_adds_next_to_nothing_is_not_used() -> None:
+    covariance = np.diag([0.01] * 3 + [math.radians(0.2)] * 3) ** 2
+    for sigma_deg, used in ((1.0, False), (0.5, True)):
+        (check,) = Priors(gravity=gravity_at(POSE, sigma_deg)).check(POSE, covariance)
+        assert (check.conflict, check.used) == (False, used)
+
+
+def test_the_covariance_with_priors_is_the_inverse_of_summed_informations() -> None:
+    rng = random_for("sharpened")
+    covariance = random_covariance(rng, 0.1, 0.2, 0.3, 0.02, 0.03, 0.01)
+    priors = Priors(planted("position", POSE, rng), gravity=gravity_at(POSE))  # type: ignore[arg-type]
+    _, information = priors.gradient_and_information(POSE)
+    expected = np.linalg.inv(np.linalg.inv(covariance) + information)
+    np.testing.assert_allclose(priors.sharpened(covariance, POSE), expected, rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(NO_PRIORS.sharpened(covariance, POSE), covariance)
+
+
+def test_a_prior_weighs_against_a_candidate_no_more_than_a_conflict() -> None:
+    near, far = gravity_at(moved(POSE, np.array([0, 0, 0, 0.01, 0, 0]))), gravity_at(moved(POSE, np.full(6, 1.0)))
+    assert Priors(gravity=near).penalty(POSE) == pytest.approx(Priors(gravity=near).cost(POSE))
+    assert Priors(gravity=far).penalty(POSE) == conflict_threshold(2)
+
+
+def test_chance_of_agreeing_is_the_share_of_directions_so_near() -> None:
+    """Counted over random rotations."""
+    rng = random_for("chance")
+    priors = Priors(gravity=gravity_at(POSE, 10.0))
+    rotations = [rotation_from_vector(rotation_vector(_random_rotation(rng))) for _ in range(4000)]
+    agreeing = [priors.log10_chance(RigidTransform(r, np.zeros(3))) < 0 for r in rotations]
+    assert np.mean(agreeing) == pytest.approx(10 ** priors.log10_chance(POSE), rel=0.2)
+    assert Priors(pose=PosePrior(POSE, 1e-6 * np.eye(6))).log10_chance(POSE) == 0.0
+
+
+def _random_rotation(rng: np.random.Generator) -> Array:
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return np.asarray(q * np.sign(np.linalg.det(q)))
+
+
+# Values
+
+
+def test_priors_shift_with_the_world() -> None:
+    rng, offset = random_for("shift"), np.array([1e6, -2e5, 300.0])
+    priors = Priors(**{kind: planted(kind, POSE, rng) for kind in KINDS})  # type: ignore[arg-type]
+    there = priors.shifted(offset)
+    assert there.cost(POSE.shifted(offset)) == pytest.approx(priors.cost(POSE), rel=1e-6)
+    assert [prior.kind for prior in there] == [
+        PriorKind.POSITION,
+        PriorKind.HEADING,
+        PriorKind.GRAVITY,
+        PriorKind.POSE,
+    ]
+
+
+def test_nothing_known_is_false() -> None:
+    assert not NO_PRIORS
+    assert Priors(gravity=gravity_at(POSE))
+    assert NO_PRIORS.check(POSE, np.eye(6)) == ()
+
+
+UNSYMMETRIC = np.eye(3)
+UNSYMMETRIC = UNSYMMETRIC + np.array([[0, 0.5, 0], [0, 0, 0], [0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    "covariance",
+    [np.eye(2), -np.eye(3), np.diag([1.0, 1.0, 0.0]), np.full((3, 3), 1.0), UNSYMMETRIC, np.full((3, 3), np.nan)],
+    ids=["size", "negative", "semidefinite", "singular", "unsymmetric", "nan"],
+)
+def test_senseless_covariances_are_refused(covariance: Array) -> None:
+    with pytest.raises(ValueError, match="covariance"):
+        PositionPrior(np.zeros(3), covariance)
+
+
+def test_a_covariance_may_mix_centimetres_with_an_unknown_height() -> None:
+    covariance = np.diag([0.01, 0.01, 1000.0]) ** 2
+    assert PositionPrior(np.zeros(3), covariance).term(POSE).cost == pytest.approx(40**2 + 20**2, rel=1e-3)
+
+
+@pytest.mark.parametrize("direction", [np.zeros(3), np.array([0, 2.0, 0]), np.array([0, np.nan, 0]), np.ones(2)])
+def test_directions_have_unit_length(direction: Array) -> None:
+    with pytest.raises(ValueError, match="unit length"):
+        GravityPrior(direction, DOWN, 1.0)
+    with pytest.raises(ValueError, match="unit length"):
+        GravityPrior(DOWN, direction, 1.0)
+
+
+@pytest.mark.parametrize("sigma_deg", [0.0, -1.0, math.nan, 181.0])
+def test_senseless_sigmas_are_refused(sigma_deg: float) -> None:
+    with pytest.raises(ValueError, match="sigma"):
+        GravityPrior(DOWN, DOWN, sigma_deg)
