@@ -45,8 +45,8 @@ def photograph(world_from_camera: RigidTransform, camera: Camera = CAMERA) -> by
     hit = centre + rays * depths.min(axis=-1, keepdims=True)
     picture = np.zeros((camera.height_px, camera.width_px, 3), np.uint8)
     for axis, paper in enumerate(_PAPERS):
-        on_wall = np.delete(hit, axis, axis=-1) * -_TEXELS_PER_M
-        found = cv2.remap(paper, on_wall.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+        across, down = np.moveaxis(np.delete(hit, axis, axis=-1) * -_TEXELS_PER_M, -1, 0).astype(np.float32)
+        found = cv2.remap(paper, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
         picture[wall == axis] = found[wall == axis]
     return encode(".png", picture)
 

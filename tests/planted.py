@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 from scenes import SyntheticScene
 
-from mapless.geometry import RigidTransform, Similarity
+from mapless.geometry import RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.correspond import Correspondences, Matches
 from mapless_server.method.match import PointMatches
-from mapless_server.method.observations import ONE_PIXEL, KeypointNoise
+from mapless_server.method.observations import ONE_PIXEL, KeypointNoise, adjust_points, estimate_noise, triangulate
+from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
 from mapless_server.method.scale import MetricScale, ScaleStage
-from mapless_server.method.structure import Structure
+from mapless_server.method.structure import Structure, observe
 from mapless_server.method.tracks import Tracks
 from mapless_server.method.views import PosedView
 
@@ -57,6 +59,10 @@ def true_structure(scene: SyntheticScene, noise: KeypointNoise = ONE_PIXEL) -> t
     return Structure(scene.x_in_world[points], tracks, noise), matches
 
 
+NOISE = KeypointNoise(0.5, 0.0)
+"""Of the scenes' keypoints, unless they are told another."""
+
+
 def metric_scale(world_from_local: Similarity, world_from_query: RigidTransform) -> MetricScale:
     """The scale stage's answer when that is the truth."""
     return MetricScale(world_from_local.scale, ScaleStage.TRIANGULATION, 0.0, 0, world_from_local, world_from_query)
@@ -65,3 +71,27 @@ def metric_scale(world_from_local: Similarity, world_from_query: RigidTransform)
 def moved_references(references: tuple[PosedView, ...], world: RigidTransform) -> tuple[PosedView, ...]:
     """The same references, told in another world frame; with keys of their own, as different references have."""
     return tuple(PosedView(f"{r.key}-moved", r.name, r.view, world.compose(r.world_from_camera)) for r in references)
+
+
+def stages(scene: SyntheticScene, references: tuple[PosedView, ...]) -> tuple[Structure, PointMatches, PoseEstimate]:
+    """Structure and pose as the stages before would hand them over, from true matches and the given reference poses."""
+    truth, matches = true_structure(scene)
+    observations = observe(truth.tracks, references, NOISE)
+    points = adjust_points(observations, triangulate(observations), 2.0, 8)
+    noise = estimate_noise(observations, points, NOISE)
+    structure = Structure(points, truth.tracks, noise)
+    estimate = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
+    assert isinstance(estimate, PoseEstimate)
+    return structure, matches, estimate
+
+
+def disturbed(
+    references: tuple[PosedView, ...], random: np.random.Generator, metres: float, degrees: float
+) -> tuple[PosedView, ...]:
+    """The references with poses that are not exact."""
+
+    def disturb(pose: RigidTransform) -> RigidTransform:
+        turn = rotation_from_vector(np.radians(random.normal(0, degrees, 3)))
+        return RigidTransform(turn @ pose.rotation, pose.translation + random.normal(0, metres, 3))
+
+    return tuple(replace(r, world_from_camera=disturb(r.world_from_camera)) for r in references)

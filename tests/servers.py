@@ -152,12 +152,15 @@ def whole(localize: Callable[..., Answer]) -> Method:
     def prepare(*arguments: Any) -> Any:
         # Nobody asks, and neither what is matched already nor what is known beforehand matters.
         *asked, _, _, _ = arguments
-        return SimpleNamespace(asked=asked, bucket="stand-in")
+        return SimpleNamespace(asked=asked, bucket="stand-in", prepared=None)
 
     def refine(coarse: Any, check: Callable[[], None]) -> Answer:
         return localize(*coarse.asked, check)
 
-    return Method(prepare, lambda batch, checks: list(batch), cast(Any, refine), lambda coarse: None)
+    def nothing(*_: Any) -> None:
+        """Neither a coarse answer nor what a photograph without a pose could give."""
+
+    return Method(prepare, lambda batch, checks: list(batch), cast(Any, refine), nothing, nothing)
 
 
 @dataclass

@@ -63,6 +63,10 @@ class AlreadyExists(MaplessError):
     """The id is taken."""
 
 
+class FailedPrecondition(MaplessError):
+    """The server is not set up for this."""
+
+
 class ResourceExhausted(MaplessError):
     """Too many calls wait (`retry_after_s` says when to come back), or the message is larger than the limit."""
 
@@ -89,6 +93,7 @@ _BY_CODE: dict[str, type[MaplessError]] = {
     "PERMISSION_DENIED": PermissionDenied,
     "NOT_FOUND": NotFound,
     "ALREADY_EXISTS": AlreadyExists,
+    "FAILED_PRECONDITION": FailedPrecondition,
     "RESOURCE_EXHAUSTED": ResourceExhausted,
     "DEADLINE_EXCEEDED": DeadlineExceeded,
     "UNAVAILABLE": Unavailable,

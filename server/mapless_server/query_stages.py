@@ -25,6 +25,7 @@ from .method.hints import hinted
 from .method.localize import Answer, Coarse, Localization, Prepared
 from .method.rejection import Rejection, RejectionReason
 from .method.retrieve import spread_choice
+from .method.support import Support
 from .method.tracked import tracked_support
 from .method.views import PosedView, View
 from .query import Query, Result
@@ -65,12 +66,16 @@ _COUNTS = (2, 5, 10, 20, 64)
 
 @dataclass(frozen=True)
 class Method:
-    """The three parts of the method, and what is known after the second; see `method.localize`."""
+    """The three parts of the method, and what is known after the second; see `method.localize`.
+
+    `tracked_support` is what a photograph without a pose can still give to the others of its rig or walk.
+    """
 
     prepare: Callable[..., Prepared | Answer] = method.prepare
     reconstruct: Callable[..., list[Coarse | Answer | Exception]] = method.reconstruct
     refine: Callable[..., Answer] = method.refine
     coarse_answer: Callable[[Coarse], Answer | None] = method.coarse_answer
+    tracked_support: Callable[..., Support | None] = tracked_support
 
 
 class ReferenceSource(Protocol):
@@ -296,7 +301,8 @@ class QueryStages:
     def _refine(self, underway: Underway[Coarse], job: Job) -> Verdict:
         answer = self._method.refine(underway.part, job.check)
         if underway.work.query.is_part and answer.support is None:
-            answer = replace(answer, support=tracked_support(underway.part.prepared, job.check))
+            support = self._method.tracked_support(underway.part.prepared, job.check)
+            answer = replace(answer, support=support)
         return self._conclude(underway.work, underway.found, answer)
 
     def _conclude(self, work: Work, found: Found, answer: Answer) -> Verdict:

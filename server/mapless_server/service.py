@@ -61,9 +61,9 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         response.diagnostics.request_id = call.request_id
         response.diagnostics.queue_duration.FromNanoseconds(round(1e9 * (call.trail.queue_s or 0.0)))
         response.diagnostics.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))
-        debug = None
-        if request.options.include_debug or self._watchers.is_watched(query.scene_key):
-            debug = await asyncio.to_thread(debug_to_message, result.attempt.answer.support)
+        debug, support = None, result.attempt.answer.support
+        if support is not None and (request.options.include_debug or self._watchers.is_watched(query.scene_key)):
+            debug = await asyncio.to_thread(debug_to_message, support)
         self._watchers.publish(query.scene_key, request, response, debug)
         if request.options.include_debug and debug is not None:
             response.debug.CopyFrom(debug)

@@ -45,7 +45,7 @@ class EscalationOptions:
     """Options of trying stronger features.
 
     Attributes:
-        doubtful_trust: a pose that is trusted less is doubtful. Of 706 photographs, many with few references, SIFT posed
+        doubtful_trust: a pose that is trusted less is doubtful. Of 706 photographs, many with few references, SIFT had
             26 over 10 cm off; trying again below this trust tries 94, all of these among them, where fewer than 50
             inliers or a large radius tried 96, with 23 of them.
         doubtful_radius_m: a pose whose claimed 68 % radius is larger is doubtful: what a robot needs to pass a door.

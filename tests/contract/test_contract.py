@@ -19,10 +19,12 @@ from servers import CAMERA, PHOTO, pose, serving
 import mapless
 import mapless_server
 from mapless import Client, NewReference, wire
+from mapless.axes import Axes
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 from mapless_server.method.localize import Variant
 from mapless_server.method.pnp import PoseStage
-from mapless_server.method.rejection import RejectionReason
+from mapless_server.method.priors import PriorKind
+from mapless_server.method.rejection import Advice, RejectionReason
 from mapless_server.method.scale import ScaleStage, ScaleStrategy
 from mapless_server.reference_service import ReferenceService
 from mapless_server.service import LocalizationService
@@ -47,13 +49,16 @@ ABOVE = {
         "cli",
         "serve",
         "service",
+        "group_service",
         "reference_service",
+        "watching",
         "rpc",
         "grpc_server",
         "status",
         "receiving",
     ),
     *("commands", "messages", "security", "observability", "demo", "ingest", "evaluation", "bench", "load"),
+    *("calibration", "view"),
 }
 BELOW = sorted(
     {path.stem for path in SERVER.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()} - ABOVE
@@ -66,7 +71,9 @@ def test_every_rpc_is_implemented(servicer: type, rpc: str) -> None:
     assert inspect.iscoroutinefunction(vars(servicer)[rpc])
 
 
-@pytest.mark.parametrize("here", [Variant, ScaleStrategy, RejectionReason, PoseStage, ScaleStage])
+@pytest.mark.parametrize(
+    "here", [Variant, ScaleStrategy, RejectionReason, PoseStage, ScaleStage, Advice, PriorKind, Axes]
+)
 def test_enums_have_the_same_values_here_and_on_the_wire(here: type[Enum]) -> None:
     on_the_wire: Any = getattr(localization_service_pb2, here.__name__)
     prefix = wire.enum_prefix(on_the_wire)

@@ -7,13 +7,16 @@ import shlex
 from collections.abc import Iterator
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import typer.main
 from images import encode, textured
 from prometheus_client import generate_latest
 from servers import pose, serving
 
+from mapless import Client, NewReference, RigidTransform
 from mapless import errors as client_errors
 from mapless.cli.arguments import make_parser
 from mapless_server import errors
@@ -95,12 +98,31 @@ def test_the_commands_of_the_server_are_understood() -> None:
 
 
 def test_the_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    (program,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    """One after the other, with what the text around them takes as given."""
+    first, *others = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     photo = encode(".jpg", textured(1600, 1067))
-    for name in ("a", "b", "query"):
+    for name in ("a", "b", "query", "photo", "left", "right"):
         (tmp_path / f"{name}.jpg").write_bytes(photo)
     monkeypatch.chdir(tmp_path)
     with serving(tmp_path / "data") as server:
-        poses = {"a": pose(0.0).matrix(), "b": pose(1.0).matrix()}
-        exec(program.replace("localhost:50051", server.address), {"poses": poses})
-    assert capsys.readouterr().out.startswith("[ 0.  2. -1.] 0.2")
+        monkeypatch.setenv("MAPLESS_ADDRESS", server.address)
+        known: dict[str, Any] = {
+            "poses": {"a": pose(0.0).matrix(), "b": pose(1.0).matrix()},
+            "xyz": pose(0.0).translation,
+            "down_in_camera": np.array([0.0, 1.0, 0.0]),
+            "rig_from_left": RigidTransform.identity(),
+            "rig_from_right": pose(0.5),
+            "walk": [("a.jpg", pose(0.0)), ("b.jpg", pose(1.0))],
+        }
+        exec(first.replace("localhost:50051", server.address), known)
+        assert capsys.readouterr().out.startswith("[ 0.  2. -1.] 0.")
+        with Client(server.address) as client:
+            known["client"] = client
+            client.create_scene("kitchen")
+            for name, world_from_camera in known["poses"].items():
+                pose_of = RigidTransform.from_matrix(world_from_camera)
+                client.add_reference("kitchen", NewReference(name, photo, known["camera"], pose_of))
+            client.update_scene("hall", down_in_world=(0, 0, -1))
+            for program in others:
+                exec(program.replace("localhost:50051", server.address), known)
+                known["client"] = client

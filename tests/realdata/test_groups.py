@@ -87,6 +87,7 @@ def test_together_they_are_no_worse_than_alone(kitchen: tuple[Client, Sequence[F
         if isinstance(sequence, SequenceLocalization):
             sequences.append(error_m(sequence.world_from_camera[-1], truth[-1]))
             assert sequence.world_from_session.scale == pytest.approx(0.5, rel=0.1)
+    print(f"single {single}", f"rigs {rigs}", f"sequences {sequences}", sep="\n")
     assert len(rigs) / len(STARTS) >= len(single) / photographs
     assert len(sequences) / len(STARTS) >= len(single) / photographs
     assert np.median(rigs) <= 1.2 * np.median(single)

@@ -139,6 +139,14 @@ def test_photographs_of_a_folder_that_are_not_localized_end_with_3(
     assert {answer["reason"] for answer in lines_of(printed)} == {"NO_USABLE_REFERENCES"}
 
 
+def test_what_would_fail_for_all_ends_at_once(
+    server: RunningServer, capsys: pytest.CaptureFixture[str], folder: Path
+) -> None:
+    code, printed, complaint = run(server, capsys, "localize", "nowhere", str(folder))
+    assert (code, printed) == (1, "")
+    assert complaint.startswith("mapless: NOT_FOUND: ")
+
+
 class TestOnATerminal:
     @pytest.fixture
     def terminal(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:

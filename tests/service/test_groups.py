@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from datetime import datetime, timezone
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from compare import assert_pose_close
@@ -54,7 +53,7 @@ def photos() -> list[Photo]:
 
 
 def png(photo: Photo) -> bytes:
-    return encode(".png", cv2.cvtColor(photo.image, cv2.COLOR_RGB2BGR))
+    return encode(".png", np.ascontiguousarray(photo.image[..., ::-1]))
 
 
 @pytest.fixture(scope="module")

@@ -101,6 +101,10 @@ def requests_on(scene_id: str) -> dict[str, Message]:
     reference = reference_pb.CreateReferenceRequest(scene=scene, reference_id="r", reference=_reference())
     requests: dict[str, Message] = {
         "LocalizationService/Localize": localize_request(scene_id),
+        "LocalizationService/LocalizeRig": localization_pb.LocalizeRigRequest(scene=scene, images=[_image()]),
+        "LocalizationService/LocalizeSequence": localization_pb.LocalizeSequenceRequest(
+            scene=scene, frames=[_frame(), _frame()]
+        ),
         "LocalizationService/WatchQueries": localization_pb.WatchQueriesRequest(scene=scene),
         "ReferenceService/GetScene": reference_pb.GetSceneRequest(name=scene),
         "ReferenceService/ListReferences": reference_pb.ListReferencesRequest(scene=scene),
@@ -124,6 +128,18 @@ def requests_on(scene_id: str) -> dict[str, Message]:
         "ReferenceService/DeleteScene": reference_pb.DeleteSceneRequest(name=scene),
     }
     return {f"/mapless.v1.{method}": request for method, request in requests.items()}
+
+
+def _image() -> localization_pb.RigImage:
+    return localization_pb.RigImage(
+        image=PHOTO, intrinsics=wire.camera_to_message(CAMERA), rig_from_camera=wire.transform_to_message(pose(0.0))
+    )
+
+
+def _frame() -> localization_pb.SequenceFrame:
+    return localization_pb.SequenceFrame(
+        image=PHOTO, intrinsics=wire.camera_to_message(CAMERA), session_from_camera=wire.transform_to_message(pose(0.0))
+    )
 
 
 def _reference() -> reference_pb.Reference:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from mapless_server.method.accuracy import accuracy_from_covariance, error_radius
+from mapless_server.method.accuracy import TAIL_95, accuracy_from_covariance, error_radius
 
 
 @pytest.mark.parametrize(
@@ -25,9 +25,9 @@ def test_radius_against_sampling(eigenvalues: tuple[float, ...], probability: fl
 def test_position_and_rotation_keep_apart() -> None:
     covariance = np.diag([0.04, 0.04, 0.04, 1e-6, 1e-6, 1e-6])
     radii = accuracy_from_covariance(covariance)
-    assert radii.position_95_m == pytest.approx(0.2 * 2.7955, rel=1e-3)
-    assert radii.rotation_95_deg == pytest.approx(math.degrees(1e-3 * 2.7955), rel=1e-3)
-    assert radii.position_68_m < radii.position_95_m
+    assert radii.position_95_m == pytest.approx(TAIL_95 * 0.2 * 2.7955, rel=1e-3)
+    assert radii.rotation_95_deg == pytest.approx(TAIL_95 * math.degrees(1e-3 * 2.7955), rel=1e-3)
+    assert radii.position_68_m == pytest.approx(0.2 * 1.8724, rel=1e-3)  # the tail is heavier, the middle is not
 
 
 def test_no_uncertainty_is_no_radius() -> None:

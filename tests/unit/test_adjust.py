@@ -8,18 +8,13 @@ import numpy as np
 import pytest
 from compare import assert_pose_close, pose_error
 from jacobians import assert_jacobian
-from planted import true_correspondences, true_structure
+from planted import NOISE, disturbed, stages, true_correspondences, true_structure
 from scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
-from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless.geometry import Array, RigidTransform
 from mapless_server.method.adjust import AdjustOptions, _pose_problem, _Problem, _State, adjust_pose
 from mapless_server.method.match import PointMatches
-from mapless_server.method.observations import KeypointNoise, adjust_points, estimate_noise, triangulate
 from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
-from mapless_server.method.structure import Structure, observe
-from mapless_server.method.views import PosedView
-
-NOISE = KeypointNoise(0.5, 0.0)
 
 
 def problem_of(case: str, moved: float = 0.0) -> tuple[_Problem, _State]:
@@ -121,30 +116,6 @@ def test_a_point_behind_a_camera_has_no_cost() -> None:
 # The adjustment
 
 
-def stages(scene: SyntheticScene, references: tuple[PosedView, ...]) -> tuple[Structure, PointMatches, PoseEstimate]:
-    """Structure and pose as the stages before would hand them over, from true matches and the given reference poses."""
-    truth, matches = true_structure(scene)
-    observations = observe(truth.tracks, references, NOISE)
-    points = adjust_points(observations, triangulate(observations), 2.0, 8)
-    noise = estimate_noise(observations, points, NOISE)
-    structure = Structure(points, truth.tracks, noise)
-    estimate = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
-    assert isinstance(estimate, PoseEstimate)
-    return structure, matches, estimate
-
-
-def disturbed(
-    references: tuple[PosedView, ...], random: np.random.Generator, metres: float, degrees: float
-) -> tuple[PosedView, ...]:
-    """The references with poses that are not exact."""
-
-    def disturb(pose: RigidTransform) -> RigidTransform:
-        turn = rotation_from_vector(np.radians(random.normal(0, degrees, 3)))
-        return RigidTransform(turn @ pose.rotation, pose.translation + random.normal(0, metres, 3))
-
-    return tuple(replace(r, world_from_camera=disturb(r.world_from_camera)) for r in references)
-
-
 def mean_errors(pose_noise: float, options: SceneOptions, seeds: int) -> tuple[Array, Array]:
     """Mean errors (metres, degrees) before and after, over seeds; references are off by `pose_noise` px or so."""
     before, after = [], []
@@ -199,31 +170,16 @@ def test_matches_far_off_take_no_part() -> None:
     assert_pose_close(adjusted.world_from_camera, scene.world_from_query, metres=1e-3, degrees=0.01)
 
 
-def test_errors_are_as_large_as_the_covariance_says() -> None:
-    """Monte Carlo, with the inflation taken off: it is for what synthetic keypoints do not have."""
-    squares = []
-    options = AdjustOptions(error_inflation=1.0)
-    for seed in range(40):
-        scene = make_scene(random_for("covariance", seed), FEW_POINTS)
-        structure, matches, estimate = stages(scene, scene.references)
-        adjusted = adjust_pose(scene.query, scene.references, structure, matches, estimate, options)
-        turn = adjusted.world_from_camera.rotation @ scene.world_from_query.rotation.T
-        skew = (turn - turn.T) / 2
-        shift = adjusted.world_from_camera.translation - scene.world_from_query.translation
-        error = np.array([*shift, skew[2, 1], skew[0, 2], skew[1, 0]])
-        np.testing.assert_allclose(adjusted.covariance, adjusted.covariance.T)
-        squares.append(error @ np.linalg.solve(adjusted.covariance, error))
-    assert 4 < np.mean(squares) < 9
-
-
-def test_the_inflation_multiplies_standard_deviations() -> None:
-    scene = make_scene(random_for("inflation"), FEW_POINTS)
+def test_the_covariance_is_symmetric_and_says_what_it_was_told_from() -> None:
+    """Whether it is right is asked in test_uncertainty."""
+    scene = make_scene(random_for("covariance"), FEW_POINTS)
     structure, matches, estimate = stages(scene, scene.references)
-    plain, inflated = (
-        adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions(error_inflation=factor))
-        for factor in (1.0, 3.0)
-    )
-    np.testing.assert_allclose(inflated.covariance, 9 * plain.covariance)
+    adjusted = adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions())
+    assert adjusted.uncertainty
+    np.testing.assert_array_equal(adjusted.covariance, adjusted.uncertainty.covariance)
+    np.testing.assert_allclose(adjusted.covariance, adjusted.covariance.T)
+    assert np.linalg.eigvalsh(adjusted.covariance).min() > 0
+    assert adjusted.uncertainty.motions.shape == (len(scene.references), 6)
 
 
 def test_references_and_points_stay_where_they_were() -> None:

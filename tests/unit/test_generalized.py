@@ -68,7 +68,9 @@ def test_the_same_matches_give_the_same_pose() -> None:
     assert first.scale == pytest.approx(second.scale, rel=1e-9)
     metric = planted(random_for("again"), (60, 40, 80), 0.5)
     poses = [rig_ransac(metric, OPTIONS) for _ in range(2)]
-    np.testing.assert_allclose(*[pose.matrix() for pose in poses if pose is not None], atol=1e-9)
+    assert poses[0] is not None
+    assert poses[1] is not None
+    np.testing.assert_allclose(poses[0].matrix(), poses[1].matrix(), atol=1e-9)
 
 
 @pytest.mark.parametrize("counts", [(), (2,), (1, 1)])

@@ -175,13 +175,13 @@ def hardly_seen(rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def test_a_weak_query_is_pulled_right() -> None:
-    """What six points in a corner leave open, gravity a half degree off and a position to 5 cm close."""
+    """What six points in a corner leave open, gravity a half degree off and a position to 2 cm close."""
     alone, helped = [], []
     for seed in range(12):
         rng = random_for("weak", seed)
         x_in_world, pixels = hardly_seen(rng)
         priors = Priors(
-            PositionPrior(POSE.translation + rng.normal(0, 0.05, 3), 0.05**2 * np.eye(3)),
+            PositionPrior(POSE.translation + rng.normal(0, 0.02, 3), 0.02**2 * np.eye(3)),
             gravity=gravity(noise_deg=0.5),
         )
         alone.append(pose_error(solved(x_in_world, pixels).world_from_camera, POSE))

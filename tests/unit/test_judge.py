@@ -54,20 +54,19 @@ def test_well_supported_is_trusted_and_poorly_supported_is_not() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "better"),
+    "better",
     [
-        ("log10_false_alarms", -2000.0),
-        ("match_count", 305),
-        ("findable_count", 320),
-        ("hull_share", 0.9),
-        ("reference_count", 8.0),
-        ("position_95_m", 0.01),
+        replace(GOOD, log10_false_alarms=-2000.0),
+        replace(GOOD, match_count=305),
+        replace(GOOD, findable_count=320),
+        replace(GOOD, hull_share=0.9),
+        replace(GOOD, reference_count=8.0),
+        replace(GOOD, position_95_m=0.01),
     ],
 )
-def test_more_evidence_never_lowers_the_trust(name: str, better: float) -> None:
-    poorer = replace(GOOD, error_sigma=2.0)
-    assert score_of(replace(poorer, **{name: better}), OPTIONS) >= score_of(poorer, OPTIONS)
-    assert score_of(poorer, OPTIONS) <= score_of(GOOD, OPTIONS)
+def test_more_evidence_never_lowers_the_trust(better: Evidence) -> None:
+    assert score_of(better, OPTIONS) >= score_of(GOOD, OPTIONS)
+    assert score_of(replace(better, error_sigma=2.0), OPTIONS) <= score_of(better, OPTIONS)
 
 
 @given(features=st.lists(st.floats(-10, 10), min_size=7, max_size=7), which=st.integers(0, 6), more=st.floats(0, 5))

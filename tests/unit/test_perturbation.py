@@ -34,10 +34,8 @@ def perturbed(perturbation: Perturbation, error: Array) -> RigidTransform:
 
 
 def error_in_world(pose: RigidTransform) -> Array:
-    """x y z rx ry rz: the centre's shift, and the turn about fixed world axes."""
-    return np.concatenate(
-        [pose.translation - POSE.translation, rotation_vector(pose.rotation @ POSE.rotation.T)]
-    )
+    """X y z rx ry rz: the centre's shift, and the turn about fixed world axes."""
+    return np.concatenate([pose.translation - POSE.translation, rotation_vector(pose.rotation @ POSE.rotation.T)])
 
 
 @EVERY_WAY
@@ -52,14 +50,14 @@ def test_the_jacobian_is_the_derivative_of_the_error_in_the_world(perturbation: 
 
 @EVERY_WAY
 def test_the_covariance_is_that_of_drawn_errors(perturbation: Perturbation) -> None:
-    """Monte Carlo, 20 000 errors of millimetres and tenths of a degree that go together: within 3 %."""
+    """Monte Carlo, 2000 errors of millimetres and tenths of a degree that go together: within a tenth."""
     random = random_for("perturbations", perturbation.value)
     mixing = random.normal(size=(6, 6)) * np.repeat([0.003, 0.002], 3)[:, None]
-    drawn = random.normal(size=(20_000, 6)) @ mixing.T
+    drawn = random.normal(size=(2000, 6)) @ mixing.T
     errors = np.stack([error_in_world(perturbed(perturbation, error)) for error in drawn])
     expected = np.cov(errors.T)
     covariance = world_covariance(np.linalg.inv(mixing @ mixing.T), POSE, perturbation)
-    assert np.linalg.norm(covariance - expected) < 0.03 * np.linalg.norm(expected)
+    assert np.linalg.norm(covariance - expected) < 0.1 * np.linalg.norm(expected)
 
 
 def test_taking_one_for_another_is_no_small_error() -> None:

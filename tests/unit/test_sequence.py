@@ -170,8 +170,8 @@ def test_the_same_frames_give_the_same_answer() -> None:
     truth = walk(random, 4)
     images, session = images_of(random, truth, keep=40, wrong_share=0.3), drifting(random, truth, 0.02)
     first, second = (estimate(solve_sequence(images, session, True, OPTIONS)) for _ in range(2))
-    poses = [it.world_from_camera[-1].matrix() for it in (first, second)]
-    np.testing.assert_allclose(*poses, atol=1e-6, err_msg="the solvers round as arrays lie in memory")
+    pose, again = (it.world_from_camera[-1].matrix() for it in (first, second))
+    np.testing.assert_allclose(pose, again, atol=1e-6, err_msg="the solvers round as arrays lie in memory")
     assert first.world_from_session.scale == pytest.approx(second.world_from_session.scale, rel=1e-6)
 
 
@@ -189,12 +189,11 @@ def moved_freedom(scale_is_free: bool, moved: float) -> SequenceFreedom:
 def test_residuals_are_differentiated(scale_is_free: bool) -> None:
     freedom = moved_freedom(scale_is_free, 1e-4)
     for i in range(2):
-        assert_jacobian(
-            freedom._jacobian_of_error(i),
-            lambda step, i=i: freedom.moved(step)._error(i),
-            np.zeros(freedom.size),
-            tolerance=1e-3,
-        )
+
+        def error(step: Array, i: int = i) -> Array:
+            return freedom.moved(step)._error(i)
+
+        assert_jacobian(freedom._jacobian_of_error(i), error, np.zeros(freedom.size), tolerance=1e-3)
 
 
 @pytest.mark.parametrize("scale_is_free", [False, True])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
-from mapless_server.method.accuracy import error_radius
+from mapless_server.method.accuracy import accuracy_from_covariance, error_radius
 from mapless_server.method.localize import Answer, Localization, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
@@ -109,7 +109,7 @@ class TestBetter:
         self, apart_m: float, sigma_m: float
     ) -> None:
         chosen = better(localized(0.0, sigma_m, inliers=40), localized(apart_m, 0.01, inliers=40))
-        reach_m = error_radius(np.eye(3) * sigma_m**2, 0.95) + error_radius(np.eye(3) * 0.01**2, 0.95)
+        reach_m = sum(accuracy_from_covariance(np.eye(6) * it**2).position_95_m for it in (sigma_m, 0.01))
         if abs(apart_m - max(reach_m, OPTIONS.same_position_m)) > 1e-9:
             agree = apart_m < max(reach_m, OPTIONS.same_position_m)
             assert isinstance(chosen.answer.outcome, Localization if agree else Rejection)
@@ -122,4 +122,4 @@ class TestBetter:
 )
 def test_options_check_themselves(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="senseless"):
-        EscalationOptions(**wrong)  # type: ignore[arg-type]
+        EscalationOptions(**wrong)

@@ -27,6 +27,7 @@ from .exits import EXIT_FAILED, EXIT_REJECTED
 from .progress import Progress
 
 ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".webp"})
+_FIELDS_OF_PHOTOS = ("image", "intrinsics")
 _DRAWN_REFERENCES, _SHOWN_REFERENCES = 16, 4
 Outcome = LocalizationResult | Rejected | MaplessError
 
@@ -65,7 +66,7 @@ def _one(client: Client, arguments: argparse.Namespace) -> int:
 
 
 def _folder(client: Client, arguments: argparse.Namespace) -> int:
-    """One line for each photograph, in their order, as they come; a call that fails ends nothing but itself."""
+    """One line for each photograph, in their order, as they come; one that fails by itself does not end the others."""
     photos = photos_of(arguments.photo, arguments.camera)
     names = [photo.name for photo in photos]
     width = max(map(len, names))
@@ -123,6 +124,8 @@ def _all(client: Client, photos: list[Photo], arguments: argparse.Namespace) -> 
         try:
             return _ask(client, photo, arguments)
         except MaplessError as error:
+            if _is_everybodys(error):
+                raise
             return error
 
     with ThreadPoolExecutor(arguments.parallel, "localize") as threads:
@@ -131,6 +134,13 @@ def _all(client: Client, photos: list[Photo], arguments: argparse.Namespace) -> 
         except BaseException:
             threads.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _is_everybodys(error: MaplessError) -> bool:
+    """Whether all other photographs would be answered the same."""
+    if error.code == "INVALID_ARGUMENT":
+        return not (error.field or "").startswith(_FIELDS_OF_PHOTOS)
+    return error.code in {"NOT_FOUND", "UNAUTHENTICATED", "PERMISSION_DENIED", "UNAVAILABLE", "UNIMPLEMENTED"}
 
 
 def _ask(client: Client, photo: Photo, arguments: argparse.Namespace) -> LocalizationResult | Rejected:

@@ -25,7 +25,9 @@ def calibrate_command(
             "by itself, on a server of its own, and nothing is stored."
         ),
     ] = "",
-    layout: Annotated[str, typer.Option(help=f"Layout of the folder: {FORMAT_NAMES}.")] = "auto",
+    layout: Annotated[
+        str, typer.Option("--layout", "--format", help=f"Layout of the folder: {FORMAT_NAMES}.")
+    ] = "auto",
     references: Annotated[
         int | None,
         typer.Option(help="Without --scene: references, evenly spread over the photographs; default: leave one out."),

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -86,6 +87,7 @@ def collect(data: Path) -> Iterator[Answered]:
     """Localizes the scenes' photographs; minutes."""
     places = read_places(data, dict.fromkeys(name for name, _ in SETTINGS))
     for name, count in SETTINGS:
+        print(f"{name}, {count or 'each left out'} ...", file=sys.stderr, flush=True)
         for it in answered(right_pairs(places[name], count, KS), UNFITTED):
             outcome = it.answer.outcome
             if isinstance(outcome, Localization) and outcome.covariance is not None and it.off is not None:

@@ -73,7 +73,7 @@ class CalibrationReport:
             "references": f"{self.references}, {self.count} a query; no photograph is compared with itself",
             "answered": f"{answered} of {len(found.outcomes)}",
             "rejected": ", ".join(f"{count} {reason}" for reason, count in found.rejections.items()) or "none",
-            "right": f"{share_text(found.right)} of the answers, within {self.right.position_m:g} {self.unit} and "
+            "right answers": f"{share_text(found.right)} within {self.right.position_m:g} {self.unit} and "
             f"{self.right.rotation_deg:g}°",
             "trust": trust_text(found),
             "computed by": "-"
@@ -96,6 +96,8 @@ def share_text(share: Share) -> str:
 
 def trust_text(found: Findings) -> str:
     """What trust is worth, for people."""
+    if not found.right.whole:
+        return "nothing was answered"
     if not found.trusted:
         return "answers have none"
     if math.isnan(found.auroc):

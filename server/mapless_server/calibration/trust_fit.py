@@ -49,7 +49,7 @@ def fit_weights(samples: Sequence[Sample]) -> Array:
     sign = np.where([it.right for it in samples], 1.0, -1.0)
     share = np.zeros(len(samples))
     for side in (1.0, -1.0):
-        rows = np.flatnonzero(sign == side)
+        rows = np.flatnonzero(sign == side).tolist()
         share[rows] = 0.5 * _balance([samples[i].scene for i in rows])
     spread = features.std(axis=0) + 1e-9
     z = (features - features.mean(axis=0)) / spread

@@ -77,9 +77,9 @@ def _samples(kind: str, pairs: Iterable[Pair]) -> Iterator[Sample]:
     options = LocalizeOptions(coverage=1.0)
     for it in answered(pairs, options):
         support = it.answer.support
-        trusted = isinstance(it.answer.outcome, Localization)
-        ambiguous = not trusted and it.answer.outcome.reason is RejectionReason.AMBIGUOUS
-        if support is not None and support.estimate is not None and (trusted or ambiguous):
+        outcome = it.answer.outcome
+        passed = isinstance(outcome, Localization) or outcome.reason is RejectionReason.AMBIGUOUS
+        if support is not None and support.estimate is not None and passed:
             scene = it.pair.references[0].name.split("/")[1]
             yield Sample(kind, scene, it.right, evidence_of(support, options.pnp.inlier_px))
 

@@ -20,10 +20,8 @@ MAX_MATCHES = 2000
 """Some 100 KB of message, and more than a picture shows."""
 
 
-def debug_to_message(support: Support | None) -> pb.Debug | None:
-    """The matches of a support, if there is one; where there are too many, inliers go first, thinned out evenly."""
-    if support is None:
-        return None
+def debug_to_message(support: Support) -> pb.Debug:
+    """The matches of a support; where there are too many, inliers go first, thinned out evenly."""
     estimate, matches = support.estimate, support.matches
     inlier = np.zeros(len(matches), bool) if estimate is None else estimate.inliers
     error_px = np.full(len(matches), np.nan) if estimate is None else estimate.errors_px

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless.geometry import Array, Camera, RigidTransform, rotation_angle_deg
 
 from .accuracy import Accuracy, accuracy_from_covariance
 from .correspond import Matches
@@ -84,6 +84,10 @@ class _Votes:
     def __getitem__(self, rows: NDArray[np.bool_]) -> _Votes:
         return _Votes(self.reference[rows], self.keypoint[rows], self.x_in_world[rows], self.pixels[rows])
 
+    def errors_px(self, camera: Camera, world_from_camera: RigidTransform) -> Array:
+        """Distances (V,) of the points' projections from the keypoints; NaN behind the camera."""
+        return reprojection_errors_px(camera, world_from_camera, self.x_in_world, self.pixels)
+
     def keypoint_count(self, rows: NDArray[np.bool_]) -> int:
         """Different keypoints among some of the votes (V,)."""
         return len(np.unique(self.keypoint[rows]))
@@ -105,46 +109,52 @@ def find_rival(
     if estimate is None:
         return None
     votes = _votes(support, query_matches)
-    errors_px = reprojection_errors_px(camera, estimate.world_from_camera, votes.x_in_world, votes.pixels)
+    errors_px = votes.errors_px(camera, estimate.world_from_camera)
     own = errors_px < options.pnp.inlier_px
-    own_count = votes.keypoint_count(own)
-    wanted = max(options.min_keypoints, int(np.ceil(options.min_share * own_count)))
-    apart = ~(errors_px < options.agreeing_px)
-    # A keypoint that the winner explains is not free to show something else, unless references disagree about it.
-    if votes.keypoint_count(apart) < wanted:
-        return None
-    asked = _dissenting(votes, own, apart, len(support.references))
+    wanted = max(options.min_keypoints, int(np.ceil(options.min_share * votes.keypoint_count(own))))
+    asked = _dissenting(votes, own, ~(errors_px < options.agreeing_px), len(support.references))
     if votes.keypoint_count(asked) < wanted:
         return None
-    free = votes[asked]
-    pose = ransac(camera, free.x_in_world, free.pixels, None, options.pnp)
-    if pose is None:
+    rival = _second_pose(camera, votes[asked], wanted, options)
+    if rival is None:
         return None
-    theirs = reprojection_errors_px(camera, pose, free.x_in_world, free.pixels) < options.pnp.inlier_px
-    count = free.keypoint_count(theirs)
-    chance = np.pi * options.pnp.inlier_px**2 / (camera.width_px * camera.height_px)
-    asked_count = len(np.unique(free.keypoint))
-    if count < wanted or false_alarms(asked_count, count, float(chance)) > options.max_log10_false_alarms:
+    pose, radii = rival
+    claim = accuracy_from_covariance(estimate.covariance)
+    if not _stand_apart(estimate.world_from_camera, claim, pose, radii, options):
         return None
-    all_theirs = reprojection_errors_px(camera, pose, votes.x_in_world, votes.pixels) < options.pnp.inlier_px
-    radii = _radii(support, free, theirs, pose)
-    if not _stand_apart(
-        estimate.world_from_camera, accuracy_from_covariance(estimate.covariance), pose, radii, options
-    ):
-        return None
-    by_reference = [np.bincount(votes.reference[rows], minlength=len(support.references)) for rows in (own, all_theirs)]
-    prefers_rival = by_reference[1] > by_reference[0]
-    if by_reference[1][prefers_rival].sum() < options.min_own_share * by_reference[1].sum():
+    theirs = votes.errors_px(camera, pose) < options.pnp.inlier_px
+    counts = [np.bincount(votes.reference[rows], minlength=len(support.references)) for rows in (own, theirs)]
+    if counts[1][counts[1] > counts[0]].sum() < options.min_own_share * counts[1].sum():
         return None
     names = [reference.name for reference in support.references]
-    sides = (by_reference[0] > by_reference[1], prefers_rival)
-    winner, rival = (
-        Hypothesis(where, number, tuple(name for name, is_theirs in zip(names, side, strict=True) if is_theirs))
-        for where, number, side in zip(
-            (estimate.world_from_camera, pose), (own_count, votes.keypoint_count(all_theirs)), sides, strict=True
-        )
+    return (
+        Hypothesis(estimate.world_from_camera, votes.keypoint_count(own), _supporters(names, counts[0], counts[1])),
+        Hypothesis(pose, votes.keypoint_count(theirs), _supporters(names, counts[1], counts[0])),
     )
-    return (winner, rival)
+
+
+def _second_pose(
+    camera: Camera, votes: _Votes, wanted: int, options: AmbiguityOptions
+) -> tuple[RigidTransform, Accuracy] | None:
+    """What some votes agree on, if enough keypoints do and chance would not; with its radii."""
+    pose = ransac(camera, votes.x_in_world, votes.pixels, None, options.pnp)
+    if pose is None:
+        return None
+    inliers = votes.errors_px(camera, pose) < options.pnp.inlier_px
+    asked, count = len(np.unique(votes.keypoint)), votes.keypoint_count(inliers)
+    # A keypoint hits by chance as often as it has votes.
+    disc_share = np.pi * options.pnp.inlier_px**2 / (camera.width_px * camera.height_px)
+    chance = float(disc_share * len(votes.keypoint) / asked)
+    if count < wanted or false_alarms(asked, count, chance) > options.max_log10_false_alarms:
+        return None
+    # By a keypoint noise of a pixel.
+    covariance = world_covariance(pose_hessian(camera, pose, votes.x_in_world[inliers]), pose)
+    return pose, accuracy_from_covariance(covariance)
+
+
+def _supporters(names: Sequence[str], own: NDArray[np.intp], other: NDArray[np.intp]) -> tuple[str, ...]:
+    """Names of the references with more votes for one place than for the other, the most first."""
+    return tuple(names[i] for i in np.argsort(-own, kind="stable") if own[i] > other[i])
 
 
 def _votes(support: Support, query_matches: Sequence[Matches]) -> _Votes:
@@ -168,13 +178,6 @@ def _dissenting(
     """The votes (V,) against the winner, of references that have more of these than for it."""
     against, favour = (np.bincount(votes.reference[rows], minlength=reference_count) for rows in (apart, own))
     return np.asarray(apart & (against > favour)[votes.reference])
-
-
-def _radii(support: Support, votes: _Votes, rows: NDArray[np.bool_], pose: RigidTransform) -> Accuracy:
-    """Of a pose found from some votes, by a keypoint noise of a pixel."""
-    return accuracy_from_covariance(
-        world_covariance(pose_hessian(support.query.camera, pose, votes.x_in_world[rows]), pose)
-    )
 
 
 def _stand_apart(

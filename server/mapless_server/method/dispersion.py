@@ -47,6 +47,9 @@ MIN_DETERMINANT = 1e-10
 """Of a point's information, by the cube of its largest diagonal element: below, the point is unknown in some direction
 and tells nothing."""
 
+LEAST_EIGENVALUE = 1e-10
+"""Of the pose's information, in units in which its diagonal is one: below, some direction is not determined."""
+
 LEAST_LEFT = 0.01
 """Share of the information that is taken to be left without a reference, at least."""
 
@@ -147,20 +150,27 @@ def _steps(query: Sightings, by_pose: Array, everything: Array, change: Array) -
     slopes = np.concatenate([x, y])
     information = (everything[:3].reshape(1, -1) @ squares).reshape(unknowns, unknowns)
     gradient = everything[3:].reshape(1, -1) @ slopes
+    if not _is_definite(information):
+        return None
     count = len(change)
     informations = information + (change[:, :3].reshape(count, -1) @ squares).reshape(count, unknowns, unknowns)
     gradients = gradient + change[:, 3:].reshape(count, -1) @ slopes
-    try:
-        offset = -np.linalg.solve(information, gradient[0])
-        # Without its only reference a point says nothing, and what is left may determine no pose.
-        without = -np.linalg.solve(informations + LEAST_LEFT * information, gradients[:, :, None])[..., 0]
-    except np.linalg.LinAlgError:
-        return None
+    offset = -np.linalg.solve(information, gradient[0])
+    # Without its only reference a point says nothing, and what is left may determine no pose.
+    without = -np.linalg.solve(informations + LEAST_LEFT * information, gradients[:, :, None])[..., 0]
     if not (np.isfinite(offset).all() and np.isfinite(without).all()):
         return None
     inverse = np.linalg.inv(information)
     spread = (_pixel_noise(query, everything[:3]).reshape(1, -1) @ squares).reshape(unknowns, unknowns)
     return Dispersion(information, offset, without - offset, inverse @ spread @ inverse)
+
+
+def _is_definite(information: Array) -> bool:
+    """Whether a symmetric matrix has an inverse worth the name, whatever its units."""
+    unit = np.sqrt(np.diag(information).clip(min=0))
+    if not (np.isfinite(information).all() and unit.min() > 0):
+        return False
+    return bool(np.linalg.eigvalsh(information / np.outer(unit, unit))[0] > LEAST_EIGENVALUE)
 
 
 def _pixel_noise(query: Sightings, marginal: Array) -> Array:

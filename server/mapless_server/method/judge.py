@@ -25,8 +25,8 @@ from .evidence import FEATURES, Evidence, evidence_of
 from .rejection import Hypothesis, Rejection, RejectionReason
 from .support import Support
 
-LEVELS = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-LEVELS += (1.0,)
+_RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
+LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Shares of the right answers, of which `JudgeOptions.scores` are the quantiles."""
 
 

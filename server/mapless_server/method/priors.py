@@ -103,6 +103,10 @@ class PositionPrior:
         """The shift from the prior: r = t - position."""
         return Term(world_from_camera.translation - self.position, np.eye(3, 6), self.covariance)
 
+    def loosened(self, factor: float) -> PositionPrior:
+        """With its covariance multiplied by a factor."""
+        return replace(self, covariance=factor * self.covariance)
+
     def shifted(self, offset: Array) -> PositionPrior:
         """The same in a world in which everything lies `offset` (3,) further."""
         return replace(self, position=self.position + offset)
@@ -144,6 +148,10 @@ class DirectionPrior:
         turned = world_from_camera.rotation @ self.in_camera
         jacobian = np.concatenate([np.zeros((3, 3)), -cross_matrix(turned)], axis=1)
         return Term(turned - self.in_world, jacobian, self.sigma**2 * np.eye(3))
+
+    def loosened(self, factor: float) -> DirectionPrior:
+        """With its variance multiplied by a factor; a sigma of half a turn says nothing already."""
+        return replace(self, sigma_deg=min(180.0, math.sqrt(factor) * self.sigma_deg))
 
     def shifted(self, offset: Array) -> DirectionPrior:
         """Directions do not shift."""
@@ -198,6 +206,10 @@ class PosePrior:
         jacobian[3:, 3:] = _log_jacobian(turn)
         return Term(np.concatenate([shift, turn]), jacobian, self.covariance)
 
+    def loosened(self, factor: float) -> PosePrior:
+        """With its covariance multiplied by a factor."""
+        return replace(self, covariance=factor * self.covariance)
+
     def shifted(self, offset: Array) -> PosePrior:
         """The same in a world in which everything lies `offset` (3,) further."""
         return replace(self, world_from_camera=self.world_from_camera.shifted(offset))
@@ -245,10 +257,6 @@ class Priors:
         """The same in a world in which everything lies `offset` (3,) further."""
         return Priors(**{prior.kind.value: prior.shifted(offset) for prior in self})  # type: ignore[arg-type]
 
-    def without(self, kinds: frozenset[PriorKind]) -> Priors:
-        """All but those of these kinds."""
-        return Priors(**{prior.kind.value: prior for prior in self if prior.kind not in kinds})  # type: ignore[arg-type]
-
     def check(self, world_from_camera: RigidTransform, covariance: Array) -> tuple[PriorCheck, ...]:
         """Each prior against a pose that was found without any, and its covariance (6, 6)."""
         checks = []
@@ -261,8 +269,19 @@ class Priors:
         return tuple(checks)
 
     def consistent(self, checks: tuple[PriorCheck, ...]) -> Priors:
-        """Those that are used."""
-        return self.without(frozenset(check.kind for check in checks if not check.used))
+        """Those that are used, each as uncertain as its distance shows it to be.
+
+        One that is further out than the average consistent prior, m^2 > n, is believed less: its covariance is
+        multiplied by m^2 / n (Birge's ratio). That costs honest priors little, and takes most of its pull from one that
+        is wrong by less than a conflict.
+        """
+        used = {check.kind: check for check in checks if check.used}
+        kept = {
+            prior.kind.value: prior.loosened(max(1.0, used[prior.kind].mahalanobis ** 2 / prior.degrees_of_freedom))
+            for prior in self
+            if prior.kind in used
+        }
+        return Priors(**kept)  # type: ignore[arg-type]
 
     def penalty(self, world_from_camera: RigidTransform) -> float:
         """What the priors say against a pose: their costs, none counted for more than a conflict.

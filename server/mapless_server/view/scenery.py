@@ -67,9 +67,9 @@ def spread_out(spots: Array, count: int) -> NDArray[np.intp]:
     first = int(np.argmin(np.linalg.norm(spots - np.median(spots, axis=0), axis=1)))
     chosen, apart = [first], np.linalg.norm(spots - spots[first], axis=1)
     while len(chosen) < min(count, len(spots)):
+        apart[chosen] = -1.0  # others may stand at the same place
         chosen.append(int(np.argmax(apart)))
         apart = np.minimum(apart, np.linalg.norm(spots - spots[chosen[-1]], axis=1))
-        apart[chosen] = -1.0  # several may stand at one place
     return np.array(chosen, np.intp)
 
 

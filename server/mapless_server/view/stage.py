@@ -28,6 +28,8 @@ _QUERY_SIZE = 1.5
 """Of a query's frustum beside those of references."""
 _VOXEL_SHARE, _POINT_SHARE = 0.002, 0.004
 """Of the scene's extent: points nearer than this to one another are shown as one; and how large one is."""
+_FOUND, _LOST = (72, 84, 96), (178, 84, 36)
+"""Of the buttons of queries."""
 _WIDE = "<style>.mantine-Modal-content { flex: 0 0 min(1000px, 94vw) !important; }</style>"
 """viser's dialogues are narrow, and photographs are not."""
 
@@ -93,7 +95,7 @@ class Stage:
     def show_query(self, query: Query) -> None:
         """Adds a query, and selects it."""
         with self._lock:
-            colour = "gray" if query.pose is not None else "orange"
+            colour = _FOUND if query.pose is not None else _LOST
             with self._list:
                 button = self._server.gui.add_button(query.label, order=-query.number, color=colour)
             shown = _Shown(query, button)

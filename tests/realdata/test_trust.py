@@ -1,0 +1,86 @@
+"""What is accepted at a stated coverage, on real photographs: the right answers, and next to nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import chain
+
+import numpy as np
+import pytest
+
+from mapless_server.calibration.pairs import (
+    METRIC,
+    OTHERS,
+    Measured,
+    answered,
+    cross_pairs,
+    read_places,
+    right_pairs,
+)
+from mapless_server.dataset import Dataset
+from mapless_server.method.localize import Localization, LocalizeOptions
+from mapless_server.method.rejection import Rejection, RejectionReason
+
+from .conftest import DATA
+
+pytestmark = pytest.mark.realdata
+
+Photographs = Callable[[str], Dataset]
+FOUNTAIN, HERZ = "fountain-P11", "herz-jesus-P8"
+ALL = LocalizeOptions(coverage=1.0)
+"""Whatever passes the gate is answered, with its trust."""
+
+
+def test_right_answers_are_trusted_and_another_place_is_not(photographs: Photographs) -> None:
+    """Two surveyed scenes, each photograph from two others of its own scene, and from those of the other one."""
+    photographs(FOUNTAIN), photographs(HERZ)
+    places = read_places(DATA, [FOUNTAIN, HERZ])
+    right = list(answered(chain.from_iterable(list(right_pairs(it, None, (2,)))[::2] for it in places.values()), ALL))
+    assert all(it.right for it in right)
+    assert min(trust_of(it) for it in right) >= 0.05
+    strangers = list(answered(cross_pairs(list(places.values()), 2, 4), ALL))
+    assert len(strangers) == 4
+    assert not [it.answer.outcome for it in strangers if isinstance(it.answer.outcome, Localization)]
+
+
+def test_a_scene_of_which_half_the_references_stand_elsewhere_is_ambiguous(photographs: Photographs) -> None:
+    """The known poses of every second reference are moved by five metres: both places are told."""
+    photographs(FOUNTAIN)
+    place = read_places(DATA, [FOUNTAIN])[FOUNTAIN]
+    shift = np.array([5.0, 0.0, 0.0])
+    poses = {i: pose.shifted(shift) if i % 2 else pose for i, pose in place.poses.items()}
+    moved = type(place)(place.name, place.views, poses)
+    (it,) = answered(list(right_pairs(moved, None, (10,)))[4:5])
+    outcome = it.answer.outcome
+    assert isinstance(outcome, Rejection), outcome
+    assert outcome.reason is RejectionReason.AMBIGUOUS
+    centres = [hypothesis.world_from_camera.translation for hypothesis in outcome.hypotheses]
+    true = place.poses[4].translation
+    off_m = sorted(min(np.linalg.norm(c - true), np.linalg.norm(c - true - shift)) for c in centres)
+    assert off_m[-1] < 0.1
+    assert np.linalg.norm(centres[0] - centres[1]) == pytest.approx(5.0, abs=0.1)
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(3600)
+def test_at_95_percent_coverage_one_percent_is_wrong_and_no_other_place_is_accepted(photographs: Photographs) -> None:
+    """All metric scenes with 10, 5, 3 and 2 references; and 588 pairs of a query and references of another place."""
+    names = [*dict.fromkeys(name for name, _ in METRIC), *OTHERS]
+    for name in names:
+        photographs(name)
+    places = read_places(DATA, names)
+    pairs = chain.from_iterable(right_pairs(places[name], count, (10, 5, 3, 2)) for name, count in METRIC)
+    measured = list(answered(pairs, ALL))
+    accepted = [it for it in measured if isinstance(it.answer.outcome, Localization) and trust_of(it) >= 0.05]
+    right = [it for it in measured if it.right]
+    assert sum(it.right for it in accepted) >= 0.93 * len(right), "coverage as stated, within what a sample may vary"
+    assert sum(not it.right for it in accepted) <= 0.01 * len(accepted)
+    strangers = list(answered(cross_pairs(list(places.values()), 14)))
+    assert len(strangers) >= 500
+    assert not [it.pair.title for it in strangers if isinstance(it.answer.outcome, Localization)]
+
+
+def trust_of(measured: Measured) -> float:
+    """Of what is answered; 0 of what is not."""
+    outcome = measured.answer.outcome
+    return outcome.trust or 0.0 if isinstance(outcome, Localization) else 0.0

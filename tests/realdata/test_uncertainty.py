@@ -1,0 +1,48 @@
+"""Claimed radii on real photographs with known poses: held about as often as they say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from mapless_server.calibration.acceptance import answered, read_places, right_pairs
+from mapless_server.method.accuracy import accuracy_from_covariance
+from mapless_server.method.localize import Localization, LocalizeOptions
+
+
+def held(data: Path, scene: str) -> tuple[int, dict[str, int]]:
+    """Answers of a scene's photographs, each left out once and given ten references, and how many radii held."""
+    place = read_places(data, [scene])[scene]
+    found = [it for it in answered(right_pairs(place, None, (10,)), LocalizeOptions(coverage=1.0))]
+    rows: list[Sequence[bool]] = []
+    for it in found:
+        assert isinstance(it.answer.outcome, Localization)
+        assert it.answer.outcome.covariance is not None
+        assert it.off is not None
+        radii, (off_m, off_deg) = accuracy_from_covariance(it.answer.outcome.covariance), it.off
+        rows.append(
+            (
+                off_m <= radii.position_68_m,
+                off_m <= radii.position_95_m,
+                off_deg <= radii.rotation_68_deg,
+                off_deg <= radii.rotation_95_deg,
+            )
+        )
+    names = ("position 68", "position 95", "rotation 68", "rotation 95")
+    return len(rows), dict(zip(names, np.sum(rows, axis=0).tolist(), strict=True))
+
+
+@pytest.mark.parametrize("scene", ["fountain-P11", "tum-fr3-office"])
+def test_radii_hold_as_often_as_they_say(data: Path, scene: str) -> None:
+    """Within what chance allows one time in a thousand; photographs of one walk are not independent, besides."""
+    count, shares = held(data, scene)
+    assert count >= 11
+    low, high = binom.ppf(0.0005, count, 0.68), binom.ppf(0.9995, count, 0.68)
+    for name in ("position 68", "rotation 68"):
+        assert low <= shares[name] <= high, (name, shares, count)
+    for name in ("position 95", "rotation 95"):
+        assert shares[name] >= binom.ppf(0.0005, count, 0.95), (name, shares, count)

@@ -1,0 +1,239 @@
+"""Calls that are answered by a stream: counted once however they end, closed behind them, and waited for by nobody."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import grpc
+import pytest
+
+from mapless.errors import from_rpc_error
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.wire import FieldError
+from mapless_server.errors import FailedPrecondition, Unauthenticated
+from mapless_server.principal import Principal
+from mapless_server.rpc import Call, CallInterceptor
+
+METHOD = "/mapless.v1.LocalizationService/WatchQueries"
+LIMIT_S = 30.0
+
+
+@dataclass
+class Counted:
+    """Calls as they were counted."""
+
+    started: int = 0
+    handled: list[str] = field(default_factory=list)
+
+    def call_started(self, method: str) -> None:
+        assert method == METHOD
+        self.started += 1
+
+    def call_handled(self, method: str, code: str, seconds: float, trace_id: str) -> None:
+        self.handled.append(code)
+
+
+class Numbers:
+    """Messages that count up to `last`; then it ends, or raises what it was given, or waits for ever."""
+
+    def __init__(self, last: int, then: Exception | str = "end") -> None:
+        self._last, self._then, self._count = last, then, 0
+        self.is_closed = False
+
+    def __aiter__(self) -> Numbers:
+        return self
+
+    async def __anext__(self) -> pb.WatchQueriesResponse:
+        if self._count == self._last:
+            if isinstance(self._then, Exception):
+                raise self._then
+            if self._then == "end":
+                raise StopAsyncIteration
+            await asyncio.Event().wait()
+        self._count += 1
+        return pb.WatchQueriesResponse(missed_count=self._count)
+
+    async def aclose(self) -> None:
+        self.is_closed = True
+
+
+@asynccontextmanager
+async def serving(
+    numbers: Numbers | Exception, counted: Counted, **options: Any
+) -> AsyncIterator[tuple[Any, CallInterceptor]]:
+    """A channel to a server whose WatchQueries is answered so."""
+
+    async def watch(request: pb.WatchQueriesRequest, call: Call) -> Numbers:
+        if isinstance(numbers, Exception):
+            raise numbers
+        assert request.scene == "scenes/hall"
+        return numbers
+
+    interceptor = CallInterceptor(observer=counted, **options)
+    server = grpc.aio.server(interceptors=[interceptor])
+    method = grpc.unary_stream_rpc_method_handler(
+        watch, pb.WatchQueriesRequest.FromString, pb.WatchQueriesResponse.SerializeToString
+    )
+    handlers = grpc.method_handlers_generic_handler("mapless.v1.LocalizationService", {"WatchQueries": method})
+    server.add_generic_rpc_handlers([handlers])
+    port = server.add_insecure_port("127.0.0.1:0")
+    await server.start()
+    try:
+        async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
+            yield channel, interceptor
+    finally:
+        await server.stop(5)
+
+
+def watching(channel: Any, timeout: float | None = LIMIT_S) -> Any:
+    request = pb.WatchQueriesRequest(scene="scenes/hall").SerializeToString()
+    return channel.unary_stream(METHOD)(request, timeout=timeout)
+
+
+async def read(call: Any, seen: list[int] | None = None) -> list[int]:
+    """The messages' numbers; `seen` has them if it fails, too."""
+    seen = [] if seen is None else seen
+    async for data in call:
+        seen += [pb.WatchQueriesResponse.FromString(data).missed_count]
+    return seen
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async def wait() -> None:
+        while not condition():
+            await asyncio.sleep(0.002)
+
+    await asyncio.wait_for(wait(), LIMIT_S)
+
+
+def test_a_stream_that_ends_by_itself() -> None:
+    async def run() -> None:
+        counted, numbers = Counted(), Numbers(5)
+        async with serving(numbers, counted) as (channel, _):
+            call = watching(channel)
+            assert await read(call) == [1, 2, 3, 4, 5]
+            assert "x-request-id" in dict(await call.trailing_metadata())
+        assert (counted.started, counted.handled, numbers.is_closed) == (1, ["OK"], True)
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (FailedPrecondition("not now"), "FAILED_PRECONDITION"),
+        (FieldError("scene", "is none"), "INVALID_ARGUMENT"),
+        (RuntimeError("secret"), "INTERNAL"),
+    ],
+)
+@pytest.mark.parametrize("when", ["at once", "later"])
+def test_a_stream_that_fails(error: Exception, code: str, when: str) -> None:
+    async def run() -> None:
+        counted, numbers = Counted(), Numbers(2, error)
+        async with serving(error if when == "at once" else numbers, counted) as (channel, _):
+            with pytest.raises(grpc.RpcError) as caught:
+                await read(watching(channel))
+            failure = from_rpc_error(caught.value)
+        assert failure.code == code
+        assert failure.request_id
+        assert "secret" not in str(failure)
+        assert counted.handled == [code]
+        assert numbers.is_closed == (when == "later")
+
+    asyncio.run(run())
+
+
+def test_a_caller_who_goes_ends_it() -> None:
+    async def run() -> None:
+        counted, numbers = Counted(), Numbers(1, "wait")
+        async with serving(numbers, counted) as (channel, _):
+            call = watching(channel)
+            await call.initial_metadata()
+            await call.read()
+            call.cancel()
+            await until(lambda: numbers.is_closed)
+            await until(lambda: counted.handled == ["CANCELLED"])
+
+    asyncio.run(run())
+
+
+def test_a_caller_who_reads_nothing_and_goes_ends_it() -> None:
+    async def run() -> None:
+        counted, numbers = Counted(), Numbers(10**9, "wait")
+        async with serving(numbers, counted) as (channel, _):
+            call = watching(channel)
+            await call.initial_metadata()
+            await asyncio.sleep(0.1)  # until what is under way fills all there is room for
+            call.cancel()
+            await until(lambda: numbers.is_closed)
+
+    asyncio.run(run())
+
+
+def test_it_lasts_beyond_the_deadline_of_other_calls_and_ends_at_its_own() -> None:
+    async def run() -> None:
+        counted, numbers = Counted(), Numbers(0, "wait")
+        async with serving(numbers, counted, default_deadline_s=0.2, max_deadline_s=0.3) as (channel, _):
+            call = watching(channel, timeout=None)
+            await call.initial_metadata()
+            await asyncio.sleep(0.5)
+            assert not numbers.is_closed
+            call.cancel()
+            await until(lambda: numbers.is_closed)
+            with pytest.raises(grpc.RpcError) as caught:
+                await read(watching(channel, timeout=0.4))
+            assert caught.value.code() is grpc.StatusCode.DEADLINE_EXCEEDED
+            await until(lambda: len(counted.handled) == 2)
+
+    asyncio.run(run())
+
+
+def test_whose_message_does_not_come_is_told_so_without_a_deadline_too() -> None:
+    async def run() -> None:
+        counted = Counted()
+        async with serving(Numbers(0), counted, default_deadline_s=0.2) as (channel, _):
+            call = channel.stream_stream(METHOD)()
+            with pytest.raises(grpc.RpcError) as caught:
+                await call.read()
+            assert from_rpc_error(caught.value).reason == "MESSAGE_LATE"
+        assert counted.handled == ["DEADLINE_EXCEEDED"]
+
+    asyncio.run(run())
+
+
+def test_nobody_waits_for_its_end() -> None:
+    async def run() -> None:
+        async with serving(Numbers(0, "wait"), Counted()) as (channel, interceptor):
+            call = watching(channel)
+            await call.initial_metadata()
+            start_s = time.monotonic()
+            await interceptor.wait_until_idle(LIMIT_S)
+            assert time.monotonic() - start_s < LIMIT_S / 2
+            call.cancel()
+
+    asyncio.run(run())
+
+
+def test_a_caller_who_may_not_any_more_sees_nothing_more() -> None:
+    allowed = [True, True, True, True, False]  # at the door, with the message, and before each that is sent
+
+    def authenticate(*_: Any) -> Principal:
+        if not allowed.pop(0):
+            raise Unauthenticated("it has been revoked", reason="TOKEN_INVALID")
+        return Principal()
+
+    async def run() -> None:
+        counted, numbers, seen = Counted(), Numbers(9), list[int]()
+        async with serving(numbers, counted, authenticate=authenticate) as (channel, _):
+            with pytest.raises(grpc.RpcError) as caught:
+                await read(watching(channel), seen)
+            assert from_rpc_error(caught.value).reason == "TOKEN_INVALID"
+        assert seen == [1, 2]
+        assert (counted.handled, numbers.is_closed) == (["UNAUTHENTICATED"], True)
+
+    asyncio.run(run())

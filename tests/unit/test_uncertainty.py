@@ -1,0 +1,176 @@
+"""The covariance of a pose against planted noise: of pixels, of reference poses, of the scale.
+
+Many poses are solved, each with noise of its own, and the mean of their squared errors is compared with the mean of
+what was stated, position and rotation apart. With 20 poses the ratio of two standard deviations is known to an eighth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted import NOISE, disturbed, metric_scale, stages, true_structure
+from scenes import SceneOptions, SyntheticScene, make_scene, random_for
+
+from mapless.geometry import Array, RigidTransform, Similarity
+from mapless_server.method.adjust import AdjustOptions, adjust_pose
+from mapless_server.method.pnp import PnpOptions, PoseEstimate, PoseStage, solve_pose
+from mapless_server.method.pose_covariance import pose_covariance
+from mapless_server.method.priors import rotation_vector
+from mapless_server.method.structure import Structure
+from mapless_server.method.support import Support
+from mapless_server.method.uncertainty import UncertaintyOptions, scale_covariance
+
+PLAIN = UncertaintyOptions(shrinkage=0.0, shared_matches=1e9, position_factor=1.0, rotation_factor=1.0)
+"""What is derived, without what was measured on photographs."""
+UNSCALED = metric_scale(Similarity(1.0, np.eye(3), np.zeros(3)), RigidTransform(np.eye(3), np.zeros(3)))
+
+
+def error(found: RigidTransform, true: RigidTransform) -> Array:
+    """X y z rx ry rz."""
+    return np.concatenate([found.translation - true.translation, rotation_vector(found.rotation @ true.rotation.T)])
+
+
+def true_by_stated(errors: list[Array], covariances: list[Array]) -> tuple[float, float]:
+    """Standard deviations of positions and of rotations, true by stated."""
+    squared, stated = np.mean(np.square(errors), axis=0), np.mean([np.diag(c) for c in covariances], axis=0)
+    return float(np.sqrt(squared[:3].sum() / stated[:3].sum())), float(np.sqrt(squared[3:].sum() / stated[3:].sum()))
+
+
+def adjusted_poses(
+    references: int, pose_noise_px: float, options: UncertaintyOptions, seeds: int = 20
+) -> tuple[float, float]:
+    """True by stated; references are turned and moved by so many pixels each."""
+    planted = SceneOptions(point_count=150, reference_count=references, distractor_count=0)
+    noise = pose_noise_px / planted.camera.focal_x_px
+    errors, covariances = [], []
+    for seed in range(seeds):
+        scene = make_scene(random_for("uncertain", references, seed), planted)
+        random = random_for("uncertain noise", seed)
+        noisy = disturbed(scene.references, random, noise * planted.distance_m, np.degrees(noise))
+        structure, matches, estimate = stages(scene, noisy)
+        adjusted = adjust_pose(scene.query, noisy, structure, matches, estimate, AdjustOptions(uncertainty=options))
+        errors.append(error(adjusted.world_from_camera, scene.world_from_query))
+        covariances.append(adjusted.covariance)
+    return true_by_stated(errors, covariances)
+
+
+@pytest.mark.parametrize("references", [4, 8])
+def test_noise_of_pixels(references: int) -> None:
+    position, rotation = adjusted_poses(references, 0.0, PLAIN)
+    assert position == pytest.approx(1, abs=0.35)
+    assert rotation == pytest.approx(1, abs=0.35)
+
+
+@pytest.mark.parametrize("references", [5, 10])
+def test_noise_of_reference_poses(references: int) -> None:
+    """Twice the pixels' noise. Errors that the references share only in part are told within a third."""
+    position, rotation = adjusted_poses(references, 1.0, PLAIN)
+    assert 0.75 < position < 1.4
+    assert 0.75 < rotation < 1.4
+
+
+def test_what_photographs_need_claims_more_than_planted_noise_does() -> None:
+    position, rotation = adjusted_poses(8, 1.0, UncertaintyOptions(), seeds=15)
+    assert 0.1 < position < 0.8
+    assert 0.1 < rotation < 0.8
+
+
+FEW = SceneOptions(point_count=120, reference_count=4, distractor_count=0)
+
+
+def support_of(
+    scene: SyntheticScene, structure: Structure, estimate: PoseEstimate, options: UncertaintyOptions = PLAIN
+) -> Support:
+    matches = true_structure(scene)[1]
+    return Support(scene.query, scene.references, structure, matches, estimate, np.zeros(3))
+
+
+def test_noise_of_the_scale() -> None:
+    """Predicted points, all too far or too near by 2 % as seen from the references' centroid: the query goes along."""
+    random, errors, covariances = random_for("scale"), [], []
+    for seed in range(20):
+        scene = make_scene(random_for("scaled", seed), replace(FEW, query_offset_m=(1.2, -0.4, 0.8)))
+        centroid = np.mean([r.world_from_camera.translation for r in scene.references], axis=0)
+        structure, matches = true_structure(scene, NOISE)
+        factor = 1 + random.normal(0, 0.02)
+        wrong = replace(structure, x_in_world=centroid + factor * (structure.x_in_world - centroid))
+        estimate = solve_pose(scene.query, wrong, matches, scene.world_from_query, PnpOptions())
+        assert isinstance(estimate, PoseEstimate)
+        errors.append(error(estimate.world_from_camera, scene.world_from_query))
+        scale = replace(UNSCALED, deviation=0.02)
+        covariances.append(scale_covariance(estimate.world_from_camera, centroid, scale.deviation))
+        stated = pose_covariance(support_of(scene, wrong, estimate), scale, PLAIN, points_are_predicted=True)
+        assert np.linalg.eigvalsh(stated - covariances[-1]).min() > -1e-12  # it comes on top of everything else
+    position, _ = true_by_stated(errors, covariances)
+    assert position == pytest.approx(1, abs=0.4)
+
+
+def test_the_scale_moves_the_camera_along_the_arm_and_turns_nothing() -> None:
+    pose = RigidTransform(np.eye(3), np.array([3.0, 4.0, 0.0]))
+    covariance = scale_covariance(pose, np.zeros(3), 0.01)
+    np.testing.assert_allclose(covariance[:3, :3], 1e-4 * np.outer([3, 4, 0], [3, 4, 0]))
+    np.testing.assert_array_equal(covariance[3:], 0)
+    np.testing.assert_array_equal(covariance[:, 3:], 0)
+
+
+def test_an_initial_pose_is_off_by_what_the_matches_say() -> None:
+    """5 cm off its optimum: that far lies within what is stated, and the direction is known."""
+    scene = make_scene(random_for("initial"), FEW)
+    structure, matches, estimate = stages(scene, scene.references)
+    off = np.array([0.03, 0.0, 0.04])
+    moved = RigidTransform(estimate.world_from_camera.rotation, estimate.world_from_camera.translation + off)
+    errors_px = np.full(len(matches), 2.0)
+    initial = replace(estimate, world_from_camera=moved, stage=PoseStage.INITIAL, errors_px=errors_px)
+    wide = replace(PLAIN, loss_scale_sigma=100.0)
+    covariance = pose_covariance(support_of(scene, structure, initial), UNSCALED, wide)
+    along = off / np.linalg.norm(off)
+    assert np.sqrt(along @ covariance[:3, :3] @ along) == pytest.approx(0.05, rel=0.3)
+    refined = pose_covariance(support_of(scene, structure, estimate), UNSCALED, wide)
+    assert np.sqrt(along @ refined[:3, :3] @ along) < 0.02
+
+
+def test_factors_are_of_standard_deviations() -> None:
+    scene = make_scene(random_for("factors"), FEW)
+    structure, _, estimate = stages(scene, scene.references)
+    support = support_of(scene, structure, estimate)
+    plain = pose_covariance(support, UNSCALED, PLAIN)
+    factored = pose_covariance(support, UNSCALED, replace(PLAIN, position_factor=2.0, rotation_factor=3.0))
+    factor = np.repeat([2.0, 3.0], 3)
+    np.testing.assert_allclose(factored, factor[:, None] * plain * factor)
+
+
+def test_many_matches_are_no_better_than_the_shared_ones() -> None:
+    scene = make_scene(random_for("shared"), FEW)
+    structure, _, estimate = stages(scene, scene.references)
+    support = support_of(scene, structure, estimate)
+    variances = [
+        np.trace(pose_covariance(support, UNSCALED, replace(PLAIN, shared_matches=n))[:3, :3])
+        for n in (10.0, 20.0, 1e9)
+    ]
+    assert variances[0] - variances[2] == pytest.approx(2 * (variances[1] - variances[2]))
+
+
+def test_matches_with_one_spot_keep_what_was_stated_before() -> None:
+    scene = make_scene(random_for("spot"), FEW)
+    structure, _, estimate = stages(scene, scene.references)
+    nowhere = replace(structure, x_in_world=np.zeros_like(structure.x_in_world))
+    covariance = pose_covariance(support_of(scene, nowhere, estimate), UNSCALED, PLAIN)
+    np.testing.assert_array_equal(covariance, estimate.covariance)
+
+
+def test_without_an_estimate_there_is_nothing_to_ask() -> None:
+    scene = make_scene(random_for("nothing"), FEW)
+    structure, matches = true_structure(scene)
+    support = Support(scene.query, scene.references, structure, matches, None, np.zeros(3))
+    with pytest.raises(ValueError, match="without an estimate"):
+        pose_covariance(support, UNSCALED, PLAIN)
+
+
+@pytest.mark.parametrize(
+    "options", [{"shrinkage": -0.1}, {"shrinkage": 1.1}, {"shared_matches": 0.0}, {"position_factor": 0.0}]
+)
+def test_senseless_options_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="senseless"):
+        UncertaintyOptions(**options)
