@@ -11,12 +11,13 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import cv2
@@ -109,7 +110,10 @@ def browsing(url: str, width_px: int = 1180, height_px: int = 760) -> Iterator[P
             "--no-first-run",
             f"--window-size={width_px},{height_px}",
         ]
-        process = subprocess.Popen([browser, *flags, "about:blank"], stderr=subprocess.PIPE, text=True)
+        # In a group of its own: what is on the path may be a script, whose end would not be the browser's.
+        process = subprocess.Popen(
+            [browser, *flags, "about:blank"], stderr=subprocess.PIPE, text=True, start_new_session=True
+        )
         try:
             with connect(_page_address(process), max_size=None) as socket:
                 page = Page(socket)
@@ -119,10 +123,20 @@ def browsing(url: str, width_px: int = 1180, height_px: int = 760) -> Iterator[P
                 page.call("Page.navigate", url=url)
                 yield page
         finally:
-            process.terminate()
-            process.wait(30)
+            _end_group(process)
             assert process.stderr is not None
             process.stderr.close()
+
+
+def _end_group(process: subprocess.Popen[str]) -> None:
+    """Ends a process and all that it started."""
+    end_s = time.monotonic() + 30
+    with suppress(ProcessLookupError):
+        while True:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.poll()  # one that nobody has asked about stays in its group
+            assert time.monotonic() < end_s
+            time.sleep(0.05)
 
 
 def _page_address(process: subprocess.Popen[str]) -> str:

@@ -282,9 +282,7 @@ class Camera:
     def from_fov(cls, width_px: int, height_px: int, horizontal_fov_deg: float) -> Camera:
         """The pinhole camera with square pixels that looks through the image's middle: of simulators and data sheets.
 
-        Args:
-            width_px, height_px: size of the image.
-            horizontal_fov_deg: angle between its left and its right edge, above 0 and below 180.
+        The field of view is the angle between the image's left and its right edge, above 0 and below 180 degrees.
         """
         if not 0 < horizontal_fov_deg < 180:
             raise ValueError(f"a field of view is above 0 and below 180 degrees, not {horizontal_fov_deg:g}")

@@ -91,6 +91,7 @@ def serve_command(
     retrieval: Annotated[str | None, typer.Option(help=_help("retrieval"))] = None,
     retrieval_cache_mib: Annotated[int | None, typer.Option(help=_help("retrieval_cache_mib"))] = None,
     reference_cache_mib: Annotated[int | None, typer.Option(help=_help("reference_cache_mib"))] = None,
+    allow_watching: Annotated[bool | None, typer.Option(help=_help("allow_watching"))] = None,
     warm_up: Annotated[bool | None, typer.Option(help=_help("warm_up"))] = None,
     drain_delay_s: Annotated[float | None, typer.Option(help=_help("drain_delay_s"))] = None,
     drain_grace_s: Annotated[float | None, typer.Option(help=_help("drain_grace_s"))] = None,

@@ -194,7 +194,7 @@ def test_an_image_checks_its_health_with_our_client(target: str) -> None:
     program, *arguments = json.loads(command)
     parsed = make_parser().parse_args(arguments)
     assert program in PROJECT["scripts"]
-    assert parsed.run.__name__ == "_health"
+    assert parsed.run.__name__ == "health"
     assert parsed.address == f"localhost:{default('port')}"
     assert parsed.timeout < seconds(re.search(r"--timeout=(\w+)", options)[1])  # type: ignore[index]
 
@@ -229,7 +229,9 @@ def test_what_is_no_code_is_packaged_too() -> None:
     """Images have the wheel, not the repository: a file that is not named would be missing there, and only there."""
     packages = PYPROJECT["tool"]["setuptools"]
     for folder in packages["packages"]["find"]["where"]:
-        files = [path for path in (ROOT / folder).rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")]
+        roots = [path for glob in packages["packages"]["find"]["include"] for path in (ROOT / folder).glob(glob)]
+        there = [path for root in roots if root.is_dir() for path in root.rglob("*")]
+        files = [path for path in there if path.is_file() and path.suffix not in (".py", ".pyc")]
         named = {
             path
             for package, globs in packages["package-data"].items()

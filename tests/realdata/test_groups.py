@@ -57,39 +57,44 @@ def error_m(found: RigidTransform, truth: RigidTransform) -> float:
     return float(np.linalg.norm(difference))
 
 
-def test_together_they_are_no_worse_than_alone(kitchen: tuple[Client, Sequence[Frame]]) -> None:
-    """A rig of three frames with their true extrinsics; eight of a device that loses 2 % of its way, in half metres."""
+def walk_of(frames: Sequence[Frame], start: int) -> tuple[list[Frame], list[bytes], list[RigidTransform]]:
+    """Eight frames, their photographs and true poses."""
+    walk = [frames[start + STEP * i] for i in range(8)]
+    return walk, [it.image_path.read_bytes() for it in walk], [it.world_from_camera for it in walk]
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_a_sequence_is_no_worse_than_its_photographs(kitchen: tuple[Client, Sequence[Frame]], start: int) -> None:
+    """Of a device that loses 2 % of its way, in half metres; where all photographs are lost alone, it is not."""
     client, frames = kitchen
-    single: list[float] = []
-    rigs: list[float] = []
-    sequences: list[float] = []
-    photographs = 0
-    for start in STARTS:
-        walk = [frames[start + STEP * i] for i in range(8)]
-        images, truth = [it.image_path.read_bytes() for it in walk], [it.world_from_camera for it in walk]
-        for image, frame in zip(images, walk, strict=True):
-            photographs += 1
-            alone = client.localize(image, frame.camera, "kitchen")
-            if isinstance(alone, LocalizationResult):
-                single.append(error_m(alone.world_from_camera, frame.world_from_camera))
-        fixed = [truth[0].inverse().compose(truth[i]) for i in (0, 3, 6)]
-        rig = client.localize_rig(
-            [RigImage(images[i], walk[i].camera, pose) for i, pose in zip((0, 3, 6), fixed, strict=True)], "kitchen"
-        )
-        if isinstance(rig, RigLocalization):
-            rigs.append(error_m(rig.world_from_rig, truth[0]))
-        session = rescaled(drifting(np.random.default_rng(start), truth, 0.02), 2.0)
-        sequence = client.localize_sequence(
-            [SequenceFrame(i, f.camera, s) for i, f, s in zip(images, walk, session, strict=True)],
-            "kitchen",
-            estimate_scale=True,
-        )
-        if isinstance(sequence, SequenceLocalization):
-            sequences.append(error_m(sequence.world_from_camera[-1], truth[-1]))
-            assert sequence.world_from_session.scale == pytest.approx(0.5, rel=0.1)
-    print(f"single {single}", f"rigs {rigs}", f"sequences {sequences}", sep="\n")
-    assert len(rigs) / len(STARTS) >= len(single) / photographs
-    assert len(sequences) / len(STARTS) >= len(single) / photographs
-    assert np.median(rigs) <= 1.2 * np.median(single)
-    assert np.median(sequences) <= np.median(single)
-    assert max(sequences) < 0.05
+    walk, images, truth = walk_of(frames, start)
+    alone = [client.localize(image, frame.camera, "kitchen") for image, frame in zip(images, walk, strict=True)]
+    errors_m = [
+        error_m(it.world_from_camera, pose)
+        for it, pose in zip(alone, truth, strict=True)
+        if isinstance(it, LocalizationResult)
+    ]
+    session = rescaled(drifting(np.random.default_rng(start), truth, 0.02), 2.0)
+    together = client.localize_sequence(
+        [SequenceFrame(i, f.camera, s) for i, f, s in zip(images, walk, session, strict=True)],
+        "kitchen",
+        estimate_scale=True,
+    )
+    assert isinstance(together, SequenceLocalization), together
+    found_m = [error_m(*it) for it in zip(together.world_from_camera, truth, strict=True)]
+    assert np.median(found_m) <= 1.2 * np.median(errors_m or [0.05])
+    assert found_m[-1] <= together.accuracy.position_95_m
+    assert together.world_from_session.scale == pytest.approx(0.5, abs=3 * together.scale_sigma)
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_a_rig_of_three_frames(kitchen: tuple[Client, Sequence[Frame]], start: int) -> None:
+    """With their true extrinsics; its error is what it claims, also where no photograph is localized alone."""
+    client, frames = kitchen
+    walk, images, truth = walk_of(frames, start)
+    rig = [RigImage(images[i], walk[i].camera, truth[0].inverse().compose(truth[i])) for i in (0, 3, 6)]
+    found = client.localize_rig(rig, "kitchen")
+    assert isinstance(found, RigLocalization), found
+    found_m = error_m(found.world_from_rig, truth[0])
+    assert found_m < 0.1
+    assert found_m <= 1.5 * found.accuracy.position_95_m

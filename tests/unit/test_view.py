@@ -17,7 +17,7 @@ from images import encode
 from typer.testing import CliRunner
 
 from mapless import Datum, Quaternion, Reference, Scene
-from mapless.answers import Accuracy, Debug, Diagnostics, Hint, LocalizationResult, ReferenceUse, Rejected
+from mapless.answers import Accuracy, Debug, Diagnostics, Hint, Hypothesis, LocalizationResult, ReferenceUse, Rejected
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_server.cli import app
 from mapless_server.view.meshes import ellipsoid, enlargement, rays
@@ -291,3 +291,37 @@ def test_the_extra_is_named_where_it_is_missing() -> None:
     from mapless_server.extras import install_hint
 
     assert "mapless[view]" in install_hint(ModuleNotFoundError("no", name="viser"))
+
+
+def test_queries_of_every_outcome_come_and_go() -> None:
+    pytest.importorskip("viser", reason="needs the extra view")
+    from mapless_server.view.guarded import GuardedViser
+    from mapless_server.view.stage import MAX_QUERIES, Stage
+
+    image, debug = TestPictures().matched()
+    hypotheses = (Hypothesis(upright(0), 9, ()), Hypothesis(upright(3), 8, ()))
+    lost = query(None, debug, image)
+    assert isinstance(lost.answer, Rejected)
+    ambiguous = replace(lost, answer=replace(lost.answer, reason="AMBIGUOUS", hypotheses=hypotheses))
+    outcomes = [query(upright(0), debug, image), query(upright(1), None, image), lost, ambiguous]
+    server = GuardedViser("127.0.0.1", 0, "test")
+    try:
+        scenery = lay_out(SCENE, [reference(i, upright(i)) for i in range(9)], 6)
+        stage = Stage(server, scenery, "hall", lambda reference_id: image)
+        stage.show_picture("r4", read_picture(image, 160))
+        for number in range(MAX_QUERIES + 5):
+            stage.show_query(replace(outcomes[number % 4], number=number + 1))
+        stage.show_points(debug.x_in_world, np.zeros((40, 3), np.uint8))
+        stage.show_points(debug.x_in_world, np.zeros((40, 3), np.uint8))
+        stage.say("live")
+        names = {name for name in server.scene._handle_from_node_name if name.startswith("/queries/")}
+    finally:
+        server.stop()
+    kept = range(6, MAX_QUERIES + 6)
+    cameras = {1: 1, 2: 1, 3: 0, 0: 2}
+    assert {it for it in names if "/camera-" in it} == {
+        f"/queries/{number}/camera-{i}" for number in kept for i in range(cameras[number % 4])
+    }
+    assert {it for it in names if it.endswith("/right")} == {
+        f"/queries/{number}/right" for number in kept if number % 4 == 1
+    }

@@ -50,7 +50,7 @@ def overlay(debug: Debug, camera: Camera, world_from_camera: RigidTransform | No
         longer = f", drawn {factor} times as long" if factor > 1 else ""
         residuals = f"Lines: from where a point is seen to where the pose puts it{longer}."
     else:
-        residuals = "There is no pose that any could agree with."
+        residuals = "The pose that some agree with was not good enough to be answered." if inlier.any() else ""
     layers += [
         _layer("outlier", _crosses(debug.query_px[~inlier], 3.2 * dot), 1.5 * dot),
         _layer("inlier halo", _dots(debug.query_px[inlier]), 6.4 * dot),
@@ -59,7 +59,7 @@ def overlay(debug: Debug, camera: Camera, world_from_camera: RigidTransform | No
     view = f"-0.5 -0.5 {camera.width_px} {camera.height_px}"
     return (
         '<figure class="overlay">'
-        f"{_switch('inlier', f'{inlier.sum()} agree with the pose')}{_switch('outlier', f'{(~inlier).sum()} do not')}"
+        f"{_switches(inlier)}"
         f'<svg viewBox="{view}" role="img" aria-label="The photograph and its matches">'
         f'<use href="#{PHOTO_ID}"/>{"".join(layers)}</svg>'
         f"<figcaption>{text(residuals)}</figcaption></figure>"
@@ -102,6 +102,12 @@ def histogram(debug: Debug) -> str:
         f'{"".join(bars)}<path class="axis" d="M0 100H320"/>{ticks}</svg>'
         f"<figcaption>Reprojection errors, pixels of the processed photograph.{more}</figcaption></figure>"
     )
+
+
+def _switches(inlier: NDArray[np.bool_]) -> str:
+    if not inlier.any():
+        return _switch("outlier", f"{len(inlier)} matches, of which none is known to be right")
+    return _switch("inlier", f"{inlier.sum()} agree with the pose") + _switch("outlier", f"{(~inlier).sum()} do not")
 
 
 def _switch(layer: str, label: str) -> str:

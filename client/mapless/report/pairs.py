@@ -44,7 +44,8 @@ def pair(
     width = offset + right * reference.camera.width_px
     start = left * (debug.query_px + 0.5)
     end = right * (debug.reference_px + 0.5) + (offset, 0.0)
-    inlier = debug.is_inlier
+    # Without a pose nobody knows which are right.
+    inlier = debug.is_inlier if debug.is_inlier.any() else np.ones(len(debug.is_inlier), bool)
     good, wrong = _some(rows & inlier, start, _MAX_LINES), _some(rows & ~inlier, start, _MAX_WRONG)
     hue = np.argsort(np.argsort(start[good, 0])) * (300 / max(len(good), 1))
     lines = [_line(start[i], end[i], 'class="outlier"') for i in wrong]

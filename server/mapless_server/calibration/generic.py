@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import binom
+from scipy.special import bdtrik
 
 from mapless.geometry import Array
 
@@ -94,9 +94,9 @@ def collect(data: Path) -> Iterator[Answered]:
                 error_m, error_deg = it.off
                 position, rotation = outcome.covariance[:3, :3], outcome.covariance[3:, 3:]
                 radii = [error_radius(c, p) for c in (position, np.degrees(np.degrees(rotation))) for p in (0.68, 0.95)]
-                ratios = np.divide([error_m, error_m, error_deg, error_deg], radii).tolist()
+                first, second, third, fourth = np.divide([error_m, error_m, error_deg, error_deg], radii).tolist()
                 k = min(KS, key=lambda k: abs(k - it.pair.k))
-                yield Answered(name, k, *ratios, error_m, error_deg, outcome.inlier_count)
+                yield Answered(name, k, first, second, third, fourth, error_m, error_deg, outcome.inlier_count)
 
 
 def fit(answers: Sequence[Answered]) -> Fit:
@@ -122,7 +122,7 @@ def left_out(answers: Sequence[Answered]) -> Iterator[str]:
             mine = [it for it in answers if it.scene == scene and it.k in ks]
             if mine:
                 shares = np.mean([constants.held(it) for it in mine], axis=0)
-                low, high = (100 * binom.ppf(p, len(mine), 0.68) / len(mine) for p in (0.025, 0.975))
+                low, high = (100 * np.ceil(bdtrik(p, len(mine), 0.68)) / len(mine) for p in (0.025, 0.975))
                 cells = " | ".join(f"{100 * share:.0f} %" for share in shares)
                 label = ", ".join(map(str, ks))
                 yield f"| {scene} | {label} | {len(mine)} | {cells} | {low:.0f} to {high:.0f} % |"

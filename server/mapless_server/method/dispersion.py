@@ -124,8 +124,8 @@ def disperse(grounds: Grounds) -> Dispersion | None:
     seen, query = grounds.references, grounds.query
     size = 1 + int(max(query.point.max(initial=0), seen.point.max(initial=0)))
     of_seen, pull = _information(seen), _gradient(seen)
-    of_point = np.stack([np.bincount(seen.point, row, size) for row in of_seen])
-    pull_of_point = np.stack([np.bincount(seen.point, row, size) for row in pull])
+    of_point = np.stack([np.bincount(seen.point, row, size) for row in of_seen]).astype(np.float64)
+    pull_of_point = np.stack([np.bincount(seen.point, row, size) for row in pull]).astype(np.float64)
 
     everything = _eliminate(query, of_point[:, query.point], pull_of_point[:, query.point])
     row, other = _pairs(query.point, seen.point, size)
