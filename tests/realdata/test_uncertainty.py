@@ -25,7 +25,7 @@ def fewest(probability: float, count: int, share: float) -> float:
 def held(data: Path, scene: str) -> tuple[int, dict[str, int]]:
     """Answers of a scene's photographs, each left out once and given ten references, and how many radii held."""
     place = read_places(data, [scene])[scene]
-    found = [it for it in answered(right_pairs(place, None, (10,)), LocalizeOptions(coverage=1.0))]
+    found = list(answered(right_pairs(place, None, (10,)), LocalizeOptions(coverage=1.0)))
     rows: list[Sequence[bool]] = []
     for it in found:
         assert isinstance(it.answer.outcome, Localization)

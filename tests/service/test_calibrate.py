@@ -260,6 +260,7 @@ def test_wrong_folders_are_one_line(server: RunningServer, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_a_folder_by_itself(tmp_path: Path) -> None:
     """Through a server of its own, with the real method: right answers, and claims that were counted."""
     camera = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)

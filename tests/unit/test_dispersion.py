@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scenes import random_for
 
 from mapless.geometry import Array
@@ -16,7 +17,7 @@ def random_grounds(case: str, points: int = 30, references: int = 4, unknowns: i
     """Random derivatives; every point is seen once by the query and by two references or more."""
     random = random_for("grounds", case)
 
-    def sightings(point: Array) -> Sightings:
+    def sightings(point: NDArray[np.intp]) -> Sightings:
         n = len(point)
         return Sightings(point, random.normal(size=(n, 2, 3)), random.normal(size=(n, 2)), random.uniform(0.3, 1, n))
 
@@ -132,3 +133,12 @@ def test_nothing_to_stand_on_is_no_dispersion() -> None:
 def test_few_matches_are_no_exception(points: int) -> None:
     found = disperse(random_grounds("few", points=points))
     assert found is None or np.isfinite(found.covariance).all()
+
+
+def test_thinning_leaves_the_references_errors_and_averages_the_photographs() -> None:
+    grounds = random_grounds("thinned")
+    every, thinned = disperse(grounds), disperse(replace(grounds, thinning=3))
+    assert every
+    assert thinned
+    np.testing.assert_allclose(thinned.photograph, every.photograph / 3)
+    np.testing.assert_array_equal(thinned.motions, every.motions)

@@ -22,8 +22,10 @@ from mapless_server.method.structure import Structure
 from mapless_server.method.support import Support
 from mapless_server.method.uncertainty import UncertaintyOptions, scale_covariance
 
+POSITION, ROTATION = slice(0, 3), slice(3, 6)
 PLAIN = UncertaintyOptions(shrinkage=0.0, shared_matches=1e9, position_factor=1.0, rotation_factor=1.0)
 """What is derived, without what was measured on photographs."""
+FEW = SceneOptions(point_count=120, reference_count=4, distractor_count=0)
 UNSCALED = metric_scale(Similarity(1.0, np.eye(3), np.zeros(3)), RigidTransform(np.eye(3), np.zeros(3)))
 
 
@@ -32,10 +34,10 @@ def error(found: RigidTransform, true: RigidTransform) -> Array:
     return np.concatenate([found.translation - true.translation, rotation_vector(found.rotation @ true.rotation.T)])
 
 
-def true_by_stated(errors: list[Array], covariances: list[Array]) -> tuple[float, float]:
-    """Standard deviations of positions and of rotations, true by stated."""
+def true_by_stated(errors: list[Array], covariances: list[Array], axes: slice) -> float:
+    """Standard deviation of the errors along these axes, true by stated."""
     squared, stated = np.mean(np.square(errors), axis=0), np.mean([np.diag(c) for c in covariances], axis=0)
-    return float(np.sqrt(squared[:3].sum() / stated[:3].sum())), float(np.sqrt(squared[3:].sum() / stated[3:].sum()))
+    return float(np.sqrt(squared[axes].sum() / stated[axes].sum()))
 
 
 def adjusted_poses(
@@ -53,7 +55,7 @@ def adjusted_poses(
         adjusted = adjust_pose(scene.query, noisy, structure, matches, estimate, AdjustOptions(uncertainty=options))
         errors.append(error(adjusted.world_from_camera, scene.world_from_query))
         covariances.append(adjusted.covariance)
-    return true_by_stated(errors, covariances)
+    return true_by_stated(errors, covariances, POSITION), true_by_stated(errors, covariances, ROTATION)
 
 
 @pytest.mark.parametrize("references", [4, 8])
@@ -61,6 +63,19 @@ def test_noise_of_pixels(references: int) -> None:
     position, rotation = adjusted_poses(references, 0.0, PLAIN)
     assert position == pytest.approx(1, abs=0.35)
     assert rotation == pytest.approx(1, abs=0.35)
+
+
+def test_thinned_matches_tell_much_the_same() -> None:
+    scene = make_scene(random_for("thinned"), replace(FEW, point_count=400, reference_count=6))
+    structure, matches, estimate = stages(scene, scene.references)
+
+    def covariance(max_matches: int) -> Array:
+        options = AdjustOptions(uncertainty=replace(PLAIN, max_matches=max_matches))
+        return adjust_pose(scene.query, scene.references, structure, matches, estimate, options).covariance
+
+    every, some = covariance(1000), covariance(130)
+    assert 0.5 < np.trace(some[:3, :3]) / np.trace(every[:3, :3]) < 4
+    assert 0.5 < np.trace(some[3:, 3:]) / np.trace(every[3:, 3:]) < 4
 
 
 @pytest.mark.parametrize("references", [5, 10])
@@ -75,9 +90,6 @@ def test_what_photographs_need_claims_more_than_planted_noise_does() -> None:
     position, rotation = adjusted_poses(8, 1.0, UncertaintyOptions(), seeds=15)
     assert 0.1 < position < 0.8
     assert 0.1 < rotation < 0.8
-
-
-FEW = SceneOptions(point_count=120, reference_count=4, distractor_count=0)
 
 
 def support_of(
@@ -103,7 +115,7 @@ def test_noise_of_the_scale() -> None:
         covariances.append(scale_covariance(estimate.world_from_camera, centroid, scale.deviation))
         stated = pose_covariance(support_of(scene, wrong, estimate), scale, PLAIN, points_are_predicted=True)
         assert np.linalg.eigvalsh(stated - covariances[-1]).min() > -1e-12  # it comes on top of everything else
-    position, _ = true_by_stated(errors, covariances)
+    position = true_by_stated(errors, covariances, POSITION)
     assert position == pytest.approx(1, abs=0.4)
 
 

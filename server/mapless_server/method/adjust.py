@@ -178,8 +178,9 @@ class _Problem:
     def uncertainty(self, state: _State, rows: Linearization, one_match: Array) -> Uncertainty | None:
         """Of the query's pose at an optimum, linearized there, without what priors say of it."""
         motions = np.concatenate([self.prior_error(state), np.zeros((1, 6))])
-        grounds = grounds_of(rows, self.observations.point, self.view, motions)
-        return uncertainty_of(grounds, state.world_from_query, one_match, self.options.uncertainty)
+        options = self.options.uncertainty
+        grounds = grounds_of(rows, self.observations.point, self.view, options.max_matches, motions)
+        return uncertainty_of(grounds, state.world_from_query, one_match, options)
 
 
 @dataclass(frozen=True, eq=False)

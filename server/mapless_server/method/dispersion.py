@@ -36,7 +36,7 @@ would otherwise hide what is looked for.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +81,8 @@ class Grounds:
         references: what the references see of the same points, with their poses as given.
         reference: (M,) which of the references, from 0.
         reference_count: K.
+        thinning: of so many observations of the query one is here. The references' errors are the same in all of them;
+            the photograph's own pixels' average out.
     """
 
     query: Sightings
@@ -88,6 +90,7 @@ class Grounds:
     references: Sightings
     reference: NDArray[np.intp]
     reference_count: int
+    thinning: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +138,8 @@ def disperse(grounds: Grounds) -> Dispersion | None:
     change = np.zeros((grounds.reference_count, 5, len(query.point)))
     # A point is seen once by a reference: no pair falls upon another.
     change[grounds.reference[other], :, row] = (without - everything[:, row]).T
-    return _steps(query, grounds.by_pose, everything, change)
+    found = _steps(query, grounds.by_pose, everything, change)
+    return found and replace(found, photograph=found.photograph / grounds.thinning)
 
 
 def _steps(query: Sightings, by_pose: Array, everything: Array, change: Array) -> Dispersion | None:
@@ -225,8 +229,8 @@ def _information(sightings: Sightings) -> Array:
 
 def _gradient(sightings: Sightings) -> Array:
     """W A^T r of each, (3, N)."""
-    weighted = sightings.residual * sightings.weight[:, None]
-    return np.asarray((sightings.by_point * weighted[:, :, None]).sum(axis=1).T)
+    x, y = (sightings.residual * sightings.weight[:, None]).T
+    return np.asarray(sightings.by_point[:, 0].T * x + sightings.by_point[:, 1].T * y)
 
 
 def _inverse(matrices: Array) -> Array:

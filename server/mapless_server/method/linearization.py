@@ -44,7 +44,11 @@ def linearize(observations: Observations, x_in_world: Array, loss_scale_sigma: f
 
 
 def grounds_of(
-    rows: Linearization, point: NDArray[np.intp], view: NDArray[np.intp], motions: Array | None = None
+    rows: Linearization,
+    point: NDArray[np.intp],
+    view: NDArray[np.intp],
+    max_matches: int,
+    motions: Array | None = None,
 ) -> Grounds:
     """What the last view's pose rests on.
 
@@ -52,19 +56,27 @@ def grounds_of(
         rows: of all observations.
         point: (O,) of each.
         view: (O,) of each; the references, in their order, and last the photograph whose pose is asked for.
+        max_matches: of its observations; more are thinned evenly.
         motions: (V, 6) left perturbations that brought the cameras from their given poses to those that `rows` is
             linearized at; None if they are at their given poses.
     """
     asked = int(view.max())
     is_asked = view == asked
+    thinning = -(-int(is_asked.sum()) // max_matches)
+    if thinning > 1:
+        taken = np.zeros(int(point.max()) + 1, bool)
+        taken[point[is_asked][::thinning]] = True
+        kept = taken[point]
+        rows = Linearization(rows.residual[kept], rows.weight[kept], rows.by_point[kept], rows.by_pose[kept])
+        point, view, is_asked = point[kept], view[kept], is_asked[kept]
     residual = rows.residual
     if motions is not None:
-        residual = residual - (rows.by_pose @ motions[view][:, :, None])[..., 0]
+        residual = residual - (rows.by_pose * motions[view][:, None, :]).sum(axis=2)
 
     def some(chosen: NDArray[np.bool_]) -> Sightings:
         return Sightings(point[chosen], rows.by_point[chosen], residual[chosen], rows.weight[chosen])
 
-    return Grounds(some(is_asked), rows.by_pose[is_asked], some(~is_asked), view[~is_asked], asked)
+    return Grounds(some(is_asked), rows.by_pose[is_asked], some(~is_asked), view[~is_asked], asked, max(thinning, 1))
 
 
 def tracks_with_query(

@@ -68,4 +68,5 @@ def _unadjusted(
     rows = linearize(observe(tracks, views, structure.noise), structure.x_in_world[chosen], options.loss_scale_sigma)
     pose, x_in_world = estimate.world_from_camera, structure.x_in_world[matches.point[estimate.inliers]]
     one_match = one_match_covariance(query.camera, pose, x_in_world, structure.noise.level_px)
-    return uncertainty_of(grounds_of(rows, tracks.point, tracks.view), pose, one_match, options, is_initial)
+    grounds = grounds_of(rows, tracks.point, tracks.view, options.max_matches)
+    return uncertainty_of(grounds, pose, one_match, options, is_initial)

@@ -53,6 +53,8 @@ class UncertaintyOptions:
         shared_matches: so many independent matches are as good as any number. Without this bound positions of the two
             surveyed scenes, where a thousand matches agree, are claimed twice as exact as they are.
         position_factor, rotation_factor: on standard deviations; as `calibration.generic` prints them.
+        max_matches: of the photograph that are looked at, evenly thinned; twice as many take twice the time, and the
+            references' errors are in all of them.
         loss_scale_sigma: of the Cauchy loss that weighs matches, for poses that no adjustment has weighed.
         max_error_px: matches further from such a pose say nothing.
     """
@@ -61,12 +63,14 @@ class UncertaintyOptions:
     shared_matches: float = 33.0
     position_factor: float = 1.0
     rotation_factor: float = 1.83
+    max_matches: int = 1500
     loss_scale_sigma: float = 1.4
     max_error_px: float = 8.0
 
     def __post_init__(self) -> None:
         positive = (
             self.shared_matches,
+            self.max_matches,
             self.position_factor,
             self.rotation_factor,
             self.loss_scale_sigma,

@@ -1,0 +1,81 @@
+"""What each photograph contributes to the adjustment of its group: points, tracks, and how often each was measured.
+
+A reference's keypoint that serves several photographs is one measurement, not several: its information is divided among
+them. So points that are the same one, known by two photographs, need not be told to be.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform
+
+from .freedom import Freedom
+from .group import Sighting
+from .match import PointMatches
+from .pnp import reprojection_errors_px
+from .tracks import Tracks
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What a photograph contributes.
+
+    Attributes:
+        sighting: the photograph.
+        world_from_camera: its pose at the start.
+        chosen: (P_b,) points of its structure that it is matched with.
+        tracks: of these, over its references and, last, the photograph itself.
+    """
+
+    sighting: Sighting
+    world_from_camera: RigidTransform
+    chosen: NDArray[np.intp]
+    tracks: Tracks
+
+
+def part_of(sighting: Sighting, matches: PointMatches, freedom: Freedom, max_error_px: float, max_matches: int) -> Part:
+    """With the matches that are near enough, evenly thinned."""
+    structure, pose = sighting.structure, freedom.camera_from_world(sighting.image).inverse()
+    pixels = sighting.query.features.keypoints[matches.keypoint].astype(np.float64)
+    errors_px = reprojection_errors_px(sighting.query.camera, pose, structure.x_in_world[matches.point], pixels)
+    used = np.flatnonzero(errors_px < max_error_px)
+    used = used[:: max(1, -(-len(used) // max_matches))]
+    chosen = np.unique(matches.point[used])
+    is_chosen = np.zeros(len(structure.x_in_world), bool)
+    is_chosen[chosen] = True
+    seen = structure.tracks.select(is_chosen)
+    point = np.concatenate([seen.point, np.searchsorted(chosen, matches.point[used])])
+    view = np.concatenate([seen.view, np.full(len(used), len(sighting.references))])
+    keypoint = np.concatenate([seen.keypoint, matches.keypoint[used]])
+    order = np.lexsort((view, point))
+    return Part(sighting, pose, chosen, Tracks(point[order], view[order], keypoint[order]))
+
+
+class Shared:
+    """How often measurements of keypoints stand in a group."""
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self._times: Counter[object] = Counter()
+        for part in parts:
+            self._times.update(_measurements(part))
+
+    def times(self, part: Part) -> Array:
+        """(O,) of a part's observations."""
+        return np.array([self._times[it] for it in _measurements(part)], np.float64)
+
+
+def _measurements(part: Part) -> list[object]:
+    """What identifies each observation: the photograph and the keypoint."""
+    views = [it.view for it in part.sighting.references]
+    # A photograph of the group that was sent twice was measured once.
+    names: list[object] = [it.key for it in part.sighting.references]
+    names.append(part.sighting.query.features.keypoints.tobytes())
+    keypoints = [it.features.keypoints for it in (*views, part.sighting.query)]
+    rows = zip(part.tracks.view.tolist(), part.tracks.keypoint.tolist(), strict=True)
+    return [(names[v], *keypoints[v][k].tolist()) for v, k in rows]
