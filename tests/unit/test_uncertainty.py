@@ -7,6 +7,7 @@ what was stated, position and rotation apart. With 20 poses the ratio of two sta
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -183,6 +184,6 @@ def test_without_an_estimate_there_is_nothing_to_ask() -> None:
 @pytest.mark.parametrize(
     "options", [{"shrinkage": -0.1}, {"shrinkage": 1.1}, {"shared_matches": 0.0}, {"position_factor": 0.0}]
 )
-def test_senseless_options_are_refused(options: dict[str, float]) -> None:
+def test_senseless_options_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="senseless"):
         UncertaintyOptions(**options)

@@ -46,7 +46,8 @@ class CoverageOptions:
             35.
         log_scale: logarithm of the ratio of scales at which it has: a ratio of 1.35 costs half.
         sigma_px: of a match, each coordinate, with what references' poses add.
-        error_inflation: on standard deviations, as of the method's final adjustment.
+        error_inflation: on standard deviations: errors of neighbouring keypoints and of one reference's points go
+            together. On scenes with known poses true errors were 1.5 to 2.8 times what independent ones would be.
         enough_matches: with so many expected a photograph is localized: 130 of 140 real ones were, the others blurred
             or with something in the way.
         least_matches: with fewer it is not: 31 of 35 were not.

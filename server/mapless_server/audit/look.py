@@ -23,7 +23,7 @@ _RANSAC = PnpOptions(min_iterations=1000, inlier_px=6.0)
 """Wider than the query's: a focal length that is off by 5 % bends the image by 6 px before a pose makes up for it."""
 
 _INFLATION = 2.0
-"""Of standard deviations, as in the method's final adjustment: errors of neighbouring keypoints go together."""
+"""Of standard deviations: errors of neighbouring keypoints go together."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,7 +117,7 @@ class Place:
     """The photographs of one scene, described."""
 
     def __init__(self, dataset: Dataset) -> None:
-        self.frames = dataset.frames[:: KITCHEN_STEP if dataset.path.name == KITCHEN else 1]
+        self.frames = dataset.frames[:: KITCHEN_STEP if dataset.name == KITCHEN else 1]
         extractor, limits = make_extractor("sift"), ImageLimits()
         self.views: list[View] = [
             extractor.extract(decode_image(f.image_path.read_bytes(), limits), f.camera) for f in self.frames

@@ -63,7 +63,7 @@ class UncertaintyOptions:
     shared_matches: float = 33.0
     position_factor: float = 1.0
     rotation_factor: float = 1.83
-    max_matches: int = 1500
+    max_matches: int = 800
     loss_scale_sigma: float = 1.4
     max_error_px: float = 8.0
 
