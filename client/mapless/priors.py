@@ -6,6 +6,7 @@ and how well they fit is answered (`PriorCheck`); one that contradicts the photo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -150,7 +151,7 @@ def _fill_pose(message: Any, prior: PosePrior) -> None:
     message.covariance.row_major.extend(np.asarray(prior.covariance, float).ravel().tolist())
 
 
-_FILLERS = {
+_FILLERS: dict[str, Callable[[Any, Any], None]] = {
     "position": _fill_position,
     "geo_position": _fill_geo_position,
     "gravity": _fill_gravity,

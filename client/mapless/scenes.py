@@ -67,9 +67,10 @@ class Calibration:
             if len(getattr(self, name)) > MAX_TEXT:
                 raise ValueError(f"{name} must have at most {MAX_TEXT} characters, has {len(getattr(self, name))}")
 
-    def is_of(self, features: str, backend: str, variant: str) -> bool:
+    def is_of(self, features: str, backend: str, variant: str, server_version: str) -> bool:
         """Whether it was measured with what computed an answer."""
-        return (self.features, self.backend, self.variant) == (features, backend, variant)
+        measured = (self.features, self.backend, self.variant, self.server_version)
+        return measured == (features, backend, variant, server_version)
 
 
 def unit_vector(x: float, y: float, z: float) -> Vector:

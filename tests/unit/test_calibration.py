@@ -36,7 +36,7 @@ from mapless_server.calibration.worlds import other_world
 from mapless_server.dataset import Dataset
 from mapless_server.method.accuracy import Accuracy, accuracy_from_covariance
 
-SIFT = Conditions("sift", "geometric", "BEST")
+SIFT = Conditions("sift", "geometric", "BEST", "1")
 SIGMA_M, SIGMA_DEG = 0.02, 0.1
 
 
@@ -162,7 +162,7 @@ class TestApplying:
             features=conditions.features,
             backend=conditions.backend,
             variant=conditions.variant,
-            server_version="1",
+            server_version=conditions.server_version,
         )
 
     def test_multiplies_radii(self) -> None:
@@ -187,7 +187,7 @@ class TestApplying:
         scaled = scaled_covariance(self.COVARIANCE, self.FACTORS)
         np.testing.assert_allclose(correlation(scaled), correlation(self.COVARIANCE), atol=1e-12)
 
-    @pytest.mark.parametrize("field", ["features", "backend", "variant"])
+    @pytest.mark.parametrize("field", ["features", "backend", "variant", "server_version"])
     def test_what_something_else_computed_stays_uncalibrated(self, field: str) -> None:
         before = Accuracy(1.0, 2.0, 3.0, 4.0)
         other = self.calibration(replace(SIFT, **{field: "other"}))
@@ -274,7 +274,6 @@ def outcome(
         rejection="",
         message="",
         conditions=conditions,
-        server_version="1.2",
         true_pose=pose,
         pose=pose,
     )
@@ -319,7 +318,7 @@ class TestFindings:
     def test_what_is_stored_says_what_was_measured(self) -> None:
         stored = calibration_of(find(self.outcomes(), RightRule()))
         assert (stored.features, stored.backend, stored.variant) == ("sift", "geometric", "BEST")
-        assert (stored.query_count, stored.server_version) == (40, "1.2")
+        assert (stored.query_count, stored.server_version) == (40, SIFT.server_version)
 
     def test_answers_of_other_features_are_left_out(self) -> None:
         stronger = [outcome(f"s{i}", 50.0, conditions=replace(SIFT, features="aliked")) for i in range(5)]

@@ -55,11 +55,13 @@ class Conditions:
         features: name of the local features, with their options: "sift-2048-1024px-0.02".
         backend: of the coarse stage.
         variant: form of the method, as `Diagnostics` names it: "BEST".
+        server_version: another one may claim other radii.
     """
 
     features: str
     backend: str
     variant: str
+    server_version: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +88,7 @@ def claimed(accuracy: Accuracy, covariance: Array, conditions: Conditions, calib
         conditions: what computed the answer.
         calibration: of the scene; None if it has none.
     """
-    if calibration is None or not calibration.is_of(conditions.features, conditions.backend, conditions.variant):
+    if calibration is None or not calibration.is_of(*astuple(conditions)):
         return Claimed(accuracy, covariance, False)
     factors = Factors.of(calibration)
     return Claimed(scaled_accuracy(accuracy, factors), scaled_covariance(covariance, factors), True)

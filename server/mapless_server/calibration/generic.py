@@ -95,7 +95,7 @@ def collect(data: Path) -> Iterator[Answered]:
                 position, rotation = outcome.covariance[:3, :3], outcome.covariance[3:, 3:]
                 radii = [error_radius(c, p) for c in (position, np.degrees(np.degrees(rotation))) for p in (0.68, 0.95)]
                 first, second, third, fourth = np.divide([error_m, error_m, error_deg, error_deg], radii).tolist()
-                k = min(KS, key=lambda k: abs(k - it.pair.k))
+                k = min(k for k in KS if k >= it.pair.k)
                 yield Answered(name, k, first, second, third, fourth, error_m, error_deg, outcome.inlier_count)
 
 

@@ -53,7 +53,6 @@ class Outcome:
         inlier_count, match_count: of the answer.
         rejection, message: why there is no pose; empty if there is one.
         conditions: what computed it; None if the server refused the photograph.
-        server_version: of the server; empty likewise.
         true_pose: world from camera.
         pose: the answered one.
     """
@@ -69,7 +68,6 @@ class Outcome:
     rejection: str
     message: str
     conditions: Conditions | None
-    server_version: str
     true_pose: RigidTransform
     pose: RigidTransform | None
 
@@ -134,7 +132,7 @@ def ask(
     except InvalidArgument as error:
         return _nothing(frame, "REFUSED", error.message)
     used = answer.diagnostics
-    conditions = Conditions(used.features, used.backend, used.variant)
+    conditions = Conditions(used.features, used.backend, used.variant, used.server_version)
     if isinstance(answer, Rejected):
         return replace(_nothing(frame, answer.reason, answer.message), conditions=conditions)
     return _outcome(frame, answer, conditions, scaled)
@@ -164,7 +162,6 @@ def _outcome(frame: Frame, answer: LocalizationResult, conditions: Conditions, s
         rejection="",
         message="",
         conditions=conditions,
-        server_version=answer.diagnostics.server_version,
         true_pose=frame.world_from_camera,
         pose=answer.world_from_camera,
     )
@@ -172,7 +169,7 @@ def _outcome(frame: Frame, answer: LocalizationResult, conditions: Conditions, s
 
 def _nothing(frame: Frame, reason: str, message: str) -> Outcome:
     pose = frame.world_from_camera
-    return Outcome(frame.name, math.inf, math.inf, None, None, None, 0, 0, reason, message, None, "", pose, None)
+    return Outcome(frame.name, math.inf, math.inf, None, None, None, 0, 0, reason, message, None, pose, None)
 
 
 def _refuse_another_pose(frame: Frame, own: Sequence[Reference], scene: str) -> None:

@@ -180,7 +180,6 @@ def calibration_of(found: Findings) -> Calibration:
     """What a scene keeps of findings that have factors."""
     assert found.factors is not None
     assert found.conditions is not None
-    measured = [it for it in found.outcomes if it.conditions == found.conditions]
     return Calibration(
         position_factor_68=found.factors.position_68,
         position_factor_95=found.factors.position_95,
@@ -190,7 +189,7 @@ def calibration_of(found: Findings) -> Calibration:
         features=found.conditions.features,
         backend=found.conditions.backend,
         variant=found.conditions.variant,
-        server_version=measured[-1].server_version,
+        server_version=found.conditions.server_version,
     )
 
 

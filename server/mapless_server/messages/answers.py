@@ -56,7 +56,7 @@ def claim_of(covariance: Array | None, attempt: Attempt, options: LocalizeOption
     if covariance is None:
         return None
     backend = attempt.tier.pipeline.reconstructor.name
-    conditions = Conditions(attempt.tier.extractor.name, backend, options.variant.name)
+    conditions = Conditions(attempt.tier.extractor.name, backend, options.variant.name, __version__)
     return claimed(accuracy_from_covariance(covariance), covariance, conditions, attempt.attributes.calibration)
 
 

@@ -16,6 +16,7 @@ from mapless.wire import FieldError
 from ..calibration.factors import Claimed
 from ..engine import EngineOptions
 from ..group_localization import GroupResult, queued_s
+from ..method.accuracy import accuracy_from_covariance
 from ..method.group import MatchedSighting
 from ..method.localize import Variant
 from ..method.rejection import Rejection
@@ -24,7 +25,7 @@ from ..method.sequence import SequenceEstimate
 from ..query import Query
 from ..retrieval.narrowing import Narrowing
 from ..tenancy import key_of
-from .answers import accuracy_to_message, claim_of, covariance_to_message, diagnostics_to_message, rejection_to_message
+from .answers import accuracy_to_message, covariance_to_message, diagnostics_to_message, rejection_to_message
 from .enums import enum_to_message
 from .frames import axes_from_message, geo_pose_to_message
 from .naming import reference_ids_from_names
@@ -115,7 +116,7 @@ def rig_to_message(
         response = pb.LocalizeRigResponse(rejection=rejection_to_message(outcome))
     else:
         message = pb.RigLocalization(world_from_rig=wire.transform_to_message(outcome.world_from_rig))
-        _set_support(message, outcome.matched, outcome.covariance, group, queries)
+        _set_support(message, outcome.matched, outcome.covariance)
         if request.HasField("session_from_rig"):
             session_from_rig = wire.transform_from_message(request.session_from_rig, "session_from_rig")
             world_from_session = outcome.world_from_rig.compose(session_from_rig.inverse())
@@ -153,7 +154,7 @@ def sequence_to_message(
             captured = message.poses.add(world_from_camera=wire.transform_to_message(pose))
             if frame.HasField("capture_time"):
                 captured.capture_time.CopyFrom(frame.capture_time)
-        _set_support(message, outcome.matched, outcome.covariances[-1], group, queries)
+        _set_support(message, outcome.matched, outcome.covariances[-1])
         response = pb.LocalizeSequenceResponse(localization=message)
     response.images.extend(_reports(outcome, group, queries))
     return response
@@ -169,26 +170,15 @@ def _set_support(
     message: pb.RigLocalization | pb.SequenceLocalization,
     matched: Sequence[MatchedSighting],
     covariance: Array,
-    group: GroupResult,
-    queries: Sequence[Query],
 ) -> None:
     """What the two kinds of answers have in common."""
-    claim = _claim(covariance, matched, group, queries)
+    # A scene's calibration was measured of single photographs.
+    claim = Claimed(accuracy_from_covariance(covariance), covariance, False)
     message.covariance.CopyFrom(covariance_to_message(claim.covariance))
     message.accuracy.CopyFrom(accuracy_to_message(claim))
     message.inlier_count = sum(int(it.inliers.sum()) for it in matched)
     message.match_count = sum(len(it.matches) for it in matched)
     message.reprojection_error_px = float(np.median(np.concatenate([it.errors_px[it.inliers] for it in matched])))
-
-
-def _claim(
-    covariance: Array, matched: Sequence[MatchedSighting], group: GroupResult, queries: Sequence[Query]
-) -> Claimed:
-    """By the scene's calibration, of the image with most inliers; that was measured of single photographs."""
-    leading = max(matched, key=lambda it: int(it.inliers.sum())).sighting.image
-    claim = claim_of(covariance, group.results[leading].attempt, queries[leading].options)
-    assert claim is not None
-    return claim
 
 
 def _reports(

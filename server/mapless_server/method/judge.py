@@ -37,6 +37,9 @@ class JudgeOptions:
     Attributes:
         weights: of each of `FEATURES`. Fitted; see the module.
         scores: that the shares `LEVELS` of the right answers do not exceed.
+        agreement_weight: of ln(1 / chance) where gravity or heading agrees with a pose: 1 if nothing but chance made
+            poses wrong. But repeated structure and wrong references stand upright too, and an answer that is off by
+            little agrees as well as one that is not.
         ambiguity: of the search for a second place.
     """
 
@@ -45,12 +48,13 @@ class JudgeOptions:
         -2.047, -1.906, -1.734, -0.347, 0.158, 0.884, 1.71, 3.284, 4.788, 5.739,
         6.596, 7.268, 8.296, 8.937, 9.455, 9.817, 10.129, 10.584, 11.191, 12.39,
     )  # fmt: skip
+    agreement_weight: float = 0.3
     ambiguity: AmbiguityOptions = field(default_factory=AmbiguityOptions)
 
     def __post_init__(self) -> None:
         rising = all(a <= b for a, b in zip(self.scores, self.scores[1:], strict=False))
         sizes = len(self.weights) == len(FEATURES) and len(self.scores) == len(LEVELS)
-        if not (sizes and rising and all(weight >= 0 for weight in self.weights)):
+        if not (sizes and rising and all(weight >= 0 for weight in (*self.weights, self.agreement_weight))):
             raise ValueError(f"senseless options: {self}")
 
 
@@ -92,7 +96,7 @@ def judge(
         supported about as well, GATE where the trust is less than 1 - coverage.
     """
     evidence = evidence_of(support, inlier_px, log10_chance)
-    trust = trust_of(evidence, options)
+    trust = trust_of(evidence, options, log10_chance)
     hypotheses = find_rival(support, query_matches, options.ambiguity)
     if hypotheses:
         return Judgement(trust, evidence, _ambiguous(hypotheses))
@@ -106,9 +110,10 @@ def score_of(evidence: Evidence, options: JudgeOptions) -> float:
     return float(evidence.features() @ np.array(options.weights))
 
 
-def trust_of(evidence: Evidence, options: JudgeOptions) -> float:
-    """Share of right answers whose score is at most this evidence's."""
-    return float(np.interp(score_of(evidence, options), options.scores, LEVELS))
+def trust_of(evidence: Evidence, options: JudgeOptions, log10_chance: float = 0.0) -> float:
+    """Share of right answers whose score is at most this evidence's, and what agreement with priors adds to it."""
+    agreement = -options.agreement_weight * math.log(10) * log10_chance
+    return float(np.interp(score_of(evidence, options) + agreement, options.scores, LEVELS))
 
 
 def _distrusted(evidence: Evidence, trust: float, coverage: float) -> Rejection:

@@ -61,8 +61,8 @@ class UncertaintyOptions:
 
     shrinkage: float = 0.5
     shared_matches: float = 33.0
-    position_factor: float = 1.0
-    rotation_factor: float = 1.83
+    position_factor: float = 0.99
+    rotation_factor: float = 1.79
     max_matches: int = 800
     loss_scale_sigma: float = 1.4
     max_error_px: float = 8.0
