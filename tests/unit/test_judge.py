@@ -145,3 +145,14 @@ def test_degenerate_evidence_has_finite_features() -> None:
 def test_options_check_themselves(wrong: dict[str, tuple[float, ...]]) -> None:
     with pytest.raises(ValueError, match="senseless"):
         JudgeOptions(**wrong)  # type: ignore[arg-type]
+
+
+def test_agreement_with_gravity_adds_to_the_trust_and_takes_nothing() -> None:
+    """As much as its chance is small, and less than if nothing but chance made poses wrong."""
+    trusts = [trust_of(POOR, OPTIONS, log10_chance) for log10_chance in (0.0, -1.0, -3.0)]
+    assert trusts[0] == trust_of(POOR, OPTIONS)
+    assert trusts[0] < trusts[1] < trusts[2]
+    all_of_it = replace(OPTIONS, agreement_weight=1.0)
+    assert trust_of(POOR, all_of_it, -3.0) > trusts[2]
+    with pytest.raises(ValueError, match="senseless"):
+        replace(OPTIONS, agreement_weight=-0.1)

@@ -38,7 +38,8 @@ class GateOptions:
         min_hull_share: least share of the image that the inliers' convex hull covers. On the same photographs the worst
             right one had 0.08; a repeated floor tile that fooled 16 matches had 0.03.
         agreeing_factor: on both shares where gravity or heading agrees with the pose. Of 120 poses found by chance none
-            agreed with gravity; of 21 that failed for what they found, and agreed, all but one were within 10 cm.
+            agreed with gravity to a degree. Of 23 photographs with few or distant references whose pose agreed and
+            found too little, none was somewhere else: 14 were off by less than 10 cm, none by more than 30.
     """
 
     max_log10_false_alarms: float = -3.0
