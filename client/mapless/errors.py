@@ -84,7 +84,10 @@ class DataLoss(MaplessError):
 
 
 class Internal(MaplessError):
-    """A fault of the server; its log has the rest under `request_id`."""
+    """A fault of the server; its log has the rest under `request_id`.
+
+    The reason MALFORMED_ANSWER is the client's: what the server sent breaks the contract.
+    """
 
 
 _BY_CODE: dict[str, type[MaplessError]] = {

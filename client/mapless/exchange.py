@@ -11,6 +11,7 @@ a message over the limit (never come back), and they repeat a creation without b
 
 from __future__ import annotations
 
+import math
 import random
 import time
 from collections.abc import Callable, Generator
@@ -19,10 +20,14 @@ from typing import Any, Generic, TypeVar
 
 from google.protobuf.message import Message
 
-from .errors import MaplessError
+from .errors import DeadlineExceeded, Internal, MaplessError
 from .options import ConnectOptions
+from .wire import FieldError
 
 T = TypeVar("T")
+
+MALFORMED_ANSWER = "MALFORMED_ANSWER"
+"""The reason of the error that an answer is which breaks its contract."""
 
 _JITTER = 0.2  # of a pause of ours, either way, as gRPC has it
 _LATENESS = 0.25  # at most so much longer than the server asked for, never earlier: it refused many, and all will come
@@ -36,11 +41,12 @@ class Call:
         method: "package.Service/Method".
         request: the message.
         response_type: of which the answer is.
-        timeout_s: deadline, retries and pauses included; None for the options' own.
+        timeout_s: deadline, above 0, with all retries and pauses, and with what `on_repeat` asks; None for the
+            options' own.
         is_upload: whether that is then `upload_timeout_s`.
         on_repeat: for calls that change something: an earlier try may have succeeded though its answer was lost, and
             then the next one fails as if somebody else had done it. Given the error, it raises it, or yields the calls
-            that find out, and returns what the lost answer would have been.
+            that find out, and returns what the lost answer would have been. All of them have the deadline of this one.
     """
 
     method: str
@@ -105,20 +111,29 @@ class _Clock:
 
 
 def attempts(
-    exchange: Exchange[T], options: ConnectOptions, clock: _Clock | None = None
+    exchange: Exchange[T], options: ConnectOptions, clock: _Clock | None = None, deadline_s: float = math.inf
 ) -> Generator[Attempt | Pause, Any, T]:
     """The exchange with retries: yields what is to be done, returns what the exchange does.
 
     A call is tried again if the server is UNAVAILABLE, or RESOURCE_EXHAUSTED and says when to come back; never if
     the pause before would outlast its deadline. A server that says when to come back is taken at its word until then;
-    other attempts are counted.
+    other attempts are counted. An answer that the exchange cannot read is an error of the server, `Internal`.
+
+    Args:
+        exchange: the calls.
+        options: how often to try, and for how long.
+        clock: another than the computer's.
+        deadline_s: of all calls together, by that clock, beside each call's own.
+
+    Raises:
+        ValueError: a call's `timeout_s` is not above 0.
     """
     clock = clock or _Clock()
     try:
         call = next(exchange)
         while True:
-            outcome = yield from _with_retries(call, options, clock)
-            call = exchange.throw(outcome) if isinstance(outcome, MaplessError) else exchange.send(outcome)
+            outcome = yield from _with_retries(call, options, clock, deadline_s)
+            call = exchange.throw(outcome) if isinstance(outcome, MaplessError) else _answered(exchange, call, outcome)
     except StopIteration as end:
         value: T = end.value
         return value
@@ -126,10 +141,27 @@ def attempts(
         exchange.close()
 
 
-def _with_retries(call: Call, options: ConnectOptions, clock: _Clock) -> Generator[Attempt | Pause, Any, Any]:
+def _answered(exchange: Exchange[Any], call: Call, response: Message) -> Call:
+    """The exchange's next call; what it cannot read in the response breaks the contract.
+
+    `wire` calls that a FieldError, which in a request is the caller's fault and here the server's.
+    """
+    try:
+        return exchange.send(response)
+    except (ValueError, OverflowError) as error:
+        field_path = error.field if isinstance(error, FieldError) else None
+        message = f"the answer of {call.method} breaks its contract: {error}"
+        request_id = getattr(getattr(response, "diagnostics", None), "request_id", "")
+        raise Internal("INTERNAL", message, reason=MALFORMED_ANSWER, field=field_path, request_id=request_id) from error
+
+
+def _with_retries(
+    call: Call, options: ConnectOptions, clock: _Clock, deadline_s: float
+) -> Generator[Attempt | Pause, Any, Any]:
     """One call until it succeeds, fails for good, or has no attempts or no time left; its response, or its error."""
-    timeout_s = call.timeout_s or (options.upload_timeout_s if call.is_upload else options.timeout_s)
-    deadline_s = clock.now_s() + timeout_s
+    deadline_s = min(clock.now_s() + _timeout_s(call, options), deadline_s)
+    if clock.now_s() >= deadline_s:
+        return DeadlineExceeded("DEADLINE_EXCEEDED", f"no time was left for {call.method}")
     may_be_done = False  # by a try whose answer never came
     attempt = 0
     while True:
@@ -138,7 +170,7 @@ def _with_retries(call: Call, options: ConnectOptions, clock: _Clock) -> Generat
         if not isinstance(outcome, MaplessError):
             return outcome
         if may_be_done and call.on_repeat is not None and outcome.code in {"ALREADY_EXISTS", "NOT_FOUND"}:
-            return (yield from _found_out(call.on_repeat(outcome), options, clock))
+            return (yield from _found_out(call.on_repeat(outcome), options, clock, deadline_s))
         pause_s = _pause_s(outcome, attempt, options, clock)
         is_last = attempt >= options.max_attempts and (outcome.retry_after_s is None or options.max_attempts == 1)
         if pause_s is None or is_last or clock.now_s() + pause_s >= deadline_s:
@@ -147,9 +179,19 @@ def _with_retries(call: Call, options: ConnectOptions, clock: _Clock) -> Generat
         yield Pause(pause_s, outcome)
 
 
-def _found_out(exchange: Exchange[Any], options: ConnectOptions, clock: _Clock) -> Generator[Attempt | Pause, Any, Any]:
+def _timeout_s(call: Call, options: ConnectOptions) -> float:
+    if call.timeout_s is None:
+        return options.upload_timeout_s if call.is_upload else options.timeout_s
+    if not call.timeout_s > 0:
+        raise ValueError(f"timeout_s must be above 0, is {call.timeout_s:g}")
+    return call.timeout_s
+
+
+def _found_out(
+    exchange: Exchange[Any], options: ConnectOptions, clock: _Clock, deadline_s: float
+) -> Generator[Attempt | Pause, Any, Any]:
     try:
-        return (yield from attempts(exchange, options, clock))
+        return (yield from attempts(exchange, options, clock, deadline_s))
     except MaplessError as error:
         return error
 

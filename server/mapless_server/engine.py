@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -163,8 +163,21 @@ class Engine:
         work = Work(query, source or self._library, views, caller.deadline_s)
         step = self._stages.first_step(work)
         with _as_request_errors():
-            size_bytes = len(query.photo.image)
+            size_bytes = 0 if query.is_part else len(query.photo.image)  # which `hold` counts
             return await self.queue.submit(caller.flow, step, caller.deadline_s, size_bytes, visits)
+
+    @contextmanager
+    def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
+        """Counts the photographs of a group as held for as long as its call lasts, whichever of them are queued.
+
+        Raises:
+            RequestError: there is no room for them.
+        """
+        with ExitStack() as stack:
+            with _as_request_errors():
+                size_bytes = sum(len(query.photo.image) for query in queries)
+                stack.enter_context(self.queue.hold(caller.flow, size_bytes))
+            yield
 
     def check_room(self) -> None:
         """Raises RequestError if no query of anybody would be admitted now: then none has to be looked at."""
@@ -226,17 +239,17 @@ class Engine:
         return max(self.options.workers, self.options.max_batch)
 
     async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
-        """What is computed of several photographs' answers, in its turn.
+        """What is computed of several photographs' answers, in its turn, however full the queue is.
 
         Raises:
-            RequestError: a full queue, a passed deadline.
+            RequestError: a passed deadline.
         """
 
         def once(_: None, check: Callable[[], None]) -> Joined:
             check()
             return compute()
 
-        (joined,) = await self._each(JOIN, [None], once, caller, 0)
+        (joined,) = await self._each(JOIN, [None], once, caller, 0, continues=True)
         return joined
 
     async def _each(
@@ -247,13 +260,16 @@ class Engine:
         caller: Caller,
         size_bytes: int,
         jobs: int | None = None,
+        continues: bool = False,
     ) -> list[Outcome]:
         """Computes items by several jobs, or else as many as there are threads; others have their turn in between."""
         work = Items(items, compute)
         jobs = min(jobs or self.options.workers, len(items))
         step = Step(stage, stage, stage, work)
         submissions = [
-            asyncio.ensure_future(self.queue.submit(caller.flow, step, caller.deadline_s, size_bytes // jobs))
+            asyncio.ensure_future(
+                self.queue.submit(caller.flow, step, caller.deadline_s, size_bytes // jobs, continues=continues)
+            )
             for _ in range(jobs)
         ]
         with _as_request_errors():

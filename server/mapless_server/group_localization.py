@@ -7,18 +7,22 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from mapless.geometry import RigidTransform
 
 from .engine import Engine
 from .errors import Overloaded, RequestError
 from .method.group import GroupImage
+from .method.group_hints import hinted_group
 from .method.localize import LocalizeOptions
 from .method.rejection import Rejection
 from .method.rig import RigEstimate, RigOptions, solve_rig
 from .method.sequence import SequenceEstimate, SequenceOptions, solve_sequence
 from .query import Caller, Query, Result
 from .scheduling.jobs import Visit
+
+Joint = TypeVar("Joint", RigEstimate, SequenceEstimate)
 
 MAX_RIG_IMAGES = 8
 MIN_FRAMES, MAX_FRAMES = 2, 16
@@ -43,6 +47,12 @@ class GroupResult:
         """For posing them together."""
         return [_image(result) for result in self.results]
 
+    def hinted(self, outcome: Joint | Rejection) -> Joint | Rejection:
+        """What was computed of them together, with a hint if it is a rejection."""
+        if not isinstance(outcome, Rejection):
+            return outcome
+        return hinted_group(outcome, [(result.attempt.answer, result.attempt.references) for result in self.results])
+
 
 async def localize_rig(
     engine: Engine, group: GroupResult, rig_from_camera: Sequence[RigidTransform], caller: Caller
@@ -50,10 +60,10 @@ async def localize_rig(
     """The pose of the rig that took the photographs.
 
     Raises:
-        RequestError: a full queue, a passed deadline.
+        RequestError: a passed deadline.
     """
     images = group.images()
-    return await engine.join(lambda: solve_rig(images, rig_from_camera, RigOptions()), caller)
+    return group.hinted(await engine.join(lambda: solve_rig(images, rig_from_camera, RigOptions()), caller))
 
 
 async def localize_sequence(
@@ -66,13 +76,21 @@ async def localize_sequence(
     """The poses of the frames of a sequence, OpenCV's axes.
 
     Raises:
-        RequestError: a full queue, a passed deadline.
+        RequestError: a passed deadline.
     """
     images, options = group.images(), SequenceOptions()
-    return await engine.join(lambda: solve_sequence(images, session_from_camera, estimate_scale, options), caller)
+    return group.hinted(
+        await engine.join(lambda: solve_sequence(images, session_from_camera, estimate_scale, options), caller)
+    )
 
 
-async def localize_each(engine: Engine, queries: Sequence[Query], caller: Caller, list_name: str) -> GroupResult:
+async def localize_each(
+    engine: Engine,
+    queries: Sequence[Query],
+    caller: Caller,
+    list_name: str,
+    visits: Sequence[list[Visit]] | None = None,
+) -> GroupResult:
     """Localizes photographs, as many at a time as the engine computes.
 
     All of them at once would be more than a caller may have waiting. A photograph that there is no room for waits until
@@ -83,11 +101,12 @@ async def localize_each(engine: Engine, queries: Sequence[Query], caller: Caller
         queries: the photographs.
         caller: whose they are.
         list_name: the field of the request that holds them, for what is wrong with one.
+        visits: of each, gets the stages that it goes through, for who wants to know how far they came if one fails.
 
     Raises:
         RequestError: as of `Engine.localize`, its field within the list.
     """
-    group = _Group(engine, queries, caller, list_name)
+    group = _Group(engine, queries, caller, list_name, visits or [[] for _ in queries])
     workers = [asyncio.ensure_future(group.work()) for _ in range(min(len(queries), engine.parallel_queries))]
     try:
         await asyncio.gather(*workers)
@@ -106,7 +125,8 @@ class _Group:
     queries: Sequence[Query]
     caller: Caller
     list_name: str
-    done: dict[int, tuple[Result, list[Visit], float]] = field(default_factory=dict)
+    visits: Sequence[list[Visit]]
+    done: dict[int, tuple[Result, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._waiting = deque(range(len(self.queries)))
@@ -128,15 +148,14 @@ class _Group:
                 self._underway -= 1
 
     async def _localize(self, index: int) -> None:
-        visits: list[Visit] = []
         start_s = time.monotonic()
         try:
-            result, _ = await self.engine.localize(self.queries[index], self.caller, visits=visits)
+            result, _ = await self.engine.localize(self.queries[index], self.caller, visits=self.visits[index])
         except RequestError as error:
             if error.field is not None and error.field.startswith("references"):
                 error.field = f"{self.list_name}[{index}].{error.field}"
             raise
-        self.done[index] = result, visits, time.monotonic() - start_s
+        self.done[index] = result, time.monotonic() - start_s
 
     async def _wait(self, refused: Overloaded) -> None:
         """Until there may be room; raises what there was no room by, if nothing was computed or there is no time."""
@@ -147,8 +166,8 @@ class _Group:
 
     def result(self) -> GroupResult:
         """Of all."""
-        results, visits, seconds = zip(*(self.done[i] for i in range(len(self.queries))), strict=True)
-        return GroupResult(results, tuple(map(tuple, visits)), seconds)
+        results, seconds = zip(*(self.done[i] for i in range(len(self.queries))), strict=True)
+        return GroupResult(results, tuple(map(tuple, self.visits)), seconds)
 
 
 def queued_s(visits: Sequence[Visit]) -> float:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
-from mapless import wire
 from mapless.v1 import localization_service_pb2 as pb
 
 from .engine import Engine
@@ -22,12 +22,14 @@ from .messages.groups import (
     queries_from_message,
     rig_to_message,
     sequence_to_message,
+    session_from_rig_from_message,
     session_poses_from_message,
 )
 from .method.rejection import Rejection
 from .observability.metrics import LOCALIZED, Metrics
 from .query import Query
 from .rpc import Call
+from .scheduling.jobs import Visit
 
 
 async def answer_rig(
@@ -37,11 +39,11 @@ async def answer_rig(
     bounds = (1, MAX_RIG_IMAGES)
     queries = queries_from_message(request, "images", bounds, call.principal.tenant, engine.options)
     rig_from_camera = poses_from_message(request.images, "images", "rig_from_camera")
-    if request.HasField("session_from_rig"):
-        wire.transform_from_message(request.session_from_rig, "session_from_rig")
-    group = await _localize_each(engine, queries, call, "images")
-    outcome = await localize_rig(engine, group, rig_from_camera, call.caller)
-    response = rig_to_message(outcome, group, queries, request)
+    session_from_rig = session_from_rig_from_message(request)
+    with engine.hold(queries, call.caller):
+        group = await _localize_each(engine, queries, call, "images")
+        outcome = await localize_rig(engine, group, rig_from_camera, call.caller)
+    response = rig_to_message(outcome, group, queries, request, session_from_rig)
     _conclude(response, outcome, group, call, metrics)
     return response
 
@@ -53,8 +55,10 @@ async def answer_sequence(
     bounds = (MIN_FRAMES, MAX_FRAMES)
     queries = queries_from_message(request, "frames", bounds, call.principal.tenant, engine.options)
     axes, session_from_camera = session_poses_from_message(request)
-    group = await _localize_each(engine, queries, call, "frames")
-    outcome = await localize_sequence(engine, group, session_from_camera, request.estimate_session_scale, call.caller)
+    scale_is_free = request.estimate_session_scale
+    with engine.hold(queries, call.caller):
+        group = await _localize_each(engine, queries, call, "frames")
+        outcome = await localize_sequence(engine, group, session_from_camera, scale_is_free, call.caller)
     response = sequence_to_message(outcome, group, queries, request, axes)
     _conclude(response, outcome, group, call, metrics)
     return response
@@ -62,13 +66,14 @@ async def answer_sequence(
 
 async def _localize_each(engine: Engine, queries: Sequence[Query], call: Call, list_name: str) -> GroupResult:
     call.note(scene=queries[0].scene_key, images=len(queries))
-    group = await localize_each(engine, queries, call.caller, list_name)
-    for visits in group.visits:
-        for visit in visits:
+    visits: list[list[Visit]] = [[] for _ in queries]
+    try:
+        return await localize_each(engine, queries, call.caller, list_name, visits)
+    finally:
+        for visit in itertools.chain.from_iterable(visits):
             call.waited(visit.stage, visit.queued_s, visit.start_s)
             if visit.jobs:
                 call.computed(visit.stage, visit.start_s, visit.end_s, batch=visit.batch, batch_size=visit.jobs)
-    return group
 
 
 def _conclude(

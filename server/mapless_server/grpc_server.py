@@ -89,7 +89,7 @@ class GrpcServer:
         self._server = grpc.aio.server(
             interceptors=[self._interceptor], options=_options(settings), maximum_concurrent_rpcs=MAX_CONCURRENT_RPCS
         )
-        self._watchers = Watchers(settings.allow_watching)
+        self._watchers = Watchers(settings.allow_watching, settings.max_message_mib * 2**20)
         self._references = ReferenceService(self._ready_engine, store)
         reference_service_pb2_grpc.add_ReferenceServiceServicer_to_server(self._references, self._server)
         localization_service_pb2_grpc.add_LocalizationServiceServicer_to_server(

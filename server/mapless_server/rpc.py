@@ -211,6 +211,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             given_s = math.inf if asked_s is None else asked_s
         else:
             given_s = min(self._default_deadline_s if asked_s is None else asked_s, self._max_deadline_s)
+        if math.isfinite(given_s):
             margin_s = min(max(ANSWER_MARGIN_S, ANSWER_MARGIN_SHARE * given_s), _MAX_MARGIN_SHARE * given_s)
         metadata = _metadata(context)
         request_id = _well_formed(metadata, REQUEST_ID_KEY) or uuid.uuid4().hex
@@ -246,7 +247,11 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
                     # The token may have been revoked, or have expired, since.
                     self._who_calls(method, _metadata(context), context.auth_context())
                     data = bytes(handler.response_serializer(response))
-                    await context.write(data)
+                    try:
+                        await context.write(data)
+                    except grpc.aio.BaseError as error:
+                        # Who leaves while it is being sent, or is not heard of any more, has ended the call.
+                        raise asyncio.CancelledError("nobody reads any more") from error
                     sent_bytes += len(data)
         except FieldError as error:
             raise InvalidArgument(str(error), field=error.field) from None

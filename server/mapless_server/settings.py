@@ -113,7 +113,9 @@ class Settings(BaseSettings):
         description="Share of right answers to accept where a call does not say; more, and more wrong ones pass too.",
     )
     allow_watching: bool = Field(
-        default=False, description="Whether WatchQueries may show callers' photographs to those with the role write."
+        default=False,
+        description="Whether WatchQueries may show callers' photographs to those with the role write. What waits for "
+        "watchers, of whom there are 8 at most, takes the memory of 24 images.",
     )
     warm_up: bool = Field(default=True, description="Whether a localization is tried before the first call is taken.")
     drain_delay_s: float = Field(

@@ -45,9 +45,9 @@ class EscalationOptions:
     """Options of trying stronger features.
 
     Attributes:
-        doubtful_trust: a pose that is trusted less is doubtful. Of 706 photographs, many with few references, SIFT had
-            26 over 10 cm off; trying again below this trust tries 94, all of these among them, where fewer than 50
-            inliers or a large radius tried 96, with 23 of them.
+        doubtful_trust: a pose that is trusted less is doubtful. Of 967 photographs, many with few references, SIFT had
+            13 over 10 cm off; trying again below this trust tries 110, all of these among them, where fewer than 50
+            inliers or a large radius tried 105, with 10 of them.
         doubtful_radius_m: a pose whose claimed 68 % radius is larger is doubtful: what a robot needs to pass a door.
         same_position_m, same_rotation_deg: two poses closer than this never contradict each other, however small the
             claimed radii, which leave out the errors of the references' poses.

@@ -1,7 +1,8 @@
 """Who watches a scene's queries as they are answered: a hub between Localize and WatchQueries.
 
 Everything runs on the event loop. Photographs are held in memory until they are sent, a few for each watcher, and
-stored nowhere. Without watchers it costs a look into a dictionary.
+stored nowhere: at most MAX_WATCHERS times QUEUE_LENGTH, so 24 images of `max_image_mib` (384 MiB by default), and the
+message that each watcher is being sent. Without watchers it costs a look into a dictionary.
 """
 
 from __future__ import annotations
@@ -40,9 +41,10 @@ class Watch:
     It ends with Unavailable, when the server stops.
     """
 
-    def __init__(self, forget: Callable[[Watch], None]) -> None:
-        """`forget` is told when it ends."""
+    def __init__(self, forget: Callable[[Watch], None], max_message_bytes: int) -> None:
+        """`forget` is told when it ends; messages larger than the limit go without their photograph."""
         self._forget = forget
+        self._max_message_bytes = max_message_bytes
         self._waiting: deque[Watched] = deque(maxlen=QUEUE_LENGTH)
         self._missed_count = 0
         self._is_over = False
@@ -72,9 +74,12 @@ class Watch:
             raise Unavailable("the server is stopping", reason="DRAINING", retry_after_s=1.0)
         watched = self._waiting.popleft()
         missed, self._missed_count = self._missed_count, 0
-        return pb.WatchQueriesResponse(
+        message = pb.WatchQueriesResponse(
             image=watched.image, intrinsics=watched.intrinsics, answer=watched.answer, missed_count=missed
         )
+        if message.ByteSize() > self._max_message_bytes:  # a photograph nearly as large as a message may be
+            message.ClearField("image")
+        return message
 
     async def aclose(self) -> None:
         """Nobody looks any more."""
@@ -84,9 +89,15 @@ class Watch:
 class Watchers:
     """Passes answers on to those who watch their scene."""
 
-    def __init__(self, are_allowed: bool) -> None:
-        """`are_allowed` is the setting: whether callers' photographs may be shown to others at all."""
+    def __init__(self, are_allowed: bool, max_message_bytes: int = 32 * 2**20) -> None:
+        """Nobody watches yet.
+
+        Args:
+            are_allowed: the setting: whether callers' photographs may be shown to others at all.
+            max_message_bytes: the largest message that can be sent.
+        """
         self._are_allowed = are_allowed
+        self._max_message_bytes = max_message_bytes
         self._of_scene: dict[SceneKey, set[Watch]] = {}
 
     def is_watched(self, scene_key: SceneKey) -> bool:
@@ -111,7 +122,10 @@ class Watchers:
         answer.CopyFrom(response)
         if debug is not None:
             answer.debug.CopyFrom(debug)
-        watched = Watched(request.image, request.intrinsics, answer)
+        # A part of a message keeps all of it, with the image a second time.
+        intrinsics = geometry_pb.CameraIntrinsics()
+        intrinsics.CopyFrom(request.intrinsics)
+        watched = Watched(request.image, intrinsics, answer)
         for watch in watches:
             watch.tell(watched)
 
@@ -139,7 +153,7 @@ class Watchers:
             FailedPrecondition, Overloaded: see `check`.
         """
         self.check(tenant_of(scene_key))
-        watch = Watch(lambda it: self._forget(scene_key, it))
+        watch = Watch(lambda it: self._forget(scene_key, it), self._max_message_bytes)
         self._of_scene.setdefault(scene_key, set()).add(watch)
         return watch
 

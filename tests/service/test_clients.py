@@ -7,6 +7,7 @@ import inspect
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +30,12 @@ from mapless import (
     Unavailable,
     aio,
 )
+from mapless.geodesy import Datum
+from mapless.geometry import Quaternion
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as reference_pb
 
+DATUM = Datum(47.0, 8.0, 400.0, Quaternion(0.1, -0.3, 0.3, 0.9))
 FAST = ConnectOptions(initial_backoff_s=0.01, max_backoff_s=0.02)
 
 both = pytest.mark.parametrize("connect", [Client, awaiting], ids=["blocking", "asyncio"])
@@ -139,7 +143,7 @@ def test_a_change_whose_answer_was_lost_is_made_once(server: RunningServer, conn
     scene = f"lost-{time.monotonic_ns()}"
     references = [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)]
     changes: list[Callable[[Client], Any]] = [
-        lambda client: client.create_scene(scene),
+        lambda client: client.create_scene(scene, datum=DATUM, down_in_world=-9.81 * DATUM.enu_from_world.matrix()[2]),
         lambda client: client.add_reference(scene, references[0]),
         lambda client: client.add_references(scene, references[1:]),
         lambda client: client.delete_reference(scene, "r0"),
@@ -167,6 +171,25 @@ def test_what_somebody_else_created_is_not_taken_for_ours(server: RunningServer,
         pytest.raises(AlreadyExists),
     ):
         client.create_scene(scene)
+    here = f"here-{time.monotonic_ns()}"
+    with Client(server.address) as somebody:
+        somebody.create_scene(here, datum=replace(DATUM, latitude_deg=-33.0))
+    with (
+        losing(server.address, does_it=False) as (address, _),
+        connect(address, FAST) as client,
+        pytest.raises(AlreadyExists),
+    ):
+        client.create_scene(here, datum=DATUM)
+
+
+@both
+def test_no_time_is_refused(server: RunningServer, connect: Connect) -> None:
+    with connect(server.address) as client:
+        for timeout_s in (0, -1.0):
+            with pytest.raises(ValueError, match="timeout_s must be above 0"):
+                client.get_scene("s", timeout_s=timeout_s)
+            with pytest.raises(ValueError, match="timeout_s must be above 0"):
+                list(client.list_scenes(timeout_s=timeout_s))
 
 
 @both

@@ -8,10 +8,21 @@ import pytest
 from google.protobuf import empty_pb2
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from played import Played
 
-from mapless.errors import AlreadyExists, InvalidArgument, MaplessError, NotFound, ResourceExhausted, Unavailable
-from mapless.exchange import Attempt, Call, Exchange, Pause, _Clock, attempts
+from mapless.errors import (
+    AlreadyExists,
+    DeadlineExceeded,
+    Internal,
+    InvalidArgument,
+    MaplessError,
+    NotFound,
+    ResourceExhausted,
+    Unavailable,
+)
+from mapless.exchange import Call, Exchange
 from mapless.options import ConnectOptions
+from mapless.wire import FieldError
 
 Empty: Any = empty_pb2.Empty  # type: ignore[attr-defined]
 UNAVAILABLE = Unavailable("UNAVAILABLE", "gone")
@@ -24,45 +35,6 @@ def full(retry_after_s: float | None) -> MaplessError:
 def asking(**given: Any) -> Exchange[Any]:
     """An exchange of one call, which returns what it is answered."""
     return (yield Call("s/M", Empty(), Empty, **given))
-
-
-class Played:
-    """An exchange with scripted outcomes; the last is repeated.
-
-    Attributes:
-        tries: the time left to each attempt, seconds.
-        pauses: seconds.
-        took_s: all of them together with the attempts, which take a second each.
-        result: what it returned, or its error.
-    """
-
-    def __init__(
-        self, exchange: Exchange[Any], outcomes: list[Any], options: ConnectOptions, dice: float = 0.5
-    ) -> None:
-        self.tries: list[float] = []
-        self.calls: list[Call] = []
-        self.pauses: list[float] = []
-        self.took_s = 0.0
-        clock = _Clock(lambda: self.took_s, lambda low, high: low + dice * (high - low))
-        steps = attempts(exchange, options, clock)
-        outcomes = list(outcomes)
-        try:
-            step = next(steps)
-            while True:
-                if isinstance(step, Pause):
-                    self.pauses.append(step.duration_s)
-                    self.took_s += step.duration_s
-                    step = next(steps)
-                else:
-                    assert isinstance(step, Attempt)
-                    self.tries.append(step.timeout_s)
-                    self.calls.append(step.call)
-                    self.took_s += 1.0
-                    step = steps.send(outcomes.pop(0) if len(outcomes) > 1 else outcomes[0])
-        except StopIteration as end:
-            self.result: Any = end.value
-        except MaplessError as error:
-            self.result = error
 
 
 def test_what_succeeds_is_asked_once() -> None:
@@ -180,3 +152,51 @@ def test_an_exchange_can_go_on_after_an_error() -> None:
 
     played = Played(two(), [ABSENT, Empty()], ConnectOptions())
     assert (played.result, [call.method for call in played.calls]) == ("done", ["s/A", "s/B"])
+
+
+def test_what_is_looked_up_after_a_lost_answer_has_the_time_that_is_left_and_no_more() -> None:
+    """Each attempt takes a second, and there are 32 things to look up."""
+
+    def each(error: MaplessError) -> Exchange[None]:
+        for _ in range(32):
+            yield Call("s/Get", Empty(), Empty)
+
+    played = Played(asking(timeout_s=10.0, on_repeat=each), [UNAVAILABLE, TAKEN, Empty()], ConnectOptions())
+    assert isinstance(played.result, DeadlineExceeded)
+    assert played.took_s < 10 + 1
+    assert played.tries == pytest.approx([10.0, *(8.8 - i for i in range(9))])
+
+
+def test_what_is_looked_up_has_no_more_time_than_any_other_call() -> None:
+    options = ConnectOptions(timeout_s=5, upload_timeout_s=300)
+    played = Played(asking(is_upload=True, on_repeat=found), [UNAVAILABLE, TAKEN, Empty()], options)
+    assert played.tries == pytest.approx([300.0, 298.8, 5.0])
+
+
+@pytest.mark.parametrize("timeout_s", [0, 0.0, -1.0, float("nan")])
+def test_no_time_is_not_the_usual_time(timeout_s: float) -> None:
+    with pytest.raises(ValueError, match="timeout_s must be above 0"):
+        Played(asking(timeout_s=timeout_s), [Empty()], ConnectOptions())
+
+
+def test_an_answer_that_cannot_be_read_is_the_servers_fault() -> None:
+    def reading() -> Exchange[None]:
+        yield Call("s/M", Empty(), Empty)
+        raise FieldError("pose.translation_m.x", "must be finite, is nan")
+
+    error = Played(reading(), [Empty()], ConnectOptions()).result
+    assert isinstance(error, Internal)
+    assert (error.code, error.reason, error.field) == ("INTERNAL", "MALFORMED_ANSWER", "pose.translation_m.x")
+    assert "s/M" in error.message
+    assert isinstance(error.__cause__, FieldError)
+
+
+def test_a_request_that_cannot_be_made_is_the_callers() -> None:
+    def without_focal_length() -> Empty:
+        raise FieldError("camera", "is none")
+
+    def making() -> Exchange[None]:
+        yield Call("s/M", without_focal_length(), Empty)
+
+    with pytest.raises(FieldError, match="is none"):
+        Played(making(), [Empty()], ConnectOptions())

@@ -117,6 +117,18 @@ def test_agreement_of_few_of_many_visible_points_is_doubted() -> None:
     assert not doubt_of((view, behind, few))
 
 
+def test_where_gravity_agrees_less_need_be_found_but_something_must() -> None:
+    view, structure, matches = planted(random_for("share"), 1000)
+
+    def doubt(count: int, log10_chance: float) -> str | None:
+        few = PointMatches(matches.point[:count], matches.keypoint[:count], matches.guided[:count], 0.0)
+        return doubts(view, structure, few, POSE, np.ones(count, bool), 4.0, GateOptions(), log10_chance)
+
+    assert "should be found" in (doubt(30, 0.0) or "")
+    assert doubt(30, -2.8) is None
+    assert "should be found" in (doubt(15, -2.8) or "")
+
+
 def test_the_hull_is_that_of_a_known_rectangle() -> None:
     corners = np.array([[0.0, 0.0], [480.0, 0.0], [480.0, 360.0], [0.0, 360.0], [100.0, 100.0]])
     query, _, matches = problem_of(np.zeros((5, 3)), corners)

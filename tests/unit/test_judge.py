@@ -149,10 +149,11 @@ def test_options_check_themselves(wrong: dict[str, tuple[float, ...]]) -> None:
 
 def test_agreement_with_gravity_adds_to_the_trust_and_takes_nothing() -> None:
     """As much as its chance is small, and less than if nothing but chance made poses wrong."""
-    trusts = [trust_of(POOR, OPTIONS, log10_chance) for log10_chance in (0.0, -1.0, -3.0)]
-    assert trusts[0] == trust_of(POOR, OPTIONS)
+    doubtful = Evidence(-60.0, 40, 60, 200, 0.2, 2.0, 1.0, 0.1)
+    trusts = [trust_of(doubtful, OPTIONS, log10_chance) for log10_chance in (0.0, -1.0, -3.0)]
+    assert trusts[0] == trust_of(doubtful, OPTIONS)
     assert trusts[0] < trusts[1] < trusts[2]
     all_of_it = replace(OPTIONS, agreement_weight=1.0)
-    assert trust_of(POOR, all_of_it, -3.0) > trusts[2]
+    assert trust_of(doubtful, all_of_it, -3.0) > trusts[2]
     with pytest.raises(ValueError, match="senseless"):
         replace(OPTIONS, agreement_weight=-0.1)

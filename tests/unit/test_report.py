@@ -269,6 +269,46 @@ class TestPictures:
         assert int.from_bytes(data[4:8], "little") == len(data) - 8
         np.testing.assert_array_equal(pixels(data), pixels(simple))
 
+    @pytest.mark.parametrize("extension", [".png", ".webp", ".jpg"])
+    def test_what_follows_a_picture_in_its_file_is_cut_off(self, extension: str) -> None:
+        image = encode(extension, textured(64, 48))
+        further = with_exif_orientation(PHOTO, 6)  # phones append smaller pictures, depth, films
+        for trailer in (b"where", b"\xff\xd9where", b"EXIF\5\0\0\0where\0", further, b"PK\3\4"):
+            data = embedded(report_html(localized(), image + trailer, CAMERA))
+            assert data == embedded(report_html(localized(), image, CAMERA))
+            assert b"where" not in data
+            np.testing.assert_array_equal(pixels(data), pixels(image))
+
+    @pytest.mark.parametrize(
+        "parameters",
+        [(cv2.IMWRITE_JPEG_PROGRESSIVE, 1), (cv2.IMWRITE_JPEG_RST_INTERVAL, 2), (cv2.IMWRITE_JPEG_OPTIMIZE, 1)],
+        ids=["several scans", "restarts", "tables of its own"],
+    )
+    def test_a_jpeg_is_followed_to_its_end(self, parameters: tuple[int, int]) -> None:
+        image = encode(".jpg", np.random.default_rng(3).integers(0, 256, (48, 64, 3)).astype(np.uint8), *parameters)
+        assert embedded(report_html(localized(), image + b"\xff\xd8\xff\xe1where", CAMERA)) == image
+
+    def test_metadata_between_the_scans_of_a_jpeg_are_cut_out(self) -> None:
+        image = encode(".jpg", textured(64, 48), cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+        second = image.index(b"\xff\xda", image.index(b"\xff\xda") + 2)
+        comment = b"\xff\xfe\0\7where"
+        data = embedded(report_html(localized(), image[:second] + comment + image[second:], CAMERA))
+        assert b"where" not in data
+        np.testing.assert_array_equal(pixels(data), pixels(image))
+
+    def test_of_application_segments_a_jpeg_keeps_those_that_decoders_need(self) -> None:
+        profile, index, depth = b"ICC_PROFILE\0\1\1profile", b"MPF\0where", b"JFXX\0\x10where"
+        segments = b"".join(
+            bytes([0xFF, kind]) + (len(body) + 2).to_bytes(2, "big") + body
+            for kind, body in ((0xE2, profile), (0xE2, index), (0xE0, depth))
+        )
+        data = embedded(report_html(localized(), PHOTO[:2] + segments + PHOTO[2:], CAMERA))
+        assert b"profile" in data
+        assert b"where" not in data
+
+    def test_a_jpeg_without_an_end_is_given_one(self) -> None:
+        assert embedded(report_html(localized(), PHOTO[:-2], CAMERA)) == PHOTO
+
     def test_the_page_can_be_mailed_however_large_they_are(self, tmp_path: Path) -> None:
         noise = np.random.default_rng(1).integers(0, 256, (1800, 2400, 3)).astype(np.uint8)
         large = encode(".jpg", noise)

@@ -19,7 +19,7 @@ from ..results import (
 )
 from ..v1 import reference_service_pb2 as pb
 from .naming import reference_name, scene_name
-from .references import SERVICE
+from .repeats import SERVICE
 
 
 def retrieve_references(

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .. import wire
 from ..errors import MaplessError
 from ..exchange import Call, Exchange, Pages
 from ..geodesy import Datum
@@ -19,10 +17,9 @@ from ..scene_messages import calibration_to_message, datum_to_message
 from ..scenes import UNCHANGED, Calibration, UnchangedType
 from ..v1 import geometry_pb2
 from ..v1 import reference_service_pb2 as pb
+from . import repeats
 from .naming import reference_name, scene_name
-
-SERVICE = "mapless.v1.ReferenceService"
-_SAME_POSE = 1e-9  # metres and rotation: what rounding leaves of a quaternion
+from .repeats import SERVICE
 
 
 def create_scene(
@@ -42,13 +39,7 @@ def create_scene(
     """
 
     def found(error: MaplessError) -> Exchange[pb.CreateSceneResponse]:
-        """The scene, if nobody has done anything with it and as much is known of it as of ours."""
-        get = pb.GetSceneRequest(name=scene_name(scene_id))
-        there = (yield Call(f"{SERVICE}/GetScene", get, pb.GetSceneResponse, timeout_s)).scene
-        is_new = error.code == "ALREADY_EXISTS" and there.generation == 1
-        if not is_new or any(there.HasField(it) != request.HasField(it) for it in ("datum", "down_in_world")):
-            raise error
-        return pb.CreateSceneResponse(scene=there)
+        return pb.CreateSceneResponse(scene=(yield from repeats.created_scene(request, error)))
 
     request = pb.CreateSceneRequest(
         scene_id=scene_id,
@@ -110,7 +101,7 @@ def list_scenes(*, page_size: int = 0, timeout_s: float | None = None) -> Pages[
 def delete_scene(scene: str, *, timeout_s: float | None = None) -> Exchange[None]:
     """Deletes a scene and all its references."""
     request = pb.DeleteSceneRequest(name=scene_name(scene))
-    yield Call(f"{SERVICE}/DeleteScene", request, pb.DeleteSceneResponse, timeout_s, on_repeat=_gone)
+    yield Call(f"{SERVICE}/DeleteScene", request, pb.DeleteSceneResponse, timeout_s, on_repeat=repeats.gone)
 
 
 def add_reference(scene: str, reference: NewReference, *, timeout_s: float | None = None) -> Exchange[Reference]:
@@ -118,7 +109,7 @@ def add_reference(scene: str, reference: NewReference, *, timeout_s: float | Non
     request = create_request(scene_name(scene), reference)
 
     def found(error: MaplessError) -> Exchange[pb.CreateReferenceResponse]:
-        return pb.CreateReferenceResponse(reference=(yield from _stored(request, error, timeout_s)))
+        return pb.CreateReferenceResponse(reference=(yield from repeats.stored_reference(request, error)))
 
     response = yield Call(f"{SERVICE}/CreateReference", request, pb.CreateReferenceResponse, timeout_s, on_repeat=found)
     return reference_from_message(response.reference)
@@ -130,10 +121,8 @@ def add_batch(
     """Stores the references of one message, all or none."""
 
     def found(error: MaplessError) -> Exchange[pb.BatchCreateReferencesResponse]:
-        response = pb.BatchCreateReferencesResponse()
-        for one in requests:
-            response.references.append((yield from _stored(one, error, timeout_s)))
-        return response
+        stored = yield from repeats.stored_references(request, error)
+        return pb.BatchCreateReferencesResponse(references=stored)
 
     request = pb.BatchCreateReferencesRequest(scene=scene_name(scene), requests=requests)
     response = yield Call(
@@ -189,34 +178,9 @@ def list_references(scene: str, *, page_size: int = 0, timeout_s: float | None =
 def delete_reference(scene: str, reference: str, *, timeout_s: float | None = None) -> Exchange[None]:
     """Deletes a reference."""
     request = pb.DeleteReferenceRequest(name=reference_name(scene, reference))
-    yield Call(f"{SERVICE}/DeleteReference", request, pb.DeleteReferenceResponse, timeout_s, on_repeat=_gone)
+    yield Call(f"{SERVICE}/DeleteReference", request, pb.DeleteReferenceResponse, timeout_s, on_repeat=repeats.gone)
 
 
 def _direction(direction: ArrayLike) -> geometry_pb2.Vector3:
     x, y, z = map(float, np.asarray(direction, float))
     return geometry_pb2.Vector3(x=x, y=y, z=z)
-
-
-def _gone(error: MaplessError) -> Exchange[None]:
-    """Nothing to find out: what an earlier try deleted, the next does not find."""
-    if error.code != "NOT_FOUND":
-        raise error
-    yield from ()
-
-
-def _stored(request: pb.CreateReferenceRequest, error: MaplessError, timeout_s: float | None) -> Exchange[pb.Reference]:
-    """The stored reference, if it is the one that was to be stored; else the error."""
-    if error.code != "ALREADY_EXISTS":
-        raise error
-    name = f"{request.scene}/references/{request.reference_id}"
-    there = yield Call(f"{SERVICE}/GetReference", pb.GetReferenceRequest(name=name), pb.GetReferenceResponse, timeout_s)
-    wanted = request.reference
-    stored: pb.Reference = there.reference
-    ours, theirs = (wire.transform_from_message(it.world_from_camera, "").matrix() for it in (wanted, stored))
-    if (
-        stored.image_sha256 != hashlib.sha256(wanted.image).hexdigest()
-        or stored.intrinsics != wanted.intrinsics
-        or not np.allclose(ours, theirs, rtol=0, atol=_SAME_POSE)
-    ):
-        raise error
-    return stored

@@ -1,20 +1,24 @@
 """Photographs inside a page: as they are where they are small, else reduced, and never with what cameras add to them.
 
 A viewer turns a picture as its EXIF orientation says, and then nothing would lie where it belongs: intrinsics and
-pixels are those of the raster in the file. So metadata are cut out; a page that is mailed does not tell where a phone
-was, either.
+pixels are those of the raster in the file. So metadata are cut out, and what stands in a file after its picture; a page
+that is mailed does not tell where a phone was, either.
 """
 
 from __future__ import annotations
 
 import base64
 import io
+import re
 from dataclasses import dataclass
 
 REDUCED_SIDE_PX = 1600
 _SEGMENTS_WITHOUT_LENGTH = {0x01, *range(0xD0, 0xD9)}
-_KEPT_SEGMENTS = {0xE0, 0xE2, 0xEE}
-"""JFIF, colour profile, Adobe's colour transform: what a decoder needs of the application segments."""
+_START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
+_KEPT_SEGMENTS = {0xE0: b"JFIF\0", 0xE2: b"ICC_PROFILE\0", 0xEE: b"Adobe"}
+"""What a decoder needs of the application segments, and how it begins: a phone's index of further pictures is an E2."""
+_AFTER_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
+"""A marker that ends the coded data of a scan: FF 00 is a byte of them, D0 to D7 begin again within them."""
 _PNG_METADATA = (b"eXIf", b"tEXt", b"zTXt", b"iTXt", b"tIME")
 _WEBP_METADATA = (b"EXIF", b"XMP ")
 _EXIF_AND_XMP = 0x0C
@@ -66,35 +70,51 @@ def _without_metadata(image: bytes, kind: str) -> bytes | None:
 
 
 def _clean_jpeg(image: bytes) -> bytes:
-    """Without application segments and comments but for those that a decoder needs."""
+    """Up to its end, without application segments and comments but for those that a decoder needs.
+
+    A file whose end is missing, as decoders take it, is given one.
+    """
     parts, position = [image[:2]], 2
     while True:
         if image[position] != 0xFF:
             raise IndexError
         marker = image[position + 1]
-        if marker == 0xDA:  # what follows is the picture
-            return b"".join([*parts, image[position:]])
+        if marker == _END_OF_IMAGE:
+            return b"".join([*parts, b"\xff\xd9"])
         size = 2 if marker in _SEGMENTS_WITHOUT_LENGTH else 2 + int.from_bytes(_take(image, position + 2, 2), "big")
         segment = b"\xff" if marker == 0xFF else _take(image, position, size)
-        if not (0xE0 <= marker <= 0xEF or marker == 0xFE) or marker in _KEPT_SEGMENTS:
+        if marker == _START_OF_SCAN:  # of which a progressive file has several, with tables between them
+            after = _AFTER_SCAN.search(image, position + size)
+            segment = image[position : after.start() if after else len(image)]
+        if _is_needed(marker, segment):
             parts.append(segment)
         position += len(segment)
+        if marker == _START_OF_SCAN and position == len(image):
+            return b"".join([*parts, b"\xff\xd9"])
+
+
+def _is_needed(marker: int, segment: bytes) -> bool:
+    if marker in _KEPT_SEGMENTS:
+        return segment[4:].startswith(_KEPT_SEGMENTS[marker])
+    return not (0xE0 <= marker <= 0xEF or marker == 0xFE)
 
 
 def _clean_png(image: bytes) -> bytes:
-    parts, position = [image[:8]], 8
-    while position < len(image):
+    parts, position, kind = [image[:8]], 8, b""
+    while position < len(image) and kind != b"IEND":
         chunk = _take(image, position, 12 + int.from_bytes(_take(image, position, 4), "big"))
-        if chunk[4:8] not in _PNG_METADATA:
+        kind = chunk[4:8]
+        if kind not in _PNG_METADATA:
             parts.append(chunk)
         position += len(chunk)
     return b"".join(parts)
 
 
 def _clean_webp(image: bytes) -> bytes:
+    """The chunks that lie within the size that the file says it has."""
     parts, position = [], 12
-    end = min(len(image), 8 + int.from_bytes(image[4:8], "little"))
-    while position < end:
+    image = image[: 8 + int.from_bytes(image[4:8], "little")]
+    while position < len(image):
         size = int.from_bytes(_take(image, position + 4, 4), "little")
         chunk = _take(image, position, 8 + size) + b"\0" * (size % 2)
         if chunk[:4] == b"VP8X":

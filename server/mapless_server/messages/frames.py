@@ -10,6 +10,9 @@ from mapless.v1 import localization_service_pb2 as pb
 
 from .enums import enum_from_message, enum_to_message
 
+MAX_SESSION_COORDINATE_M = 1e7
+"""Where no device has tracked itself to; what is further is a mistake, and long sums of squares would lose digits."""
+
 
 def axes_from_message(options: pb.LocalizeOptions) -> Axes:
     """The axes that a request speaks of its camera in; FieldError if there are no such axes."""
@@ -20,7 +23,7 @@ def session_from_message(request: pb.LocalizeRequest) -> RigidTransform | None:
     """Where the device believed its camera to be, in the request's axes; FieldError if it is no pose."""
     if not request.HasField("session_from_camera"):
         return None
-    return wire.transform_from_message(request.session_from_camera, "session_from_camera")
+    return wire.transform_from_message(request.session_from_camera, "session_from_camera", MAX_SESSION_COORDINATE_M)
 
 
 def set_frames(

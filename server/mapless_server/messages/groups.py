@@ -27,13 +27,10 @@ from ..retrieval.narrowing import Narrowing
 from ..tenancy import key_of
 from .answers import accuracy_to_message, covariance_to_message, diagnostics_to_message, rejection_to_message
 from .enums import enum_to_message
-from .frames import axes_from_message, geo_pose_to_message
+from .frames import MAX_SESSION_COORDINATE_M, axes_from_message, geo_pose_to_message
 from .naming import reference_ids_from_names
 from .photos import photo_from_message
 from .queries import MAX_CANDIDATES, MAX_REFERENCES, options_from_message, reference_count_from_message
-
-MAX_SESSION_COORDINATE_M = 1e7
-"""Where no device has tracked itself to; what is further is a mistake, and long sums of squares would lose digits."""
 
 
 def queries_from_message(
@@ -63,6 +60,8 @@ def queries_from_message(
     options = options_from_message(request.options, engine.coverage)
     if options.variant is not Variant.BEST:
         raise FieldError("options.variant", "several photographs are posed together by the default variant alone")
+    if isinstance(request, pb.LocalizeRigRequest) and axes_from_message(request.options) is not Axes.OPENCV:
+        raise FieldError("options.axes", "a rig is posed in OpenCV's axes alone")
     reranks = request.options.rerank_references
     count = reference_count_from_message(request.options)
     return tuple(
@@ -108,8 +107,19 @@ def session_poses_from_message(request: pb.LocalizeSequenceRequest) -> tuple[Axe
     return axes, tuple(pose_from(axes, pose) for pose in poses)
 
 
+def session_from_rig_from_message(request: pb.LocalizeRigRequest) -> RigidTransform | None:
+    """Where the device believed its rig to be, OpenCV's axes; FieldError if it is no pose."""
+    if not request.HasField("session_from_rig"):
+        return None
+    return wire.transform_from_message(request.session_from_rig, "session_from_rig", MAX_SESSION_COORDINATE_M)
+
+
 def rig_to_message(
-    outcome: RigEstimate | Rejection, group: GroupResult, queries: Sequence[Query], request: pb.LocalizeRigRequest
+    outcome: RigEstimate | Rejection,
+    group: GroupResult,
+    queries: Sequence[Query],
+    request: pb.LocalizeRigRequest,
+    session_from_rig: RigidTransform | None,
 ) -> pb.LocalizeRigResponse:
     """The answer, but for what the call alone knows."""
     if isinstance(outcome, Rejection):
@@ -117,8 +127,7 @@ def rig_to_message(
     else:
         message = pb.RigLocalization(world_from_rig=wire.transform_to_message(outcome.world_from_rig))
         _set_support(message, outcome.matched, outcome.covariance)
-        if request.HasField("session_from_rig"):
-            session_from_rig = wire.transform_from_message(request.session_from_rig, "session_from_rig")
+        if session_from_rig is not None:
             world_from_session = outcome.world_from_rig.compose(session_from_rig.inverse())
             message.world_from_session.CopyFrom(wire.transform_to_message(world_from_session))
         datum = group.results[0].attempt.attributes.datum

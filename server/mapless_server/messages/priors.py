@@ -86,7 +86,7 @@ def _has(request: Any, field: str) -> bool:
 def _position(message: pb.PositionPrior, field: str) -> tuple[Sphere | None, PositionPrior | None]:
     if not message.HasField("position_m"):
         raise FieldError(f"{field}.position_m", "is required")
-    position = vector_from_message(message.position_m, f"{field}.position_m")
+    position = vector_from_message(message.position_m, f"{field}.position_m", MAX_COORDINATE_M)
     if not 0 <= message.radius_m < math.inf:
         raise FieldError(f"{field}.radius_m", f"must be finite and above 0, or 0 for none, is {message.radius_m:g}")
     if not message.radius_m and not message.covariance_m2:

@@ -69,11 +69,14 @@ def changes_from_message(request: pb.UpdateSceneRequest) -> dict[str, Any]:
 
 
 def _measured(message: pb.SceneCalibration, field: str) -> Calibration:
-    """A calibration that says what it was measured with."""
+    """A calibration that says what it was measured with; when, the server says itself."""
     variants: wire.ProtoEnum = localization_pb.Variant
     if message.variant not in variants.values()[1:]:
         raise FieldError(joined(field, "variant"), f"must be one of Variant's values, is {message.variant}")
-    return calibration_from_message(message, field)
+    measured = pb.SceneCalibration()
+    measured.CopyFrom(message)
+    measured.ClearField("create_time")  # ignored, so that it may be anything
+    return calibration_from_message(measured, field)
 
 
 _READERS: dict[str, Any] = {

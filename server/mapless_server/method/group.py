@@ -137,7 +137,7 @@ def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
     if not rejected:
         return Rejection(RejectionReason.TOO_FEW_MATCHES, "no image has 2D-3D matches")
     _, i, furthest = max(rejected, key=lambda it: (it[0], -it[1]))
-    return Rejection(furthest.reason, f"no image has 2D-3D matches; image {i}: {furthest.message}")
+    return Rejection(furthest.reason, f"no image has 2D-3D matches; image {i}: {furthest.message}", furthest.hint)
 
 
 def group_doubts(matched: Sequence[MatchedSighting], inlier_px: float, options: GateOptions) -> str | None:

@@ -43,10 +43,10 @@ class JudgeOptions:
         ambiguity: of the search for a second place.
     """
 
-    weights: tuple[float, ...] = (0.683, 3.495, 0.584, 0.303, 0.84, 3.423, 1.072)
+    weights: tuple[float, ...] = (0.441, 3.474, 0.0, 1.779, 0.601, 4.552, 1.243)
     scores: tuple[float, ...] = (
-        -2.047, -1.906, -1.734, -0.347, 0.158, 0.884, 1.71, 3.284, 4.788, 5.739,
-        6.596, 7.268, 8.296, 8.937, 9.455, 9.817, 10.129, 10.584, 11.191, 12.39,
+        -9.29, -7.942, -6.365, -4.514, -0.949, 0.287, 1.425, 2.709, 3.32, 3.708,
+        4.478, 5.112, 6.224, 7.021, 7.648, 8.076, 8.425, 8.805, 9.285, 10.588,
     )  # fmt: skip
     agreement_weight: float = 0.3
     ambiguity: AmbiguityOptions = field(default_factory=AmbiguityOptions)

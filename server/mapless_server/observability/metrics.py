@@ -127,6 +127,8 @@ class Metrics(Observer):
         """A call ended with a gRPC status; the trace's id becomes the exemplar."""
         service_and_name = self._methods.get(method, (_OTHER, _OTHER))
         self._handled(*service_and_name, code).inc()
+        if method in self._streaming:
+            return  # it lasts as long as its caller wants to watch, which is no latency
         exemplar = {"trace_id": trace_id} if trace_id else None
         self._handling(*service_and_name).observe(seconds, exemplar)
 
@@ -273,14 +275,24 @@ class Metrics(Observer):
             for service in services
             for method in service.methods
         }
+        self._streaming = frozenset(
+            f"/{service.full_name}/{method.name}"
+            for service in services
+            for method in service.methods
+            if method.server_streaming
+        )
         known = list(self._methods.values())
+        unary = [labelled for method, labelled in self._methods.items() if method not in self._streaming]
         self._started = _Children(self._counter("grpc_server_started", "Calls that arrived.", labels), known)
         self._handled = _Children(
             self._counter("grpc_server_handled", "Calls that ended, by status.", [*labels, "grpc_code"]),
             [(*method, code) for method in known for code in _CODES],
         )
         self._handling = _Children(
-            self._histogram("grpc_server_handling_seconds", "Time from arrival to answer.", CALL_BUCKETS, labels), known
+            self._histogram(
+                "grpc_server_handling_seconds", "Time from arrival to answer; of streams none.", CALL_BUCKETS, labels
+            ),
+            unary,
         )
 
     def _make_queue_metrics(self) -> None:

@@ -40,8 +40,8 @@ class Sphere:
 
     def keeps(self, centres: Array, margin_m: float) -> NDArray[np.bool_]:
         """Which centres (N, 3) lie no further outside than the margin, (N,)."""
-        away = centres - self.position
-        return np.asarray(np.einsum("ij,ij->i", away, away) <= (self.radius_m + margin_m) ** 2)
+        # Not squared: a radius may be any number.
+        return np.asarray(np.linalg.norm(centres - self.position, axis=1) <= self.radius_m + margin_m)
 
 
 @dataclass(frozen=True, eq=False)

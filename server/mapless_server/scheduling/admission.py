@@ -23,7 +23,7 @@ class ScheduleOptions:
     Attributes:
         max_queued_s: predicted computing time that may be admitted and not done, seconds a thread. Whoever is let in
             later would get an old answer; and a full queue never drains sooner for being longer.
-        max_bytes: memory that admitted jobs may hold.
+        max_bytes: memory that admitted jobs may hold, and calls of several jobs until their last one is done.
         flow_share: of what others have left of either bound, what one caller may fill. So there is always room for one
             who comes later.
         caution: a job is let in if so many times the time predicted for it is left. Predictions are means, and what is
@@ -62,16 +62,15 @@ class Admission:
     def check(self, job: Job, cost_s: Counter[str], now_s: float) -> None:
         """Raises Refused if a job for which so much computing is predicted, by lane, cannot be let in."""
         options, ledger = self._options, self._ledger
-        if job.size_bytes > options.max_bytes:
-            raise Refused(Refusal.TOO_LARGE, f"the call holds {job.size_bytes} bytes, {options.max_bytes} are allowed")
+        self._check_size(job.size_bytes)
         if now_s >= job.deadline_s:
             raise Refused(Refusal.DEADLINE_INFEASIBLE, "the deadline has passed")
+        if job.continues:
+            return
         self.check_queue(job.flow, cost_s)
+        self.check_memory(job.flow, job.size_bytes)
         if not ledger.jobs:
             return
-        held_bytes = ledger.size_bytes(job.flow)
-        if held_bytes + job.size_bytes > self._share(options.max_bytes, ledger.size_bytes(), held_bytes):
-            raise Refused(Refusal.TOO_MUCH_MEMORY, "the calls in progress hold too much memory", RETRY_ELSEWHERE_S)
         own_s = cost_s.total()
         waits_s = (ledger.ahead_s(job.flow, lane, it) / self._threads[lane] for lane, it in cost_s.items())
         late_s = now_s + options.caution * (max(waits_s) + own_s) - job.deadline_s
@@ -91,6 +90,21 @@ class Admission:
             if excess_s > 0:
                 message = "as much is admitted already as can be computed soon"
                 raise Refused(Refusal.QUEUE_FULL, message, max(MIN_RETRY_S, excess_s / self._threads[lane]))
+
+    def check_memory(self, flow: Flow, size_bytes: int) -> None:
+        """Raises Refused if a caller cannot hold so much more; where nobody holds anything it can hold all there is."""
+        self._check_size(size_bytes)
+        all_bytes, held_bytes = self._ledger.size_bytes(), self._ledger.size_bytes(flow)
+        is_first = not (all_bytes or self._ledger.jobs)
+        if not size_bytes or is_first:
+            return
+        if held_bytes + size_bytes > self._share(self._options.max_bytes, all_bytes, held_bytes):
+            raise Refused(Refusal.TOO_MUCH_MEMORY, "the calls in progress hold too much memory", RETRY_ELSEWHERE_S)
+
+    def _check_size(self, size_bytes: int) -> None:
+        most = self._options.max_bytes
+        if size_bytes > most:
+            raise Refused(Refusal.TOO_LARGE, f"the call holds {size_bytes} bytes, {most} are allowed")
 
     def fits(self, job: Job, cost_s: Counter[str]) -> bool:
         """Whether a job that was let in may go on although it needs more than it was let in for."""

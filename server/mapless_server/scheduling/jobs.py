@@ -126,6 +126,7 @@ class Job:
         size_bytes: memory that it holds.
         on_end: told how it ended and with what: the result, or the exception.
         visits: the stages that it has been through.
+        continues: whether it completes what other jobs of its call have computed; then it is always let in.
         used_s: computing time it has had so far.
         fallback: what stands for expiry.
         waits_since_s: when it began to wait for the step, by the queue's clock.
@@ -143,6 +144,7 @@ class Job:
     size_bytes: int
     on_end: Callable[[Ending, Any], None]
     visits: list[Visit] = field(default_factory=list)
+    continues: bool = False
     used_s: float = 0.0
     fallback: Fallback | None = None
     waits_since_s: float = 0.0

@@ -9,7 +9,7 @@ from .jobs import Job
 
 
 class Ledger:
-    """The books of the schedule; they count exactly the jobs that are admitted and have not ended.
+    """The books of the schedule; they count exactly the jobs that are admitted and have not ended, and what calls hold.
 
     Attributes:
         jobs: these jobs.
@@ -45,8 +45,23 @@ class Ledger:
             holdings.size_bytes -= job.size_bytes
             if not holdings.jobs:
                 holdings.booked_s.clear()  # rounding has left something
-        if not self._flows[job.flow].jobs:
-            del self._flows[job.flow]
+        self._forget(job.flow)
+
+    def hold(self, flow: Flow, size_bytes: int) -> None:
+        """Books memory that a call of several jobs holds, whether one of them is admitted or not."""
+        for holdings in (self._flows.setdefault(flow, _Holdings()), self._all):
+            holdings.size_bytes += size_bytes
+
+    def release(self, flow: Flow, size_bytes: int) -> None:
+        """The call holds it no longer."""
+        for holdings in (self._flows[flow], self._all):
+            holdings.size_bytes -= size_bytes
+        self._forget(flow)
+
+    def _forget(self, flow: Flow) -> None:
+        held = self._flows[flow]
+        if not (held.jobs or held.size_bytes):
+            del self._flows[flow]
 
     def size_bytes(self, flow: Flow | None = None) -> int:
         """Memory that a caller's jobs hold, or all."""

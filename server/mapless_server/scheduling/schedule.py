@@ -121,7 +121,8 @@ class Schedule:
         cost_s = self._predict(job.step)
         try:
             self._admission.check(job, cost_s, now_s)
-            if self._quota is not None and job.flow.tenant:  # nobody's jobs, the server's own, are free
+            # Nobody's jobs, the server's own, are free; what continues others is charged what it took, when it ends.
+            if self._quota is not None and job.flow.tenant and not job.continues:
                 job.charged_s = cost_s.total()
                 wait_s = self._quota.charge(job.flow.tenant, job.charged_s, now_s)
                 if wait_s > 0:
@@ -132,6 +133,19 @@ class Schedule:
         self._observer.admitted(cost_s.total())
         self._ledger.open(job, cost_s)
         self._enqueue(job, now_s)
+
+    def hold(self, flow: Flow, size_bytes: int) -> None:
+        """Books memory that a call holds until it is released, beside its jobs; Refused if there is no room."""
+        try:
+            self._admission.check_memory(flow, size_bytes)
+        except Refused as refused:
+            self._observer.refused(refused.reason)
+            raise
+        self._ledger.hold(flow, size_bytes)
+
+    def release(self, flow: Flow, size_bytes: int) -> None:
+        """A call holds its memory no longer."""
+        self._ledger.release(flow, size_bytes)
 
     def check_room(self, step: Step) -> None:
         """Raises Refused if even a caller with no other jobs would not be admitted with a job that begins like this."""

@@ -7,7 +7,8 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
@@ -151,7 +152,14 @@ class WorkQueue:
                 thread.start()
 
     async def submit(
-        self, flow: Flow, step: Step, deadline_s: float, size_bytes: int, visits: list[Visit] | None = None
+        self,
+        flow: Flow,
+        step: Step,
+        deadline_s: float,
+        size_bytes: int,
+        visits: list[Visit] | None = None,
+        *,
+        continues: bool = False,
     ) -> tuple[Any, Sequence[Visit]]:
         """Lets a job in, and waits for it; whoever is cancelled while waiting gives up the job's place.
 
@@ -161,6 +169,8 @@ class WorkQueue:
             deadline_s: when its result is of no use any more, `time.monotonic`.
             size_bytes: memory that it holds.
             visits: gets the stages that it goes through, for who wants to know how far it came if it fails.
+            continues: whether it completes what other jobs of the same call have computed: then it is let in however
+                full the queue is, and while the server drains, since else all that was in vain.
 
         Returns:
             Its result, and the stages that it went through.
@@ -177,8 +187,10 @@ class WorkQueue:
         def on_end(_: Ending, value: Any) -> None:  # in whatever thread ends the job
             loop.call_soon_threadsafe(_resolve, future, value)
 
-        job = Job(flow, step, deadline_s, size_bytes, on_end, [] if visits is None else visits)
+        job = Job(flow, step, deadline_s, size_bytes, on_end, [] if visits is None else visits, continues)
         with self._lock:
+            if continues and self._is_closed:
+                raise Fatal("the server has stopped")
             self._schedule.admit(job, time.monotonic())
             self._spread_news()
         self.start()
@@ -188,6 +200,21 @@ class WorkQueue:
             if not job.is_over:
                 with self._lock:
                     self._schedule.cancel(job, time.monotonic())
+
+    @contextmanager
+    def hold(self, flow: Flow, size_bytes: int) -> Iterator[None]:
+        """Books memory that a call of several jobs holds all the while, which its jobs then need not say.
+
+        Raises:
+            Refused: there is no room for it.
+        """
+        with self._lock:
+            self._schedule.hold(flow, size_bytes)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._schedule.release(flow, size_bytes)
 
     def check_room(self, step: Step) -> None:
         """Raises Refused if nobody would be admitted who began with a step like this."""

@@ -108,6 +108,8 @@ class Feed:
             if answer.diagnostics.request_id.startswith(self._own):
                 continue
             self._count += 1 + message.missed_count
+            if not message.image:  # too large to be shown
+                continue
             camera = wire.camera_from_message(message.intrinsics, "intrinsics")
             self._show(Query(self._count, message.image, camera, answer))
 

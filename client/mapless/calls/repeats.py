@@ -1,0 +1,101 @@
+"""What becomes of a change that was made before, though its answer was lost: found, or somebody else's.
+
+The calls that ask have no deadline of their own: theirs is that of the change.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+
+from .. import wire
+from ..errors import MaplessError, NotFound
+from ..exchange import Call, Exchange
+from ..geometry import Array
+from ..scene_messages import datum_from_message, direction_from_message
+from ..v1 import reference_service_pb2 as pb
+from .naming import scene_name
+
+SERVICE = "mapless.v1.ReferenceService"
+_SAME = 1e-9  # metres, degrees, entries of a rotation or direction: what rounding leaves of one that is normalized
+_PAGE_SIZE = 1000  # the most that a server lists at once
+
+
+def gone(error: MaplessError) -> Exchange[None]:
+    """Nothing to find out: what an earlier try deleted, the next does not find."""
+    if error.code != "NOT_FOUND":
+        raise error
+    yield from ()
+
+
+def created_scene(wanted: pb.CreateSceneRequest, error: MaplessError) -> Exchange[pb.Scene]:
+    """The scene, if nobody has done anything with it and the same is known of its world as of ours; else the error."""
+    if error.code != "ALREADY_EXISTS":
+        raise error
+    get = pb.GetSceneRequest(name=scene_name(wanted.scene_id))
+    there: pb.Scene = (yield Call(f"{SERVICE}/GetScene", get, pb.GetSceneResponse)).scene
+    ours, theirs = _of_world(wanted), _of_world(there)
+    if there.generation != 1 or ours.shape != theirs.shape or not np.allclose(ours, theirs, rtol=0, atol=_SAME):
+        raise error
+    return there
+
+
+def stored_reference(wanted: pb.CreateReferenceRequest, error: MaplessError) -> Exchange[pb.Reference]:
+    """The stored reference, if it is the one that was to be stored; else the error."""
+    if error.code != "ALREADY_EXISTS":
+        raise error
+    get = pb.GetReferenceRequest(name=_name(wanted))
+    try:
+        there: pb.Reference = (yield Call(f"{SERVICE}/GetReference", get, pb.GetReferenceResponse)).reference
+    except NotFound:  # of a batch, another one is there
+        raise error from None
+    if not _is_same(wanted.reference, there):
+        raise error
+    return there
+
+
+def stored_references(wanted: pb.BatchCreateReferencesRequest, error: MaplessError) -> Exchange[list[pb.Reference]]:
+    """The stored references in the request's order, if all are those that were to be stored; else the error.
+
+    Most scenes are listed by one call. Of a larger one, those that stand on later pages are asked for one by one.
+    """
+    if error.code != "ALREADY_EXISTS":
+        raise error
+    request = pb.ListReferencesRequest(scene=wanted.scene, page_size=_PAGE_SIZE)
+    page = yield Call(f"{SERVICE}/ListReferences", request, pb.ListReferencesResponse)
+    listed: dict[str, pb.Reference] = {it.name: it for it in page.references}
+    stored = []
+    for one in wanted.requests:
+        there = listed.get(_name(one))
+        if there is None and page.next_page_token:
+            there = yield from stored_reference(one, error)
+        if there is None or not _is_same(one.reference, there):
+            raise error
+        stored.append(there)
+    return stored
+
+
+def _name(wanted: pb.CreateReferenceRequest) -> str:
+    return f"{wanted.scene}/references/{wanted.reference_id}"
+
+
+def _is_same(wanted: pb.Reference, stored: pb.Reference) -> bool:
+    ours, theirs = (wire.transform_from_message(it.world_from_camera, "").matrix() for it in (wanted, stored))
+    return (
+        stored.image_sha256 == hashlib.sha256(wanted.image).hexdigest()
+        and stored.intrinsics == wanted.intrinsics
+        and np.allclose(ours, theirs, rtol=0, atol=_SAME)
+    )
+
+
+def _of_world(message: Any) -> Array:
+    """What a message says of a scene's world: 12 numbers of its datum, if it has one, and 3 of its down."""
+    numbers: list[float] = []
+    if message.HasField("datum"):
+        datum = datum_from_message(message.datum, "datum")
+        numbers += [datum.latitude_deg, datum.longitude_deg, datum.height_m, *datum.enu_from_world.matrix().flat]
+    if message.HasField("down_in_world"):
+        numbers += direction_from_message(message.down_in_world, "down_in_world")
+    return np.array(numbers)

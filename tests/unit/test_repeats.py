@@ -1,0 +1,228 @@
+"""A change whose answer was lost: what is found is ours if it is all that we sent, and else somebody else's.
+
+And whatever a server answers, a client raises no errors but its own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf.message import Message
+from played import Played
+
+from mapless import wire
+from mapless.calls import asking, groups, localization, references
+from mapless.errors import AlreadyExists, DeadlineExceeded, Internal, NotFound, Unavailable
+from mapless.exchange import Exchange
+from mapless.geodesy import Datum
+from mapless.geometry import Camera, Quaternion, RigidTransform
+from mapless.options import ConnectOptions
+from mapless.requests import NewReference, create_request
+from mapless.v1 import localization_service_pb2 as localization_pb
+from mapless.v1 import reference_service_pb2 as pb
+
+GONE = Unavailable("UNAVAILABLE", "gone")
+TAKEN = AlreadyExists("ALREADY_EXISTS", "taken")
+ABSENT = NotFound("NOT_FOUND", "absent")
+DATUM = Datum(47.0, 8.0, 400.0, Quaternion(0.0, 0.0, math.sin(0.3), math.cos(0.3)))
+DOWN = (0.0, 9.81, 0.3)
+CAMERA = Camera(640, 480, 500, 500, 320, 240)
+
+
+def methods(played: Played) -> list[str]:
+    return [call.method.rpartition("/")[2] for call in played.calls]
+
+
+def created(there: Any, generation: int = 1) -> Any:
+    """What `create_scene` with DATUM and DOWN makes of it if this scene is there after a lost answer."""
+    there = pb.GetSceneResponse(
+        scene=pb.Scene(name="scenes/hall", generation=generation, datum=there.datum, down_in_world=there.down_in_world)
+        if isinstance(there, pb.CreateSceneRequest)
+        else there
+    )
+    exchange = references.create_scene("hall", datum=DATUM, down_in_world=DOWN)
+    return Played(exchange, [GONE, TAKEN, there], ConnectOptions()).result
+
+
+def sent() -> pb.CreateSceneRequest:
+    request = next(references.create_scene("hall", datum=DATUM, down_in_world=DOWN)).request
+    assert isinstance(request, pb.CreateSceneRequest)
+    return request
+
+
+def test_a_scene_is_ours_though_the_server_has_normalized_what_we_sent() -> None:
+    there = sent()
+    length = math.hypot(*DOWN)
+    for axis in ("x", "y", "z"):
+        setattr(there.down_in_world, axis, getattr(there.down_in_world, axis) / length)
+    for axis in ("x", "y", "z", "w"):  # of a quaternion and its opposite, which turn alike
+        q = there.datum.enu_from_world
+        setattr(q, axis, -getattr(q, axis) * (1 + 1e-15))
+    assert created(there).datum.latitude_deg == 47.0
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("datum.latitude_deg", -33.0),
+        ("datum.longitude_deg", 8.0000001),
+        ("datum.height_m", 400.001),
+        ("datum.enu_from_world.z", 0.2955202),
+        ("down_in_world.x", 0.001),
+    ],
+)
+def test_a_scene_of_another_world_is_not_ours(path: str, value: float) -> None:
+    there = sent()
+    *parents, name = path.split(".")
+    part: Any = there
+    for parent in parents:
+        part = getattr(part, parent)
+    setattr(part, name, value)
+    assert created(there) is TAKEN
+
+
+def test_a_scene_of_which_less_is_known_or_that_was_changed_is_not_ours() -> None:
+    assert created(pb.Scene(name="scenes/hall", generation=1)) is TAKEN
+    assert created(pb.Scene(name="scenes/hall", generation=1, datum=sent().datum)) is TAKEN
+    assert created(sent(), generation=2) is TAKEN
+    assert created(sent()).scene_id == "hall"
+
+
+def requests(count: int) -> list[pb.CreateReferenceRequest]:
+    pose = RigidTransform(np.eye(3), np.zeros(3))
+    return [create_request("scenes/a", NewReference(f"r{i:02}", b"photo %d" % i, CAMERA, pose)) for i in range(count)]
+
+
+def stored(request: pb.CreateReferenceRequest) -> pb.Reference:
+    reference = pb.Reference()
+    reference.CopyFrom(request.reference)
+    reference.name = f"{request.scene}/references/{request.reference_id}"
+    reference.image_sha256 = hashlib.sha256(request.reference.image).hexdigest()
+    reference.ClearField("image")
+    return reference
+
+
+def test_a_batch_is_found_by_one_call() -> None:
+    wanted = requests(32)
+    page = pb.ListReferencesResponse(references=map(stored, wanted))
+    played = Played(references.add_batch("a", wanted, 10.0), [GONE, TAKEN, page], ConnectOptions())
+    assert [it.reference_id for it in played.result] == [it.reference_id for it in wanted]
+    assert methods(played) == ["BatchCreateReferences"] * 2 + ["ListReferences"]
+
+
+def test_what_a_large_scene_lists_later_is_asked_for_one_by_one() -> None:
+    wanted = requests(3)
+    page = pb.ListReferencesResponse(references=map(stored, wanted[:1]), next_page_token="more")
+    singles = [pb.GetReferenceResponse(reference=stored(it)) for it in wanted[1:]]
+    played = Played(references.add_batch("a", wanted, None), [GONE, TAKEN, page, *singles], ConnectOptions())
+    assert [it.reference_id for it in played.result] == ["r00", "r01", "r02"]
+    absent = Played(references.add_batch("a", wanted, None), [GONE, TAKEN, page, ABSENT], ConnectOptions())
+    assert absent.result is TAKEN
+
+
+def test_a_batch_of_which_one_is_somebody_elses_is_not_ours() -> None:
+    wanted = requests(3)
+    there = [stored(it) for it in wanted]
+    there[2].image_sha256 = "0" * 64
+    for found in (there, there[:2]):
+        page = pb.ListReferencesResponse(references=found)
+        played = Played(references.add_batch("a", wanted, None), [GONE, TAKEN, page], ConnectOptions())
+        assert played.result is TAKEN
+
+
+def test_an_upload_that_is_looked_up_ends_by_its_deadline() -> None:
+    """Each attempt takes a second; of a large scene there are 31 references to ask for."""
+    wanted = requests(32)
+    page = pb.ListReferencesResponse(references=[stored(wanted[0])], next_page_token="more")
+    singles = [pb.GetReferenceResponse(reference=stored(it)) for it in wanted[1:]]
+    played = Played(references.add_batch("a", wanted, 10.0), [GONE, TAKEN, page, *singles], ConnectOptions())
+    assert isinstance(played.result, DeadlineExceeded)
+    assert played.took_s < 11
+
+
+def a_pose_that_is_none() -> Any:
+    pose = wire.transform_to_message(RigidTransform(np.eye(3), np.zeros(3)))
+    pose.translation_m.x = math.nan
+    return pose
+
+
+def localized() -> Message:
+    answer = localization_pb.LocalizeResponse()
+    answer.localization.world_from_camera.CopyFrom(a_pose_that_is_none())
+    answer.diagnostics.request_id = "id-7"
+    return answer
+
+
+def of_35_covariances() -> Message:
+    answer = localization_pb.LocalizeResponse()
+    answer.localization.world_from_camera.CopyFrom(wire.transform_to_message(RigidTransform(np.eye(3), np.zeros(3))))
+    answer.localization.covariance.row_major.extend([0.0] * 35)
+    return answer
+
+
+def of_unequal_columns() -> Message:
+    answer = localization_pb.LocalizeResponse()
+    answer.rejection.message = "no"
+    answer.debug.query_x_px.append(1.0)
+    return answer
+
+
+def before_the_calendar() -> Message:
+    answer = localization_pb.LocalizeResponse()
+    answer.rejection.message = "no"
+    answer.capture_time.seconds = -(10**15)
+    return answer
+
+
+def of_a_rig() -> Message:
+    answer = localization_pb.LocalizeRigResponse()
+    answer.localization.world_from_rig.CopyFrom(a_pose_that_is_none())
+    return answer
+
+
+def localize() -> Exchange[Any]:
+    return localization.localize(b"photo", CAMERA, "a")
+
+
+@pytest.mark.parametrize(
+    ("ask", "answer"),
+    [
+        (localize, localized),
+        (localize, of_35_covariances),
+        (localize, of_unequal_columns),
+        (localize, before_the_calendar),
+        (lambda: groups.localize_rig([], "a"), of_a_rig),
+        (
+            lambda: asking.retrieve_references(b"photo", CAMERA, "a"),
+            lambda: pb.RetrieveReferencesResponse(references=[pb.RetrievedReference()]),
+        ),
+        (lambda: references.get_scene("a"), pb.GetSceneResponse),
+        (lambda: references.get_reference("a", "b"), pb.GetReferenceResponse),
+        (lambda: references.list_scenes().fetch(""), lambda: pb.ListScenesResponse(scenes=[pb.Scene()])),
+    ],
+)
+def test_an_answer_that_breaks_its_contract_is_an_error_of_the_server(
+    ask: Callable[[], Exchange[Any]], answer: Callable[[], Message]
+) -> None:
+    error = Played(ask(), [answer()], ConnectOptions()).result
+    assert isinstance(error, Internal)
+    assert error.reason == "MALFORMED_ANSWER"
+
+
+def test_such_an_error_says_which_field_of_which_call() -> None:
+    error = Played(localize(), [localized()], ConnectOptions()).result
+    assert (error.field, error.request_id) == ("localization.world_from_camera.translation_m.x", "id-7")
+    assert "LocalizationService/Localize" in error.message
+
+
+def test_what_is_looked_up_and_breaks_its_contract_is_an_error_of_the_server_too() -> None:
+    there = stored(requests(1)[0])
+    there.world_from_camera.CopyFrom(a_pose_that_is_none())
+    page = pb.ListReferencesResponse(references=[there])
+    played = Played(references.add_batch("a", requests(1), None), [GONE, TAKEN, page], ConnectOptions())
+    assert isinstance(played.result, Internal)
