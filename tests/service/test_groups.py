@@ -135,6 +135,8 @@ def test_what_shows_nothing_is_rejected_with_each_images_reason(corner: Client) 
     answer = corner.localize_rig(as_rig([BLANK] * 4)[:2], "corner")
     assert isinstance(answer, GroupRejected)
     assert answer.reason == "LOW_TEXTURE"
+    assert answer.hint is not None
+    assert answer.hint.advice == "RETAKE_PHOTOGRAPH"
     assert [report.rejected_alone for report in answer.images] == ["LOW_TEXTURE"] * 2
 
 
@@ -143,6 +145,9 @@ def test_a_session_without_motion_has_no_scale(corner: Client, queries: list[byt
     answer = corner.localize_sequence(frames, "corner", estimate_scale=True)
     assert isinstance(answer, GroupRejected)
     assert answer.reason == "SCALE_UNRELIABLE"
+    assert answer.hint is not None
+    assert (answer.hint.stage, answer.hint.advice) == ("join", "RETAKE_PHOTOGRAPH")
+    assert answer.hint.best_reference.startswith("scenes/corner/references/p")
 
 
 def test_references_may_be_named_for_each_image(corner: Client, queries: list[bytes]) -> None:
@@ -211,6 +216,14 @@ BAD_RIGS: dict[str, tuple[Change, str]] = {
         ),
         "session_from_rig.translation_m.y",
     ),
+    "session far away": (
+        lambda request: request.session_from_rig.CopyFrom(
+            wire.transform_to_message(RigidTransform(np.eye(3), np.array([0, 1.7e308, 0])))
+        ),
+        "session_from_rig.translation_m.y",
+    ),
+    "other axes": (lambda request: setattr(request.options, "axes", pb.AXES_UNITY), "options.axes"),
+    "unknown axes": (lambda request: setattr(request.options, "axes", 77), "options.axes"),
 }
 
 BAD_SEQUENCES: dict[str, tuple[Change, str]] = {

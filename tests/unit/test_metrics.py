@@ -206,6 +206,20 @@ def test_an_answer_is_counted_under_its_outcome(metrics: Metrics, outcome: str) 
     assert changed(before, samples_of(metrics)) == {key: 1}
 
 
+def test_how_long_somebody_watches_is_counted_as_a_call_and_as_no_latency(metrics: Metrics) -> None:
+    before, watch = samples_of(metrics), "/mapless.v1.LocalizationService/WatchQueries"
+    metrics.call_started(watch)
+    metrics.call_handled(watch, "CANCELLED", 3600.0, "ab" * 16)
+    after = changed(before, samples_of(metrics))
+    assert {name for name, _ in after} == {"grpc_server_started_total", "grpc_server_handled_total"}
+    watched = {
+        name
+        for name, labels in samples_of(metrics)
+        if name.startswith("grpc_server_handling") and ("grpc_method", "WatchQueries") in labels
+    }
+    assert not watched
+
+
 def test_a_batch_adds_to_size_time_and_business(metrics: Metrics) -> None:
     before = samples_of(metrics)
     metrics.computed("coarse", "392x518x10", 3, 0.25)

@@ -140,6 +140,18 @@ def test_what_is_likely_never_leaves_no_reference_at_all() -> None:
     assert narrowing.keeps(np.zeros((3, 3)), np.tile([0, 0, 1.0], (3, 1))).all()
 
 
+@pytest.mark.parametrize("radius_m", [1e200, 1.7e308])
+def test_a_radius_of_any_size_keeps_what_is_inside(radius_m: float) -> None:
+    prior = {"positionM": vector(1e7, 0, 0), "radiusM": radius_m}
+    for message in (
+        request(positionPrior=prior),
+        ParseDict({"positionPrior": prior}, reference_pb.RetrieveReferencesRequest()),
+    ):
+        narrowing, _ = priors_from_message(message, NOTHING)
+        far = np.array([[-1e7, -1e7, 1e7], [0.0, 0, 0]])
+        assert narrowing.keeps(far, np.eye(3)[:2]).all()
+
+
 def test_retrieval_takes_what_its_request_has() -> None:
     message = ParseDict(
         {"positionPrior": {"positionM": vector(0, 0, 0), "radiusM": 2}}, reference_pb.RetrieveReferencesRequest()
@@ -155,6 +167,7 @@ POSITION = {"positionM": vector(0, 0, 0)}
 BAD: list[tuple[str, dict[str, Any]]] = [
     ("position_prior.position_m", {"positionPrior": {"radiusM": 1}}),
     ("position_prior.position_m.x", {"positionPrior": {"positionM": vector("NaN", 0, 0), "radiusM": 1}}),
+    ("position_prior.position_m.y", {"positionPrior": {"positionM": vector(0, 1.01e7, 0), "radiusM": 1}}),
     ("position_prior.radius_m", {"positionPrior": POSITION}),
     ("position_prior.radius_m", {"positionPrior": POSITION | {"radiusM": -1}}),
     ("position_prior.radius_m", {"positionPrior": POSITION | {"radiusM": "Infinity"}}),

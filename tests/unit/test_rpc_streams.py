@@ -175,6 +175,39 @@ def test_a_caller_who_reads_nothing_and_goes_ends_it() -> None:
     asyncio.run(run())
 
 
+class Photographs(Numbers):
+    """Messages that are larger than what a connection takes before somebody reads."""
+
+    async def __anext__(self) -> pb.WatchQueriesResponse:
+        await asyncio.sleep(0.001)
+        message = await super().__anext__()
+        message.image = bytes(2**20)
+        return message
+
+
+@pytest.mark.parametrize("how", ["cancels", "closes its channel", "reaches its deadline"])
+def test_a_watcher_who_leaves_while_a_photograph_is_sent_is_no_fault_of_the_server(
+    how: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        counted, numbers = Counted(), Photographs(10**9)
+        async with serving(numbers, counted) as (channel, _):
+            call = watching(channel, 1.0 if how == "reaches its deadline" else LIMIT_S)
+            await call.initial_metadata()
+            await asyncio.sleep(0.3)  # nobody reads: the server waits in the middle of a message
+            if how == "cancels":
+                call.cancel()
+            elif how == "closes its channel":
+                await channel.close()
+            await until(lambda: len(counted.handled) == 1)
+        assert numbers.is_closed
+        assert counted.handled == ["DEADLINE_EXCEEDED" if how == "reaches its deadline" else "CANCELLED"]
+
+    with caplog.at_level("WARNING"):
+        asyncio.run(run())
+    assert not caplog.records
+
+
 def test_it_lasts_beyond_the_deadline_of_other_calls_and_ends_at_its_own() -> None:
     async def run() -> None:
         counted, numbers = Counted(), Numbers(0, "wait")

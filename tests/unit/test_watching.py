@@ -52,6 +52,36 @@ def test_an_answer_reaches_those_who_watch_its_scene_with_the_photograph_and_the
     asyncio.run(run())
 
 
+def test_what_waits_for_a_watcher_keeps_nothing_else_of_the_request() -> None:
+    """A part of a message keeps the whole message, so that each photograph would be held twice."""
+
+    async def run() -> None:
+        watchers = Watchers(True)
+        watch = watchers.watch(HALL)
+        request = pb.LocalizeRequest()
+        request.CopyFrom(REQUEST)
+        watchers.publish(HALL, request, answer(1), None)  # type: ignore[arg-type]
+        request.intrinsics.width_px = 111
+        assert (await next_of(watch)).intrinsics.width_px == 640
+
+    asyncio.run(run())
+
+
+def test_a_photograph_as_large_as_a_message_may_be_is_left_out_and_the_answer_is_told() -> None:
+    async def run() -> None:
+        watchers = Watchers(True, 2000)
+        watch = watchers.watch(HALL)
+        for size in (1000, 1999, 5):
+            request = pb.LocalizeRequest(image=bytes(size))
+            watchers.publish(HALL, request, answer(size), pb.Debug(error_px=[0.5] * 10))  # type: ignore[arg-type]
+        seen = [await next_of(watch) for _ in range(3)]
+        assert [len(it.image) for it in seen] == [1000, 0, 5]
+        assert [inliers_of(it) for it in seen] == [1000, 1999, 5]
+        assert all(it.ByteSize() <= 2000 for it in seen)
+
+    asyncio.run(run())
+
+
 def test_the_callers_own_answer_stays_as_it_was() -> None:
     watchers = Watchers(True)
     response = answer(3)

@@ -1,0 +1,67 @@
+"""Each rejection of a rig or a sequence says what to do about it, and which reference to look at."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from groups import NOTHING
+from scenes import make_scene, random_for
+
+from mapless_server.method.answer import Answer
+from mapless_server.method.group import rejection_without_matches
+from mapless_server.method.group_hints import hinted_group
+from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
+
+SCENE = make_scene(random_for("group hints"))
+NAMES = [reference.name for reference in SCENE.references]
+
+
+def hint_of(reason: RejectionReason, *matches: tuple[int, ...]) -> Hint:
+    """Of a group whose photographs share so many features with the references."""
+    images = [
+        (Answer(Rejection(reason, "alone"), reference_match_counts=counts), SCENE.references) for counts in matches
+    ]
+    outcome = hinted_group(Rejection(reason, "planted"), images)
+    assert (outcome.reason, outcome.message) == (reason, "planted")
+    assert isinstance(outcome.hint, Hint)
+    return outcome.hint
+
+
+@pytest.mark.parametrize("reason", RejectionReason)
+@pytest.mark.parametrize("matches", [(), (0, 0), (20, 5), (60, 50), (400, 9)])
+def test_every_reason_has_a_hint_of_one_sentence(reason: RejectionReason, matches: tuple[int, ...]) -> None:
+    hint = hint_of(reason, matches, ())
+    assert hint.stage == "join"
+    assert hint.message[0].isupper()
+    assert hint.message.endswith(".")
+
+
+def test_the_reference_to_look_at_shares_most_with_any_of_the_photographs() -> None:
+    assert hint_of(RejectionReason.GATE, (40, 60, 50), (31, 33, 70), ()).best_reference == NAMES[2]
+    assert hint_of(RejectionReason.GATE, (0, 0), ()).best_reference is None
+
+
+@pytest.mark.parametrize(
+    ("reason", "best", "advice"),
+    [
+        (RejectionReason.TOO_FEW_MATCHES, 8, Advice.CHOOSE_OTHER_REFERENCES),
+        (RejectionReason.TOO_FEW_MATCHES, 50, Advice.LOOK_AT_REFERENCE),
+        (RejectionReason.PNP_FAILED, 400, Advice.CHECK_CALIBRATION),
+        (RejectionReason.GATE, 50, Advice.LOOK_AT_REFERENCE),
+        (RejectionReason.SCALE_UNRELIABLE, 400, Advice.RETAKE_PHOTOGRAPH),
+    ],
+)
+def test_what_is_advised_follows_from_what_is_shared(reason: RejectionReason, best: int, advice: Advice) -> None:
+    hint = hint_of(reason, (best, 3))
+    assert hint.advice is advice
+    if reason is not RejectionReason.SCALE_UNRELIABLE:
+        assert str(best) in hint.message
+
+
+def test_where_no_photograph_came_to_matches_the_one_that_came_furthest_says_what_it_lacks() -> None:
+    own = Hint("coarse", Advice.SPREAD_REFERENCES, "Spread them.", NAMES[0])
+    furthest = Rejection(RejectionReason.LOW_OVERLAP, "another place", own)
+    images = [NOTHING, replace(NOTHING, answer=Answer(furthest))]
+    outcome = hinted_group(rejection_without_matches(images), [])
+    assert (outcome.reason, outcome.hint) == (RejectionReason.LOW_OVERLAP, own)
