@@ -46,6 +46,8 @@ class LatestFrame:
 
     def __init__(self, video: Path, speed: float = 1.0) -> None:
         """Begins at once; `speed`: how many times faster than it was recorded."""
+        if not video.is_file():
+            raise OSError(f"there is no video {video}")
         self._capture = cv2.VideoCapture(str(video))
         if not self._capture.isOpened():
             raise OSError(f"{video} is no video that OpenCV can read")
@@ -195,6 +197,15 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--tum", type=Path, help="the poses in TUM's form, too")
     parser.add_argument("--speed", type=float, default=1.0, help="play the video so many times faster")
     given = parser.parse_args(arguments)
+    try:
+        _follow(given)
+    except (OSError, ValueError, mapless.MaplessError) as error:
+        sys.exit(f"robot_loop: {error}")
+
+
+def _follow(given: argparse.Namespace) -> None:
+    camera = mapless.read_camera(given.camera)
+    frames = LatestFrame(given.video, given.speed)
     # One attempt: for a frame that failed there is a newer one.
     options = mapless.ConnectOptions(timeout_s=5.0, max_attempts=1, max_reconnect_s=1.0, client_id=given.client_id)
     with (
@@ -202,8 +213,8 @@ def main(arguments: list[str] | None = None) -> None:
         given.poses.open("w") if given.poses else nullcontext(sys.stdout) as poses,
         given.tum.open("w") if given.tum else nullcontext() as tum,
     ):
-        robot = Robot(client, mapless.read_camera(given.camera), given.scene, Outputs(poses, tum))
-        for frame in LatestFrame(given.video, given.speed):
+        robot = Robot(client, camera, given.scene, Outputs(poses, tum))
+        for frame in frames:
             robot.look(frame)
 
 

@@ -18,7 +18,7 @@ from .v1 import geometry_pb2
 M = TypeVar("M", bound=Message)
 
 FOLDER_FILE = "cameras.json"
-_FOUR_NUMBERS = re.compile(r"[-+0-9.eE]+(,[-+0-9.eE]+){3}")
+_NUMBERS = re.compile(r"[-+0-9.eE]+(,[-+0-9.eE]*)+")
 
 
 def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
@@ -33,15 +33,20 @@ def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
         ValueError: it is no camera.
     """
     text = str(source)
-    if not _FOUR_NUMBERS.fullmatch(text):
+    if not _NUMBERS.fullmatch(text):
+        if Path(text).name == FOLDER_FILE:
+            raise ValueError(f"{text} holds the cameras of a folder's photographs, where a single camera is wanted")
         return wire.camera_from_message(_read_json(text, geometry_pb2.CameraIntrinsics()), "camera")
+    numbers = text.split(",")
+    if len(numbers) != 4 or not all(numbers):
+        raise ValueError(f"{text}: a camera in numbers is four of them: fx,fy,cx,cy")
     if photo is None:
         raise ValueError(f"{text}: four numbers are a camera only together with a photograph that it took")
     try:
         width_px, height_px = size_of_image(Path(photo).read_bytes())
     except ValueError as error:
         raise ValueError(f"{photo}: {error}") from None
-    focal_x_px, focal_y_px, principal_x_px, principal_y_px = map(float, text.split(","))
+    focal_x_px, focal_y_px, principal_x_px, principal_y_px = map(float, numbers)
     camera = Camera(width_px, height_px, focal_x_px, focal_y_px, principal_x_px, principal_y_px)
     return wire.camera_from_message(wire.camera_to_message(camera), "camera")  # which checks the ranges
 

@@ -10,6 +10,7 @@ import os
 import threading
 
 from .answers import LocalizationResult, Rejected
+from .axes import Axes
 from .client import Client
 from .geometry import Camera
 from .options import ConnectOptions
@@ -31,7 +32,7 @@ def localize(
     address: str | None = None,
     options: ConnectOptions | None = None,
     priors: Priors | None = None,
-    axes: str = "",
+    axes: Axes | str = "",
     timeout_s: float | None = None,
 ) -> LocalizationResult | Rejected:
     """Where a photograph was taken, in one line; `Client.localize` can do more.
@@ -45,7 +46,7 @@ def localize(
         address: "host:port"; None: that in MAPLESS_ADDRESS, or localhost:50051.
         options: how to connect; None: without encryption, with the token in MAPLESS_TOKEN if there is one.
         priors: what is known of the camera beforehand.
-        axes: "opencv" (default), "arkit", "arcore", "unity" or "ros": of `LocalizationResult.in_axes`.
+        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or a value of `Axes`: of `LocalizationResult.in_axes`.
         timeout_s: deadline of the call.
 
     Raises:

@@ -78,7 +78,7 @@ def test_a_sequence_is_no_worse_than_its_photographs(kitchen: tuple[Client, Sequ
     together = client.localize_sequence(
         [SequenceFrame(i, f.camera, s) for i, f, s in zip(images, walk, session, strict=True)],
         "kitchen",
-        estimate_scale=True,
+        estimate_session_scale=True,
     )
     assert isinstance(together, SequenceLocalization), together
     found_m = [error_m(*it) for it in zip(together.world_from_camera, truth, strict=True)]

@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from compare import assert_pose_close
 from images import encode
-from servers import CAMERA, PHOTO, Stubs, failure_of, pose
+from servers import CAMERA, PHOTO, Stubs, failure_of, pose, serving
 
 from mapless import (
     Camera,
     Client,
     GroupRejected,
+    MaplessError,
     NewReference,
     NotFound,
     RigidTransform,
@@ -119,7 +121,7 @@ def test_a_sequence(corner: Client, queries: list[bytes], axes: str) -> None:
         SequenceFrame(image, CORNER, tracked(at), taken if i == 2 else None)
         for i, (image, at) in enumerate(zip(queries, WALK, strict=True))
     ]
-    answer = corner.localize_sequence(frames, "corner", estimate_scale=True, axes=axes)
+    answer = corner.localize_sequence(frames, "corner", estimate_session_scale=True, axes=axes)
     assert isinstance(answer, SequenceLocalization), answer
     for found, truth in zip(answer.world_from_camera, WALK, strict=True):
         assert_pose_close(found, truth, metres=0.01, degrees=0.5)
@@ -142,7 +144,7 @@ def test_what_shows_nothing_is_rejected_with_each_images_reason(corner: Client) 
 
 def test_a_session_without_motion_has_no_scale(corner: Client, queries: list[bytes]) -> None:
     frames = [SequenceFrame(queries[0], CORNER, pose(1.0))] * 2
-    answer = corner.localize_sequence(frames, "corner", estimate_scale=True)
+    answer = corner.localize_sequence(frames, "corner", estimate_session_scale=True)
     assert isinstance(answer, GroupRejected)
     assert answer.reason == "SCALE_UNRELIABLE"
     assert answer.hint is not None
@@ -258,6 +260,20 @@ def test_bad_sequences_are_refused_by_field(stubs: Stubs, scene: str, name: str)
     change(request)
     error = failure_of(stubs.localization.LocalizeSequence, request)
     assert (error.code, error.field) == ("INVALID_ARGUMENT", field), error
+
+
+def test_photographs_of_all_that_together_are_more_than_may_be_held_are_refused(tmp_path: Path) -> None:
+    noise = np.random.default_rng(3).integers(0, 255, (400, 500, 3), np.uint8)
+    camera = Camera(500, 400, 400.0, 400.0, 250.0, 200.0)
+    png_bytes = encode(".png", noise)
+    assert 2**19 < len(png_bytes) < 2**20
+    image = RigImage(png_bytes, camera, pose(0.1))
+    with serving(tmp_path, max_queued_mib=1) as server, Client(server.address) as client:
+        client.create_scene("hall")
+        with pytest.raises(MaplessError) as refused:
+            client.localize_rig([image] * 2, "hall")
+        assert (refused.value.code, refused.value.reason) == ("RESOURCE_EXHAUSTED", "TOO_LARGE")
+        assert isinstance(client.localize_rig([image], "hall"), GroupRejected)
 
 
 def test_an_unknown_scene_is_not_found(stubs: Stubs) -> None:

@@ -274,6 +274,23 @@ class TestTiers:
                 Engine(setting.store, tiers, EngineOptions())
 
 
+class TestMemory:
+    def test_a_photograph_of_a_group_is_counted_once_with_its_group_and_a_single_one_by_itself(
+        self, setting: Setting, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        setting.replies["cheap"] = localized(SURE_INLIERS)
+        submit, sizes = setting.engine.queue.submit, list[int]()
+
+        def noted(flow: Flow, step: Any, deadline_s: float, size_bytes: int, *others: Any) -> Any:
+            sizes.append(size_bytes)
+            return submit(flow, step, deadline_s, size_bytes, *others)
+
+        monkeypatch.setattr(setting.engine.queue, "submit", noted)
+        setting.localize()
+        setting.localize(is_part=True)
+        assert sizes == [len(PHOTO), 0]
+
+
 class TestPhotograph:
     def test_reaches_the_method_with_the_query_and_every_reference(self, setting: Setting) -> None:
         setting.replies["cheap"] = localized(SURE_INLIERS)

@@ -60,7 +60,7 @@ def test_what_waits_for_a_watcher_keeps_nothing_else_of_the_request() -> None:
         watch = watchers.watch(HALL)
         request = pb.LocalizeRequest()
         request.CopyFrom(REQUEST)
-        watchers.publish(HALL, request, answer(1), None)  # type: ignore[arg-type]
+        watchers.publish(HALL, request, answer(1), None)
         request.intrinsics.width_px = 111
         assert (await next_of(watch)).intrinsics.width_px == 640
 
@@ -73,7 +73,7 @@ def test_a_photograph_as_large_as_a_message_may_be_is_left_out_and_the_answer_is
         watch = watchers.watch(HALL)
         for size in (1000, 1999, 5):
             request = pb.LocalizeRequest(image=bytes(size))
-            watchers.publish(HALL, request, answer(size), pb.Debug(error_px=[0.5] * 10))  # type: ignore[arg-type]
+            watchers.publish(HALL, request, answer(size), pb.Debug(error_px=[0.5] * 10))
         seen = [await next_of(watch) for _ in range(3)]
         assert [len(it.image) for it in seen] == [1000, 0, 5]
         assert [inliers_of(it) for it in seen] == [1000, 1999, 5]

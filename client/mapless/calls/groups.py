@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from datetime import datetime
 
 from .. import wire
+from ..axes import Axes
 from ..exchange import Call, Exchange
 from ..geometry import RigidTransform
 from ..groups import (
@@ -72,10 +73,10 @@ def localize_sequence(
     frames: Sequence[SequenceFrame],
     scene: str,
     *,
-    estimate_scale: bool = False,
+    estimate_session_scale: bool = False,
     reference_count: int = 0,
     coverage: float = 0.0,
-    axes: str = "",
+    axes: Axes | str = "",
     timeout_s: float | None = None,
 ) -> Exchange[SequenceLocalization | GroupRejected]:
     """Where a device was, by a few photographs and the poses that it tracked meanwhile, which may drift.
@@ -83,17 +84,17 @@ def localize_sequence(
     Args:
         frames: 2 to 16 photographs with the device's poses, the oldest first.
         scene: where to look.
-        estimate_scale: whether the unit of the device's poses is unknown; then it has to have moved.
+        estimate_session_scale: whether the unit of the device's poses is unknown; then it has to have moved.
         reference_count: how many references the server chooses for each, if it does; 0 is its default.
         coverage: see `localize`; decides which photographs are believed alone.
-        axes: "opencv" (default), "arkit", "arcore", "unity" or "ros": of the device's poses and of
+        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or a value of `Axes`: of the device's poses and of
             `SequenceLocalization.world_from_session`.
         timeout_s: deadline of the call.
     """
     request = pb.LocalizeSequenceRequest(
         scene=scene_name(scene),
         frames=[_frame_to_message(frame, scene) for frame in frames],
-        estimate_session_scale=estimate_scale,
+        estimate_session_scale=estimate_session_scale,
         options=pb.LocalizeOptions(reference_count=reference_count, coverage=coverage, axes=enum_value(pb.Axes, axes)),
     )
     response = yield Call(f"{SERVICE}/LocalizeSequence", request, pb.LocalizeSequenceResponse, timeout_s)

@@ -7,6 +7,7 @@ from datetime import datetime
 
 from .. import wire
 from ..answers import LocalizationResult, Rejected, answer_from_message
+from ..axes import Axes
 from ..exchange import Call, Exchange
 from ..geometry import Camera, RigidTransform
 from ..priors import Priors, set_priors
@@ -30,7 +31,7 @@ def localize(
     rerank_references: bool = False,
     allow_coarse: bool = False,
     coverage: float = 0.0,
-    axes: str = "",
+    axes: Axes | str = "",
     include_debug: bool = False,
     capture_time: datetime | None = None,
     session_from_camera: RigidTransform | None = None,
@@ -51,7 +52,7 @@ def localize(
         allow_coarse: whether a pose that could not be refined before the deadline is answered all the same, with
             `LocalizationResult.pose_stage` "COARSE" and no covariance, instead of raising `DeadlineExceeded`.
         coverage: share of the right answers that are to be accepted, above 0 and below 1; 0 is the server's default.
-        axes: "opencv" (default), "arkit", "arcore", "unity" or "ros": of `session_from_camera` and of
+        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or a value of `Axes`: of `session_from_camera` and of
             `LocalizationResult.in_axes`.
         include_debug: whether the answer is to carry the matches it rests on.
         capture_time: when it was taken, with time zone; echoed.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import Any
 
 from .. import names, wire
@@ -17,12 +18,13 @@ def reference_name(scene: str, reference: str) -> str:
     return reference if reference.startswith("scenes/") else f"{scene_name(scene)}/references/{reference}"
 
 
-def enum_value(enum: wire.ProtoEnum, value: str) -> Any:
-    """The number of an option's value; ValueError names those there are."""
+def enum_value(enum: wire.ProtoEnum, value: str | Enum) -> Any:
+    """The number of an option's value, in small or capital letters; ValueError names those there are."""
     prefix = wire.enum_prefix(enum)
-    if not value:
+    written = str(value.value if isinstance(value, Enum) else value)
+    if not written:
         return 0
     known = [name.removeprefix(prefix).lower() for name in enum.keys()[1:]]
-    if value not in known:
-        raise ValueError(f"{enum.DESCRIPTOR.name} is one of {', '.join(known)}, not {value!r}")
-    return enum.Value(prefix + value.upper())
+    if written.lower() not in known:
+        raise ValueError(f"{enum.DESCRIPTOR.name} is one of {', '.join(known)}, not {written!r}")
+    return enum.Value(prefix + written.upper())

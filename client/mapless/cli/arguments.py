@@ -6,6 +6,7 @@ import argparse
 import os
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from ..options import ConnectOptions
 from ..shortcut import ADDRESS_VARIABLE, TOKEN_VARIABLE, default_address
@@ -30,6 +31,25 @@ POSE is a JSON file likewise, RigidTransform:
 """
 
 
+_CONNECTION_DEFAULTS: dict[str, Any] = {
+    "timeout": 30.0,
+    "tls": False,
+    "ca": None,
+    "cert": None,
+    "key": None,
+    "token_file": None,
+    "client_id": "",
+}
+
+
+class _Command(argparse.ArgumentParser):
+    """A command: takes the flags that say how to connect as well, and leaves those that stand before it."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        _add_connection(self)
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The whole command line; `run` of what it parses is the command."""
     parser = argparse.ArgumentParser(
@@ -39,14 +59,9 @@ def make_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"mapless {version('mapless')}")
-    parser.add_argument(
-        "--address",
-        default=default_address(),
-        help=f"of the server (default: that in {ADDRESS_VARIABLE}, or localhost:50051)",
-    )
-    parser.add_argument("--timeout", type=float, default=30.0, help="of a call, seconds (default: %(default)s)")
-    _add_connection(parser.add_argument_group("connection"))
-    groups = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    _add_connection(parser)
+    parser.set_defaults(**_CONNECTION_DEFAULTS, address=default_address())
+    groups = parser.add_subparsers(title="commands", required=True, metavar="COMMAND", parser_class=_Command)
     groups.add_parser("health", help="whether the server takes calls").set_defaults(run=commands.health)
     _add_scene(groups.add_parser("scene", help="create, update, get, list, delete"))
     _add_reference(groups.add_parser("reference", help="add, list, delete"))
@@ -70,17 +85,21 @@ def connect_options(arguments: argparse.Namespace) -> ConnectOptions:
     )
 
 
-def _add_connection(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--tls", action="store_true", help="encrypt; --ca and --cert imply it")
-    group.add_argument(
-        "--ca", type=Path, metavar="FILE", help="certificate that signed the server's, PEM (default: the system's)"
-    )
-    group.add_argument("--cert", type=Path, metavar="FILE", help="our own certificate, PEM, if the server asks")
-    group.add_argument("--key", type=Path, metavar="FILE", help="its key, PEM")
-    group.add_argument(
-        "--token-file", type=Path, metavar="FILE", help=f"holds the token to show (default: that in {TOKEN_VARIABLE})"
-    )
-    group.add_argument("--client-id", default="", help="which of the token's users this is")
+def _add_connection(parser: argparse.ArgumentParser) -> None:
+    """Flags without defaults, so that a command where they are not given changes nothing."""
+    group = parser.add_argument_group("connection")
+
+    def add(flag: str, **options: Any) -> None:
+        group.add_argument(flag, default=argparse.SUPPRESS, **options)
+
+    add("--address", help=f"of the server (default: that in {ADDRESS_VARIABLE}, or localhost:50051)")
+    add("--timeout", type=float, help=f"of a call, seconds (default: {_CONNECTION_DEFAULTS['timeout']:g})")
+    add("--tls", action="store_true", help="encrypt; --ca and --cert imply it")
+    add("--ca", type=Path, metavar="FILE", help="certificate that signed the server's, PEM (default: the system's)")
+    add("--cert", type=Path, metavar="FILE", help="our own certificate, PEM, if the server asks")
+    add("--key", type=Path, metavar="FILE", help="its key, PEM")
+    add("--token-file", type=Path, metavar="FILE", help=f"holds the token to show (default: that in {TOKEN_VARIABLE})")
+    add("--client-id", help="which of the token's users this is")
 
 
 def _add_scene(scene: argparse.ArgumentParser) -> None:
@@ -147,7 +166,7 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
     command.add_argument("scene")
     command.add_argument("photo", type=Path, help="or a folder of photographs")
     command.add_argument(
-        "--camera", help="that took it, or all, see `mapless --help`; a folder with a cameras.json needs none"
+        "--camera", help="that took it, or all, see `mapless --help`; beside or in a cameras.json none is needed"
     )
     command.add_argument("--reference", action="append", default=[], help="compare with this one; may be repeated")
     command.add_argument("--count", type=int, default=0, help="how many references the server chooses")

@@ -30,6 +30,7 @@ ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 _FIELDS_OF_PHOTOS = ("image", "intrinsics")
 _DRAWN_REFERENCES, _SHOWN_REFERENCES = 16, 4
 Outcome = LocalizationResult | Rejected | MaplessError
+_WITHOUT = {LocalizationResult: "", Rejected: "not localized"}
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ def _one(client: Client, arguments: argparse.Namespace) -> int:
             print(json.dumps(output.plain(_told(answer, arguments)), indent=2), file=file, flush=True)
         else:
             print("\n".join(output.lines(answer)), file=file, flush=True)
+    _tell_where(arguments)
     return EXIT_REJECTED if isinstance(answer, Rejected) else 0
 
 
@@ -78,13 +80,21 @@ def _folder(client: Client, arguments: argparse.Namespace) -> int:
         for name, outcome in zip(names, _all(client, photos, arguments), strict=True):
             progress.clear()
             print(_row(name, width, outcome, as_json, arguments), file=file, flush=True)
-            progress.step(not isinstance(outcome, LocalizationResult))
+            progress.step(_WITHOUT.get(type(outcome), "failed"))
             counts[MaplessError if isinstance(outcome, MaplessError) else type(outcome)] += 1
-    failed = f", {counts[MaplessError]} failed" if counts[MaplessError] else ""
-    print(f"{counts[LocalizationResult]} of {len(photos)} localized{failed}", file=sys.stderr)
+    print(f"{counts[LocalizationResult]} of {len(photos)} localized{progress.without()}", file=sys.stderr)
+    _tell_where(arguments)
     if counts[MaplessError]:
         return EXIT_FAILED
     return EXIT_REJECTED if counts[Rejected] else 0
+
+
+def _tell_where(arguments: argparse.Namespace) -> None:
+    """Which files there are now."""
+    if arguments.output is not None:
+        print(f"answers are in {arguments.output}", file=sys.stderr)
+    if arguments.draw is not None:
+        print(f"pages to look at are in {arguments.draw}", file=sys.stderr)
 
 
 def photos_of(folder: Path, camera: str | None) -> list[Photo]:
@@ -108,13 +118,21 @@ def photos_of(folder: Path, camera: str | None) -> list[Photo]:
 
 def _camera_of(path: Path, camera: str | None) -> Camera:
     if camera is None:
-        raise ValueError("say --camera: which camera took the photograph")
+        return _camera_beside(path)
     if Path(camera).name != FOLDER_FILE:
         return read_camera(camera, path)
     cameras = {known.resolve(): its for known, its in read_cameras(camera).items()}
     if path.resolve() not in cameras:
         raise ValueError(f"{camera} knows no {path}")
     return cameras[path.resolve()]
+
+
+def _camera_beside(path: Path) -> Camera:
+    """The camera of a photograph by the cameras.json of its folder, or of the one around it."""
+    for folder in path.resolve().parents[:2]:
+        if (folder / FOLDER_FILE).is_file():
+            return _camera_of(path, str(folder / FOLDER_FILE))
+    raise ValueError(f"say --camera: which camera took the photograph; there is no {FOLDER_FILE} beside it")
 
 
 def _all(client: Client, photos: list[Photo], arguments: argparse.Namespace) -> Iterator[Outcome]:
@@ -167,12 +185,16 @@ def _ask(client: Client, photo: Photo, arguments: argparse.Namespace) -> Localiz
 
 
 def _references(client: Client, scene: str, answer: LocalizationResult | Rejected) -> list[Reference]:
-    """Those that were used, as far as they are still there; the best with their photographs."""
+    """Those that matched, as far as they are still there; the best with their photographs, the hint's first."""
     uses = sorted(answer.diagnostics.references, key=lambda use: (-use.inlier_count, -use.match_count))
+    names = [use.name for use in uses if use.match_count > 0]
+    hint = answer.hint if isinstance(answer, Rejected) else None
+    if hint is not None and hint.best_reference:
+        names = [hint.best_reference, *(name for name in names if name != hint.best_reference)]
     found = []
-    for rank, use in enumerate(uses[:_DRAWN_REFERENCES]):
+    for rank, name in enumerate(names[:_DRAWN_REFERENCES]):
         with contextlib.suppress(NotFound):
-            found.append(client.get_reference(scene, use.name, include_image=rank < _SHOWN_REFERENCES))
+            found.append(client.get_reference(scene, name, include_image=rank < _SHOWN_REFERENCES))
     return found
 
 

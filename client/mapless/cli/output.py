@@ -14,8 +14,11 @@ from google.protobuf import json_format
 from google.protobuf.message import Message
 
 from .. import wire
-from ..answers import Accuracy, LocalizationResult, Rejected
+from ..answers import Accuracy, LocalizationResult, PriorCheck, Rejected
 from ..geometry import Camera, RigidTransform
+
+DOUBTFUL_TRUST = 0.05
+"""Below, an answer looks worse than 19 of 20 right ones: usually what was said of the camera is wrong."""
 
 
 def print_json(value: object) -> int:
@@ -55,6 +58,8 @@ def lines(answer: LocalizationResult | Rejected) -> list[str]:
         told = [f"not localized: {answer.reason}", f"  {answer.message}"]
         if answer.hint is not None and answer.hint.message:
             told.append(f"  {answer.hint.message}")
+        if answer.hint is not None and answer.hint.best_reference:
+            told.append(f"  shares most with reference {answer.hint.best_reference.rpartition('/')[2]}")
         return told
     pose = answer.world_from_camera if answer.in_axes is None else answer.in_axes.world_from_camera
     frame = "" if answer.in_axes is None else f"   in {answer.in_axes.axes} axes"
@@ -68,17 +73,17 @@ def lines(answer: LocalizationResult | Rejected) -> list[str]:
     if answer.geo_pose is not None:
         geo = answer.geo_pose
         told.append(f"  on earth  {geo.lat:.7f}, {geo.lon:.7f}, {geo.h:.2f} m")
-    told += [
-        f"  prior     {check.kind} contradicts the photograph: {check.mahalanobis:.1f} standard deviations"
-        for check in answer.prior_checks
-        if check.conflict
-    ]
+    told += [f"  prior     {_checked(check)}" for check in answer.prior_checks]
     used = sum(use.inlier_count > 0 for use in answer.diagnostics.references)
-    return [
-        *told,
+    told.append(
         f"  support   {answer.inlier_count} of {answer.match_count} matches, {used} references, "
-        f"{answer.diagnostics.total_s:.2f} s",
-    ]
+        f"{answer.diagnostics.total_s:.2f} s"
+    )
+    if answer.trust is not None and answer.trust < DOUBTFUL_TRUST:
+        told.append(
+            f"  warning   fewer than {100 * DOUBTFUL_TRUST:g} % of right answers look as doubtful: check the intrinsics"
+        )
+    return told
 
 
 def line(name: str, answer: LocalizationResult | Rejected) -> str:
@@ -95,6 +100,14 @@ def line(name: str, answer: LocalizationResult | Rejected) -> str:
 def heading(width: int) -> str:
     """Of the table whose names are so wide."""
     return f"{'photograph':{width}}  {'x':>9} {'y':>9} {'z':>9}    {'95 % within':>10} {'trust':>6}  {'inliers':>9}"
+
+
+def _checked(check: PriorCheck) -> str:
+    """How an answer compares with a prior, in words."""
+    if check.conflict:
+        ignored = "" if check.used else ", not used"
+        return f"{check.kind} contradicts the photograph: {check.mahalanobis:.1f} standard deviations{ignored}"
+    return f"{check.kind} agrees, " + ("used" if check.used else "knows less than the photograph, not needed")
 
 
 def _radius(accuracy: Accuracy | None, kind: str, unit: str) -> str:

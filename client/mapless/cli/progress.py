@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections import Counter
 from types import TracebackType
 from typing import TextIO
 
@@ -21,7 +22,8 @@ class Progress:
         self._is_shown = self._stream.isatty()
         self._start_s = time.monotonic()
         self._drawn_s = 0.0
-        self._done = self._lost = 0
+        self._done = 0
+        self._without: Counter[str] = Counter()
         self._lock = threading.Lock()
 
     def __enter__(self) -> Progress:
@@ -33,11 +35,12 @@ class Progress:
     ) -> None:
         self.clear()
 
-    def step(self, is_lost: bool = False) -> None:
-        """One more is done; `is_lost`: without what was hoped for."""
+    def step(self, without: str = "") -> None:
+        """One more is done; `without` what was hoped for, in words: "not localized"."""
         with self._lock:
             self._done += 1
-            self._lost += is_lost
+            if without:
+                self._without[without] += 1
             if time.monotonic() - self._drawn_s >= _REDRAW_S or self._done == self._total:
                 self._draw()
 
@@ -53,11 +56,14 @@ class Progress:
         filled = _BAR_CHARACTERS * self._done // max(self._total, 1)
         took_s = time.monotonic() - self._start_s
         line = f"[{'#' * filled}{'.' * (_BAR_CHARACTERS - filled)}] {self._done}/{self._total}"
-        if self._lost:
-            line += f", {self._lost} not localized"
+        line += self.without()
         if 0 < self._done < self._total:
             line += f", {took_s / self._done * (self._total - self._done):.0f} s to go"
         return line
+
+    def without(self) -> str:
+        """How many were done without what was hoped for, to be appended: ", 2 not localized, 1 failed"."""
+        return "".join(f", {count} {what}" for what, count in sorted(self._without.items(), reverse=True))
 
     def _draw(self) -> None:
         if self._is_shown:

@@ -12,8 +12,8 @@ from ..answers import LocalizationResult, Rejected
 from ..geometry import Camera, RigidTransform
 from ..results import Reference
 from . import sections
-from .markup import section, text
-from .overlay import define, histogram, overlay
+from .markup import reference_id, section, text
+from .overlay import define, histogram, image_of, overlay
 from .pairs import best_references, pairs
 from .pictures import Picture, picture
 from .plan import plan_view
@@ -61,14 +61,13 @@ def report_html(
         _header(answer, title),
         define(photograph, camera),
         _photograph_section(answer, camera, photograph),
+        _best_reference(answer, by_name, pictures),
         section("Beside the references", pairs(answer.debug, diagnostics.references, camera, by_name, pictures)),
         section("Where it is", _plan(answer, by_name, camera, down_in_world)),
         *first,
         *further,
-        '<div class="columns">',
         sections.references_section(diagnostics),
         sections.timings_section(diagnostics),
-        "</div>",
         sections.provenance_section(diagnostics, camera),
         f"<footer>Written {datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC. This page holds the photograph itself and "
         "needs nothing else.</footer>",
@@ -110,12 +109,38 @@ def _photograph_section(answer: LocalizationResult | Rejected, camera: Camera, p
         return section(
             "The photograph and its matches", note, overlay(answer.debug, camera, pose), histogram(answer.debug)
         )
-    if answer.debug is None:
-        why = "The answer carries no matches: they come with include_debug, where the computation gets that far."
-    else:
+    if answer.debug is not None:
         why = "Nothing in it was matched."
+    elif "pnp" in answer.diagnostics.stage_s:
+        why = "The answer carries no matches: they come with include_debug."
+    else:
+        why = "The computation ended before it was matched with points of the scene."
     shown = f'<svg viewBox="-0.5 -0.5 {camera.width_px} {camera.height_px}"><use href="#photograph"/></svg>'
     return section("The photograph", note, f"<figure>{shown}<figcaption>{why}</figcaption></figure>")
+
+
+def _best_reference(
+    answer: LocalizationResult | Rejected, references: Mapping[str, Reference], pictures: Mapping[str, Picture]
+) -> str:
+    """What to point the camera at, where that would help."""
+    name = _hinted(answer)
+    shown = pictures.get(name)
+    if shown is None:
+        return ""
+    camera = references[name].camera
+    figure = (
+        f'<figure><svg viewBox="-0.5 -0.5 {camera.width_px} {camera.height_px}" role="img" '
+        f'aria-label="{text(reference_id(name))}">{image_of(shown, camera)}</svg>'
+        f"<figcaption><b>{text(reference_id(name))}</b>: of all references, it shares most with the photograph. "
+        f"{text(shown.note)}</figcaption></figure>"
+    )
+    return section("Point the camera at this", figure)
+
+
+def _hinted(answer: LocalizationResult | Rejected) -> str:
+    """Name of the reference that a rejection names as the best; empty if there is none."""
+    hint = answer.hint if isinstance(answer, Rejected) else None
+    return hint.best_reference if hint is not None else ""
 
 
 def _plan(
@@ -134,14 +159,16 @@ def _plan(
         poses = [(letter, it.world_from_camera) for letter, it in zip("ABCDEFGH", answer.hypotheses, strict=False)]
         if answer.debug is not None:
             points = answer.debug.x_in_world
-    used = [use.name for use in answer.diagnostics.references]
+    used = [use.name for use in answer.diagnostics.references if use.match_count > 0]
+    if not used and not poses:
+        return ""
     return plan_view(references, used, poses, camera, covariance, points, down_in_world)
 
 
 def _pictures(answer: LocalizationResult | Rejected, references: Mapping[str, Reference]) -> dict[str, Picture]:
     """Of the references that are shown beside the photograph, and have one."""
     found = {}
-    for name in best_references(answer.debug, answer.diagnostics.references):
+    for name in {_hinted(answer), *best_references(answer.debug, answer.diagnostics.references)}:
         image = references[name].image if name in references else None
         if image is not None:
             found[name] = picture(image, REFERENCE_BYTES)

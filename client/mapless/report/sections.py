@@ -19,14 +19,17 @@ def cards(answer: LocalizationResult | Rejected) -> str:
     shown: list[tuple[str, str]] = []
     if isinstance(answer, LocalizationResult):
         if answer.accuracy is not None:
-            shown.append((length(answer.accuracy.position_95_m), "position is not further off, in 95 % of cases"))
-            shown.append((angle(answer.accuracy.rotation_95_deg), "direction is not further off, in 95 % of cases"))
+            how = "in 95 % of cases" + ("" if answer.accuracy.calibrated else " (uncalibrated)")
+            shown.append((length(answer.accuracy.position_95_m), f"position is not further off, {how}"))
+            shown.append((angle(answer.accuracy.rotation_95_deg), f"direction is not further off, {how}"))
         if answer.trust is not None:
             shown.append((f"{answer.trust:.2f}", "trust: share of right answers that look no better"))
         shown.append((f"{answer.inlier_count}/{answer.match_count}", "matches agree with the pose"))
     elif answer.debug is not None:
         shown.append((str(len(answer.debug.is_inlier)), "matches with points of the references"))
-    shown.append((str(len(answer.diagnostics.references)), "references compared"))
+    compared = sum(use.match_count > 0 for use in answer.diagnostics.references)
+    if compared:
+        shown.append((str(compared), "references share features with it"))
     shown.append((duration(answer.diagnostics.total_s), "in the server"))
     return (
         '<div class="cards">'
@@ -137,7 +140,7 @@ def references_section(diagnostics: Diagnostics) -> str:
         similarity = f"{it.similarity:.2f}" if it.similarity else UNKNOWN
         rows.append([text(reference_id(it.name)), similarity, str(it.match_count), str(it.inlier_count), bars])
     head = ("reference", "similarity", "feature matches", "inliers it shows", "")
-    return section("References", table(head, rows)) if rows else ""
+    return section("References", table(head, rows, "names")) if rows else ""
 
 
 def timings_section(diagnostics: Diagnostics) -> str:

@@ -24,8 +24,6 @@ h3 { font-size: .95rem; margin: 1.2rem 0 .4rem; font-weight: 600; color: var(--s
 .hint { border-left: 4px solid var(--accent); background: var(--wash); padding: .7rem 1rem;
   border-radius: 0 8px 8px 0;
   margin: 1.2rem 0 0; } .hint.conflict { border-color: var(--bad); }
-.columns { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr)); gap: 1rem 2rem; }
-.columns > * { min-width: 0; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-size: 13.5px; font-variant-numeric: tabular-nums; width: 100%; }
 th, td { padding: .28rem .7rem .28rem 0; text-align: right; border-bottom: 1px solid var(--line);
@@ -34,6 +32,7 @@ th { color: var(--soft); font-weight: 550; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; overflow-wrap: anywhere; }
 table.words td { text-align: left; overflow-wrap: anywhere; } table.words td:first-child { color: var(--soft);
   width: 11rem; }
+table.names td:first-child { white-space: nowrap; overflow-wrap: normal; }
 table.matrix td { font-size: 12.5px; white-space: nowrap; padding: .3rem .5rem; text-align: center; }
 table.matrix { width: auto; } table.matrix th, table.matrix td { text-align: center; }
 td:has(> .bar) { text-align: left; } .tint { padding: .1rem .35rem; border-radius: 3px; }

@@ -33,7 +33,7 @@ def charts_of(found: Findings, unit: str) -> list[Chart]:
 def _reliability(kind: str, claims: Sequence[Claim], after: Sequence[Claim]) -> Chart:
     curves = [Curve("as claimed", _per_cent(reliability(claims)))]
     if after:
-        curves.append(Curve("with factors, left out", _per_cent(reliability(after))))
+        curves.append(Curve("with the factors of all others", _per_cent(reliability(after))))
     curves.append(Curve("exactly right", ((0.0, 0.0), (100.0, 100.0)), from_paper=True))
     for name, tail in (("by chance, at least", 0.025), ("by chance, at most", 0.975)):
         shares = tuple((100 * p, 100 * _chance(len(claims), p, tail)) for p in DIAGRAM)

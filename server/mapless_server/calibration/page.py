@@ -49,7 +49,7 @@ def page(report: CalibrationReport) -> str:
             *map(svg.draw, charts_of(report.found, report.unit)),
             "</div>",
             "<h2>What exceeds its claim most</h2>",
-            *_table(_QUERY_COLUMNS, (_query_row(it, report.unit) for it in worst(report))),
+            *_exceeding(report),
             *_rejected(report.found.outcomes),
             "<h2>How to read it</h2>",
             *(f'<p class="note">{escape(rule)}</p>' for rule in RULES),
@@ -59,6 +59,11 @@ def page(report: CalibrationReport) -> str:
 
 
 _QUERY_COLUMNS = ("photograph", "off", "claimed 95 %", "turned", "claimed 95 %", "trust", "inliers")
+
+
+def _exceeding(report: CalibrationReport) -> list[str]:
+    rows = [_query_row(it, report.unit) for it in worst(report)]
+    return _table(_QUERY_COLUMNS, rows) if rows else ["<p>No answer is further off than its radii of 95 %.</p>"]
 
 
 def _query_row(it: Outcome, unit: str) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ RULES = (
     "calibrate nothing.",
     "Dotted in the diagrams: what exactly right claims would show, and how far from that chance alone leads with so "
     "many answers, in 95 % of cases at each probability.",
-    "With factors, left out: each answer with the factors that all others give, so that none is judged by itself.",
+    "With the factors of all others: each answer with those that all others give, so that none is judged by itself.",
     "Radii for other probabilities than 68 and 95 % are the covariance's, times what the stated radii are of its own: "
     "exactly at both, linear between, constant beyond.",
     "Trust is shown of the answers that were given; what the server rejected is counted by its reason alone.",
@@ -116,13 +116,13 @@ def held_rows(report: CalibrationReport) -> Iterator[tuple[str, ...]]:
         )
 
 
-COLUMNS = ("radius", "held, as claimed", "factor", "with factors, left out")
+COLUMNS = ("radius", "held, as claimed", "factor", "with the factors of all others")
 
 
 def worst(report: CalibrationReport, count: int = 10) -> list[Outcome]:
-    """The answers that exceed their claims most."""
+    """The answers that exceed a radius of 95 % that they claim, by most first."""
     answered = [it for it in report.found.outcomes if it.position is not None and it.rotation is not None]
-    return sorted(answered, key=lambda it: -_excess(it))[:count]
+    return sorted((it for it in answered if _excess(it) > 1), key=lambda it: -_excess(it))[:count]
 
 
 def print_report(report: CalibrationReport, console: Console) -> None:

@@ -245,12 +245,24 @@ def reconstruct(batch: Sequence[Prepared], checks: Sequence[Check] = ()) -> list
 
 
 def refine(coarse: Coarse, check: Check = _somebody_waits) -> Answer:
-    """The third part: structure, matches and pose; and where that gives little, all again more widely."""
+    """The third part: structure, matches and pose; and where that gives little, all again more widely.
+
+    Where all that is not enough for a pose to be believed, its agreement with gravity or heading may be.
+    """
+    answer = _refined(coarse, check, counts_agreement=False)
+    priors, outcome = coarse.prepared.priors, answer.outcome
+    if not (isinstance(outcome, Rejection) and outcome.reason is RejectionReason.GATE and priors.tells_directions):
+        return answer
+    return _refined(replace(coarse, stage_seconds=answer.stage_seconds), check, counts_agreement=True)
+
+
+def _refined(coarse: Coarse, check: Check, counts_agreement: bool) -> Answer:
+    """Strictly, and if that gives little more widely; `counts_agreement` as in `_pose`."""
     prepared, options = coarse.prepared, coarse.prepared.options
-    answer = _pose(coarse, check)
+    answer = _pose(coarse, check, counts_agreement)
     if not _may_be_better(answer, prepared):
         return answer
-    wide = _pose(_look_wider(coarse, answer.stage_seconds, check), check)
+    wide = _pose(_look_wider(coarse, answer.stage_seconds, check), check, counts_agreement)
     better = wide if is_better(wide, answer, options) else answer
     return replace(better, stage_seconds=wide.stage_seconds)
 
@@ -326,8 +338,8 @@ def _settled(coarse: Coarse) -> Coarse | Answer:
     return coarse
 
 
-def _pose(coarse: Coarse, check: Check) -> Answer:
-    """From the metric scale to the pose."""
+def _pose(coarse: Coarse, check: Check, counts_agreement: bool) -> Answer:
+    """From the metric scale to the pose, believed or not; agreement with gravity and heading speaks for it if asked."""
     prepared, scale, seconds = coarse.prepared, coarse.scale, dict(coarse.stage_seconds)
     if isinstance(scale, Rejection):
         return coarse.answer(scale, seconds)
@@ -339,7 +351,7 @@ def _pose(coarse: Coarse, check: Check) -> Answer:
     if isinstance(estimate, Rejection):
         return coarse.answer(estimate, seconds, support)
     pose, inliers = estimate.world_from_camera, estimate.inliers
-    chance = prepared.priors.consistent(estimate.prior_checks).log10_chance(pose)
+    chance = prepared.priors.log10_chance(pose) if counts_agreement else 0.0
     doubt = doubts(query, structure, matches, pose, inliers, options.pnp.inlier_px, options.gate, chance)
     if doubt:
         rejection = Rejection(RejectionReason.GATE, doubt)

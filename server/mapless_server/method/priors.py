@@ -253,6 +253,11 @@ class Priors:
     def __bool__(self) -> bool:
         return any(True for _ in self)
 
+    @property
+    def tells_directions(self) -> bool:
+        """Whether `log10_chance` may say anything."""
+        return self.gravity is not None or self.heading is not None
+
     def shifted(self, offset: Array) -> Priors:
         """The same in a world in which everything lies `offset` (3,) further."""
         return Priors(**{prior.kind.value: prior.shifted(offset) for prior in self})  # type: ignore[arg-type]

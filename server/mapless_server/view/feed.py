@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import uuid
 from collections.abc import Callable, Sequence
@@ -10,13 +11,16 @@ import grpc
 
 from mapless import ConnectOptions, MaplessError, wire
 from mapless.answers import LocalizationResult, Rejected, answer_from_message
-from mapless.errors import from_rpc_error
+from mapless.errors import Internal, from_rpc_error
 from mapless.geometry import Camera
 from mapless.names import scene_name
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless.wire import FieldError
 
 from .queries import Query
+
+log = logging.getLogger(__name__)
 
 RETRY_S = 3.0
 """Between two tries to watch: servers end a connection now and then, so that it moves on to another."""
@@ -33,7 +37,7 @@ class Feed:
         options: ConnectOptions,
         scene: str,
         show: Callable[[Query], None],
-        say: Callable[[str], None],
+        say: Callable[[str, bool], None],
     ) -> None:
         """Begins at once.
 
@@ -42,7 +46,7 @@ class Feed:
             options: how to connect.
             scene: its id.
             show: given each query; called in the feed's thread.
-            say: told how the watching goes, in a few words.
+            say: told how the watching goes, in a few words, and whether there will be queries.
         """
         self._channel = options.channel(address)
         self._metadata = options.metadata()
@@ -76,6 +80,8 @@ class Feed:
             return answer_from_message(self._stub.Localize(request, timeout=self._timeout_s, metadata=metadata))
         except grpc.RpcError as error:
             raise from_rpc_error(error) from error
+        except FieldError as error:
+            raise Internal("INTERNAL", str(error), reason="MALFORMED_ANSWER", field=error.field) from error
 
     def close(self) -> None:
         """Ends the watching."""
@@ -91,9 +97,11 @@ class Feed:
                 failure = from_rpc_error(error)
                 if self._closing.is_set():
                     return
-                self._say(_words(failure))
+                self._say(_words(failure), failure.code not in _HOPELESS)
                 if failure.code in _HOPELESS:
                     return
+            except FieldError as error:
+                log.warning("an answer of the server breaks its contract: %s", error)
             except ValueError:  # grpc's own word for a channel that was closed meanwhile
                 return
             self._closing.wait(RETRY_S)
@@ -102,7 +110,7 @@ class Feed:
         call = self._stub.WatchQueries(self._request, metadata=self._metadata)
         call.initial_metadata()
         if call.is_active():
-            self._say("live")
+            self._say("live", True)
         for message in call:
             answer = answer_from_message(message.answer)
             if answer.diagnostics.request_id.startswith(self._own):
@@ -116,9 +124,9 @@ class Feed:
 
 def _words(failure: MaplessError) -> str:
     if failure.reason == "WATCHING_NOT_ALLOWED":
-        return "queries are not shown: the server's setting allow_watching is off"
+        return "not shown: the server's setting allow_watching is off"
     if failure.code == "PERMISSION_DENIED":
-        return "queries are not shown: that takes a token of the role write"
+        return "not shown: that takes a token of the role write"
     if failure.code in _HOPELESS:
-        return f"queries are not shown: {failure.message}"
+        return f"not shown: {failure.message}"
     return "waiting for the server"

@@ -25,10 +25,10 @@ class GuardedViser(viser.ViserServer):
     """A viser server that serves its own pages only."""
 
     def __init__(self, host: str, port: int, label: str) -> None:
-        """Listens on a loopback address; where the port is taken, on the next that is free.
+        """Listens on a loopback address; port 0 takes any free one.
 
         Raises:
-            RuntimeError: viser does not serve as it used to, so that it could not be guarded.
+            RuntimeError: the port is taken; or viser does not serve as it used to, so that it could not be guarded.
         """
         # It prints its address, which is ours to tell.
         with _guarded_connections() as guarded, redirect_stdout(io.StringIO()):
@@ -38,6 +38,9 @@ class GuardedViser(viser.ViserServer):
             raise RuntimeError(
                 f"viser {viser.__version__} listens in a way that cannot be guarded; take another version"
             )
+        if port not in (0, self.get_port()):  # viser takes the next one
+            self.stop()
+            raise RuntimeError(f"port {port} of {host} is taken: say another, or 0 for any")
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """There is none: what the viewer shows is not for everybody."""

@@ -67,9 +67,11 @@ class Stage:
         self._dots = self._draw_others()
         self._panel(title)
 
-    def say(self, status: str) -> None:
-        """How the watching goes."""
-        self._status.content = f"Queries: **{status}**"
+    def say(self, status: str, is_watching: bool) -> None:
+        """How the watching goes, and whether there will be queries."""
+        with self._lock:
+            self._status.content = f"Queries: **{status}**"
+            self._nothing.content = _NONE_YET if is_watching else "None."
 
     def show_picture(self, reference_id: str, picture: Picture) -> None:
         """Puts a photograph onto a reference's frustum."""
@@ -183,7 +185,7 @@ class Stage:
             self._show_matches = gui.add_checkbox("Matches of the selected query", True)
             self._size = gui.add_slider("Size of cameras", 0.2, 3.0, 0.1, 1.0)
         with gui.add_folder("Queries", order=2) as self._list:
-            self._nothing = gui.add_markdown("None yet. They appear here as the server answers them.")
+            self._nothing = gui.add_markdown(_NONE_YET)
         show_references.on_update(lambda _: self._show_references(show_references.value))
         self._show_points.on_update(lambda _: self._show_cloud())
         self._show_matches.on_update(lambda _: self._select(self._selected) if self._selected else None)

@@ -21,7 +21,7 @@ from ..informed import informed_pose
 from ..match import PointMatches, vote
 from ..observations import FIRST_GUESS, adjust_points, triangulate, trustworthy
 from ..pnp import PnpOptions, ransac, reprojection_errors_px
-from ..priors import Priors
+from ..priors import NO_PRIORS, Priors
 from ..rejection import Rejection, RejectionReason
 from ..structure import Structure, StructureOptions, observe
 from ..tracks import build_tracks
@@ -99,26 +99,22 @@ class GeometricReconstructor:
         matches = vote(structure, [len(r.view.features) for r in references], correspondences)
         x_in_world = structure.x_in_world[matches.point]
         pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
-        pose = self._pose(query, x_in_world, pixels, request.priors)
-        rejection, inliers = self._judge(query, structure, matches, pose, request.priors)
+        options, priors = self.options.pnp, request.priors
+        enough = len(matches) >= options.min_matches
+        pose = ransac(query.camera, x_in_world, pixels, None, options) if enough else None
+        rejection, inliers = self._judge(query, structure, matches, pose, NO_PRIORS)
+        if rejection and enough and priors:
+            informed = informed_pose(query.camera, x_in_world, pixels, pose, priors, options.informed)
+            pose = informed.world_from_camera if informed else None
+            rejection, inliers = self._judge(query, structure, matches, pose, priors)
         if rejection:
-            known = request.priors.pose
+            known = priors.pose
             if known is None:
                 return rejection
             # Where the photograph tells too little at first sight, what was known of its pose says where to look.
             pose, inliers = known.world_from_camera, np.zeros(len(matches), bool)
         assert pose is not None
         return self._scatter(query, references, structure, pose, x_in_world[inliers], pixels[inliers])
-
-    def _pose(self, query: View, x_in_world: Array, pixels: Array, priors: Priors) -> RigidTransform | None:
-        options = self.options.pnp
-        if len(pixels) < options.min_matches:
-            return None
-        pose = ransac(query.camera, x_in_world, pixels, None, options)
-        if not priors:
-            return pose
-        informed = informed_pose(query.camera, x_in_world, pixels, pose, priors, options.informed)
-        return informed.world_from_camera if informed else None
 
     def _judge(
         self, query: View, structure: Structure, matches: PointMatches, pose: RigidTransform | None, priors: Priors
