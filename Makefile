@@ -25,11 +25,13 @@ setup: $(VENV)/.installed  ## Create .venv with everything
 
 # The matrices are small: threads gain nothing, and wait for one another where cores are shared. Not so the full networks.
 THREADS ?= 1
+# Two cores at once; WORKERS= for one after the other.
+WORKERS ?= -n 2 --dist loadfile
 test: setup $(PROTO_VENV)/.installed  ## Run the tests; ARGS=... for pytest, ARGS="-m slow" THREADS=2 for the slow ones
-	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=$(THREADS) PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(ARGS)
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=$(THREADS) PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(WORKERS) $(ARGS)
 
 thorough:  ## Run the tests that repeat with many cases what others show with few: ten minutes
-	$(MAKE) test ARGS="-m thorough --timeout=600"
+	$(MAKE) test WORKERS= ARGS="-m thorough --timeout=600"
 
 lint: setup  ## Check style, types and protos
 	$(BIN)/ruff check .

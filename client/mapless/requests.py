@@ -41,10 +41,12 @@ def read_image(image: ImageSource) -> bytes:
     """The file's bytes; TypeError for pixels, which have to be encoded first."""
     if isinstance(image, bytes):
         return image
-    if not isinstance(image, str | os.PathLike):
+    try:
+        path = Path(image)
+    except TypeError:
         kind = f"{type(image).__module__}.{type(image).__qualname__}"
         raise TypeError(
             f"image is the path or the bytes of a JPEG, PNG or WebP file, not {kind}: encode pixels first, "
             'for instance with cv2.imencode(".jpg", pixels)[1].tobytes()'
-        )
-    return Path(image).read_bytes()
+        ) from None
+    return path.read_bytes()

@@ -46,7 +46,7 @@ def localize(
         address: "host:port"; None: that in MAPLESS_ADDRESS, or localhost:50051.
         options: how to connect; None: without encryption, with the token in MAPLESS_TOKEN if there is one.
         priors: what is known of the camera beforehand.
-        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or a value of `Axes`: of `LocalizationResult.in_axes`.
+        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of `LocalizationResult.in_axes`.
         timeout_s: deadline of the call.
 
     Raises:

@@ -6,6 +6,7 @@ import re
 
 from .errors import (
     AlreadyExists,
+    FailedPrecondition,
     InvalidArgument,
     NotFound,
     PermissionDenied,
@@ -13,7 +14,7 @@ from .errors import (
 )
 from .scheduling.work_queue import Failure
 
-_CALLERS = (InvalidArgument, Unauthenticated, PermissionDenied, NotFound, AlreadyExists)
+_CALLERS = (InvalidArgument, Unauthenticated, PermissionDenied, NotFound, AlreadyExists, FailedPrecondition)
 """What the caller has to mend. The other errors of requests are told to callers, too, but are the server's."""
 
 _LOST = re.compile(r"CUDA error|CUBLAS_STATUS_(?!ALLOC_FAILED)|CUDNN_STATUS_(?!ALLOC_FAILED)|device-side assert")

@@ -112,6 +112,17 @@ def test_the_last_pose_fades_as_a_prior(loop: Any) -> None:
     assert robot._prior(loop.Frame(2, begin + timedelta(seconds=6), None)) is None
 
 
+@pytest.mark.parametrize(("video", "camera"), [("absent.mp4", "camera.json"), ("drive.avi", "cameras.json")])
+def test_what_is_wrong_is_one_line(loop: Any, tmp_path: Path, camera_json: str, video: str, camera: str) -> None:
+    write_video(tmp_path / "drive.avi", 2)
+    (tmp_path / "cameras.json").write_text('{"frames": []}')
+    with pytest.raises(SystemExit) as caught:
+        loop.main([str(tmp_path / video), "--camera", str(tmp_path / camera), "--scene", "hall"])
+    told = str(caught.value.code)
+    assert told.startswith("robot_loop: ")
+    assert "\n" not in told
+
+
 def test_what_is_no_video_is_said(loop: Any, tmp_path: Path) -> None:
     with pytest.raises(OSError, match="is no video"):
         loop.LatestFrame(tmp_path / "absent.mp4")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
 from itertools import chain
 
 import numpy as np
@@ -12,14 +14,16 @@ from mapless_server.calibration.pairs import (
     METRIC,
     OTHERS,
     Measured,
+    Place,
     answered,
     cross_pairs,
     read_places,
     right_pairs,
 )
 from mapless_server.dataset import Dataset
+from mapless_server.method.focal import FocalOptions, wrong_focal
 from mapless_server.method.localize import Localization, LocalizeOptions
-from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 
 from .conftest import DATA
 
@@ -31,10 +35,16 @@ ALL = LocalizeOptions(coverage=1.0)
 """Whatever passes the gate is answered, with its trust."""
 
 
+@cache
+def fountain() -> Place:
+    """Described once."""
+    return read_places(DATA, [FOUNTAIN])[FOUNTAIN]
+
+
 def test_right_answers_are_trusted_and_another_place_is_not(photographs: Photographs) -> None:
     """Two surveyed scenes, each photograph from two others of its own scene, and from those of the other one."""
     photographs(FOUNTAIN), photographs(HERZ)
-    places = read_places(DATA, [FOUNTAIN, HERZ])
+    places = {FOUNTAIN: fountain()} | read_places(DATA, [HERZ])
     right = list(answered(chain.from_iterable(list(right_pairs(it, None, (2,)))[::2] for it in places.values()), ALL))
     assert all(it.right for it in right)
     assert min(trust_of(it) for it in right) >= 0.05
@@ -43,10 +53,28 @@ def test_right_answers_are_trusted_and_another_place_is_not(photographs: Photogr
     assert not [it.answer.outcome for it in strangers if isinstance(it.answer.outcome, Localization)]
 
 
+def test_a_photograph_with_the_focal_length_of_another_size_is_told_its_own(photographs: Photographs) -> None:
+    """15 percent off, of which the answer would be as far from what it sees: next to all of it is found again."""
+    photographs(FOUNTAIN)
+    place = fountain()
+    pair = list(right_pairs(place, None, (4,)))[5]
+    given = pair.query.camera
+    for factor in (0.85, 1.15):
+        camera = replace(given, focal_x_px=factor * given.focal_x_px, focal_y_px=factor * given.focal_y_px)
+        (it,) = answered([replace(pair, query=replace(pair.query, camera=camera))], ALL)
+        assert it.answer.support is not None
+        told = wrong_focal(it.answer.support, FocalOptions())
+        assert told is not None
+        assert told.told_px == pytest.approx(given.focal_x_px, rel=0.01)
+        assert isinstance(it.answer.outcome, Rejection)
+        assert it.answer.outcome.hint is not None
+        assert it.answer.outcome.hint.advice is Advice.CHECK_CALIBRATION
+
+
 def test_a_scene_of_which_half_the_references_stand_elsewhere_is_ambiguous(photographs: Photographs) -> None:
     """The known poses of every second reference are moved by five metres: both places are told."""
     photographs(FOUNTAIN)
-    place = read_places(DATA, [FOUNTAIN])[FOUNTAIN]
+    place = fountain()
     shift = np.array([5.0, 0.0, 0.0])
     poses = {i: pose.shifted(shift) if i % 2 else pose for i, pose in place.poses.items()}
     moved = type(place)(place.name, place.views, poses)

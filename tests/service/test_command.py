@@ -15,6 +15,7 @@ from servers import CAMERA, PHOTO, RunningServer, pose
 
 from mapless import wire
 from mapless.__main__ import main
+from mapless.cli.arguments import make_parser
 
 
 def run(server: RunningServer, capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, Any, str]:
@@ -118,7 +119,7 @@ def test_a_call_that_fails_does_not_end_the_others(
     code, printed, told = run(
         server, capsys, "localize", scene, str(folder / "images"), "--camera", camera, "--output", str(written)
     )
-    assert (code, printed, told) == (1, "", "2 of 3 localized, 1 failed\n")
+    assert (code, printed, told) == (1, "", f"2 of 3 localized, 1 failed\nanswers are in {written}\n")
     first, second, third = lines_of(written.read_text())
     assert (second["photo"], second["error"]["code"], second["error"]["field"]) == (
         "1.png",
@@ -135,8 +136,20 @@ def test_photographs_of_a_folder_that_are_not_localized_end_with_3(
 ) -> None:
     assert run(server, capsys, "scene", "create", "bare")[0] == 0
     code, printed, told = run(server, capsys, "localize", "bare", str(folder))
-    assert (code, told) == (3, "0 of 2 localized\n")
+    assert (code, told) == (3, "0 of 2 localized, 2 not localized\n")
     assert {answer["reason"] for answer in lines_of(printed)} == {"NO_USABLE_REFERENCES"}
+
+
+def test_a_photograph_beside_a_cameras_json_needs_no_camera(
+    server: RunningServer, capsys: pytest.CaptureFixture[str], scene: str, folder: Path
+) -> None:
+    code, answer, told = run(server, capsys, "localize", scene, str(folder / "images" / "0.png"))
+    assert (code, answer["inlier_count"], told) == (0, 90, "")
+    code, _, complaint = run(server, capsys, "localize", scene, str(folder / "images" / "1.png"))
+    assert (code, "knows no" in complaint) == (2, True)
+    (folder / "cameras.json").unlink()
+    code, _, complaint = run(server, capsys, "localize", scene, str(folder / "images" / "0.png"))
+    assert (code, "say --camera" in complaint) == (2, True)
 
 
 def test_what_would_fail_for_all_ends_at_once(
@@ -210,8 +223,8 @@ def test_drawings_are_a_page_each_and_debug_is_what_was_asked_for_by_name(
     server: RunningServer, capsys: pytest.CaptureFixture[str], scene: str, folder: Path, tmp_path: Path
 ) -> None:
     pages = tmp_path / "pages"
-    code, printed, _ = run(server, capsys, "localize", scene, str(folder), "--draw", str(pages))
-    assert code == 0
+    code, printed, told = run(server, capsys, "localize", scene, str(folder), "--draw", str(pages))
+    assert (code, told) == (0, f"2 of 2 localized\npages to look at are in {pages}\n")
     assert all(answer["debug"] is None for answer in lines_of(printed))
     assert sorted(page.name for page in pages.iterdir()) == ["images_0.png.html", "images_2.png.html"]
     assert "images/0.png" in (pages / "images_0.png.html").read_text()
@@ -240,7 +253,8 @@ def test_a_scene_has_its_place_on_the_earth(server: RunningServer, capsys: pytes
         (["--rerank"], "--rerank chooses among references"),
         ([], "has no cameras.json: say --camera"),
         (["--camera", FOUR_NUMBERS], "1.png"),
-        (["--camera", "1,2,3"], "1,2,3"),
+        (["--camera", "1,2,3"], "1,2,3: a camera in numbers is four of them"),
+        (["--camera", "1,2,3,4,5"], "four of them"),
         (["--camera", "nan,1,2,3"], "nan,1,2,3"),
         (["--camera", "cameras.json"], "cameras.json"),
         (["--axes", "sideways", "--camera", '{"width_px": 96}'], "camera.height_px"),
@@ -253,6 +267,28 @@ def test_what_is_wrong_is_said_before_anything_is_asked(
     assert (code, printed) == (2, "")
     assert told in complaint
     assert "Traceback" not in complaint
+
+
+@pytest.mark.parametrize("command", [["health"], ["scene", "list"]])
+def test_how_to_connect_may_be_said_before_and_after_the_command(
+    server: RunningServer, capsys: pytest.CaptureFixture[str], command: list[str]
+) -> None:
+    for arguments in (
+        [*command, "--address", server.address],
+        ["--address", "127.0.0.1:1", *command, "--address", server.address],
+        ["--address", server.address, *command, "--timeout", "20"],
+        [command[0], "--address", server.address, *command[1:]],
+    ):
+        with pytest.raises(SystemExit) as caught:
+            main(arguments)
+        assert caught.value.code == 0, capsys.readouterr().err
+
+
+def test_the_connection_flags_of_a_command_leave_those_before_it() -> None:
+    first = make_parser().parse_args(["--timeout", "3", "--tls", "--client-id", "a", "health", "--client-id", "b"])
+    assert (first.timeout, first.tls, first.client_id, first.ca) == (3.0, True, "b", None)
+    last = make_parser().parse_args(["localize", "s", "p.jpg", "--ca", "x.crt", "--camera", "c.json"])
+    assert (str(last.ca), last.camera, last.timeout, last.tls) == ("x.crt", "c.json", 30.0, False)
 
 
 def test_the_address_is_that_of_the_environment(

@@ -128,7 +128,10 @@ def test_three_times_as_many_as_fit_are_answered_or_refused_and_all_are_counted(
     with overloaded(tmp_path, slow(COST_S), max_queued_s=1.0) as server, ExitStack() as stack:
         with Client(server.address) as client:
             make_scene(client, calls=10)
-        stubs = [LocalizationServiceStub(stack.enter_context(grpc.insecure_channel(server.address))) for _ in range(4)]
+        # Four robots have four connections, each with its own limit of calls.
+        own_connection = [("grpc.use_local_subchannel_pool", 1)]
+        channels = [grpc.insecure_channel(server.address, own_connection) for _ in range(4)]
+        stubs = [LocalizationServiceStub(stack.enter_context(channel)) for channel in channels]
         before = {code: calls_handled(server, code) for code in ("OK", "RESOURCE_EXHAUSTED")}
         start_s, calls = time.monotonic(), []
         for i in range(sent):

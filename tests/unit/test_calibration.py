@@ -29,7 +29,7 @@ from mapless_server.calibration.findings import RightRule, Share, find, reliabil
 from mapless_server.calibration.fit import MIN_QUERIES, Sample, TooFewQueries, factor_for, fit_factors, left_one_out
 from mapless_server.calibration.page import page
 from mapless_server.calibration.queries import Outcome
-from mapless_server.calibration.report import CalibrationReport, to_json
+from mapless_server.calibration.report import CalibrationReport, to_json, worst
 from mapless_server.calibration.run import calibration_of
 from mapless_server.calibration.selective import at_coverage, auroc, risk_coverage
 from mapless_server.calibration.worlds import other_world
@@ -337,6 +337,14 @@ class TestFindings:
         assert html.count("<svg") == 5
         assert "few &lt;matches&gt;" in html
         assert re.findall(r"(?:src|href|url)\s*[=(]|<script|@import|https?://", html) == []
+
+    def test_only_what_exceeds_its_claim_is_listed_as_such(self) -> None:
+        exceeding = [it.name for it in worst(report(find(self.outcomes(), RightRule())))]
+        assert exceeding[0] == "a39"
+        assert len(exceeding) == 10
+        held = report(find([outcome(f"a{i}", 0.5) for i in range(12)], RightRule()))
+        assert worst(held) == []
+        assert "No answer is further off" in page(held)
 
     def test_the_json_has_the_diagram(self) -> None:
         content = json.loads(json.dumps(to_json(report(find(self.outcomes(), RightRule()))), allow_nan=False))

@@ -96,7 +96,9 @@ def test_coverage_is_what_trust_is_compared_with() -> None:
     refused = verdict(support, too_little)[1]
     assert refused is not None
     assert refused.reason is RejectionReason.GATE
-    assert f"{100 * trust:.1f} %" in refused.message
+    assert refused.message.startswith(
+        f"its trust of {np.floor(1000 * trust) / 1000:g} is below the {1 - too_little:.6g} "
+    )
     assert "matches agree" in refused.message
 
 

@@ -6,7 +6,6 @@ import base64
 import re
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timezone
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -14,27 +13,23 @@ import cv2
 import numpy as np
 import pytest
 from images import encode, textured, with_exif_orientation
+from planted_answers import CAMERA, NOW, debug, diagnostics, localized, rejected, truth
 
 from mapless.answers import (
     Accuracy,
-    Debug,
-    Diagnostics,
     Hint,
     Hypothesis,
     LocalizationResult,
     PriorCheck,
-    ReferenceUse,
     Rejected,
 )
-from mapless.geometry import Array, Camera, RadialTangential, RigidTransform, rotation_from_vector
+from mapless.geometry import Array
 from mapless.report import pictures, report_html, write_report
 from mapless.report.overlay import magnification
 from mapless.report.plan import _fit, ellipse_in_plane
 from mapless.results import Reference
 
-CAMERA = Camera(640, 480, 500.0, 505.0, 321.0, 238.0, RadialTangential(-0.1, 0.02, 0.001, 0.0, 0.0))
 PHOTO = encode(".jpg", textured(640, 480))
-NOW = datetime(2026, 11, 21, 12, 0, 0, tzinfo=timezone.utc)
 VOID = {"meta", "input"}
 ALLOWED = re.findall(
     r"\w+",
@@ -78,49 +73,6 @@ class Page(HTMLParser):
         page.close()
         assert not page.open
         return page
-
-
-def truth() -> RigidTransform:
-    return RigidTransform(rotation_from_vector([0.2, -0.1, 0.3]), np.array([1.0, 2.0, 3.0]))
-
-
-def debug(noise_px: float = 1.0, wrong: int = 20) -> Debug:
-    """Two hundred points of a planted scene, as the photograph and two references show them."""
-    random = np.random.default_rng(5)
-    x = truth().apply(random.uniform((-2, -1.5, 4), (2, 1.5, 8), (200, 3)))
-    pixels = CAMERA.project(truth().inverse().apply(x)) + random.normal(0, noise_px, (200, 2))
-    is_inlier = np.arange(200) >= wrong
-    pixels[~is_inlier] = random.uniform(0, 480, (wrong, 2))
-    shown = random.uniform(0, 480, (200, 2))
-    return Debug(pixels, x, is_inlier, np.where(is_inlier, 0.8, 30.0), np.arange(200) % 2, shown)
-
-
-def diagnostics(names: tuple[str, ...] = ("a", "b")) -> Diagnostics:
-    uses = tuple(ReferenceUse(f"scenes/hall/references/{name}", 90 - i, 70 - i, 0.4) for i, name in enumerate(names))
-    return Diagnostics("id-1", "geometric", "", "sift", "BEST", 3, uses, None, {"pnp": 0.02}, 0, 0.3, 640, 480, "0.1.0")
-
-
-def localized(**changes: object) -> LocalizationResult:
-    answer = LocalizationResult(
-        truth(),
-        np.diag([4e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6]),
-        Accuracy(0.02, 0.04, 0.1, 0.2, False),
-        "REFINED",
-        180,
-        200,
-        0.8,
-        diagnostics(),
-        capture_time=NOW,
-        trust=0.4,
-        prior_checks=(PriorCheck("GRAVITY", 0.7, 2, False, True), PriorCheck("POSITION", 8.0, 3, True, False)),
-        debug=debug(),
-    )
-    return replace(answer, **changes)  # type: ignore[arg-type]
-
-
-def rejected(**changes: object) -> Rejected:
-    hint = Hint("pnp", "LOOK_AT_REFERENCE", "Point the camera there.", "scenes/hall/references/a")
-    return replace(Rejected("LOW_OVERLAP", "only 3 matches", diagnostics(), hint=hint), **changes)  # type: ignore[arg-type]
 
 
 def reference(name: str, image: bytes | None = PHOTO) -> Reference:
@@ -240,6 +192,42 @@ def test_a_rejection_says_why_and_what_helps() -> None:
     assert "LOW_OVERLAP" in text
     assert "Point the camera there." in text
     assert "drawn" not in text
+
+
+def test_a_rejection_shows_what_to_point_the_camera_at() -> None:
+    other = encode(".png", textured(64, 48))
+    early = replace(diagnostics(), stage_s={"correspond": 0.1})
+    html = report_html(rejected(diagnostics=early), PHOTO, CAMERA, (reference("a", other), reference("b")))
+    assert "Point the camera at this" in html
+    assert base64.b64encode(other).decode() in html
+    assert "include_debug" not in html
+    hint = rejected().hint
+    assert hint is not None
+    other_advice = rejected(hint=replace(hint, advice="CHECK_CALIBRATION"))
+    assert "What it shares most with" in report_html(other_advice, PHOTO, CAMERA, BOTH)
+    assert "Point the camera at this" not in report_html(rejected(hint=None), PHOTO, CAMERA, BOTH)
+    assert "Point the camera at this" not in report_html(localized(), PHOTO, CAMERA, BOTH)
+
+
+def test_references_that_share_nothing_are_neither_mapped_nor_counted() -> None:
+    uses = tuple(replace(use, match_count=0, inlier_count=0, similarity=0.0) for use in diagnostics().references)
+    page = report_html(rejected(hint=None, diagnostics=replace(diagnostics(), references=uses)), PHOTO, CAMERA, BOTH)
+    assert "From above" not in page
+    assert "references compared" not in page
+    assert "feature matches" not in page
+    assert "From above" in report_html(rejected(), PHOTO, CAMERA, BOTH)
+
+
+def test_matches_that_were_not_asked_for_are_told_from_none() -> None:
+    assert "they come with include_debug" in report_html(localized(debug=None), PHOTO, CAMERA)
+    early = replace(diagnostics(), stage_s={"features": 0.1})
+    assert "include_debug" not in report_html(rejected(diagnostics=early), PHOTO, CAMERA)
+
+
+def test_what_is_not_calibrated_says_so_where_it_is_read_first() -> None:
+    assert report_html(localized(), PHOTO, CAMERA).count("(uncalibrated)") == 2
+    calibrated = localized(accuracy=Accuracy(0.02, 0.04, 0.1, 0.2, True))
+    assert "uncalibrated" not in report_html(calibrated, PHOTO, CAMERA)
 
 
 def embedded(html: str) -> bytes:

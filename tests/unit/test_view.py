@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import sys
 import threading
 from collections.abc import Iterator
@@ -293,6 +294,16 @@ def test_the_extra_is_named_where_it_is_missing() -> None:
     assert "mapless[view]" in install_hint(ModuleNotFoundError("no", name="viser"))
 
 
+def test_a_port_that_is_taken_is_not_exchanged_for_another() -> None:
+    pytest.importorskip("viser", reason="needs the extra view")
+    from mapless_server.view.guarded import GuardedViser
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(RuntimeError, match=f"port {port} of 127.0.0.1 is taken"):
+            GuardedViser("127.0.0.1", port, "test")
+
+
 def test_queries_of_every_outcome_come_and_go() -> None:
     pytest.importorskip("viser", reason="needs the extra view")
     from mapless_server.view.guarded import GuardedViser
@@ -313,7 +324,10 @@ def test_queries_of_every_outcome_come_and_go() -> None:
             stage.show_query(replace(outcomes[number % 4], number=number + 1))
         stage.show_points(debug.x_in_world, np.zeros((40, 3), np.uint8))
         stage.show_points(debug.x_in_world, np.zeros((40, 3), np.uint8))
-        stage.say("live")
+        stage.say("live", True)
+        assert "None yet" in stage._nothing.content
+        stage.say("not shown", False)
+        assert "yet" not in stage._nothing.content
         names = {name for name in server.scene._handle_from_node_name if name.startswith("/queries/")}
     finally:
         server.stop()

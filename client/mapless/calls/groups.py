@@ -87,7 +87,7 @@ def localize_sequence(
         estimate_session_scale: whether the unit of the device's poses is unknown; then it has to have moved.
         reference_count: how many references the server chooses for each, if it does; 0 is its default.
         coverage: see `localize`; decides which photographs are believed alone.
-        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or a value of `Axes`: of the device's poses and of
+        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of the device's poses and of
             `SequenceLocalization.world_from_session`.
         timeout_s: deadline of the call.
     """

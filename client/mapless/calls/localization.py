@@ -52,7 +52,7 @@ def localize(
         allow_coarse: whether a pose that could not be refined before the deadline is answered all the same, with
             `LocalizationResult.pose_stage` "COARSE" and no covariance, instead of raising `DeadlineExceeded`.
         coverage: share of the right answers that are to be accepted, above 0 and below 1; 0 is the server's default.
-        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or a value of `Axes`: of `session_from_camera` and of
+        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of `session_from_camera` and of
             `LocalizationResult.in_axes`.
         include_debug: whether the answer is to carry the matches it rests on.
         capture_time: when it was taken, with time zone; echoed.

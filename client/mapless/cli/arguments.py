@@ -198,7 +198,7 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=localize.run)
 
 
-def _add_questions(groups: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_questions(groups: argparse._SubParsersAction[_Command]) -> None:
     retrieve = groups.add_parser("retrieve", help="the references that resemble a photograph most")
     retrieve.add_argument("scene")
     retrieve.add_argument("photo", type=Path)

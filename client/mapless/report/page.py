@@ -63,7 +63,7 @@ def report_html(
         _photograph_section(answer, camera, photograph),
         _best_reference(answer, by_name, pictures),
         section("Beside the references", pairs(answer.debug, diagnostics.references, camera, by_name, pictures)),
-        section("Where it is", _plan(answer, by_name, camera, down_in_world)),
+        section(_whereabouts(answer), _plan(answer, by_name, camera, down_in_world)),
         *first,
         *further,
         sections.references_section(diagnostics),
@@ -128,13 +128,21 @@ def _best_reference(
     if shown is None:
         return ""
     camera = references[name].camera
+    is_target = isinstance(answer, Rejected) and answer.hint is not None and answer.hint.advice == "LOOK_AT_REFERENCE"
     figure = (
-        f'<figure><svg viewBox="-0.5 -0.5 {camera.width_px} {camera.height_px}" role="img" '
+        f'<figure class="target"><svg viewBox="-0.5 -0.5 {camera.width_px} {camera.height_px}" role="img" '
         f'aria-label="{text(reference_id(name))}">{image_of(shown, camera)}</svg>'
         f"<figcaption><b>{text(reference_id(name))}</b>: of all references, it shares most with the photograph. "
         f"{text(shown.note)}</figcaption></figure>"
     )
-    return section("Point the camera at this", figure)
+    return section("Point the camera at this" if is_target else "What it shares most with", figure)
+
+
+def _whereabouts(answer: LocalizationResult | Rejected) -> str:
+    """Title of the plan."""
+    if isinstance(answer, LocalizationResult):
+        return "Where it is"
+    return "Where it could be, from above" if answer.hypotheses else "Where the references stand"
 
 
 def _hinted(answer: LocalizationResult | Rejected) -> str:

@@ -99,7 +99,7 @@ def _legend(
 ) -> str:
     parts = []
     if any(name in references for name in used):
-        parts.append('<span class="key used">references used</span>')
+        parts.append('<span class="key used">references compared</span>')
     if any(name not in used for name in references):
         parts.append('<span class="key unused">other references</span>')
     if poses:

@@ -29,7 +29,7 @@ def cards(answer: LocalizationResult | Rejected) -> str:
         shown.append((str(len(answer.debug.is_inlier)), "matches with points of the references"))
     compared = sum(use.match_count > 0 for use in answer.diagnostics.references)
     if compared:
-        shown.append((str(compared), "references share features with it"))
+        shown.append((str(compared), "references compared"))
     shown.append((duration(answer.diagnostics.total_s), "in the server"))
     return (
         '<div class="cards">'
@@ -130,7 +130,9 @@ def priors_section(checks: Sequence[PriorCheck]) -> str:
 
 
 def references_section(diagnostics: Diagnostics) -> str:
-    """What each reference contributed."""
+    """What each reference contributed; nothing where none was compared, or is known to resemble the photograph."""
+    if not any(it.match_count or it.similarity for it in diagnostics.references):
+        return ""
     most = max((it.match_count for it in diagnostics.references), default=0) or 1
     rows = []
     for it in diagnostics.references:

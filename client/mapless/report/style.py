@@ -82,6 +82,7 @@ svg .empty { fill: var(--wash); stroke: var(--line); }
 .key.used::before { border-color: var(--accent); background: color-mix(in srgb, var(--accent) 30%, transparent); }
 .key.unused::before { border-color: var(--soft); } .key.pose::before { border-color: var(--bad);
   background: color-mix(in srgb, var(--bad) 45%, transparent); }
+.target svg { max-width: 640px; }
 .histogram svg { max-width: 460px; } .histogram .inlier { fill: #12b886; } .histogram .outlier { fill: #ff6b2b; }
 .histogram .axis { stroke: var(--soft); } .histogram text { fill: var(--soft); font-size: 10px; }
 .ok { color: var(--good); } .conflict-mark { color: var(--bad); font-weight: 600; }

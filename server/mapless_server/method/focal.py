@@ -1,17 +1,17 @@
 """What focal length a photograph itself says it has, next to the one that came with it.
 
-A wrong focal length is the classic mistake of a caller who crops or resizes photographs: the pose is off by the share
-that the focal length is, towards what is seen or away from it, and nothing in the pose's own residuals is large, since
-most of the error is absorbed by that motion. But not all of it, where points lie at several depths. So the pose is
-solved again with one more unknown, s = ln(f / f given), the points where they are:
+A wrong focal length is the classic mistake of whoever crops or resizes photographs. The pose is then off towards what
+is seen, or away from it, and its own residuals tell little of that: the motion absorbs most of the error. But not all
+where points lie at several depths. So the pose is solved again with one more unknown, s = ln(f / f given), the points
+where they are,
 
     min  sum_i rho(|u_i - c - e^s f pi(P X_i)|^2 / sigma_i^2),      rho(q) = l^2 log(1 + q / l^2)    (Cauchy's loss)
 
-by Levenberg-Marquardt over seven unknowns, from the answered pose, with all matches: a wrong focal length leaves right
-ones out. The loss begins wide and narrows. What s may be off is told by a sandwich, H^-1 (sum_g b_g b_g^T) H^-1 with
-b_g the sum of the gradients of the matches in group g (Liang and Zeger 1986), once with references for groups and once
-with parts of the image: what neighbours share does not average out over their number. Where depth hardly varies, or all
-is far, s and its error are large together, and nothing is said.
+by Levenberg-Marquardt from the answered pose, with all its matches: a wrong focal length makes outliers of right ones,
+and the loss begins wide and narrows to find them again. How far off s may be is told by a sandwich,
+H^-1 (sum_g b_g b_g^T) H^-1, b_g the gradients of the matches in group g (Liang and Zeger 1986), once with references
+for groups and once with parts of the image: what neighbours share does not average out over their number. Where depth
+hardly varies, or all is far away, it is large, and nothing is said.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, RigidTransform, normalize, normalize_jacobian, rotation_from_vector
+from mapless.geometry import Array, Camera, normalize, normalize_jacobian, rotation_from_vector
 
 from .perturbation import motion_jacobian
 from .support import Support
@@ -33,26 +33,33 @@ class FocalOptions:
     """Options of the check.
 
     Attributes:
-        max_log_ratio: tolerated |ln(f / f given)|.
-        max_sigmas: a difference is believed beyond so many standard deviations.
-        loss_scales_sigma: of the Cauchy loss, from wide, where right matches lie beside a wrong pose, to narrow.
+        max_log_ratio: |ln(f / f given)| up to which a focal length is never doubted.
+        max_sigmas: a larger one is believed beyond so many standard deviations.
+        first_loss_sigma: loss scale of the one step that decides whether to look closer, which most photographs end at.
+        loss_scales_sigma: of the closer look, from wide, where right matches lie beside a wrong pose, to narrow.
         iterations: steps with each of them.
+        max_step: of s at once.
+        min_decrease: a step that lowers the cost by a smaller share is the last with this loss.
         max_matches: more are thinned evenly.
-        min_matches: fewer with a weight of a half at the end say nothing.
+        min_agreeing: fewer matches within three times the last loss scale say nothing.
         grid: the image is split into so many parts along each side.
     """
 
     max_log_ratio: float = 0.05
     max_sigmas: float = 4.0
-    loss_scales_sigma: tuple[float, ...] = (15.0, 5.0, 1.4)
-    iterations: int = 4
+    first_loss_sigma: float = 5.0
+    loss_scales_sigma: tuple[float, ...] = (40.0, 10.0, 3.0, 1.4)
+    iterations: int = 8
+    max_step: float = 0.5
+    min_decrease: float = 1e-3
     max_matches: int = 400
-    min_matches: int = 20
+    min_agreeing: int = 20
     grid: int = 4
 
     def __post_init__(self) -> None:
-        counts = (self.iterations, self.max_matches, self.min_matches, self.grid)
-        if not min(self.max_log_ratio, self.max_sigmas, *self.loss_scales_sigma, *counts) > 0:
+        counts = (self.iterations, self.max_matches, self.min_agreeing, self.grid)
+        shares = (self.max_log_ratio, self.max_sigmas, self.first_loss_sigma, self.max_step, self.min_decrease)
+        if not self.loss_scales_sigma or not min(*counts, *shares, *self.loss_scales_sigma) > 0:
             raise ValueError(f"senseless options: {self}")
 
 
@@ -61,136 +68,208 @@ class Focal:
     """What a photograph says of its focal length.
 
     Attributes:
-        log_ratio: ln of what it says over what it was given.
-        sigma: standard deviation of that.
-        match_count: matches that say so.
-        given_px: focal length it came with, along x.
+        log_ratio: s, ln of what it says over what came with it.
+        sigma: standard deviation of s.
+        agreeing: matches that agree with it, of those looked at, within three times the last loss scale.
+        agreeing_before: matches that agree with the answered pose and the given focal length as well.
+        given_px: focal length that came with it, along x.
     """
 
     log_ratio: float
     sigma: float
-    match_count: int
+    agreeing: int
+    agreeing_before: int
     given_px: float
 
     @property
     def told_px(self) -> float:
-        """Focal length that the photograph says."""
+        """Focal length along x that the photograph says."""
         return self.given_px * math.exp(self.log_ratio)
+
+    def is_wrong(self, options: FocalOptions) -> bool:
+        """Whether the focal length that came with the photograph is not its own."""
+        is_told = self.agreeing >= max(options.min_agreeing, self.agreeing_before)
+        return is_told and abs(self.log_ratio) > max(options.max_log_ratio, options.max_sigmas * self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
-    """Matches; row i is one of N.
+class FocalProblem:
+    """Matches of a photograph with points that stay where they are; row i is one of N.
 
     Attributes:
         camera: with the focal length given.
-        x_in_world: (N, 3).
-        pixels: (N, 2).
-        sigma_px: (N,).
+        x_in_world: (N, 3) points.
+        pixels: (N, 2) where they are seen.
+        sigma_px: (N,) standard deviation of each coordinate.
+        seen_by: (N, K) which references observe the point.
     """
 
     camera: Camera
     x_in_world: Array
     pixels: Array
     sigma_px: Array
+    seen_by: NDArray[np.bool_]
 
-    def residuals(self, rotation: Array, translation: Array, log_ratio: float) -> tuple[Array, Array, Array]:
-        """Points in the camera (N, 3), centred pixels (N, 2) and residuals (N, 2) in sigma, NaN behind the camera."""
-        x_in_camera = self.x_in_world @ rotation.T + translation
-        focal = np.array([self.camera.focal_x_px, self.camera.focal_y_px]) * math.exp(log_ratio)
+    def at(self, state: _State) -> _Rows:
+        """Residuals and what their derivatives need."""
+        x_in_camera = self.x_in_world @ state.rotation.T + state.translation
+        focal = np.array([self.camera.focal_x_px, self.camera.focal_y_px]) * math.exp(state.log_ratio)
         centred = normalize(x_in_camera) * focal
-        principal = (self.camera.principal_x_px, self.camera.principal_y_px)
-        return x_in_camera, centred, (centred + principal - self.pixels) / self.sigma_px[:, None]
-
-    def jacobian(self, x_in_camera: Array, centred: Array, log_ratio: float) -> Array:
-        """(N, 2, 7) of the residuals by a left perturbation (v, w) of camera_from_world, and by s."""
-        focal = np.array([self.camera.focal_x_px, self.camera.focal_y_px]) * math.exp(log_ratio)
-        by_point = normalize_jacobian(x_in_camera) * focal[:, None]
-        by_pose = by_point @ motion_jacobian(x_in_camera)
-        return np.concatenate([by_pose, centred[:, :, None]], axis=2) / self.sigma_px[:, None, None]
+        offset = np.array([self.camera.principal_x_px, self.camera.principal_y_px]) - self.pixels
+        return _Rows(x_in_camera, focal, centred, (centred + offset) / self.sigma_px[:, None], self.sigma_px)
 
 
-def focal_of(support: Support, options: FocalOptions) -> Focal | None:
-    """What a support's photograph says of its focal length; None where its matches are too few to say anything.
+@dataclass(frozen=True, eq=False)
+class _State:
+    """camera_from_world and s."""
+
+    rotation: Array
+    translation: Array
+    log_ratio: float
+
+    def moved(self, step: Array) -> _State:
+        """After a left perturbation (v, w) of camera_from_world and a step of s, (7,)."""
+        turn = rotation_from_vector(step[3:6])
+        return _State(turn @ self.rotation, turn @ self.translation + step[:3], self.log_ratio + float(step[6]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """A problem at a state.
+
+    Attributes:
+        x_in_camera: (N, 3) points.
+        focal_px: (2,) along x and y.
+        centred_px: (N, 2) where the points project, from the principal point.
+        residual: (N, 2) in standard deviations; NaN behind the camera.
+        sigma_px: (N,) these.
+    """
+
+    x_in_camera: Array
+    focal_px: Array
+    centred_px: Array
+    residual: Array
+    sigma_px: Array
+
+    @property
+    def squared(self) -> Array:
+        """(N,) squared lengths of the residuals."""
+        return np.asarray(np.einsum("na,na->n", self.residual, self.residual))
+
+    def cost(self, loss_scale: float) -> float:
+        """NaN for a point behind the camera, which is no decrease."""
+        return loss_scale**2 * float(np.log1p(self.squared / loss_scale**2).sum())
+
+    def jacobian(self) -> Array:
+        """(N, 2, 7) of the residuals, by a left perturbation (v, w) of camera_from_world and by s."""
+        by_point = normalize_jacobian(self.x_in_camera) * (self.focal_px / self.sigma_px[:, None])[:, :, None]
+        by_focal = self.centred_px / self.sigma_px[:, None]
+        return np.concatenate([by_point @ motion_jacobian(self.x_in_camera), by_focal[:, :, None]], axis=2)
+
+    def equations(self, loss_scale: float) -> tuple[Array, Array]:
+        """Hessian (7, 7) of half the cost, and its gradient match by match (N, 7)."""
+        jacobian, weight = self.jacobian(), 1 / (1 + self.squared / loss_scale**2)
+        weighted = jacobian * weight[:, None, None]
+        hessian = weighted.reshape(-1, 7).T @ jacobian.reshape(-1, 7)
+        return hessian, np.asarray(np.einsum("nia,ni->na", weighted, self.residual))
+
+
+def wrong_focal(support: Support, options: FocalOptions) -> Focal | None:
+    """What a support's photograph says of its focal length, where that contradicts the one that came with it.
 
     Raises:
         ValueError: there is no estimate.
     """
+    problem, start = _problem_of(support, options)
+    if len(problem.pixels) < options.min_agreeing:
+        return None
+    hessian, gradient = problem.at(start).equations(options.first_loss_sigma)
+    first = _solved(hessian, gradient.sum(axis=0), 0.0)
+    if first is None or abs(first[6]) < options.max_log_ratio / 2:
+        return None
+    told = focal_of(problem, start, options)
+    return told if told is not None and told.is_wrong(options) else None
+
+
+def focal_of(problem: FocalProblem, start: _State, options: FocalOptions) -> Focal | None:
+    """What a photograph says of its focal length; None where it says nothing at all (singular equations)."""
+    state = start
+    for loss_scale in options.loss_scales_sigma:
+        state = _minimize(problem, state, loss_scale, options)
+    narrow = options.loss_scales_sigma[-1]
+    rows, limit = problem.at(state), (3 * narrow) ** 2
+    sigma = _sigma(problem, rows, narrow, options.grid)
+    if sigma is None:
+        return None
+    before = int((problem.at(start).squared < limit).sum())
+    return Focal(state.log_ratio, sigma, int((rows.squared < limit).sum()), before, problem.camera.focal_x_px)
+
+
+def _problem_of(support: Support, options: FocalOptions) -> tuple[FocalProblem, _State]:
+    """Evenly thinned, without points behind the camera; and the answered pose."""
     if support.estimate is None:
         raise ValueError("without an estimate there is nothing to begin with")
-    matches, structure = support.matches, support.structure
-    taken = np.arange(len(matches))[:: -(-len(matches) // options.max_matches)]
+    matches, structure, features = support.matches, support.structure, support.query.features
+    camera_from_world = support.estimate.world_from_camera.inverse()
+    start = _State(camera_from_world.rotation, camera_from_world.translation, 0.0)
+    taken = np.arange(len(matches))[:: max(1, -(-len(matches) // options.max_matches))]
+    taken = taken[camera_from_world.apply(structure.x_in_world[matches.point[taken]])[:, 2] > 0]
     point, keypoint = matches.point[taken], matches.keypoint[taken]
-    features = support.query.features
     seen_by = np.zeros((len(structure.x_in_world), len(support.references)), bool)
     seen_by[structure.tracks.point, structure.tracks.view] = True
-    problem = _Problem(
-        support.query.camera,
-        structure.x_in_world[point],
-        features.keypoints[keypoint].astype(np.float64),
-        np.asarray(structure.noise.sigma_px(features.sizes_px[keypoint].astype(np.float64))),
-    )
-    return solve_focal(problem, seen_by[point], support.estimate.world_from_camera, options)
+    sigma_px = np.asarray(structure.noise.sigma_px(features.sizes_px[keypoint].astype(np.float64)))
+    pixels = features.keypoints[keypoint].astype(np.float64)
+    problem = FocalProblem(support.query.camera, structure.x_in_world[point], pixels, sigma_px, seen_by[point])
+    return problem, start
 
 
-def solve_focal(
-    problem: _Problem, seen_by: NDArray[np.bool_], world_from_camera: RigidTransform, options: FocalOptions
-) -> Focal | None:
-    camera_from_world = world_from_camera.inverse()
-    x = camera_from_world.apply(problem.x_in_world)
-    ok = x[:, 2] > 0
-    problem = _Problem(problem.camera, problem.x_in_world[ok], problem.pixels[ok], problem.sigma_px[ok])
-    seen_by = seen_by[ok]
-    R, t, s = camera_from_world.rotation, camera_from_world.translation, 0.0
-    if len(problem.pixels) < options.min_matches:
+def _minimize(problem: FocalProblem, state: _State, loss_scale: float, options: FocalOptions) -> _State:
+    rows, damping = problem.at(state), 1e-4
+    cost = rows.cost(loss_scale)
+    hessian, gradient = rows.equations(loss_scale)
+    for _ in range(options.iterations):
+        step = _solved(hessian, gradient.sum(axis=0), damping)
+        if step is None:
+            break
+        candidate = state.moved(step * min(1.0, options.max_step / max(abs(step[6]), 1e-12)))
+        candidate_rows = problem.at(candidate)
+        candidate_cost = candidate_rows.cost(loss_scale)
+        if not candidate_cost < cost:
+            damping *= 100
+            continue
+        converged = cost - candidate_cost < options.min_decrease * cost
+        state, rows, cost, damping = candidate, candidate_rows, candidate_cost, damping * 0.1
+        if converged:
+            break
+        hessian, gradient = rows.equations(loss_scale)
+    return state
+
+
+def _solved(hessian: Array, gradient: Array, damping: float) -> Array | None:
+    """The step (7,); None where nothing determines it."""
+    try:
+        step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
+    except np.linalg.LinAlgError:
         return None
-    def cost(r, l2):
-        c = l2 * np.log1p((r**2).sum(1) / l2)
-        return float(c.sum())
-    for scale in options.loss_scales_sigma:
-        l2 = scale**2
-        damping = 1e-4
-        xc, cen, r = problem.residuals(R, t, s)
-        c0 = cost(r, l2)
-        for _ in range(options.iterations):
-            J = problem.jacobian(xc, cen, s).reshape(-1, 7)
-            w = np.repeat(1 / (1 + (r**2).sum(1) / l2), 2)
-            H = (J * w[:, None]).T @ J
-            g = J.T @ (w * r.ravel())
-            while True:
-                step = -np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
-                T = rotation_from_vector(step[3:6])
-                R2, t2, s2 = T @ R, T @ t + step[:3], s + float(np.clip(step[6], -0.5, 0.5))
-                xc2, cen2, r2 = problem.residuals(R2, t2, s2)
-                c2 = cost(r2, l2)
-                if c2 <= c0 or damping > 1e3:
-                    break
-                damping *= 10
-            if not c2 <= c0:
-                break
-            done = c0 - c2 < 1e-4 * c0
-            R, t, s, xc, cen, r, c0 = R2, t2, s2, xc2, cen2, r2, c2
-            damping *= 0.1
-            if done:
-                break
-    q = (r**2).sum(1)
-    w = 1 / (1 + q / l2)
-    n = int((w > 0.3).sum())
-    J = problem.jacobian(xc, cen, s)
-    Jw = J * w[:, None, None]
-    H = np.einsum("nia,nib->ab", Jw, J)
-    b = np.einsum("nia,ni->na", Jw, r)
-    Hi = np.linalg.pinv(H, hermitian=True)
-    row = b @ Hi[6]  # per-match influence on s
-    share = seen_by / np.maximum(1, seen_by.sum(1, keepdims=True))
-    by_ref = row @ share
-    K = max(2, int((share.sum(0) > 0).sum()))
-    v_ref = float((by_ref**2).sum()) * K / (K - 1)
-    size = np.array([problem.camera.width_px, problem.camera.height_px])
-    cell = np.clip((problem.pixels / size * options.grid).astype(int), 0, options.grid - 1)
-    by_cell = np.bincount(cell[:, 0] * options.grid + cell[:, 1], row, minlength=options.grid**2)
-    v_cell = float((by_cell**2).sum())
-    v_ind = float(Hi[6, 6]) * max(1.0, float(np.median(q[w > 0.3]) / (2 * math.log(2))) if n else 1.0)
-    f = Focal(s, math.sqrt(v_ref + v_cell + v_ind), n, problem.camera.focal_x_px)
-    object.__setattr__(f, "parts", (math.sqrt(v_ref), math.sqrt(v_cell), math.sqrt(v_ind), c0))
-    return f
+    return np.asarray(step, np.float64) if np.isfinite(step).all() else None
+
+
+def _sigma(problem: FocalProblem, rows: _Rows, loss_scale: float, grid: int) -> float | None:
+    """Standard deviation of s at an optimum: of independent matches, of references and of parts of the image."""
+    hessian, gradient = rows.equations(loss_scale)
+    column = _solved(hessian, np.eye(7)[6], 0.0)
+    if column is None or not column[6] < 0:
+        return None
+    pull = gradient @ column  # (N,), how far each match alone moves s
+    shares = problem.seen_by / np.maximum(1, problem.seen_by.sum(axis=1, keepdims=True))
+    size_px = np.array([problem.camera.width_px, problem.camera.height_px])
+    cell = np.clip((problem.pixels / size_px * grid).astype(int), 0, grid - 1) @ [grid, 1]
+    by_cell = np.zeros(grid**2)
+    np.add.at(by_cell, cell, pull)
+    return math.sqrt(-float(column[6]) + _scatter(pull @ shares) + _scatter(by_cell))
+
+
+def _scatter(pulls: Array) -> float:
+    """Variance of a sum of independent pulls (G,) whose mean is zero, of which those at zero are not there."""
+    count = max(2, int((pulls != 0).sum()))
+    return float((pulls**2).sum()) * count / (count - 1)

@@ -7,6 +7,9 @@ share c of right answers, whatever the score's own unit: trust is the p-value of
 conformal prediction (Vovk, Gammerman and Shafer 2005). It is no probability of being right, which would depend on how
 many of a caller's photographs show the place at all.
 
+One mistake of the caller's is looked for by itself, because answers to it look as good as right ones and are not: a
+wrong focal length (`focal`).
+
 Weights and quantiles come from `calibration.trust_fit`, which tells wrong poses (of other places, mirrored photographs,
 references with wrong poses, hardly any overlap) from right ones by logistic regression with weights of one sign.
 """
@@ -22,7 +25,8 @@ import numpy as np
 from .ambiguity import AmbiguityOptions, find_rival
 from .correspond import Matches
 from .evidence import FEATURES, Evidence, evidence_of
-from .rejection import Hypothesis, Rejection, RejectionReason
+from .focal import Focal, FocalOptions, wrong_focal
+from .rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
 from .support import Support
 
 _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
@@ -41,6 +45,7 @@ class JudgeOptions:
             poses wrong. But repeated structure and wrong references stand upright too, and an answer that is off by
             little agrees as well as one that is not.
         ambiguity: of the search for a second place.
+        focal: of the check of the photograph's focal length.
     """
 
     weights: tuple[float, ...] = (0.441, 3.474, 0.0, 1.779, 0.601, 4.552, 1.243)
@@ -50,6 +55,7 @@ class JudgeOptions:
     )  # fmt: skip
     agreement_weight: float = 0.3
     ambiguity: AmbiguityOptions = field(default_factory=AmbiguityOptions)
+    focal: FocalOptions = field(default_factory=FocalOptions)
 
     def __post_init__(self) -> None:
         rising = all(a <= b for a, b in zip(self.scores, self.scores[1:], strict=False))
@@ -92,11 +98,15 @@ def judge(
         log10_chance: how improbable it is that a pose found by chance agrees with what is known of it.
 
     Returns:
-        The judgement. Rejections, in the support's world: AMBIGUOUS with both hypotheses where another place is
-        supported about as well, GATE where the trust is less than 1 - coverage.
+        The judgement. Rejections, in the support's world: GATE, with a hint, where the photograph says another focal
+        length than it came with, AMBIGUOUS with both hypotheses where another place is supported about as well, GATE
+        where the trust is less than 1 - coverage.
     """
     evidence = evidence_of(support, inlier_px, log10_chance)
     trust = trust_of(evidence, options, log10_chance)
+    focal = wrong_focal(support, options.focal)
+    if focal:
+        return Judgement(trust, evidence, _miscalibrated(support, focal))
     hypotheses = find_rival(support, query_matches, options.ambiguity)
     if hypotheses:
         return Judgement(trust, evidence, _ambiguous(hypotheses))
@@ -117,11 +127,26 @@ def trust_of(evidence: Evidence, options: JudgeOptions, log10_chance: float = 0.
 
 
 def _distrusted(evidence: Evidence, trust: float, coverage: float) -> Rejection:
+    shown = math.floor(1000 * trust) / 1000  # never as much as what it is below
     message = (
-        f"{100 * trust:.1f} % of right answers look at most as good, and {100 * (1 - coverage):.3g} % may be lost: "
+        f"its trust of {shown:g} is below the {round(1 - coverage, 6):g} that a coverage of {coverage:g} asks for: "
         f"{told(evidence)}"
     )
     return Rejection(RejectionReason.GATE, message)
+
+
+def _miscalibrated(support: Support, focal: Focal) -> Rejection:
+    message = (
+        f"the photograph says a focal length of {focal.told_px:.0f} px (standard deviation "
+        f"{focal.sigma * focal.told_px:.2g}), its intrinsics say {focal.given_px:.0f}: {focal.agreeing} of the matches "
+        f"looked at agree with the former, {focal.agreeing_before} with the latter"
+    )
+    advice = (
+        "Check the photograph's focal length: intrinsics belong to one image size, change with it when a photograph is "
+        "resized, and have another principal point when it is cropped."
+    )
+    best = support.references[int(np.argmax(support.inliers_by_reference()))].name
+    return Rejection(RejectionReason.GATE, message, Hint("judge", Advice.CHECK_CALIBRATION, advice, best))
 
 
 def told(evidence: Evidence) -> str:

@@ -30,6 +30,7 @@ _VOXEL_SHARE, _POINT_SHARE = 0.002, 0.004
 """Of the scene's extent: points nearer than this to one another are shown as one; and how large one is."""
 _FOUND, _LOST = (72, 84, 96), (178, 84, 36)
 """Of the buttons of queries."""
+_NONE_YET = "None yet. They appear here as the server answers them."
 _WIDE = "<style>.mantine-Modal-content { flex: 0 0 min(1000px, 94vw) !important; }</style>"
 """viser's dialogues are narrow, and photographs are not."""
 

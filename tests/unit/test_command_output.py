@@ -1,0 +1,81 @@
+"""What a person reads on the terminal, and the small change of the command's arguments."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from planted_answers import localized, rejected
+
+from mapless.answers import PriorCheck
+from mapless.axes import Axes
+from mapless.calls.naming import enum_value
+from mapless.cameras import read_camera
+from mapless.cli.output import lines
+from mapless.cli.progress import Progress
+from mapless.requests import read_image
+from mapless.v1 import localization_service_pb2 as pb
+
+
+def test_each_prior_has_its_line() -> None:
+    checks = (
+        PriorCheck("GRAVITY", 0.7, 2, False, True),
+        PriorCheck("HEADING", 0.7, 2, False, False),
+        PriorCheck("POSITION", 8.04, 3, True, False),
+    )
+    assert [line.strip() for line in lines(localized(prior_checks=checks)) if "prior" in line] == [
+        "prior     GRAVITY agrees, used",
+        "prior     HEADING agrees, knows less than the photograph, not needed",
+        "prior     POSITION contradicts the photograph: 8.0 standard deviations, not used",
+    ]
+
+
+def test_what_hardly_any_right_answer_looks_like_is_warned_of() -> None:
+    warning = "  warning   fewer than 5 % of right answers look as doubtful: check the intrinsics"
+    assert lines(localized(trust=0.049))[-1] == warning
+    for trust in (0.05, 0.9, None):
+        assert not [line for line in lines(localized(trust=trust)) if "warning" in line]
+
+
+def test_a_rejection_names_the_reference_that_shares_most() -> None:
+    assert lines(rejected())[-1] == "  shares most with reference a"
+    hint = rejected().hint
+    assert hint is not None
+    assert lines(rejected(hint=replace(hint, best_reference="")))[-1] == "  Point the camera there."
+
+
+def test_progress_counts_each_kind_by_its_name() -> None:
+    with Progress(5) as progress:
+        for without in ("", "failed", "not localized", "not localized"):
+            progress.step(without)
+        assert "] 4/5, 2 not localized, 1 failed, " in progress.text()
+    assert progress.without() == ", 2 not localized, 1 failed"
+
+
+@pytest.mark.parametrize("axes", ["arkit", "ARKit", "ARKIT", Axes.ARKIT])
+def test_axes_are_taken_in_any_case_and_as_values(axes: str | Axes) -> None:
+    assert enum_value(pb.Axes, axes) == pb.AXES_ARKIT
+
+
+def test_axes_that_are_none_are_named_among_those_there_are() -> None:
+    with pytest.raises(ValueError, match=r"Axes is one of opencv, .* not 'Blender'"):
+        enum_value(pb.Axes, "Blender")
+    assert enum_value(pb.Axes, "") == 0
+
+
+def test_pixels_are_to_be_encoded_first() -> None:
+    with pytest.raises(TypeError, match=r"not numpy\.ndarray: encode pixels first"):
+        read_image(np.zeros((4, 4, 3), np.uint8))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("numbers", ["1,2", "1,2,3", "1,2,3,", "1,2,3,4,5"])
+def test_a_camera_in_numbers_is_four_of_them(numbers: str) -> None:
+    with pytest.raises(ValueError, match="four of them"):
+        read_camera(numbers)
+
+
+def test_the_cameras_of_a_folder_are_not_one_camera(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="a single camera is wanted"):
+        read_camera(tmp_path / "cameras.json")

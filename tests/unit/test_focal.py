@@ -1,0 +1,99 @@
+"""The focal length that a photograph itself says: planted ones are found again, and none is doubted without ground."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted import true_structure
+from scenes import SceneOptions, SyntheticScene, make_scene, random_for
+
+from mapless_server.method.focal import Focal, FocalOptions, wrong_focal
+from mapless_server.method.judge import JudgeOptions, judge
+from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
+from mapless_server.method.rejection import Advice, RejectionReason
+from mapless_server.method.support import Support
+
+OPTIONS = FocalOptions()
+FACTORS = (0.6, 0.85, 0.93, 1.07, 1.15, 1.7)
+
+
+def solved(scene: SyntheticScene, factor: float) -> Support:
+    """A planted photograph, solved with a focal length that is so many times the true one."""
+    given = scene.query.camera
+    camera = replace(given, focal_x_px=given.focal_x_px * factor, focal_y_px=given.focal_y_px * factor)
+    query = replace(scene.query, camera=camera)
+    structure, matches = true_structure(scene)
+    estimate = solve_pose(query, structure, matches, scene.world_from_query, PnpOptions())
+    assert isinstance(estimate, PoseEstimate)
+    return Support(query, scene.references, structure, matches, estimate, np.zeros(3))
+
+
+def planted(case: object, **options: object) -> SyntheticScene:
+    return make_scene(random_for("focal", case), replace(SceneOptions(outlier_share=0.2), **options))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+def test_a_wrong_focal_length_is_told_and_the_true_one_found(factor: float) -> None:
+    """With every fifth match wrong; within what the answer says it may be off."""
+    scene = planted(factor)
+    told = wrong_focal(solved(scene, factor), OPTIONS)
+    assert told is not None
+    true_px = scene.query.camera.focal_x_px
+    assert told.given_px == pytest.approx(factor * true_px)
+    assert abs(np.log(told.told_px / true_px)) < 4 * told.sigma
+    assert told.sigma < 0.02
+    assert told.agreeing > told.agreeing_before
+
+
+def test_the_true_focal_length_is_never_doubted() -> None:
+    for case in range(16):
+        few = {"point_count": 60, "noise_px": 1.5} if case % 2 else {}
+        assert wrong_focal(solved(planted(case, **few), 1.0), OPTIONS) is None
+
+
+def test_what_lies_in_a_plane_ahead_says_nothing_of_it() -> None:
+    """Nearer with a wider lens looks the same."""
+    for factor in (0.85, 1.15):
+        scene = planted(
+            factor, box_m=(4.0, 2.4, 0.0), query_offset_m=(0.0, 0.0, 0.0), reference_count=2, outlier_share=0.0
+        )
+        told = wrong_focal(solved(scene, factor), OPTIONS)
+        assert told is None
+
+
+def test_few_matches_say_nothing_of_it() -> None:
+    scene = planted("few", point_count=18, outlier_share=0.0)
+    assert wrong_focal(solved(scene, 1.15), OPTIONS) is None
+
+
+def test_the_judge_rejects_it_with_both_numbers_and_says_what_to_check() -> None:
+    support = solved(planted("judge"), 1.15)
+    matches = [np.empty((0, 2), np.int32)] * len(support.references)
+    rejection = judge(support, matches, PnpOptions().inlier_px, 1.0, JudgeOptions()).rejection
+    assert rejection is not None
+    assert rejection.reason is RejectionReason.GATE
+    assert f"its intrinsics say {support.query.camera.focal_x_px:.0f}" in rejection.message
+    assert rejection.hint is not None
+    assert rejection.hint.advice is Advice.CHECK_CALIBRATION
+    assert rejection.hint.best_reference in {reference.name for reference in support.references}
+
+
+def test_a_focal_length_is_wrong_beyond_the_tolerance_and_beyond_its_error_only() -> None:
+    wrong = Focal(log_ratio=0.2, sigma=0.01, agreeing=100, agreeing_before=40, given_px=500.0)
+    assert wrong.is_wrong(OPTIONS)
+    assert not replace(wrong, log_ratio=OPTIONS.max_log_ratio * 0.9).is_wrong(OPTIONS)
+    assert not replace(wrong, sigma=0.06).is_wrong(OPTIONS)
+    assert not replace(wrong, agreeing=30).is_wrong(OPTIONS)
+
+
+def test_nothing_is_said_without_a_pose() -> None:
+    with pytest.raises(ValueError, match="estimate"):
+        wrong_focal(replace(solved(planted("none"), 1.0), estimate=None), OPTIONS)
+
+
+@pytest.mark.parametrize("wrong", [{"max_log_ratio": 0.0}, {"loss_scales_sigma": ()}, {"grid": 0}])
+def test_senseless_options_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="senseless"):
+        FocalOptions(**wrong)  # type: ignore[arg-type]
