@@ -14,6 +14,7 @@ from mapless.geometry import RigidTransform
 from .engine import Engine
 from .errors import Overloaded, RequestError
 from .method.group import GroupImage
+from .method.group_checks import metric_as_said, mounted_as_said
 from .method.group_hints import hinted_group
 from .method.localize import LocalizeOptions
 from .method.rejection import Rejection
@@ -63,7 +64,10 @@ async def localize_rig(
         RequestError: a passed deadline.
     """
     images = group.images()
-    return group.hinted(await engine.join(lambda: solve_rig(images, rig_from_camera, RigOptions()), caller))
+    found = await engine.join(lambda: solve_rig(images, rig_from_camera, RigOptions()), caller)
+    if not isinstance(found, Rejection):
+        found = mounted_as_said(found, [result.attempt.answer for result in group.results])
+    return group.hinted(found)
 
 
 async def localize_sequence(
@@ -79,9 +83,10 @@ async def localize_sequence(
         RequestError: a passed deadline.
     """
     images, options = group.images(), SequenceOptions()
-    return group.hinted(
-        await engine.join(lambda: solve_sequence(images, session_from_camera, estimate_scale, options), caller)
-    )
+    found = await engine.join(lambda: solve_sequence(images, session_from_camera, estimate_scale, options), caller)
+    if not isinstance(found, Rejection) and not estimate_scale:
+        found = metric_as_said(found, session_from_camera)
+    return group.hinted(found)
 
 
 async def localize_each(
