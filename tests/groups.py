@@ -11,7 +11,7 @@ from scenes import SceneOptions, SyntheticScene, look_at, make_scene, observe
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.group import GroupImage
+from mapless_server.method.groups.sightings import GroupImage
 from mapless_server.method.match import MatchOptions, PointMatches
 from mapless_server.method.observations import KeypointNoise
 from mapless_server.method.pnp import PoseStage

@@ -13,13 +13,13 @@ from mapless.geometry import RigidTransform
 
 from .engine import Engine
 from .errors import Overloaded, RequestError
-from .method.group import GroupImage
-from .method.group_checks import metric_as_said, mounted_as_said
-from .method.group_hints import hinted_group
+from .method.groups.checks import metric_as_said, mounted_as_said
+from .method.groups.hints import hinted_group
+from .method.groups.rig import RigEstimate, RigOptions, solve_rig
+from .method.groups.sequence import SequenceEstimate, SequenceOptions, solve_sequence
+from .method.groups.sightings import GroupImage
 from .method.localize import LocalizeOptions
 from .method.rejection import Rejection
-from .method.rig import RigEstimate, RigOptions, solve_rig
-from .method.sequence import SequenceEstimate, SequenceOptions, solve_sequence
 from .query import Caller, Query, Result
 from .scheduling.jobs import Visit
 

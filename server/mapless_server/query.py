@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from mapless.geometry import Camera
 
 from .method.localize import LocalizeOptions
-from .method.priors import NO_PRIORS, Priors
+from .method.priors.known import NO_PRIORS, Priors
 from .retrieval.narrowing import Narrowing
 from .scheduling.fair import Flow
 from .tenancy import SceneKey

@@ -21,12 +21,12 @@ from .library import Loaded, NotDescribedYet, load_usable
 from .method import localize as method
 from .method.correspond import Matches
 from .method.features import FeatureExtractor
-from .method.hints import hinted
+from .method.groups.tracked import tracked_support
 from .method.localize import Answer, Coarse, Localization, Prepared
 from .method.rejection import Rejection, RejectionReason
 from .method.retrieve import spread_choice
 from .method.support import Support
-from .method.tracked import tracked_support
+from .method.trust.hints import hinted
 from .method.views import PosedView, View
 from .query import Query, Result
 from .query_views import QueryViews

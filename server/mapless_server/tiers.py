@@ -14,10 +14,10 @@ import numpy as np
 
 from mapless.geometry import Camera, rotation_angle_deg
 
-from .method.accuracy import Accuracy, accuracy_from_covariance
 from .method.features import FeatureExtractor
 from .method.localize import Answer, Localization, Pipeline
 from .method.rejection import Rejection, RejectionReason
+from .method.uncertainty.accuracy import Accuracy, accuracy_from_covariance
 from .method.views import PosedView
 from .retrieval.chosen import Choice
 from .store import SceneAttributes

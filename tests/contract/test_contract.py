@@ -23,7 +23,7 @@ from mapless.axes import Axes
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 from mapless_server.method.localize import Variant
 from mapless_server.method.pnp import PoseStage
-from mapless_server.method.priors import PriorKind
+from mapless_server.method.priors.known import PriorKind
 from mapless_server.method.rejection import Advice, RejectionReason
 from mapless_server.method.scale import ScaleStage, ScaleStrategy
 from mapless_server.reference_service import ReferenceService

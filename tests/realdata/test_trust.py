@@ -21,9 +21,9 @@ from mapless_server.calibration.pairs import (
     right_pairs,
 )
 from mapless_server.dataset import Dataset
-from mapless_server.method.focal import FocalOptions, wrong_focal
 from mapless_server.method.localize import Localization, LocalizeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
+from mapless_server.method.trust.focal import FocalOptions, wrong_focal
 
 from .conftest import DATA
 

@@ -11,8 +11,8 @@ from scipy.special import bdtrik
 
 from mapless_server.calibration.pairs import answered, read_places, right_pairs
 from mapless_server.dataset import Dataset
-from mapless_server.method.accuracy import accuracy_from_covariance
 from mapless_server.method.localize import Localization, LocalizeOptions
+from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 
 pytestmark = pytest.mark.realdata
 

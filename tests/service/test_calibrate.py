@@ -24,7 +24,7 @@ from mapless.geometry import rotation_from_vector
 from mapless_server.calibration.claims import Claim
 from mapless_server.calibration.fit import Sample, fit_factors
 from mapless_server.cli import app
-from mapless_server.method.accuracy import accuracy_from_covariance
+from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_server.store import Store
 
 COUNT = 12

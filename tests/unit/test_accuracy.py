@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from mapless_server.method.accuracy import TAIL_95, accuracy_from_covariance, error_radius
+from mapless_server.method.uncertainty.accuracy import TAIL_95, accuracy_from_covariance, error_radius
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,15 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.adjust import AdjustOptions, _pose_problem, _State, adjust_pose
 from mapless_server.method.match import PointMatches
 from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
-from mapless_server.method.pose_only import moved
-from mapless_server.method.priors import NO_PRIORS, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
+from mapless_server.method.priors.known import (
+    NO_PRIORS,
+    GravityPrior,
+    HeadingPrior,
+    PosePrior,
+    PositionPrior,
+    Priors,
+)
+from mapless_server.method.priors.pose_only import moved
 from mapless_server.method.structure import Structure
 
 DOWN = np.array([0.0, 1.0, 0.0])

@@ -14,12 +14,12 @@ from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.demo.raycast import Quad, Surface
 from mapless_server.demo.room import Station, look_at, take
 from mapless_server.demo.textures import painting
-from mapless_server.method import ambiguity
-from mapless_server.method.ambiguity import AmbiguityOptions
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import make_extractor
 from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline, localize
 from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.trust import ambiguity
+from mapless_server.method.trust.ambiguity import AmbiguityOptions
 from mapless_server.method.views import PosedView, View
 
 ELSEWHERE = RigidTransform(rotation_from_vector([0.0, 0.7, 0.0]), np.array([20.0, -3.0, 8.0]))

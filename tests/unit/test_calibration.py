@@ -34,7 +34,7 @@ from mapless_server.calibration.run import calibration_of
 from mapless_server.calibration.selective import at_coverage, auroc, risk_coverage
 from mapless_server.calibration.worlds import other_world
 from mapless_server.dataset import Dataset
-from mapless_server.method.accuracy import Accuracy, accuracy_from_covariance
+from mapless_server.method.uncertainty.accuracy import Accuracy, accuracy_from_covariance
 
 SIFT = Conditions("sift", "geometric", "BEST", "1")
 SIGMA_M, SIGMA_DEG = 0.02, 0.1

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scenes import random_for
 
 from mapless.geometry import Array
-from mapless_server.method.dispersion import Dispersion, Grounds, Sightings, disperse
+from mapless_server.method.uncertainty.dispersion import Dispersion, Grounds, Sightings, disperse
 
 
 def random_grounds(case: str, points: int = 30, references: int = 4, unknowns: int = 6) -> Grounds:

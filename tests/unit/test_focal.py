@@ -9,11 +9,11 @@ import pytest
 from planted import true_structure
 from scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
-from mapless_server.method.focal import Focal, FocalOptions, wrong_focal
-from mapless_server.method.judge import JudgeOptions, judge
 from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
 from mapless_server.method.rejection import Advice, RejectionReason
 from mapless_server.method.support import Support
+from mapless_server.method.trust.focal import Focal, FocalOptions, wrong_focal
+from mapless_server.method.trust.judge import JudgeOptions, judge
 
 OPTIONS = FocalOptions()
 FACTORS = (0.6, 0.85, 0.93, 1.07, 1.15, 1.7)

@@ -10,7 +10,13 @@ import pytest
 from scenes import CAMERA, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.gate import (
+from mapless_server.method.match import PointMatches
+from mapless_server.method.observations import ONE_PIXEL
+from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.structure import Structure
+from mapless_server.method.tracks import Tracks
+from mapless_server.method.trust.gate import (
     GateOptions,
     doubts,
     false_alarms,
@@ -19,12 +25,6 @@ from mapless_server.method.gate import (
     log10_false_alarms,
     told_false_alarms,
 )
-from mapless_server.method.match import PointMatches
-from mapless_server.method.observations import ONE_PIXEL
-from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
-from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.structure import Structure
-from mapless_server.method.tracks import Tracks
 from mapless_server.method.views import Features, View
 
 POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))

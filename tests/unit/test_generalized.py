@@ -8,7 +8,7 @@ from compare import assert_pose_close
 from scenes import CAMERA, random_for
 
 from mapless.geometry import RigidTransform, Similarity, rotation_from_vector
-from mapless_server.method.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
+from mapless_server.method.groups.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from mapless_server.method.pnp import PnpOptions
 
 OPTIONS = PnpOptions()

@@ -10,11 +10,11 @@ import pytest
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.group_checks import metric_as_said, mounted_as_said
+from mapless_server.method.groups.checks import metric_as_said, mounted_as_said
+from mapless_server.method.groups.rig import RigEstimate
+from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
-from mapless_server.method.rig import RigEstimate
-from mapless_server.method.sequence import SequenceEstimate
 
 HERE = RigidTransform.identity()
 

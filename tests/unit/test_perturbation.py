@@ -8,14 +8,14 @@ from jacobians import assert_jacobian, finite_differences
 from scenes import CAMERA, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.perturbation import (
+from mapless_server.method.priors.known import rotation_vector
+from mapless_server.method.uncertainty.perturbation import (
     Perturbation,
     motion_jacobian,
     pose_hessian,
     world_covariance,
     world_jacobian,
 )
-from mapless_server.method.priors import rotation_vector
 
 POSE = RigidTransform(rotation_from_vector([0.7, -1.1, 0.4]), np.array([3.0, -2.0, 1.5]))
 EVERY_WAY = pytest.mark.parametrize("perturbation", list(Perturbation))

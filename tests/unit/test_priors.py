@@ -11,8 +11,7 @@ from scenes import random_for
 from scipy.special import chdtrc, chdtri
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.pose_only import moved
-from mapless_server.method.priors import (
+from mapless_server.method.priors.known import (
     NO_PRIORS,
     GravityPrior,
     HeadingPrior,
@@ -24,6 +23,7 @@ from mapless_server.method.priors import (
     conflict_threshold,
     rotation_vector,
 )
+from mapless_server.method.priors.pose_only import moved
 
 POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
 DOWN = np.array([0.0, 0.0, -1.0])

@@ -10,10 +10,10 @@ from jacobians import assert_jacobian
 from scenes import SceneOptions, look_at, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.drift import DriftOptions, SequenceFreedom, world_from_session_at
+from mapless_server.method.groups.drift import DriftOptions, SequenceFreedom, world_from_session_at
+from mapless_server.method.groups.rig import RigOptions, solve_rig
+from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOptions, solve_sequence
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.rig import RigOptions, solve_rig
-from mapless_server.method.sequence import SequenceEstimate, SequenceOptions, solve_sequence
 
 OPTIONS = SequenceOptions()
 UNGUIDED = SceneOptions(point_count=80, noise_px=0.5, descriptor_noise=3.0)

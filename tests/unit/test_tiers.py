@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
-from mapless_server.method.accuracy import accuracy_from_covariance, error_radius
 from mapless_server.method.localize import Answer, Localization, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance, error_radius
 from mapless_server.tiers import UNMENDABLE, Attempt, EscalationOptions, Tier, better_of, is_doubtful
 
 OPTIONS = EscalationOptions()

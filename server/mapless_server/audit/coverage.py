@@ -17,9 +17,9 @@ import numpy as np
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
 
-from ..method.accuracy import accuracy_from_covariance
-from ..method.perturbation import motion_jacobian, world_covariance
 from ..method.structure import StructureOptions
+from ..method.uncertainty.accuracy import accuracy_from_covariance
+from ..method.uncertainty.perturbation import motion_jacobian, world_covariance
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood
 from .surroundings import Surroundings
 from .visibility import VisibilityOptions, Visible, visible_points

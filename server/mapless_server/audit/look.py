@@ -10,9 +10,9 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 
-from ..method.gate import false_alarms
-from ..method.perturbation import world_covariance
 from ..method.pnp import PnpOptions, ransac
+from ..method.trust.gate import false_alarms
+from ..method.uncertainty.perturbation import world_covariance
 from ..method.views import PosedView
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood, sight
 from .options import AuditOptions

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize, normalize_jacobian, rotation_from_vector
 
-from ..method.perturbation import motion_jacobian
+from ..method.uncertainty.perturbation import motion_jacobian
 
 
 class Freedom(Enum):

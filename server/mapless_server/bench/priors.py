@@ -24,7 +24,7 @@ from ..method.coarse.make import make_reconstructor
 from ..method.correspond import OPTIONS, make_matcher
 from ..method.features import make_extractor
 from ..method.localize import Localization, LocalizeOptions, Pipeline, localize
-from ..method.priors import NO_PRIORS, GravityPrior, Priors
+from ..method.priors.known import NO_PRIORS, GravityPrior, Priors
 from ..method.retrieve import choose_references
 from ..method.views import PosedView, View
 from .scenes import KITCHEN

@@ -17,10 +17,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..method.evidence import evidence_of
-from ..method.judge import trust_of
 from ..method.localize import Answer, Localization, LocalizeOptions
 from ..method.rejection import RejectionReason
+from ..method.trust.evidence import evidence_of
+from ..method.trust.judge import trust_of
 from .pairs import METRIC, OTHERS, Measured, answered, cross_pairs, read_places, right_pairs
 from .selective import at_coverage, auroc
 

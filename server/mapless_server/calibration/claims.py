@@ -8,7 +8,7 @@ import numpy as np
 
 from mapless.geometry import Array
 
-from ..method.accuracy import error_radii
+from ..method.uncertainty.accuracy import error_radii
 
 LEVELS = np.concatenate([[0.005], np.arange(1, 100) / 100, [0.995, 0.999]])
 """Probabilities for which radii are known; between them they are interpolated."""

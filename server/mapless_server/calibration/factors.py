@@ -10,7 +10,7 @@ import numpy as np
 from mapless.geometry import Array
 from mapless.scenes import MAX_FACTOR, MIN_FACTOR, Calibration
 
-from ..method.accuracy import Accuracy
+from ..method.uncertainty.accuracy import Accuracy
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,10 @@ from scipy.special import bdtrik
 
 from mapless.geometry import Array
 
-from ..method.accuracy import error_radius
 from ..method.adjust import AdjustOptions
 from ..method.localize import Localization, LocalizeOptions
-from ..method.uncertainty import UncertaintyOptions
+from ..method.uncertainty.accuracy import error_radius
+from ..method.uncertainty.covariance import UncertaintyOptions
 from .pairs import METRIC, answered, read_places, right_pairs
 
 KS = (10, 5, 3)

@@ -15,7 +15,7 @@ from ..dataset import Frame
 from ..evaluation.metrics import pose_error
 from ..evaluation.plan import PlannedQuery, UsageError
 from ..evaluation.run import CONNECT
-from ..method.accuracy import Accuracy
+from ..method.uncertainty.accuracy import Accuracy
 from ..progress import Progress
 from .claims import Claim
 from .factors import Conditions, Factors, scaled_accuracy, scaled_covariance

@@ -22,8 +22,8 @@ from scipy.optimize import minimize
 
 from mapless.geometry import Array
 
-from ..method.evidence import FEATURES, Evidence
-from ..method.judge import LEVELS, JudgeOptions, trust_of
+from ..method.trust.evidence import FEATURES, Evidence
+from ..method.trust.judge import LEVELS, JudgeOptions, trust_of
 from .trust_samples import Sample, collect
 
 COVERAGES = (0.90, 0.95, 0.99)

@@ -21,10 +21,10 @@ from mapless.geometry import RigidTransform, rotation_from_vector
 
 from ..dataset import Frame, read_folder
 from ..decode import ImageLimits, decode_image
-from ..method.evidence import Evidence, evidence_of
 from ..method.features import make_extractor
 from ..method.localize import Localization, LocalizeOptions
 from ..method.rejection import RejectionReason
+from ..method.trust.evidence import Evidence, evidence_of
 from ..method.views import Features, PosedView
 from .pairs import KITCHEN, METRIC, OTHERS, Pair, Place, answered, cross_pairs, read_places, right_pairs
 

@@ -11,11 +11,11 @@ from mapless.v1 import localization_service_pb2 as pb
 
 from .. import __version__
 from ..calibration.factors import Claimed, Conditions, claimed
-from ..method.accuracy import accuracy_from_covariance
 from ..method.localize import Answer, Localization, LocalizeOptions
-from ..method.priors import PriorCheck
+from ..method.priors.known import PriorCheck
 from ..method.rejection import Hint, Rejection
 from ..method.scale import MetricScale
+from ..method.uncertainty.accuracy import accuracy_from_covariance
 from ..query import Result
 from ..store import SceneAttributes
 from ..tiers import Attempt

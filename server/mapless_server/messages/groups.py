@@ -16,12 +16,12 @@ from mapless.wire import FieldError
 from ..calibration.factors import Claimed
 from ..engine import EngineOptions
 from ..group_localization import GroupResult, queued_s
-from ..method.accuracy import accuracy_from_covariance
-from ..method.group import MatchedSighting
+from ..method.groups.rig import RigEstimate
+from ..method.groups.sequence import SequenceEstimate
+from ..method.groups.sightings import MatchedSighting
 from ..method.localize import Variant
 from ..method.rejection import Rejection
-from ..method.rig import RigEstimate
-from ..method.sequence import SequenceEstimate
+from ..method.uncertainty.accuracy import accuracy_from_covariance
 from ..query import Query
 from ..retrieval.narrowing import Narrowing
 from ..tenancy import key_of

@@ -18,7 +18,7 @@ from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError, transform_from_message, vector_from_message
 
-from ..method.priors import GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors, check_covariance
+from ..method.priors.known import GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors, check_covariance
 from ..retrieval.narrowing import Cone, Narrowing, Sphere
 from ..store.records import SceneAttributes
 

@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 
-from .linearization import Linearization, grounds_of, linearize, tracks_with_query
 from .match import PointMatches
 from .observations import Observations, invert_symmetric
 from .pnp import PoseEstimate, PoseStage, reprojection_errors_px
-from .priors import NO_PRIORS, Priors
+from .priors.known import NO_PRIORS, Priors
 from .structure import Structure, observe
-from .uncertainty import Uncertainty, UncertaintyOptions, one_match_covariance, uncertainty_of
+from .uncertainty.covariance import Uncertainty, UncertaintyOptions, one_match_covariance, uncertainty_of
+from .uncertainty.linearization import Linearization, grounds_of, linearize, tracks_with_query
 from .views import PosedView, View
 
 

@@ -8,17 +8,17 @@ from enum import Enum
 
 from mapless.geometry import Array, RigidTransform
 
-from .accuracy import accuracy_from_covariance
 from .adjust import AdjustOptions
-from .gate import GateOptions
-from .judge import JudgeOptions
 from .match import PAPER_MATCH, MatchOptions
 from .pnp import PnpOptions, PoseStage
-from .priors import PriorCheck
+from .priors.known import PriorCheck
 from .rejection import Rejection
 from .scale import MetricScale, ScaleStrategy
 from .structure import PAPER_STRUCTURE, StructureOptions
 from .support import Support
+from .trust.gate import GateOptions
+from .trust.judge import JudgeOptions
+from .uncertainty.accuracy import accuracy_from_covariance
 
 
 class Variant(str, Enum):

@@ -31,16 +31,16 @@ from .answer import Answer, Localization, LocalizeOptions, Variant, is_better, s
 from .coarse import Bucket, Outcome, Reconstruction, Reconstructor, Request, reconstruct_one
 from .coarse.geometric import GeometricReconstructor
 from .correspond import Correspondences, Matcher, Matches
-from .gate import doubts
-from .judge import judge
 from .match import MatchOptions, PointMatches, match_points
 from .pnp import PoseStage, solve_pose
-from .pose_covariance import pose_covariance
-from .priors import NO_PRIORS, Priors
+from .priors.known import NO_PRIORS, Priors
 from .rejection import Rejection, RejectionReason
 from .scale import MetricScale, ScaleOptions, estimate_scale
 from .structure import Structure, build_structure
 from .support import Support
+from .trust.gate import doubts
+from .trust.judge import judge
+from .uncertainty.pose_covariance import pose_covariance
 from .views import PosedView, View
 
 __all__ = [

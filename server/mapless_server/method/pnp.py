@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
 
-from .informed import InformedOptions, informed_pose
 from .match import PointMatches
-from .perturbation import pose_hessian, world_covariance
-from .pose_only import PoseOnlyOptions
-from .pose_only import reprojection_errors_px as reprojection_errors_px
-from .priors import NO_PRIORS, PriorCheck, Priors
+from .priors.informed import InformedOptions, informed_pose
+from .priors.known import NO_PRIORS, PriorCheck, Priors
+from .priors.pose_only import PoseOnlyOptions
+from .priors.pose_only import reprojection_errors_px as reprojection_errors_px
 from .rejection import Rejection, RejectionReason
 from .structure import Structure
-from .uncertainty import Uncertainty
+from .uncertainty.covariance import Uncertainty
+from .uncertainty.perturbation import pose_hessian, world_covariance
 from .views import View
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..method.priors import PosePrior, PositionPrior, Priors
+from ..method.priors.known import PosePrior, PositionPrior, Priors
 
 PRIOR_MARGIN_M = 10.0
 """References further from where the camera may be than this are not considered: they see other things."""

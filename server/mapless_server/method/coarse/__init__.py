@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera, RigidTransform
 
 from ..correspond import Correspondences
-from ..priors import NO_PRIORS, Priors
+from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection
 from ..views import PosedView, View
 

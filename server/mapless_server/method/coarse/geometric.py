@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..correspond import Correspondences
-from ..gate import GateOptions, log10_false_alarms, told_false_alarms
-from ..informed import informed_pose
 from ..match import PointMatches, vote
 from ..observations import FIRST_GUESS, adjust_points, triangulate, trustworthy
 from ..pnp import PnpOptions, ransac, reprojection_errors_px
-from ..priors import NO_PRIORS, Priors
+from ..priors.informed import informed_pose
+from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection, RejectionReason
 from ..structure import Structure, StructureOptions, observe
 from ..tracks import build_tracks
+from ..trust.gate import GateOptions, log10_false_alarms, told_false_alarms
 from ..views import PosedView, View
 from . import Bucket, Outcome, ReconstructedView, Reconstruction, Request
 

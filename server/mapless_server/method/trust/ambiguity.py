@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform, rotation_angle_deg
 
-from .accuracy import Accuracy, accuracy_from_covariance
-from .correspond import Matches
+from ..correspond import Matches
+from ..pnp import PnpOptions, ransac, reprojection_errors_px
+from ..rejection import Hypothesis
+from ..support import Support
+from ..uncertainty.accuracy import Accuracy, accuracy_from_covariance
+from ..uncertainty.perturbation import pose_hessian, world_covariance
 from .gate import false_alarms
-from .perturbation import pose_hessian, world_covariance
-from .pnp import PnpOptions, ransac, reprojection_errors_px
-from .rejection import Hypothesis
-from .support import Support
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ import numpy as np
 
 from mapless.geometry import Array
 
-from .accuracy import accuracy_from_covariance
+from ..support import Support
+from ..uncertainty.accuracy import accuracy_from_covariance
 from .gate import findable_count, hull_share, log10_false_alarms
-from .support import Support
 
 FEATURES = ("significance", "inlier share", "found share", "hull share", "references", "fit", "precision")
 """What `Evidence.features` holds; more is better in each."""

@@ -18,11 +18,11 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 
+from ..match import PointMatches
+from ..pnp import reprojection_errors_px
 from .freedom import F, Freedom
-from .group import MatchedSighting, Sighting
-from .group_problem import GroupProblem, JointOptions
-from .match import PointMatches
-from .pnp import reprojection_errors_px
+from .problem import GroupProblem, JointOptions
+from .sightings import MatchedSighting, Sighting
 
 __all__ = ["Freedom", "JointEstimate", "JointOptions", "adjust_in_rounds", "adjust_jointly", "covariance_in_world"]
 

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
-from .adjust import AdjustOptions, _NormalEquations, _Problem, _State
+from ..adjust import AdjustOptions, _NormalEquations, _Problem, _State
+from ..match import PointMatches
+from ..structure import observe
+from ..views import PosedView
 from .freedom import F, Freedom
-from .group import Sighting
-from .group_parts import Part, Shared, part_of
-from .match import PointMatches
-from .structure import observe
-from .views import PosedView
+from .parts import Part, Shared, part_of
+from .sightings import Sighting
 
 
 @dataclass(frozen=True)

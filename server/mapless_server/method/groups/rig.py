@@ -14,9 +14,13 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
-from .gate import GateOptions
+from ..pnp import PnpOptions
+from ..rejection import Rejection, RejectionReason
+from ..trust.gate import GateOptions
 from .generalized import inlier_count, rig_ransac
-from .group import (
+from .joint import JointOptions, adjust_in_rounds, covariance_in_world
+from .rigid import perturbed
+from .sightings import (
     GroupImage,
     MatchedSighting,
     Sighting,
@@ -24,10 +28,6 @@ from .group import (
     rejection_without_matches,
     sightings_of,
 )
-from .joint import JointOptions, adjust_in_rounds, covariance_in_world
-from .pnp import PnpOptions
-from .rejection import Rejection, RejectionReason
-from .rigid import perturbed
 
 
 @dataclass(frozen=True)

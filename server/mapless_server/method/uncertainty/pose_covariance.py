@@ -1,4 +1,4 @@
-"""The covariance of an answer's pose: `uncertainty`'s parts, for whatever stage the pose is of.
+"""The covariance of an answer's pose: `covariance`'s parts, for whatever stage the pose is of.
 
 An adjusted pose has its own (see `adjust`). The others are looked at from where they are: the matches near them and the
 references' poses as given.
@@ -10,14 +10,14 @@ import numpy as np
 
 from mapless.geometry import Array
 
+from ..pnp import PoseEstimate, PoseStage
+from ..priors.known import NO_PRIORS, Priors
+from ..scale import MetricScale
+from ..structure import observe
+from ..support import Support
+from ..views import PosedView
+from .covariance import Uncertainty, UncertaintyOptions, one_match_covariance, scale_covariance, uncertainty_of
 from .linearization import grounds_of, linearize, tracks_with_query
-from .pnp import PoseEstimate, PoseStage
-from .priors import NO_PRIORS, Priors
-from .scale import MetricScale
-from .structure import observe
-from .support import Support
-from .uncertainty import Uncertainty, UncertaintyOptions, one_match_covariance, scale_covariance, uncertainty_of
-from .views import PosedView
 
 
 def pose_covariance(

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform, Similarity
 
-from .pnp import PnpOptions, reprojection_errors_px
+from ..pnp import PnpOptions, reprojection_errors_px
 
 
 @dataclass(frozen=True, eq=False)

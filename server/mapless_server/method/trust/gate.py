@@ -18,9 +18,9 @@ from scipy.special import gammaln
 
 from mapless.geometry import Camera, RigidTransform
 
-from .match import PointMatches
-from .structure import Structure
-from .views import View
+from ..match import PointMatches
+from ..structure import Structure
+from ..views import View
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from .answer import Answer, Localization
-from .gate import GateOptions, false_alarms, findable_count, hull_share, told_false_alarms
+from ..answer import Answer, Localization
+from ..match import MatchOptions, PointMatches, search
+from ..rejection import Rejection, RejectionReason
+from ..structure import Structure
+from ..support import Support
+from ..trust.gate import GateOptions, false_alarms, findable_count, hull_share, told_false_alarms
+from ..views import PosedView, View
 from .generalized import CameraMatches
-from .match import MatchOptions, PointMatches, search
-from .rejection import Rejection, RejectionReason
-from .structure import Structure
-from .support import Support
-from .views import PosedView, View
 
 
 @dataclass(frozen=True, eq=False)

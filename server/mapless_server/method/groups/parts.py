@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
+from ..match import PointMatches
+from ..pnp import reprojection_errors_px
+from ..tracks import Tracks
 from .freedom import Freedom
-from .group import Sighting
-from .match import PointMatches
-from .pnp import reprojection_errors_px
-from .tracks import Tracks
+from .sightings import Sighting
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ import numpy as np
 
 from mapless.geometry import RigidTransform
 
-from .answer import Answer, Localization
-from .group_hints import STAGE
-from .rejection import Advice, Hint, Rejection, RejectionReason
+from ..answer import Answer, Localization
+from ..rejection import Advice, Hint, Rejection, RejectionReason
+from .hints import STAGE
 from .rig import RigEstimate
 from .sequence import SequenceEstimate
 

@@ -22,12 +22,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..correspond import Matches
+from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
+from ..support import Support
 from .ambiguity import AmbiguityOptions, find_rival
-from .correspond import Matches
 from .evidence import FEATURES, Evidence, evidence_of
 from .focal import Focal, FocalOptions, wrong_focal
-from .rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
-from .support import Support
 
 _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
 LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)

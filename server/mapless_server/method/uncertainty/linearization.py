@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
+from ..observations import Observations
+from ..structure import Structure
+from ..tracks import Tracks
 from .dispersion import Grounds, Sightings
-from .observations import Observations
 from .perturbation import motion_jacobian
-from .structure import Structure
-from .tracks import Tracks
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
 
+from .known import GravityPrior, Priors
 from .pose_only import PoseOnlyOptions, refine_pose
-from .priors import GravityPrior, Priors
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,13 @@ from scipy.sparse.csgraph import connected_components
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_angle_deg
 
+from ..pnp import PnpOptions
+from ..rejection import Rejection, RejectionReason
+from ..trust.gate import GateOptions
 from .drift import DriftOptions, SequenceFreedom, world_from_session_at
-from .gate import GateOptions
 from .generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
-from .group import GroupImage, MatchedSighting, Sighting, group_doubts, rejection_without_matches, sightings_of
 from .joint import JointEstimate, JointOptions, adjust_in_rounds, covariance_in_world
-from .pnp import PnpOptions
-from .rejection import Rejection, RejectionReason
+from .sightings import GroupImage, MatchedSighting, Sighting, group_doubts, rejection_without_matches, sightings_of
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from .answer import Answer
-from .hints import HintOptions
-from .rejection import Advice, Hint, Rejection, RejectionReason
-from .views import PosedView
+from ..answer import Answer
+from ..rejection import Advice, Hint, Rejection, RejectionReason
+from ..trust.hints import HintOptions
+from ..views import PosedView
 
 STAGE = "join"
 """In which photographs are posed together."""

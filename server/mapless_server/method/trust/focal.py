@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, normalize, normalize_jacobian, rotation_from_vector
 
-from .perturbation import motion_jacobian
-from .support import Support
+from ..support import Support
+from ..uncertainty.perturbation import motion_jacobian
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from .localize import Prepared
-from .match import vote
-from .observations import triangulate
-from .structure import Structure, StructureOptions, observe, refine_points, tracks_of
-from .support import Support
-from .tracks import Tracks
+from ..localize import Prepared
+from ..match import vote
+from ..observations import triangulate
+from ..structure import Structure, StructureOptions, observe, refine_points, tracks_of
+from ..support import Support
+from ..tracks import Tracks
 
 
 def tracked_support(prepared: Prepared, check: Callable[[], None]) -> Support | None:

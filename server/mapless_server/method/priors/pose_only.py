@@ -13,7 +13,7 @@ import numpy as np
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian, rotation_from_vector
 
-from .priors import NO_PRIORS, Priors
+from .known import NO_PRIORS, Priors
 
 
 @dataclass(frozen=True)

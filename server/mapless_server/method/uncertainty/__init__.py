@@ -1,0 +1,1 @@
+"""How far a pose may be off: `covariance` has the model, `dispersion` its data, `perturbation` the conventions."""
