@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from compare import assert_pose_close, pose_error
@@ -113,3 +115,17 @@ def test_gravity_that_knows_less_than_the_photograph_changes_nothing() -> None:
     assert_pose_close(
         estimate.world_from_camera, adjusted(scene, structure, matches).world_from_camera, metres=0, degrees=1e-9
     )
+
+
+def test_what_priors_pulled_before_they_turned_out_to_know_too_little_is_undone() -> None:
+    """The pose solver, to whom points are fixed, knew less: its pull must not be seen in the answer."""
+    scene, structure, matches = scene_of("undone")
+    solved = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
+    assert isinstance(solved, PoseEstimate)
+    pulled_to = moved(solved.world_from_camera, np.array([0.01, 0, 0, 0.002, 0, 0]))
+    pulled = replace(solved, world_from_camera=pulled_to, errors_px=solved.errors_px + 1, unpulled=solved)
+    priors = Priors(gravity=gravity_at(scene.world_from_query, 3.0))
+    given = scene.query, scene.references, structure, matches
+    answer, alone = adjust_pose(*given, pulled, AdjustOptions(), priors), adjust_pose(*given, solved, AdjustOptions())
+    assert [check.used for check in answer.prior_checks] == [False]
+    assert answer.world_from_camera.matrix().tobytes() == alone.world_from_camera.matrix().tobytes()

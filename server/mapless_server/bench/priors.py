@@ -175,7 +175,8 @@ def rows(setting: Setting, place: Place, most: int) -> Iterator[str]:
         lost = [i for i, it in enumerate(results) if not it.is_right(setting.metric)]
         rescued, harmed = len(set(failed) - set(lost)), len(set(lost) - set(failed))
         length = f"{100 * median_m:.3f} cm" if setting.metric else f"{median_m:.5f}"
-        counts = [len(lost), rescued, harmed, sum(it.conflict for it in results), sum(it.used for it in results)]
+        wrong = sum(math.isfinite(results[i].error_m) for i in lost)
+        counts = [len(lost), wrong, rescued, harmed, sum(it.conflict for it in results), sum(it.used for it in results)]
         cells = [str(setting), name, str(len(cases)), f"{length} / {median_deg:.4f}°", *map(str, counts)]
         yield "| " + " | ".join(cells) + " |"
 
@@ -187,8 +188,10 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=40, help="of a setting with stored references, at most")
     parser.add_argument("--only", help="settings whose name contains this")
     arguments = parser.parse_args()
-    print("| references | gravity | queries | median | failed | rescued | harmed | conflicts | used |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    print(
+        "| references | gravity | queries | median | failed | of these answered | rescued | harmed | conflicts | used |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
     places: dict[str, Place] = {}
     for setting in SETTINGS:
         folder = arguments.data / setting.folder

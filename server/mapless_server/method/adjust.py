@@ -247,25 +247,40 @@ def adjust_pose(
     Returns:
         The estimate with another pose and covariance; unchanged when there is nothing to gain.
     """
+
+    def adjusted(start: PoseEstimate, pulling: Priors) -> PoseEstimate | None:
+        return _adjusted(query, references, structure, matches, start, options, pulling)
+
+    # Where priors turn out not to be used, the answer is, to the last bit, the one without them.
+    unpulled = estimate.unpulled or estimate
+    alone = adjusted(unpulled, NO_PRIORS)
+    if not priors:
+        return alone or unpulled
+    checks = priors.check(alone.world_from_camera, alone.covariance) if alone else estimate.prior_checks
+    used = priors.consistent(checks)
+    answer = (adjusted(estimate, used) or estimate) if used else (alone or unpulled)
+    return replace(answer, prior_checks=checks)
+
+
+def _adjusted(
+    query: View,
+    references: Sequence[PosedView],
+    structure: Structure,
+    matches: PointMatches,
+    estimate: PoseEstimate,
+    options: AdjustOptions,
+    priors: Priors,
+) -> PoseEstimate | None:
+    """The estimate at the optimum that priors pull; None if there is none nearby, or too few matches for any."""
     used = np.flatnonzero(estimate.errors_px < options.max_error_px)
     if len(used) < 3:  # two equations each, for six unknowns
-        return estimate
+        return None
     problem, start = _pose_problem(query, references, structure, matches, used, estimate.world_from_camera, options)
-
-    def adjusted(pulling: Priors) -> PoseEstimate | None:
-        state, equations = _minimize(problem.with_priors(pulling), start, options)
-        found = _conclude(query, structure, matches, used, estimate, problem, state, equations)
-        if found is None:
-            return None
-        return replace(found, covariance=pulling.sharpened(found.covariance, found.world_from_camera))
-
-    alone = adjusted(NO_PRIORS)
-    if not priors:
-        return alone or estimate
-    checks = priors.check(alone.world_from_camera, alone.covariance) if alone else estimate.prior_checks
-    consistent = priors.consistent(checks)
-    answer = (adjusted(consistent) if consistent else alone) or estimate
-    return replace(answer, prior_checks=checks)
+    state, equations = _minimize(problem.with_priors(priors), start, options)
+    found = _conclude(query, structure, matches, used, estimate, problem, state, equations)
+    if found is None:
+        return None
+    return replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
 
 
 def _conclude(

@@ -7,7 +7,7 @@ candidates and a pull of its own (see `informed`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -86,6 +86,7 @@ class PoseEstimate:
         prior_checks: of each prior.
         uncertainty: what the covariance was told from, before priors sharpened it; None where it was told from the
             residuals alone, and errors that go together are not in it yet (see `pose_covariance`).
+        unpulled: the estimate before priors pulled it; None where none did.
     """
 
     world_from_camera: RigidTransform
@@ -95,6 +96,7 @@ class PoseEstimate:
     covariance: Array
     prior_checks: tuple[PriorCheck, ...] = ()
     uncertainty: Uncertainty | None = None
+    unpulled: PoseEstimate | None = None
 
 
 def solve_pose(
@@ -121,20 +123,35 @@ def solve_pose(
     candidates.append((PoseStage.INITIAL, world_from_query_initial))
     errors = [reprojection_errors_px(camera, pose, x_in_world, pixels) for _, pose in candidates]
     stage, pose = candidates[int(np.argmax([(e < options.inlier_px).sum() for e in errors]))]
-    pulled = informed_pose(camera, x_in_world, pixels, pose, priors, options.informed) if priors else None
-    if pulled and pulled.world_from_camera is not pose:
-        stage, pose = PoseStage.REFINED, pulled.world_from_camera
+    if not priors:
+        return _estimate(camera, x_in_world, pixels, stage, pose, options)
+    informed = informed_pose(camera, x_in_world, pixels, pose, priors, options.informed)
+    assert informed  # `pose` at the least
+    if informed.unpulled is not pose:
+        stage = PoseStage.REFINED
+    unpulled = _estimate(camera, x_in_world, pixels, stage, informed.unpulled, options)
+    if not informed.used or isinstance(unpulled, Rejection):
+        return unpulled if isinstance(unpulled, Rejection) else replace(unpulled, prior_checks=informed.checks)
+    pulled = _estimate(camera, x_in_world, pixels, PoseStage.REFINED, informed.world_from_camera, options)
+    if isinstance(pulled, Rejection):
+        return pulled
+    covariance = informed.used.sharpened(pulled.covariance, pulled.world_from_camera)
+    return replace(pulled, covariance=covariance, prior_checks=informed.checks, unpulled=unpulled)
+
+
+def _estimate(
+    camera: Camera, x_in_world: Array, pixels: Array, stage: PoseStage, pose: RigidTransform, options: PnpOptions
+) -> PoseEstimate | Rejection:
+    """What the matches say of a pose; PNP_FAILED if it explains no four of them."""
     errors_px = reprojection_errors_px(camera, pose, x_in_world, pixels)
     inliers = errors_px < options.inlier_px
     if inliers.sum() < 4:
-        message = f"no pose explains more than {inliers.sum()} of {len(matches)} matches"
+        message = f"no pose explains more than {inliers.sum()} of {len(pixels)} matches"
         return Rejection(RejectionReason.PNP_FAILED, message)
     # Of half-normal lengths in two dimensions the median is sqrt(2 ln 2) sigma.
     sigma_px = max(0.1, float(np.median(errors_px[inliers])) / np.sqrt(2 * np.log(2)))
     covariance = world_covariance(pose_hessian(camera, pose, x_in_world[inliers]) / sigma_px**2, pose)
-    if not pulled:
-        return PoseEstimate(pose, stage, inliers, errors_px, covariance)
-    return PoseEstimate(pose, stage, inliers, errors_px, pulled.used.sharpened(covariance, pose), pulled.checks)
+    return PoseEstimate(pose, stage, inliers, errors_px, covariance)
 
 
 def ransac(

@@ -59,11 +59,13 @@ class Pulled:
 
     Attributes:
         world_from_camera: metric.
+        unpulled: the same before priors pulled it.
         checks: of each prior.
         used: those that pulled.
     """
 
     world_from_camera: RigidTransform
+    unpulled: RigidTransform
     checks: tuple[PriorCheck, ...]
     used: Priors
 
@@ -144,9 +146,10 @@ def pull(
     covariance = np.linalg.inv(found / options.refine.prior_weight + SOMEWHERE)
     checks = priors.check(alone, np.asarray(covariance, np.float64))
     used = priors.consistent(checks)
+    pulled = world_from_camera
     if used:
-        world_from_camera = refine_pose(camera, x_in_world, pixels, world_from_camera, used, options.refine)
-    return Pulled(world_from_camera, checks, used)
+        pulled = refine_pose(camera, x_in_world, pixels, world_from_camera, used, options.refine)
+    return Pulled(pulled, world_from_camera, checks, used)
 
 
 def supporting(
