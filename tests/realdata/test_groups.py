@@ -23,7 +23,7 @@ from mapless_server.child import child_server
 from mapless_server.dataset import Dataset, Frame
 from mapless_server.evaluation.run import CONNECT
 
-pytestmark = [pytest.mark.realdata, pytest.mark.slow]
+pytestmark = [pytest.mark.realdata, pytest.mark.thorough]
 
 KITCHEN = "7scenes-redkitchen-seq01-first600"
 STARTS = (40, 200, 380, 530)
