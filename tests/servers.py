@@ -100,12 +100,14 @@ class StandInMethod:
 
     Attributes:
         inlier_count: that it claims.
+        trust: likewise.
         gate: calls wait here; open unless a test closes it.
         started: released by every call that begins.
         failure: raised instead of an answer.
     """
 
     inlier_count: int = 90
+    trust: float | None = None
     gate: threading.Event = field(default_factory=threading.Event)
     started: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
     failure: Exception | None = None
@@ -125,7 +127,13 @@ class StandInMethod:
         if self.failure is not None:
             raise self.failure
         found = Localization(
-            references[0].world_from_camera, COVARIANCE, PoseStage.REFINED, self.inlier_count, 120, 0.7
+            references[0].world_from_camera,
+            COVARIANCE,
+            PoseStage.REFINED,
+            self.inlier_count,
+            120,
+            0.7,
+            trust=self.trust,
         )
         counts = tuple(range(len(references)))
         return Answer(

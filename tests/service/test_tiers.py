@@ -13,21 +13,21 @@ STAGES = ["decode", "features", "coarse", "pnp"]
 
 
 @pytest.mark.parametrize(
-    ("inliers", "answered", "stages"),
+    ("trust", "answered", "stages"),
     [
-        (90, "cheap", STAGES),
-        (3, "strong", [*STAGES, *(f"strong/{it}" for it in ("features", "coarse", "pnp"))]),
+        (0.9, "cheap", STAGES),
+        (0.01, "strong", [*STAGES, *(f"strong/{it}" for it in ("features", "coarse", "pnp"))]),
     ],
     ids=["sure", "doubtful"],
 )
 def test_an_answer_names_its_features_and_the_time_of_all(
-    tmp_path: Path, inliers: int, answered: str, stages: list[str]
+    tmp_path: Path, trust: float, answered: str, stages: list[str]
 ) -> None:
     with serving(tmp_path, ("cheap", "strong")) as server, Client(server.address) as client:
         client.create_scene("s")
         client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)])
         assert [len(it.seen) for it in server.extractors] == [2, 2], "each tier sees each reference when it is added"
-        server.method.inlier_count = inliers
+        server.method.trust = trust
         used = client.localize(PHOTO, CAMERA, "s", ["r0", "r1"]).diagnostics
     assert (used.features, list(used.stage_s)) == (answered, stages)
 
