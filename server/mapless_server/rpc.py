@@ -8,7 +8,7 @@ import math
 import re
 import time
 import uuid
-from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from contextlib import aclosing, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -100,8 +100,11 @@ class Call:
         self.trail.computed(stage, start_s, end_s, part_seconds or {}, **about)
 
 
-class CallInterceptor(grpc.aio.ServerInterceptor):
-    """Wraps all methods but the open ones (health, reflection); servicers get a `Call` in place of the context."""
+class CallGuard:
+    """Wraps the handlers of all methods but the open ones (health, reflection): servicers get a `Call`, not a context.
+
+    No interceptor: a server that somebody else made, and that takes none, can be given handlers.
+    """
 
     def __init__(
         self,
@@ -136,15 +139,10 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         self._receiver = Receiver()
         self._open = OpenMethods(self._receiver)
 
-    async def intercept_service(self, continuation: Callable[[Any], Awaitable[Any]], handler_call_details: Any) -> Any:
-        """Implements grpc.aio.ServerInterceptor."""
-        handler = await continuation(handler_call_details)
-        method = handler_call_details.method
-        if handler is None:
-            return handler
+    def guarded(self, method: str, handler: Any) -> Any:
+        """The handler of "/package.Service/Method" as it is to be served."""
         if method in OPEN_METHODS:
             return self._open.guarded(handler)
-        refusal: Exception | None = None
         streams = handler.response_streaming
 
         async def answer(_: object, context: Context) -> bytes | None:
@@ -158,8 +156,8 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             log.debug("%s begins", method, extra={"request_id": call.request_id})
             code = "UNKNOWN"
             try:
-                if refusal is not None:
-                    raise refusal
+                self._who_calls(method, context)
+                self._check_door(method)
                 response = await (self._stream if streams else self._answer)(handler, method, call, context)
                 context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id),))
                 code = "OK"
@@ -185,11 +183,6 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
                     self._idle.set()
                 self._end(method, code, call, span)
 
-        try:
-            self._who_calls(method, handler_call_details.invocation_metadata or (), {})
-            self._check_door(method)
-        except Exception as error:
-            refusal = error
         # Not as a unary method, whose message grpc receives first: what is refused shall cost nothing, and who sends no
         # message shall not hold a place. Without a deserializer a malformed message is answered here, too.
         if streams:
@@ -201,8 +194,10 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(self._idle.wait(), limit_s)
 
-    def _who_calls(self, method: str, metadata: Metadata, auth_context: Mapping[str, Iterable[bytes]]) -> Principal:
-        return Principal() if self._authenticate is None else self._authenticate(metadata, method, auth_context)
+    def _who_calls(self, method: str, context: Context) -> Principal:
+        if self._authenticate is None:
+            return Principal()
+        return self._authenticate(_metadata(context), method, context.auth_context())
 
     def _begin(self, context: Context, streams: bool) -> Call:
         now_s = time.monotonic()
@@ -245,7 +240,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
                 await context.send_initial_metadata(())
                 async for response in responses:
                     # The token may have been revoked, or have expired, since.
-                    self._who_calls(method, _metadata(context), context.auth_context())
+                    self._who_calls(method, context)
                     data = bytes(handler.response_serializer(response))
                     try:
                         await context.write(data)
@@ -265,7 +260,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
             limit_s = min(limit_s, self._default_deadline_s)
         data = await self._receiver.message(context, limit_s)
         call.note(bytes_in=len(data))
-        call = replace(call, principal=self._who_calls(method, _metadata(context), context.auth_context()))
+        call = replace(call, principal=self._who_calls(method, context))
         call.note(tenant=call.principal.tenant, **({"principal": call.principal.name} if call.principal.name else {}))
         try:
             # Reading holds the interpreter, about 1 ms for a MiB, in whatever thread: in another one it would hold up

@@ -12,7 +12,9 @@ import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
+
+import grpc
 
 from . import __version__
 from .assembly import gpu_memory, make_descriptor, make_tiers, what_is_missing
@@ -29,6 +31,7 @@ from .security.errors import SecurityError
 from .security.protection import Protection
 from .security.rate import RateLimiter
 from .security.reloading import keep_fresh
+from .services import Services
 from .settings import Settings
 from .store import Store, StoreError
 from .warm_up import warm_up
@@ -106,6 +109,28 @@ def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateL
         raise StartupError(str(error)) from error
 
 
+class Listener(Protocol):
+    """Brings the services their calls; bound to its address when it is made.
+
+    Attributes:
+        address: "host:port".
+    """
+
+    address: str
+
+    async def start(self) -> None:
+        """Takes calls."""
+
+    async def stop(self) -> None:
+        """Takes no more calls; all have been answered, but the last bytes may be on their way."""
+
+    async def close(self) -> None:
+        """Ends at once; may follow `stop`."""
+
+
+Listen = Callable[[Settings, Services, "grpc.ServerCredentials | None"], Listener]
+
+
 @dataclass(frozen=True)
 class Running:
     """A server that serves.
@@ -125,7 +150,7 @@ class Running:
 
 @asynccontextmanager
 async def running_server(
-    settings: Settings, make: MakeEngine = make_engine, store: Store | None = None
+    settings: Settings, make: MakeEngine = make_engine, store: Store | None = None, listen: Listen = GrpcServer
 ) -> AsyncIterator[Running]:
     """A running server, for use within a program; it is drained when the block is left.
 
@@ -135,6 +160,7 @@ async def running_server(
         settings: port 0 takes any free one.
         make: makes the engine, in a thread of its own: networks take long to load. Closed at the end.
         store: what the engine reads; opened from the settings if None. Closed at the end either way.
+        listen: makes what brings the calls.
 
     Raises:
         StartupError: no such backend or features, the data folder or a file cannot be used, a port is taken, or the
@@ -149,9 +175,12 @@ async def running_server(
         tracer = _make_tracer(settings)
         stack.push_async_callback(asyncio.to_thread, tracer.close, _TRACES_FLUSH_S)
         metrics_address = _serve_metrics(settings, metrics, store, protection, stack)
-        server = _make_server(settings, store, metrics, protection, tracer)
-        stack.push_async_callback(server.close)
-        await server.start()
+        services = Services(settings, store, metrics, authenticate=protection.authenticator.authenticate, tracer=tracer)
+        stack.push_async_callback(services.close)
+        await services.set_serving(False)
+        listener = _make_listener(listen, settings, services, protection)
+        stack.push_async_callback(listener.close)
+        await listener.start()
         engine = await asyncio.to_thread(make, settings, store, metrics, protection.quota)
         stack.push_async_callback(engine.close)
         failed: asyncio.Future[Fatal] = asyncio.get_running_loop().create_future()
@@ -159,11 +188,12 @@ async def running_server(
         engine.queue.on_fatal = lambda fatal: _announce_failure(fatal, failed, metrics)
         _keep(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
         _keep(stack, keep_fresh(protection.refreshable))
-        _keep(stack, _stop_serving(server, failed))
+        _keep(stack, _stop_serving(services, failed))
         await _warm_up(settings, engine, metrics)
-        await server.open(engine)
-        stack.push_async_callback(server.drain, settings.drain_delay_s, settings.drain_grace_s)
-        yield Running(server.address, metrics_address, engine, failed)
+        await services.open(engine)
+        stack.push_async_callback(listener.stop)
+        stack.push_async_callback(services.drain, settings.drain_delay_s, settings.drain_grace_s)
+        yield Running(listener.address, metrics_address, engine, failed)
 
 
 async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
@@ -215,10 +245,10 @@ async def _end_broken() -> NoReturn:
     os._exit(FATAL_EXIT_CODE)  # threads may hang, so none is waited for
 
 
-async def _stop_serving(server: GrpcServer, failed: asyncio.Future[Fatal]) -> None:
+async def _stop_serving(services: Services, failed: asyncio.Future[Fatal]) -> None:
     """Health says so when the server has failed."""
     await asyncio.wait({failed})
-    await server.set_serving(False)
+    await services.set_serving(False)
 
 
 def _make_protection(settings: Settings) -> Protection:
@@ -267,18 +297,9 @@ def _watch_engine(engine: Engine, metrics: Metrics) -> None:
         metrics.watch_token_cache(lambda: cache.counters)
 
 
-def _make_server(
-    settings: Settings, store: Store, metrics: Metrics, protection: Protection, tracer: Tracer
-) -> GrpcServer:
+def _make_listener(listen: Listen, settings: Settings, services: Services, protection: Protection) -> Listener:
     try:
-        return GrpcServer(
-            settings,
-            store,
-            metrics,
-            authenticate=protection.authenticator.authenticate,
-            tracer=tracer,
-            credentials=None if protection.tls is None else protection.tls.server_credentials(),
-        )
+        return listen(settings, services, None if protection.tls is None else protection.tls.server_credentials())
     except AddressTaken as error:
         raise StartupError(str(error)) from error
 

@@ -22,7 +22,7 @@ import kubernetes_validate  # type: ignore[import-untyped]
 import pytest
 import yaml  # type: ignore[import-untyped]
 
-from mapless_server.grpc_server import SERVICE_NAMES
+from mapless_server.services import SERVICE_NAMES
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.binding import Verdict, advise

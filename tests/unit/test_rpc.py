@@ -22,9 +22,9 @@ from mapless_server import receiving
 from mapless_server.errors import NotFound, Overloaded, PermissionDenied, Unauthenticated
 from mapless_server.observability.trail import MAX_STEPS, Step
 from mapless_server.principal import Principal, Role
-from mapless_server.rpc import ANSWER_MARGIN_SHARE, Call, CallInterceptor
+from mapless_server.rpc import ANSWER_MARGIN_SHARE, Call, CallGuard
 
-CHECK = "/grpc.health.v1.Health/Check"
+CHECK, WATCH = "/grpc.health.v1.Health/Check", "/grpc.health.v1.Health/Watch"
 METHOD = "/mapless.v1.LocalizationService/Localize"
 LIMIT_S = 30.0
 
@@ -75,16 +75,24 @@ async def serving(answer: Answer, counted: Counted, **options: Any) -> AsyncIter
 @asynccontextmanager
 async def listening(answer: Answer, counted: Counted, **options: Any) -> AsyncIterator[int]:
     """The port of such a server."""
-    interceptor = CallInterceptor(observer=counted, tracer=counted, **options)
-    server = grpc.aio.server(interceptors=[interceptor], options=[("grpc.max_receive_message_length", 2**20)])
+    guard = CallGuard(observer=counted, tracer=counted, **options)
+    server = grpc.aio.server(options=[("grpc.max_receive_message_length", 2**20)])
     method = grpc.unary_unary_rpc_method_handler(
         answer, pb.LocalizeRequest.FromString, pb.LocalizeResponse.SerializeToString
     )
     server.add_generic_rpc_handlers(
-        [grpc.method_handlers_generic_handler("mapless.v1.LocalizationService", {"Localize": method})]
+        [
+            grpc.method_handlers_generic_handler(
+                "mapless.v1.LocalizationService", {"Localize": guard.guarded(METHOD, method)}
+            )
+        ]
     )
     healthy = health.aio.HealthServicer()  # type: ignore[attr-defined]
-    health_pb2_grpc.add_HealthServicer_to_server(healthy, server)
+    forms = health_pb2.HealthCheckRequest.FromString, health_pb2.HealthCheckResponse.SerializeToString
+    check = grpc.unary_unary_rpc_method_handler(healthy.Check, *forms)
+    watch = grpc.unary_stream_rpc_method_handler(healthy.Watch, *forms)
+    guarded = {"Check": guard.guarded(CHECK, check), "Watch": guard.guarded(WATCH, watch)}
+    server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("grpc.health.v1.Health", guarded)])
     await healthy.set("", health_pb2.HealthCheckResponse.SERVING)
     port = server.add_insecure_port("127.0.0.1:0")
     await server.start()
@@ -347,7 +355,7 @@ class TestCallsOfWhichOnlyTheHeadersCome:
         assert counted.codes == ["DEADLINE_EXCEEDED"]
         assert lines_of(caplog)[0]["reason"] == "MESSAGE_LATE"
 
-    @pytest.mark.parametrize("method", [CHECK, "/grpc.health.v1.Health/Watch"])
+    @pytest.mark.parametrize("method", [CHECK, WATCH])
     def test_the_message_of_an_open_method_has_little_time(
         self, counted: Counted, monkeypatch: pytest.MonkeyPatch, method: str
     ) -> None:

@@ -17,7 +17,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.errors import FailedPrecondition, Unauthenticated
 from mapless_server.principal import Principal
-from mapless_server.rpc import Call, CallInterceptor
+from mapless_server.rpc import Call, CallGuard
 
 METHOD = "/mapless.v1.LocalizationService/WatchQueries"
 LIMIT_S = 30.0
@@ -65,7 +65,7 @@ class Numbers:
 @asynccontextmanager
 async def serving(
     numbers: Numbers | Exception, counted: Counted, **options: Any
-) -> AsyncIterator[tuple[Any, CallInterceptor]]:
+) -> AsyncIterator[tuple[Any, CallGuard]]:
     """A channel to a server whose WatchQueries is answered so."""
 
     async def watch(request: pb.WatchQueriesRequest, call: Call) -> Numbers:
@@ -74,18 +74,20 @@ async def serving(
         assert request.scene == "scenes/hall"
         return numbers
 
-    interceptor = CallInterceptor(observer=counted, **options)
-    server = grpc.aio.server(interceptors=[interceptor])
+    guard = CallGuard(observer=counted, **options)
+    server = grpc.aio.server()
     method = grpc.unary_stream_rpc_method_handler(
         watch, pb.WatchQueriesRequest.FromString, pb.WatchQueriesResponse.SerializeToString
     )
-    handlers = grpc.method_handlers_generic_handler("mapless.v1.LocalizationService", {"WatchQueries": method})
+    handlers = grpc.method_handlers_generic_handler(
+        "mapless.v1.LocalizationService", {"WatchQueries": guard.guarded(METHOD, method)}
+    )
     server.add_generic_rpc_handlers([handlers])
     port = server.add_insecure_port("127.0.0.1:0")
     await server.start()
     try:
         async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
-            yield channel, interceptor
+            yield channel, guard
     finally:
         await server.stop(5)
 
@@ -241,11 +243,11 @@ def test_whose_message_does_not_come_is_told_so_without_a_deadline_too() -> None
 
 def test_nobody_waits_for_its_end() -> None:
     async def run() -> None:
-        async with serving(Numbers(0, "wait"), Counted()) as (channel, interceptor):
+        async with serving(Numbers(0, "wait"), Counted()) as (channel, guard):
             call = watching(channel)
             await call.initial_metadata()
             start_s = time.monotonic()
-            await interceptor.wait_until_idle(LIMIT_S)
+            await guard.wait_until_idle(LIMIT_S)
             assert time.monotonic() - start_s < LIMIT_S / 2
             call.cancel()
 
