@@ -18,6 +18,9 @@ import grpc
 
 from . import __version__
 from .assembly import gpu_memory, make_descriptor, make_tiers, what_is_missing
+from .capture.errors import CaptureError
+from .capture.folder import CaptureFolder, Retention
+from .capture.recorder import Recorder
 from .decode import ImageLimits
 from .engine import Engine, EngineOptions
 from .grpc_server import AddressTaken, GrpcServer
@@ -51,7 +54,7 @@ CLOSING_LIMIT_S = 15.0
 """After the calls' own time, for threads to be through with their step, traces and the store; then whatever still runs
 hangs. With the drain's times it must be less than what the supervisor gives, see deploy/kubernetes."""
 
-_SWITCH_INTERVAL_S = 0.001
+SWITCH_INTERVAL_S = 0.001
 """How long a computing thread keeps the interpreter from the event loop; Python's own 5 ms add up to late answers."""
 
 _HEARTBEAT_LIMIT_S = 5.0
@@ -175,7 +178,11 @@ async def running_server(
         tracer = _make_tracer(settings)
         stack.push_async_callback(asyncio.to_thread, tracer.close, _TRACES_FLUSH_S)
         metrics_address = _serve_metrics(settings, metrics, store, protection, stack)
-        services = Services(settings, store, metrics, authenticate=protection.authenticator.authenticate, tracer=tracer)
+        recorder = await asyncio.to_thread(_make_recorder, settings, store, metrics)
+        if recorder is not None:
+            stack.push_async_callback(asyncio.to_thread, recorder.close)
+        authenticate = protection.authenticator.authenticate
+        services = Services(settings, store, metrics, authenticate=authenticate, tracer=tracer, recorder=recorder)
         stack.push_async_callback(services.close)
         await services.set_serving(False)
         listener = _make_listener(listen, settings, services, protection)
@@ -185,6 +192,8 @@ async def running_server(
         stack.push_async_callback(engine.close)
         failed: asyncio.Future[Fatal] = asyncio.get_running_loop().create_future()
         _watch_engine(engine, metrics)
+        if recorder is not None:
+            recorder.describe(settings, engine.tiers)
         engine.queue.on_fatal = lambda fatal: _announce_failure(fatal, failed, metrics)
         _keep(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
         _keep(stack, keep_fresh(protection.refreshable))
@@ -202,7 +211,7 @@ async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
     If something inside breaks that cannot be mended, even while it stops, or hangs when all calls have had their time,
     the process ends with FATAL_EXIT_CODE.
     """
-    sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
@@ -225,21 +234,21 @@ async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
         ended: set[asyncio.Future[Any]] = {stopped, running.failed}
         await asyncio.wait(ended, return_when=asyncio.FIRST_COMPLETED)
         if running.failed.done():
-            await _end_broken()
+            await end_broken()
         log.info("stopping: running calls get %g s", settings.drain_grace_s)
         closing = asyncio.ensure_future(stack.aclose())
         limit_s = settings.drain_delay_s + settings.drain_grace_s + CLOSING_LIMIT_S
         ended = {closing, running.failed}
         await asyncio.wait(ended, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
         if running.failed.done():
-            await _end_broken()
+            await end_broken()
         if not closing.done():
             log.critical("the server hangs: it has not stopped after %g s", limit_s)
-            await _end_broken()
+            await end_broken()
         await closing
 
 
-async def _end_broken() -> NoReturn:
+async def end_broken() -> NoReturn:
     await asyncio.sleep(LAST_WORDS_S)
     logging.shutdown()
     os._exit(FATAL_EXIT_CODE)  # threads may hang, so none is waited for
@@ -295,6 +304,26 @@ def _watch_engine(engine: Engine, metrics: Metrics) -> None:
     cache = getattr(reconstructor, "cache", None)  # of tokens; only networks have one
     if cache is not None:
         metrics.watch_token_cache(lambda: cache.counters)
+
+
+def _make_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorder | None:
+    """What captures calls, if the settings ask for it; says so, since photographs are then kept."""
+    if settings.capture_dir is None:
+        return None
+    retention = Retention(3600 * settings.capture_hours, settings.capture_mib * 2**20)
+    try:
+        folder = CaptureFolder(settings.capture_dir, retention)
+    except CaptureError as error:
+        raise StartupError(str(error)) from error
+    log.warning(
+        "calls are captured, photographs and all: %s, for %g hours, %d MiB at most",
+        settings.capture_dir,
+        settings.capture_hours,
+        settings.capture_mib,
+    )
+    metrics.watch_captures(lambda: folder.space_bytes)
+    tenants = frozenset(filter(None, settings.capture_tenants.split(",")))
+    return Recorder(folder, store, metrics, settings.capture_share, tenants)
 
 
 def _make_listener(listen: Listen, settings: Settings, services: Services, protection: Protection) -> Listener:

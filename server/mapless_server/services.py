@@ -18,6 +18,7 @@ from mapless.v1 import (
     reference_service_pb2_grpc,
 )
 
+from .capture.recorder import Recorder
 from .engine import Engine
 from .errors import Unavailable
 from .observability.metrics import Metrics
@@ -34,7 +35,9 @@ SERVICE_NAMES = (
     reference_service_pb2.DESCRIPTOR.services_by_name["ReferenceService"].full_name,
 )
 
-LOCALIZE_METHODS = frozenset(f"/{SERVICE_NAMES[0]}/{name}" for name in ("Localize", "LocalizeRig", "LocalizeSequence"))
+LOCALIZE_METHODS = frozenset(
+    f"/{SERVICE_NAMES[0]}/{name}" for name in ("Localize", "LocalizeProgressively", "LocalizeRig", "LocalizeSequence")
+)
 
 
 class Services:
@@ -52,6 +55,7 @@ class Services:
         *,
         authenticate: Authenticate | None = None,
         tracer: Tracer | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
         self._metrics = metrics
         self._engine: Engine | None = None
@@ -70,14 +74,14 @@ class Services:
         self.handlers: dict[str, dict[str, grpc.RpcMethodHandler]] = {}
         reference_service_pb2_grpc.add_ReferenceServiceServicer_to_server(self._references, self)
         localization_service_pb2_grpc.add_LocalizationServiceServicer_to_server(
-            LocalizationService(self._ready_engine, metrics, store, self._watchers), self
+            LocalizationService(self._ready_engine, metrics, store, self._watchers, recorder), self
         )
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self)
         if settings.reflection:
             self._add_reflection((*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME))
 
-    def add_to(self, server: grpc.aio.Server) -> None:
-        """Has a server, which does not run yet, answer the services' calls."""
+    def add_to(self, server: Any) -> None:
+        """Has a grpc.aio.Server that does not run yet answer the services' calls."""
         for service, methods in self.handlers.items():
             server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(service, methods),))
 

@@ -49,12 +49,14 @@ class _Lane:
         stages: in the order in which jobs go through them.
         free: threads that have nothing to do.
         passed_over: batches since an earlier stage than the one served had its turn.
+        busy_s: what the threads have computed so far, in sum.
     """
 
     threads: int
     stages: list[Stage]
     free: int
     passed_over: int = 0
+    busy_s: float = 0.0
 
 
 class Schedule:
@@ -104,6 +106,16 @@ class Schedule:
     def jobs(self) -> frozenset[Job]:
         """Those that are admitted and have not ended."""
         return frozenset(self._ledger.jobs)
+
+    @property
+    def backlog_s(self) -> float:
+        """Computing time predicted for the jobs, of the lane that has most of it a thread."""
+        return max(self._ledger.booked_s(name) / lane.threads for name, lane in self._lanes.items())
+
+    @property
+    def busy_s(self) -> float:
+        """What has been computed so far, of the lane that has computed most a thread."""
+        return max(lane.busy_s / lane.threads for lane in self._lanes.values())
 
     @property
     def next_due_s(self) -> float | None:
@@ -177,7 +189,9 @@ class Schedule:
     def finish(self, batch: Batch, verdicts: Sequence[Verdict], now_s: float) -> None:
         """A batch was computed: each of its jobs ends or goes on, unless it has ended meanwhile."""
         stage, seconds = batch.stage, now_s - batch.start_s
-        self._lanes[stage.lane].free += 1
+        lane = self._lanes[stage.lane]
+        lane.free += 1
+        lane.busy_s += seconds
         self._running[stage.name] -= len(batch.jobs)
         self._observer.computed(stage.name, batch.jobs[0].step.bucket, len(batch.jobs), seconds)
         unusual_s = max(job.unusual_s for job in batch.jobs)

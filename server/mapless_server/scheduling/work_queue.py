@@ -133,6 +133,18 @@ class WorkQueue:
         with self._lock:
             return len(self._schedule.jobs)
 
+    @property
+    def backlog_s(self) -> float:
+        """Computing time predicted for what is admitted and has not ended, of the lane that has most of it a thread."""
+        with self._lock:
+            return self._schedule.backlog_s
+
+    @property
+    def busy_s(self) -> float:
+        """Seconds of computing so far, of the lane that has computed most a thread."""
+        with self._lock:
+            return self._schedule.busy_s
+
     def is_alive_within(self, limit_s: float) -> bool:
         """Whether what is admitted will be computed, as far as was seen in so many seconds."""
         runs = self._task is not None and not self._task.done() and not self._is_closed

@@ -1,0 +1,98 @@
+"""mapless's own handlers on the gRPC server that Serve opens in every replica.
+
+In Serve's HAProxy mode (RAY_SERVE_ENABLE_HA_PROXY=1) a call goes from the load balancer straight to a gRPC server in
+the replica's process. Serve would read the request there, call a method of the deployment, and turn exceptions into
+statuses; on that way the caller's deadline, its time to send the message, rich error details and health by
+grpc.health.v1 are lost. So the handlers are registered as they are on a server of mapless's own: what a caller meets
+there it meets here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any, Protocol
+
+import grpc
+from grpc_health.v1 import health_pb2
+from grpc_status import rpc_status
+
+from mapless.v1 import localization_service_pb2, reference_service_pb2
+from mapless_server.errors import Unavailable
+from mapless_server.services import Services
+from mapless_server.settings import Settings
+from mapless_server.status import to_status
+
+_SERVICES = (
+    localization_service_pb2.DESCRIPTOR.services_by_name["LocalizationService"],
+    reference_service_pb2.DESCRIPTOR.services_by_name["ReferenceService"],
+    health_pb2.DESCRIPTOR.services_by_name["Health"],
+)
+
+
+class ServeServer(Protocol):
+    """What is used of Serve's gRPC server, a grpc.aio.Server."""
+
+    def add_passthrough_service(self, service_name: str) -> None:
+        """The service's handlers, which are added after this, are not replaced by Serve's."""
+
+    def add_generic_rpc_handlers(self, handlers: Any) -> None:
+        """As of grpc.aio.Server."""
+
+
+class Ingress:
+    """What brings a replica its calls; there is one a process. Implements `mapless_server.serve.Listener`.
+
+    Attributes:
+        address: unknown; Serve opens the port, which it chooses, once the replica is ready.
+    """
+
+    address = "ray"
+    current: Ingress | None = None
+
+    def __init__(self, settings: Settings, services: Services, credentials: grpc.ServerCredentials | None) -> None:
+        if credentials is not None:
+            raise ValueError("Serve's gRPC server knows no TLS: unset tls_certificate, and end TLS at the gateway")
+        self.services = services
+        self.loop = asyncio.get_running_loop()
+
+    async def start(self) -> None:
+        """Serve opens its server once the replica's constructor has returned."""
+        Ingress.current = self
+
+    async def stop(self) -> None:
+        """Serve has stopped its server, and waited for running calls, before it lets the replica go."""
+
+    async def close(self) -> None:
+        """Nothing is left to close."""
+        Ingress.current = None
+
+
+def add_services(_: object, server: ServeServer) -> None:
+    """What Serve's `grpc_servicer_functions` names: called with each gRPC server that Serve makes, in its event loop.
+
+    Raises:
+        RuntimeError: the replica lives in another event loop than its gRPC server.
+    """
+    ingress = Ingress.current
+    if ingress is None:
+        _add_refusals(server)
+        return
+    if asyncio.get_running_loop() is not ingress.loop:
+        raise RuntimeError("a replica needs RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD=0, which mapless_ray.app sets")
+    for service in ingress.services.handlers:
+        server.add_passthrough_service(service)
+    ingress.services.add_to(server)
+
+
+def _add_refusals(server: ServeServer) -> None:
+    """In Serve's proxies, to which calls come when no replica is ready."""
+    error = Unavailable("no replica is ready", reason="STARTING", retry_after_s=1.0)
+    status = rpc_status.to_status(to_status(error))
+
+    async def refuse(_: object, context: Any) -> None:
+        await context.abort(status.code, status.details, status.trailing_metadata)
+
+    for service in _SERVICES:
+        server.add_passthrough_service(service.full_name)
+        refusals = {method.name: grpc.stream_unary_rpc_method_handler(refuse) for method in service.methods}
+        server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(service.full_name, refusals),))
