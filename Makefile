@@ -10,7 +10,7 @@ TORCH  ?= torch==2.13.0
 PROTO_TOOLS := grpcio-tools==1.71.2 setuptools==80.9.0
 PROTO_VENV  := $(VENV)/proto-tools
 
-.PHONY: help setup test thorough lint format proto demo bench bench-gpu load clean
+.PHONY: help setup test thorough lint format proto demo bench bench-gpu load load-ray fuzz clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -63,6 +63,13 @@ bench-gpu: setup  ## Measure the networks and whole queries on a CUDA device; wi
 
 load: setup  ## Measure the server under load; DATA=folder for real photographs, ARGS="--minutes 2" for all's options
 	$(BIN)/mapless-server load all $(if $(DATA),--data '$(DATA)') $(ARGS)
+
+RUNS ?= 1000000
+fuzz: setup  ## Fuzz what reads the inputs of strangers; TARGET="images names" for some, RUNS=1000 for few, ARGS="--parallel 2"
+	PYTHONPATH=tests $(BIN)/python -m fuzz.campaign --output fuzz-output --runs $(RUNS) --targets $(TARGET) $(ARGS)
+
+load-ray: setup  ## Measure replicas on Ray Serve, on this machine: half an hour; PART=overhead, throughput, failover or redeploys
+	$(BIN)/python -m mapless_ray.trial $(or $(PART),all) $(if $(DATA),--data '$(DATA)') $(ARGS)
 
 clean:  ## Remove the environment and caches
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache build *.egg-info

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mapless.geodesy import Datum
-from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential, RigidTransform
+from mapless.geometry import MAX_COORDINATE_M, Array, Camera, Distortion, Fisheye, RadialTangential, RigidTransform
 from mapless.scenes import Vector, unit_vector
 
 FILE_NAME = "cameras.json"
@@ -28,6 +28,8 @@ MAX_NAME_LENGTH = 128
 MAX_SIDE_PX = 2**30
 """No image's: what arithmetic with doubles and 32 bits takes without complaint."""
 SPLITS = ("", "train", "test")
+_MAX_TOLD = 1000
+"""Characters of what is told of a file's content, which may be anything and of any length."""
 
 Told = TypeVar("Told")
 
@@ -67,6 +69,10 @@ class Refusal:
     frame: str
     reason: str
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frame", printable(self.frame))
+        object.__setattr__(self, "reason", printable(self.reason))
+
 
 @dataclass(frozen=True)
 class Dataset:
@@ -95,6 +101,12 @@ class Dataset:
     notes: tuple[str, ...] = ()
     datum: Datum | None = None
     down_in_world: Vector | None = None
+
+
+def printable(text: str) -> str:
+    """A text that quotes what others wrote, as a terminal can show it: cut, and with nothing that moves the cursor."""
+    text = text if len(text) <= _MAX_TOLD else f"{text[:_MAX_TOLD]}..."
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def read_folder(path: Path) -> Dataset:
@@ -150,12 +162,17 @@ def dataset_of(
         path.resolve().name,
         tuple(frames),
         content.get("metric", True),
-        str(content.get("source", "")),
-        str(content.get("ground_truth", "")),
+        _text(content, "source"),
+        _text(content, "ground_truth"),
         refused=tuple(refused),
         datum=_told(path, content, "datum", Datum.from_json),
         down_in_world=_told(path, content, "down_in_world", _direction),
     )
+
+
+def _text(content: Mapping[str, Any], field: str) -> str:
+    told = content.get(field, "")
+    return printable(told) if isinstance(told, str) else ""
 
 
 def _told(path: Path, content: Mapping[str, Any], field: str, read: Callable[[object], Told]) -> Told | None:
@@ -220,6 +237,8 @@ def read_frame(folder: Path, entry: object, taken: Container[str]) -> Frame:
     file = image_file(folder, image)
     try:
         pose = RigidTransform.from_matrix(_numbers(entry, "world_from_camera", (4, 4)))
+        if not np.abs(pose.translation).max() <= MAX_COORDINATE_M:
+            raise ValueError(f"lies more than {MAX_COORDINATE_M:g} m from the origin")
     except ValueError as error:
         raise ValueError(f"world_from_camera: {error}") from error
     return Frame(reference_id(image, taken), file, _camera(entry), pose, entry.get("split", ""))

@@ -18,10 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InvalidArgument
+from .png_chunks import BadChunks, essential_png
 
 # IMREAD_UNCHANGED would also ignore the orientation, but keeps alpha and 16 bits. Asked for 8-bit colour, the decoder
 # keeps the high byte of 16, drops alpha, repeats grey and converts CMYK.
 _DECODE_FLAGS = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+_PNG = b"\x89PNG\r\n\x1a\n"
 _MAX_JPEG_SEGMENTS = 2000  # 64 KiB each; bounds the walk through a file of nothing but empty ones
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd9-\xfe]", re.DOTALL)
 _MAX_JPEG_SCANS = 100  # a progressive file has about ten; thousands make a small file decode for minutes
@@ -93,6 +95,12 @@ def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDAr
     width, height = image_size(data, limits, field)
     if data.startswith(b"\xff\xd8") and _has_many_scans(data):
         raise InvalidArgument("the JPEG has too many scans", reason="IMAGE_TOO_COMPLEX", field=field)
+    if data.startswith(_PNG):
+        try:
+            data = essential_png(data)
+        except BadChunks as error:
+            reason = "IMAGE_TOO_COMPLEX" if error.is_too_much else "IMAGE_UNDECODABLE"
+            raise InvalidArgument(str(error), reason=reason, field=field) from None
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), _DECODE_FLAGS)
     except cv2.error:
@@ -133,7 +141,7 @@ def _read_header(data: bytes) -> tuple[int, int]:
     """Width and height; IndexError where the bytes end too early."""
     if data.startswith(b"\xff\xd8\xff"):
         return _read_jpeg_header(data)
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+    if data.startswith(_PNG):
         return _read_png_header(data)
     if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
         return _read_webp_header(data)

@@ -16,7 +16,7 @@ import numpy as np
 
 from mapless.geometry import MAX_COORDINATE_M, Array, Camera, RigidTransform
 
-from ..dataset import Dataset, Frame, Refusal, image_file, legal_id
+from ..dataset import MAX_SIDE_PX, Dataset, Frame, Refusal, image_file, legal_id
 from ..decode import ImageLimits, image_size
 from ..errors import InvalidArgument
 
@@ -73,7 +73,7 @@ class Collector:
         """
         file = self.image(image)
         check_camera(camera)
-        if np.abs(world_from_camera.translation).max() > MAX_COORDINATE_M:
+        if not np.abs(world_from_camera.translation).max() <= MAX_COORDINATE_M:  # NaN where a reader's sums overflowed
             raise ValueError(f"pose: lies more than {MAX_COORDINATE_M:g} m from the origin")
         # The folders belong to the id: sequences count their frames from 0, each of them.
         parts = PurePosixPath(name or image.removesuffix(PurePosixPath(image).suffix)).parts
@@ -94,7 +94,7 @@ class Collector:
 
 def check_camera(camera: Camera) -> None:
     """Raises ValueError if a camera's size or intrinsics cannot be any camera's."""
-    if not (camera.width_px >= 1 and camera.height_px >= 1):
+    if not (1 <= camera.width_px <= MAX_SIDE_PX and 1 <= camera.height_px <= MAX_SIDE_PX):
         raise ValueError(f"camera: {camera.width_px}x{camera.height_px} is no size")
     numbers = [camera.focal_x_px, camera.focal_y_px, camera.principal_x_px, camera.principal_y_px]
     if camera.distortion is not None:

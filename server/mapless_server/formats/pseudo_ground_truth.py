@@ -15,7 +15,7 @@ from pathlib import Path
 
 from mapless.geometry import Camera, Quaternion, RigidTransform
 
-from .collecting import from_corner, numbers, read_text
+from .collecting import check_camera, from_corner, numbers, read_text
 from .colmap.model import Model, find_model, read_model
 from .options import Intrinsics
 
@@ -42,6 +42,7 @@ class PosesBySplit:
         """Of an image of this size; intrinsics if given stand for those found. ValueError if the image has no pose."""
         if self.model is not None:
             camera, pose = self.model.camera_and_pose(image)
+            check_camera(camera)  # before it is divided by its size
             if (camera.width_px, camera.height_px) != size:
                 camera = camera.resized(*size)
         else:

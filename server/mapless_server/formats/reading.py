@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
 
-from ..dataset import Dataset
+from ..dataset import Dataset, printable
 from . import arkit, cambridge, cameras, colmap, nerf, seven_scenes, tum, twelve_scenes
 from .options import FORMATS, ReadOptions
 
@@ -43,11 +43,14 @@ def read_dataset(path: Path, format: str = "auto", options: ReadOptions | None =
         The dataset. Frames that cannot be used are in `refused`, with the reason; at least one can be.
 
     Raises:
-        ValueError: the folder as a whole cannot be read; the message names file and field.
+        ValueError: the folder as a whole cannot be read; the message, which can be printed, names file and field.
     """
     if format != "auto" and format not in FORMATS:
         raise ValueError(f"format must be auto or one of {', '.join(FORMATS)}, not {format!r}")
     if not path.is_dir():
         raise ValueError(f"{path} is not a folder")
     read: Callable[[Path, ReadOptions], Dataset] = _MODULES[recognize(path) if format == "auto" else format].read
-    return read(path, options or ReadOptions())
+    try:
+        return read(path, options or ReadOptions())
+    except ValueError as error:
+        raise ValueError(printable(str(error))) from error

@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 from ..dataset import Dataset
-from .collecting import Collector, numbers, read_text, size_of
+from .collecting import Collector, check_camera, numbers, read_text, size_of
 from .options import Intrinsics, ReadOptions
 from .pseudo_ground_truth import GROUND_TRUTH, find_ground_truth
 from .seven_scenes import read_pose
@@ -44,6 +44,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
             else:
                 camera = (options.intrinsics or found).camera(*size)
                 pose = read_pose(image.with_name(image.name.removesuffix(_IMAGE_END) + ".pose.txt"))
+            check_camera(camera)  # before it is divided by its size
             if size_of(image) != size:
                 camera = camera.resized(*size_of(image))
             split = "test" if int(number[1]) in queries else "train"

@@ -7,6 +7,7 @@ pixel is taken off here, and put back by `writing`.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from ...dataset import Dataset
@@ -59,7 +60,8 @@ def _images_folder(path: Path, model_folder: Path, model: Model, given: Path | N
     names = sorted(model.images)[:: max(1, len(model.images) // _SAMPLE)]
     places = [path / "images", *(parent / "images" for parent in (model_folder, *model_folder.resolve().parents[:2]))]
     places += [path, model_folder]
-    found = {place: sum((place / name).is_file() for name in names) for place in places}
+    # Not Path.is_file, which raises where a name is longer than any file's.
+    found = {place: sum(os.path.isfile(place / name) for name in names) for place in places}
     best = max(found, key=lambda place: found[place])
     if names and not found[best]:
         raise ValueError(

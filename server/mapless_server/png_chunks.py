@@ -1,0 +1,68 @@
+"""What of a PNG is handed to the decoder: the chunks that its pixels are made of, and nothing else.
+
+The decoder allocates for whatever length a chunk of text claims, gigabytes for a file of a kilobyte, and inflates every
+compressed text and profile, megabytes for kilobytes each; so it does not get to see them. Colour profiles, gamma and
+transparency are not applied, so that nothing is lost.
+"""
+
+from __future__ import annotations
+
+import struct
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_ESSENTIAL = frozenset({b"IHDR", b"PLTE", b"IDAT"})
+_END = b"\0\0\0\0IEND\xaeB`\x82"
+_MAX_CHUNKS = 100_000  # of 160 bytes each in the largest file; encoders make chunks of 4 KiB and more
+_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+"""By the header's colour type."""
+_DATA_SLACK_BYTES = 2**16
+
+
+class BadChunks(Exception):
+    """A PNG is cut off, or has more in it than its pixels need; the message is for the caller.
+
+    Attributes:
+        is_too_much: which of the two.
+    """
+
+    def __init__(self, message: str, is_too_much: bool) -> None:
+        super().__init__(message)
+        self.is_too_much = is_too_much
+
+
+def essential_png(data: bytes) -> bytes:
+    """The PNG with nothing but header, palette and pixels; its checksums are the decoder's to check.
+
+    Raises:
+        BadChunks: a chunk reaches beyond the file's end, the file has no end, too many chunks, or more data than
+            pixels, which would be inflated all the same.
+    """
+    view = memoryview(data)
+    kept: list[memoryview | bytes] = [_SIGNATURE]
+    position, data_bytes = len(_SIGNATURE), 0
+    for _ in range(_MAX_CHUNKS):
+        if position + 12 > len(data):
+            raise BadChunks("the image cannot be decoded: the PNG is cut off", False)
+        (length,) = struct.unpack_from(">I", data, position)
+        kind, end = data[position + 4 : position + 8], position + 12 + length
+        if end > len(data):
+            raise BadChunks("the image cannot be decoded: the PNG is cut off or damaged", False)
+        if kind == b"IEND":
+            break
+        if kind in _ESSENTIAL:
+            kept.append(view[position:end])
+            data_bytes += length if kind == b"IDAT" else 0
+        position = end
+    else:
+        raise BadChunks("the PNG has too many chunks", True)
+    if data_bytes > _most_data_bytes(data):
+        raise BadChunks("the PNG has more data than pixels", True)
+    return b"".join([*kept, _END])
+
+
+def _most_data_bytes(data: bytes) -> int:
+    """What the pixels of an honest file take at most, however badly they are compressed."""
+    width, height, depth, colour = struct.unpack_from(">IIBB", data, 16)
+    row_bytes = (width * depth * _CHANNELS.get(colour, 4) + 7) // 8
+    # Interlaced rows come in seven parts, each with its own filter byte and padding, and stored blocks have headers.
+    return int((row_bytes + 16) * height * 9 // 8 + _DATA_SLACK_BYTES)

@@ -1,0 +1,285 @@
+"""Request validation: ReferenceService as it is, before an engine and a store that look at what comes.
+
+Laws: a refusal names a field that the request has; what the store gets has keys of the caller's tenant and legal ids,
+can be written down, and reads back as it was; a page begins after a legal id.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from datetime import datetime, timezone
+from functools import cache
+from random import Random
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from google.protobuf.message_factory import GetMessageClass
+
+from mapless import wire
+from mapless.names import check_id
+from mapless.scenes import UNCHANGED
+from mapless.v1 import geometry_pb2
+from mapless.v1 import localization_service_pb2 as localization_pb
+from mapless.v1 import reference_service_pb2 as pb
+from mapless_server import reference_service
+from mapless_server.audit.coverage import Coverage, CoverageVerdict
+from mapless_server.auditing import Viewpoint
+from mapless_server.describing import Description
+from mapless_server.engine import EngineOptions
+from mapless_server.messages.pages import MAX_PAGE_SIZE
+from mapless_server.method.views import Features, View
+from mapless_server.principal import Principal
+from mapless_server.query import Caller, Photo
+from mapless_server.retrieval.chosen import Choice
+from mapless_server.retrieval.narrowing import Narrowing
+from mapless_server.rpc import Call
+from mapless_server.store import (
+    NewReference,
+    ReferenceRecord,
+    SceneAttributes,
+    SceneRecord,
+    codec,
+    rows,
+)
+from mapless_server.tenancy import SceneKey, key_of, scene_id_of, tenant_of
+
+from . import messages
+from .laws import answered, check_pose, check_received_camera
+from .localization import CAMERA, POSE, photograph
+from .target import MutateBytes, Target
+
+_SERVICE = pb.DESCRIPTOR.services_by_name["ReferenceService"]
+METHODS = {GetMessageClass(method.input_type): method.name for method in _SERVICE.methods}
+KINDS = tuple(METHODS)
+TENANT = "acme"
+NOTHING_KNOWN = SceneAttributes()
+_NOW = datetime(2026, 11, 21, tzinfo=timezone.utc)
+_VIEW = View(CAMERA, Features(np.ones((2, 2), np.float32), np.ones((2, 4), np.float32), np.ones(2, np.float32)))
+
+
+class InlineExecutor(ThreadPoolExecutor):
+    """Does at once what it is given: no thread is waited for."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Implements Executor."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class WatchfulEngine:
+    """Finds nothing, and looks at what it is given."""
+
+    options = EngineOptions()
+
+    async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
+        """Implements Engine."""
+        for photo in photos:
+            check_received_camera(photo.camera)
+        return [Description({"sift": _VIEW}, {"vlad": np.ones(4, np.float32)}) for _ in photos]
+
+    async def retrieve(self, key: SceneKey, photo: Photo, count: int, narrowing: Narrowing, caller: Caller) -> Choice:
+        """Implements Engine."""
+        check_key(key)
+        check_received_camera(photo.camera)
+        assert 1 <= count <= reference_service.MAX_RETRIEVED
+        return Choice((), "vlad", 1)
+
+    async def audit(self, key: SceneKey, ids: Sequence[str], caller: Caller, are_listed: bool) -> tuple[int, list[Any]]:
+        """Implements Engine."""
+        check_key(key)
+        assert [check_id(it) for it in ids]
+        assert len(set(ids)) == len(ids) <= reference_service.MAX_AUDITS
+        return 1, []
+
+    async def check_coverage(self, key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
+        """Implements Engine."""
+        check_key(key)
+        check_received_camera(view.camera)
+        check_pose(view.world_from_camera)
+        return 1, Coverage(CoverageVerdict.DOUBTFUL, "", 0, 0.0, None, ())
+
+
+class WatchfulStore:
+    """Has whatever it is asked for, keeps nothing, and looks at what it is given."""
+
+    def get_generation(self, key: SceneKey) -> int:
+        """Implements Store."""
+        check_key(key)
+        return 1
+
+    def get_scene(self, key: SceneKey) -> SceneRecord:
+        """Implements Store."""
+        return self.create_scene(key)
+
+    def create_scene(self, key: SceneKey, attributes: SceneAttributes = NOTHING_KNOWN) -> SceneRecord:
+        """Implements Store."""
+        check_key(key)
+        row = rows.attributes_row(key, attributes)
+        owner = rows.attributes_owner(key)
+        assert codec.decode_attributes(owner, row["attributes"], row["attributes_sha256"]) == attributes
+        return SceneRecord(key, 1, 0, _NOW, attributes)
+
+    def update_scene(self, key: SceneKey, **changes: Any) -> SceneRecord:
+        """Implements Store."""
+        assert changes
+        assert UNCHANGED not in changes.values()
+        return self.create_scene(key, SceneAttributes(**changes))
+
+    def delete_scene(self, key: SceneKey) -> None:
+        """Implements Store."""
+        check_key(key)
+
+    def list_scenes(self, tenant: str, limit: int, after: str) -> list[SceneRecord]:
+        """Implements Store."""
+        check_page(limit, after)
+        return [self.create_scene(key_of(tenant, f"s{i}")) for i in range(min(limit, 3))]
+
+    def add_references(self, key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
+        """Implements Store."""
+        check_key(key)
+        assert len({check_id(it.reference_id) for it in references}) == len(references)
+        return [_stored(key, it) for it in references]
+
+    def get_reference(self, key: SceneKey, reference_id: str) -> ReferenceRecord:
+        """Implements Store."""
+        check_key(key)
+        return _stored(key, NewReference(check_id(reference_id), b"", CAMERA, POSE, {"sift": _VIEW}))
+
+    def read_image(self, key: SceneKey, reference_id: str) -> bytes:
+        """Implements Store."""
+        return b""
+
+    def delete_reference(self, key: SceneKey, reference_id: str) -> None:
+        """Implements Store."""
+        check_key(key)
+        check_id(reference_id)
+
+    def list_references(self, key: SceneKey, limit: int, after: str) -> list[ReferenceRecord]:
+        """Implements Store."""
+        return [self.get_reference(key, it) for it in self.list_reference_ids(key, limit, after)]
+
+    def list_reference_ids(self, key: SceneKey, limit: int, after: str) -> list[str]:
+        """Implements Store."""
+        check_key(key)
+        check_page(limit, after)
+        return [f"r{i}" for i in range(min(limit, 3))]
+
+
+def check_key(key: SceneKey) -> None:
+    """It is the key of a scene of the caller's."""
+    assert tenant_of(key) == TENANT
+    assert key_of(TENANT, check_id(scene_id_of(key))) == key
+
+
+def check_page(limit: int, after: str) -> None:
+    """It is part of a list."""
+    assert 2 <= limit <= MAX_PAGE_SIZE + 1
+    assert not after or check_id(after)
+
+
+def _stored(key: SceneKey, new: NewReference) -> ReferenceRecord:
+    """The record, written down and read."""
+    check_pose(new.world_from_camera)
+    record = rows.new_record(key, new, _NOW)
+    row = rows.reference_row(record)
+    camera, pose = codec.decode_geometry(record.key, row["geometry"], row["geometry_sha256"])
+    assert camera == new.camera
+    assert (pose.matrix() == new.world_from_camera.matrix()).all()
+    return record
+
+
+@cache
+def _service() -> tuple[reference_service.ReferenceService, asyncio.AbstractEventLoop]:
+    engine: Any = WatchfulEngine()
+    store: Any = WatchfulStore()
+    with patch.object(reference_service, "ThreadPoolExecutor", InlineExecutor):
+        service = reference_service.ReferenceService(lambda: engine, store)
+    loop = asyncio.new_event_loop()
+    loop.set_default_executor(InlineExecutor())
+    return service, loop
+
+
+def check(data: bytes) -> bool:
+    """See Target."""
+    request = messages.decoded(KINDS, data)
+    if request is None:
+        return False
+    service, loop = _service()
+    call = Call("id", 0.0, float("inf"), Principal(TENANT))
+    method = getattr(service, METHODS[type(request)])
+    return answered(request, lambda: loop.run_until_complete(method(request, call)).SerializeToString())
+
+
+@cache
+def seeds() -> tuple[bytes, ...]:
+    """A request of every method, with every field."""
+    scene, reference = "scenes/hall", "scenes/hall/references/r0"
+    photo: dict[str, Any] = {"image": photograph(), "intrinsics": wire.camera_to_message(CAMERA)}
+    pose = wire.transform_to_message(POSE)
+    down = geometry_pb2.Vector3(z=-1)
+    datum = pb.Datum(latitude_deg=48, longitude_deg=11, enu_from_world=geometry_pb2.Quaternion(w=1))
+    factors = dict.fromkeys(
+        ("position_factor_68", "position_factor_95", "rotation_factor_68", "rotation_factor_95"), 2.0
+    )
+    calibration = pb.SceneCalibration(
+        **factors,
+        query_count=9,
+        features="sift",
+        backend="geometric",
+        variant=localization_pb.VARIANT_BEST,
+        server_version="1",
+    )
+    update = pb.UpdateSceneRequest(scene=pb.Scene(name=scene, datum=datum, down_in_world=down, calibration=calibration))
+    update.update_mask.paths.extend(["datum", "down_in_world", "calibration"])
+    create = pb.CreateReferenceRequest(
+        scene=scene, reference_id="r0", reference=pb.Reference(world_from_camera=pose, **photo)
+    )
+    batch = pb.BatchCreateReferencesRequest(scene=scene, requests=[create, create])
+    batch.requests[1].reference_id = "r1"
+    retrieve = pb.RetrieveReferencesRequest(scene=scene, count=5, **photo)
+    retrieve.position_prior.position_m.x, retrieve.position_prior.radius_m = 1.0, 3.0
+    retrieve.heading_prior.direction.x, retrieve.heading_prior.max_angle_deg = 1.0, 60.0
+    made = (
+        pb.CreateSceneRequest(scene_id="hall", datum=datum, down_in_world=down),
+        pb.GetSceneRequest(name=scene),
+        update,
+        pb.ListScenesRequest(page_size=2, page_token=_token(pb.ListScenesRequest(page_size=2))),
+        pb.DeleteSceneRequest(name=scene),
+        create,
+        batch,
+        pb.GetReferenceRequest(name=reference, include_image=True),
+        pb.ListReferencesRequest(
+            scene=scene, page_size=2, page_token=_token(pb.ListReferencesRequest(scene=scene, page_size=2))
+        ),
+        pb.DeleteReferenceRequest(name=reference),
+        retrieve,
+        pb.AuditSceneRequest(
+            scene=scene, page_size=2, page_token=_token(pb.AuditSceneRequest(scene=scene, page_size=2))
+        ),
+        pb.AuditSceneRequest(scene=scene, references=[reference]),
+        pb.CheckCoverageRequest(scene=scene, world_from_camera=pose, intrinsics=photo["intrinsics"]),
+    )
+    return tuple(messages.encoded(KINDS, it) for it in made)
+
+
+def _token(request: Any) -> str:
+    """Of the second page."""
+    service, loop = _service()
+    call = Call("id", 0.0, float("inf"), Principal(TENANT))
+    token: str = loop.run_until_complete(getattr(service, METHODS[type(request)])(request, call)).next_page_token
+    return token
+
+
+def mutate(data: bytes, random: Random, mutate_bytes: MutateBytes) -> bytes:
+    """See Target."""
+    return messages.mutate(KINDS, data, random, mutate_bytes)
+
+
+TARGET = Target(seeds, check, mutate, max_bytes=16384)
