@@ -134,7 +134,13 @@ namespace Mapless
                 SessionFromCamera = ToMessage(sensorPose),
                 Options = new LocalizeOptions { Axes = Axes.Unity },
             };
-            var options = new CallOptions(headers, DateTime.UtcNow + timeout, cancellation);
+            // By the scene, a load balancer finds the server that has it in memory.
+            var ofCall = new Metadata { { "x-mapless-scene", scene } };
+            foreach (Metadata.Entry header in headers)
+            {
+                ofCall.Add(header);
+            }
+            var options = new CallOptions(ofCall, DateTime.UtcNow + timeout, cancellation);
             using (var call = invoker.AsyncUnaryCall(LocalizeMethod, null, options, request))
             {
                 return new MaplessAnswer(await call.ResponseAsync.ConfigureAwait(true));

@@ -1,0 +1,217 @@
+"""The manifests with Envoy in front are what Kubernetes takes, and fit servers, settings and Envoy's configuration."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import kubernetes_validate  # type: ignore[import-untyped]
+import pytest
+import yaml  # type: ignore[import-untyped]
+
+from mapless.routing import SCENE_KEY
+from mapless.v1 import localization_service_pb2
+from mapless_server.services import SERVICE_NAMES
+from mapless_server.settings import Settings
+
+FOLDER = Path(__file__).parents[2] / "deploy" / "envoy"
+OLDEST = "1.31"
+CONFIG = yaml.safe_load((FOLDER / "gateway" / "envoy.yaml").read_text())
+CLUSTERS = {it["name"]: it for it in CONFIG["static_resources"]["clusters"]}
+LISTENERS = {it["name"]: it for it in CONFIG["static_resources"]["listeners"]}
+GATEWAY = {"app.kubernetes.io/name": "mapless-gateway"}
+SERVERS = {"app.kubernetes.io/name": "mapless"}
+needs_kubectl = pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl, which has kustomize, is not here")
+
+Json = dict[str, Any]
+
+
+@cache
+def built() -> tuple[Json, ...]:
+    command = ["kubectl", "kustomize", str(FOLDER)]
+    text = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
+    return tuple(yaml.safe_load_all(text))
+
+
+def the(kind: str, name: str) -> Json:
+    (found,) = [it for it in built() if it["kind"] == kind and it["metadata"]["name"] == name]
+    return found
+
+
+def gateway() -> tuple[Json, Json]:
+    pod = the("Deployment", "mapless-gateway")["spec"]["template"]
+    (container,) = pod["spec"]["containers"]
+    return pod, container
+
+
+def port_of(listener: str) -> int:
+    port: int = LISTENERS[listener]["address"]["socket_address"]["port_value"]
+    return port
+
+
+def manager(listener: str) -> Json:
+    ((chain,),) = (LISTENERS[listener]["filter_chains"],)
+    (only,) = chain["filters"]
+    config: Json = only["typed_config"]
+    return config
+
+
+def seconds(duration: str) -> float:
+    assert re.fullmatch(r"[\d.]+s", duration)
+    return float(duration[:-1])
+
+
+@needs_kubectl
+def test_everything_is_valid_and_in_its_namespace() -> None:
+    for document in built():
+        for version in (OLDEST, kubernetes_validate.latest_version()):
+            kubernetes_validate.validate(document, version, strict=True)
+        assert document["kind"] != "Secret"
+        assert document["kind"] == "Namespace" or document["metadata"]["namespace"] == "mapless"
+
+
+@needs_kubectl
+def test_the_gateway_is_confined_as_the_servers_are() -> None:
+    for name in ("mapless", "mapless-gateway"):
+        pod = the("Deployment", name)["spec"]["template"]["spec"]
+        assert pod["automountServiceAccountToken"] is False
+        security = pod["securityContext"]
+        assert security["runAsNonRoot"] is True
+        assert security["runAsUser"] == 10001
+        assert security["seccompProfile"] == {"type": "RuntimeDefault"}
+        (container,) = pod["containers"]
+        assert container["securityContext"] == {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        }
+    _, container = gateway()
+    assert re.fullmatch(r"envoyproxy/envoy:v\d+\.\d+\.\d+", container["image"])
+    assert all(mount["readOnly"] for mount in container["volumeMounts"])
+
+
+@needs_kubectl
+def test_ports_are_those_of_the_configuration() -> None:
+    pod, container = gateway()
+    ports = {port["name"]: port["containerPort"] for port in container["ports"]}
+    assert ports == {"grpc": port_of("calls"), "status": port_of("status")}
+    assert pod["metadata"]["annotations"]["prometheus.io/port"] == str(ports["status"])
+    for probe in ("startupProbe", "readinessProbe"):
+        assert container[probe]["httpGet"] == {"port": "status", "path": "/ready"}
+    service = the("Service", "mapless-gateway")["spec"]
+    assert service["selector"].items() <= pod["metadata"]["labels"].items()
+    assert [port["targetPort"] for port in service["ports"]] == ["grpc"]
+
+
+@needs_kubectl
+def test_the_servers_are_found_by_the_name_and_port_that_they_have() -> None:
+    headless = the("Service", "mapless-headless")["spec"]
+    assert headless["clusterIP"] == "None"
+    server = the("Deployment", "mapless")["spec"]["template"]
+    assert headless["selector"].items() <= server["metadata"]["labels"].items()
+    for name in ("by_scene", "by_load"):
+        (group,) = CLUSTERS[name]["load_assignment"]["endpoints"]
+        (endpoint,) = group["lb_endpoints"]
+        at = endpoint["endpoint"]["address"]["socket_address"]
+        assert at == {"address": "mapless-headless", "port_value": Settings.model_fields["port"].default}
+        assert {"port": at["port_value"]}.items() <= headless["ports"][0].items()
+
+
+@needs_kubectl
+def test_nobody_but_the_gateway_reaches_the_servers() -> None:
+    calls, metrics = the("NetworkPolicy", "mapless")["spec"]["ingress"]
+    assert calls["from"] == [{"podSelector": {"matchLabels": GATEWAY}}]
+    assert calls["ports"] == [{"port": "grpc"}]
+    assert metrics["ports"] == [{"port": "metrics"}]
+    policy = the("NetworkPolicy", "mapless-gateway")["spec"]
+    assert policy["policyTypes"] == ["Ingress", "Egress"]
+    assert [[port["port"] for port in rule["ports"]] for rule in policy["ingress"]] == [["grpc"], ["status"]]
+    assert all(rule["from"] for rule in policy["ingress"])
+    servers, names = policy["egress"]
+    assert servers["to"] == [{"podSelector": {"matchLabels": SERVERS}}]
+    assert servers["ports"] == [{"port": Settings.model_fields["port"].default}]
+    assert {port["port"] for port in names["ports"]} == {53}
+
+
+@needs_kubectl
+def test_files_of_the_configuration_are_mounted() -> None:
+    pod, container = gateway()
+    mounts = {mount["mountPath"] for mount in container["volumeMounts"]}
+    assert container["args"][:2] == ["--config-path", "/etc/envoy/envoy.yaml"]
+    named = re.findall(r"(?:path|filename): (/[\w/.]+)", (FOLDER / "gateway" / "envoy.yaml").read_text())
+    named += re.findall(r"filename: (/[\w/.]+)", (FOLDER / "gateway" / "certificate.yaml").read_text())
+    files = [Path(it) for it in named if it not in {"/ready", "/metrics"} and not it.startswith("/mapless.v1.")]
+    assert {str(it) for it in files} & mounts == {"/etc/mapless/tls"}
+    assert {str(it if str(it) in mounts else it.parent) for it in files} == mounts
+    (configured,) = [it for it in built() if it["kind"] == "ConfigMap"]
+    assert set(configured["data"]) == {"envoy.yaml", "certificate.yaml"}
+    (volume,) = [it for it in pod["spec"]["volumes"] if it["name"] == "config"]
+    assert volume["configMap"]["name"] == configured["metadata"]["name"]
+
+
+@needs_kubectl
+def test_a_server_that_drains_is_left_before_it_stops() -> None:
+    server = the("Deployment", "mapless")["spec"]["template"]["spec"]["containers"][0]
+    (delay,) = [it["value"] for it in server["env"] if it["name"] == "MAPLESS_DRAIN_DELAY_S"]
+    for name in ("by_scene", "by_load"):
+        (check,) = CLUSTERS[name]["health_checks"]
+        assert check["grpc_health_check"]["service_name"] in SERVICE_NAMES
+        noticed_s = check["unhealthy_threshold"] * (seconds(check["interval"]) + seconds(check["timeout"]))
+        assert noticed_s < float(delay)
+
+
+@needs_kubectl
+def test_a_gateway_that_goes_has_time_for_the_calls_that_run() -> None:
+    pod, container = gateway()
+    (slept,) = re.findall(r"sleep (\d+)", container["lifecycle"]["preStop"]["exec"]["command"][-1])
+    assert (
+        pod["spec"]["terminationGracePeriodSeconds"] > int(slept) > Settings.model_fields["default_deadline_s"].default
+    )
+
+
+@needs_kubectl
+def test_memory_is_bounded_below_the_containers() -> None:
+    _, container = gateway()
+    (bound,) = [
+        it["typed_config"]["max_heap_size_bytes"]
+        for it in CONFIG["overload_manager"]["resource_monitors"]
+        if it["name"] == "envoy.resource_monitors.fixed_heap"
+    ]
+    assert container["resources"]["limits"]["memory"] == "1Gi"
+    assert bound == 0.75 * 2**30
+
+
+def test_administration_is_for_the_pod_alone() -> None:
+    assert CONFIG["admin"]["address"]["socket_address"]["address"] == "127.0.0.1"
+    (host,) = manager("status")["route_config"]["virtual_hosts"]
+    (route,) = host["routes"]
+    assert route["match"]["path"] == "/metrics"
+
+
+def test_calls_with_a_scene_are_hashed_by_it_and_others_go_where_least_is_under_way() -> None:
+    (host,) = manager("calls")["route_config"]["virtual_hosts"]
+    watching, by_scene, by_load, health = host["routes"]
+    method = localization_service_pb2.DESCRIPTOR.services_by_name["LocalizationService"].methods_by_name["WatchQueries"]
+    assert watching["match"]["path"] == f"/{method.containing_service.full_name}/{method.name}"
+    assert by_scene["match"]["headers"] == [{"name": SCENE_KEY, "present_match": True}]
+    for route in (watching, by_scene):
+        assert route["route"]["hash_policy"] == [{"header": {"header_name": SCENE_KEY}}]
+        assert CLUSTERS[route["route"]["cluster"]]["lb_policy"] == "RING_HASH"
+    for route in (by_load, health):
+        assert CLUSTERS[route["route"]["cluster"]]["lb_policy"] == "LEAST_REQUEST"
+    assert {route["route"]["timeout"] for route in host["routes"]} == {"0s"}
+    longest_s = Settings.model_fields["max_deadline_s"].default
+    for route in (by_scene, by_load):
+        assert seconds(route["route"]["max_stream_duration"]["grpc_timeout_header_max"]) > longest_s
+    assert seconds(manager("calls")["stream_idle_timeout"]) > longest_s
+
+
+def test_only_what_reached_no_server_is_repeated() -> None:
+    (host,) = manager("calls")["route_config"]["virtual_hosts"]
+    assert set(host["retry_policy"]["retry_on"].split(",")) == {"connect-failure", "refused-stream"}
+    assert "per_try_timeout" not in host["retry_policy"]
+    assert not any("retry_policy" in route["route"] for route in host["routes"])

@@ -1,0 +1,116 @@
+"""Every call that concerns a scene says so beside the message, and nothing that could not travel is ever said."""
+
+from __future__ import annotations
+
+import re
+from concurrent import futures
+from typing import Any
+
+import grpc
+import pytest
+from clients import Connect, awaiting
+from google.protobuf import empty_pb2
+from google.protobuf.message import Message
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapless import Client, ConnectOptions, names
+from mapless.errors import MaplessError
+from mapless.routing import SCENE_KEY, scene_metadata
+from mapless.v1 import localization_service_pb2 as localization_pb
+from mapless.v1 import reference_service_pb2 as reference_pb
+
+SERVICES = [
+    localization_pb.DESCRIPTOR.services_by_name["LocalizationService"],
+    reference_pb.DESCRIPTOR.services_by_name["ReferenceService"],
+]
+REQUESTS: dict[str, Any] = {
+    method.name: getattr(module, method.input_type.name)
+    for module, service in zip((localization_pb, reference_pb), SERVICES, strict=True)
+    for method in service.methods
+}
+OF_NO_SCENE = {"ListScenes"}
+IDS = st.from_regex(r"[A-Za-z0-9_]([A-Za-z0-9._-]{0,126}[A-Za-z0-9_])?", fullmatch=True).filter(
+    lambda it: ".." not in it
+)
+
+
+def about(request: Any, scene_id: str) -> Message:
+    """A request that concerns the scene, in whichever of its fields that is said."""
+    known: dict[str, Any] = request.DESCRIPTOR.fields_by_name
+    given: dict[str, Any] = {"scene": f"scenes/{scene_id}"}
+    if "scene_id" in known:
+        given = {"scene_id": scene_id}
+    elif "name" in known:
+        of_reference = "Reference" in request.DESCRIPTOR.name
+        given = {"name": f"scenes/{scene_id}/references/r" if of_reference else f"scenes/{scene_id}"}
+    elif known["scene"].message_type is not None:
+        given = {"scene": reference_pb.Scene(name=f"scenes/{scene_id}")}
+    message: Message = request(**given)
+    return message
+
+
+@pytest.mark.parametrize("method", sorted(REQUESTS.keys() - OF_NO_SCENE))
+@settings(max_examples=20)
+@given(scene_id=IDS)
+def test_every_method_says_which_scene_it_concerns(method: str, scene_id: str) -> None:
+    assert scene_metadata(about(REQUESTS[method], scene_id)) == ((SCENE_KEY, f"scenes/{scene_id}"),)
+
+
+def test_what_concerns_no_scene_says_nothing() -> None:
+    empty: Any = empty_pb2
+    assert scene_metadata(empty.Empty()) == ()
+    for method in OF_NO_SCENE:
+        assert scene_metadata(REQUESTS[method]()) == ()
+
+
+@given(scene=st.one_of(st.text(), st.text().map("scenes/".__add__), st.text().map("scenes/a\n/references/".__add__)))
+def test_what_is_no_name_is_left_to_the_server_and_what_is_one_fits_a_header(scene: str) -> None:
+    for request in (localization_pb.LocalizeRequest(scene=scene), reference_pb.GetReferenceRequest(name=scene)):
+        for key, value in scene_metadata(request):
+            assert (key, value) == (SCENE_KEY, f"scenes/{names.check_id(value.removeprefix('scenes/'))}")
+            assert re.fullmatch(r"[!-~]{8,135}", value)
+
+
+@pytest.mark.parametrize("scene", ["", "kitchen", "scenes/", "scenes/ä", "scenes/a\r\nauthorization: x", "scenes/a/b"])
+def test_bad_names_say_nothing(scene: str) -> None:
+    assert scene_metadata(localization_pb.LocalizeRequest(scene=scene)) == ()
+
+
+class Recording(grpc.GenericRpcHandler):
+    """Refuses every call, and keeps its metadata."""
+
+    def __init__(self) -> None:
+        self.seen: list[dict[str, str]] = []
+
+    def service(self, details: Any) -> Any:
+        self.seen.append(dict(details.invocation_metadata))
+
+        def refuse(_: bytes, context: grpc.ServicerContext) -> bytes:
+            context.abort(grpc.StatusCode.NOT_FOUND, "nothing here")
+            raise AssertionError
+
+        return grpc.unary_unary_rpc_method_handler(refuse)
+
+
+@pytest.mark.parametrize("connect", [Client, awaiting], ids=["blocking", "asyncio"])
+def test_clients_send_it_beside_what_they_always_send(connect: Connect) -> None:
+    recording = Recording()
+    server = grpc.server(futures.ThreadPoolExecutor(2), handlers=[recording])
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    try:
+        with connect(f"127.0.0.1:{port}", ConnectOptions(token="t", client_id="robot-7")) as client:
+            for call in (
+                lambda: client.get_scene("kitchen"),
+                lambda: client.get_reference("scenes/hall", "r1"),
+                lambda: list(client.list_references("a.b")),
+                lambda: list(client.list_scenes()),
+                lambda: client.get_scene("no\nname"),
+            ):
+                with pytest.raises(MaplessError):
+                    call()
+    finally:
+        server.stop(None).wait(20)
+    assert [it.get(SCENE_KEY) for it in recording.seen] == ["scenes/kitchen", "scenes/hall", "scenes/a.b", None, None]
+    assert all((it["authorization"], it["x-client-id"]) == ("Bearer t", "robot-7") for it in recording.seen)
