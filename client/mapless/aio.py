@@ -7,7 +7,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterable
+from contextlib import aclosing
 from functools import wraps
 from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -19,7 +20,7 @@ from google.protobuf.message import Message
 from .calls import asking, groups, health, localization
 from .calls import references as reference_calls
 from .errors import MaplessError, from_rpc_error
-from .exchange import Attempt, Exchange, Methods, Pages, Pause, attempts
+from .exchange import Attempt, Exchange, Heard, Methods, Pages, Pause, attempts
 from .options import ConnectOptions
 from .requests import NewReference
 from .results import Reference
@@ -50,6 +51,16 @@ def _paged(call: Callable[P, Pages[T]]) -> Callable[Concatenate[Client, P], Asyn
                 yield item
             if not token:
                 return
+
+    return method
+
+
+def _followed(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P], AsyncIterator[T]]:
+    """The method that yields what a call tells early, and its answer."""
+
+    @wraps(call)
+    def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> AsyncIterator[T]:
+        return self._follow(call(*arguments, **named))
 
     return method
 
@@ -92,6 +103,7 @@ class Client:
     is_serving = _awaited(health.is_serving)
 
     localize = _awaited(localization.localize)
+    localize_progressively = _followed(localization.localize_progressively)
     localize_rig = _awaited(groups.localize_rig)
     localize_sequence = _awaited(groups.localize_sequence)
 
@@ -143,12 +155,48 @@ class Client:
             value: T = end.value
             return value
 
+    async def _follow(self, exchange: Exchange[T]) -> AsyncIterator[T]:
+        """The same for calls that are answered by streams; what they tell early comes first."""
+        steps, heard = attempts(exchange, self.options), Heard()
+        step = await asyncio.to_thread(next, steps)
+        try:
+            while True:
+                if isinstance(step, Pause):
+                    await asyncio.sleep(step.duration_s)
+                    step = next(steps)
+                else:
+                    async with aclosing(self._messages(step, heard)) as messages:
+                        async for message in messages:
+                            early: T | None = heard.hear(message)
+                            if early is not None:
+                                yield early
+                    step = steps.send(heard.outcome)
+        except StopIteration as end:
+            yield end.value
+
     async def _attempt(self, attempt: Attempt) -> Message | MaplessError:
         method = self._methods.of(attempt.call)
+        metadata = self._metadata + attempt.call.metadata
         try:
-            response: Message = await method(attempt.call.request, timeout=attempt.timeout_s, metadata=self._metadata)
+            response: Message = await method(attempt.call.request, timeout=attempt.timeout_s, metadata=metadata)
         except grpc.RpcError as error:
             failure = from_rpc_error(error)
             failure.__cause__ = error
             return failure
         return response
+
+    async def _messages(self, attempt: Attempt, heard: Heard) -> AsyncGenerator[Message, None]:
+        """What a stream says; whoever reads no further ends the call."""
+        method = self._methods.of(attempt.call)
+        heard.begin(attempt.call)
+        metadata = self._metadata + attempt.call.metadata
+        stream = method(attempt.call.request, timeout=attempt.timeout_s, metadata=metadata)
+        try:
+            async for message in stream:
+                yield message
+        except grpc.RpcError as error:
+            failure = from_rpc_error(error)
+            failure.__cause__ = error
+            heard.fail(failure)
+        finally:
+            stream.cancel()

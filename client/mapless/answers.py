@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from typing import Any
 
@@ -183,11 +183,12 @@ class LocalizationResult:
         geo_pose: the same pose on the Earth; None unless the scene has a datum.
         prior_checks: how the answer compares with each soft prior.
         pose_stage: "REFINED" or "INITIAL"; "COARSE" for a pose that nothing has checked, because there was no time to,
-            which only a call that allows it is given.
+            which only a call that allows it is given, or because there was none yet (`localize_progressively`).
         inlier_count, match_count: 2D-3D matches that agree with the pose, and all that were tried.
         reprojection_error_px: median of the inliers, pixels of the processed image.
         debug: the matches it rests on, if they were asked for.
         capture_time, session_from_camera: as they were sent.
+        is_final: whether no better answer follows; False for the coarse one of `localize_progressively` alone.
     """
 
     world_from_camera: RigidTransform
@@ -205,6 +206,7 @@ class LocalizationResult:
     geo_pose: GeoPose | None = None
     prior_checks: tuple[PriorCheck, ...] = ()
     debug: Debug | None = None
+    is_final: bool = True
 
     @property
     def world_from_session(self) -> RigidTransform | None:
@@ -227,6 +229,7 @@ class Rejected:
         hypotheses: poses that contradict each other, the better supported first, where the reason is "AMBIGUOUS".
         debug: the matches, if they were asked for and there were any.
         capture_time, session_from_camera: as they were sent.
+        is_final: always; a rejection is never a first answer.
     """
 
     reason: str
@@ -237,6 +240,7 @@ class Rejected:
     hint: Hint | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
     debug: Debug | None = None
+    is_final: bool = field(default=True, init=False)
 
 
 def answer_from_message(message: localization_pb.LocalizeResponse) -> LocalizationResult | Rejected:

@@ -66,11 +66,22 @@ WORLD_FROM_RIGHT_HANDED = {axes: _constant(np.diag([1, 1, -1 if axes is Axes.UNI
 """From the scene's world, or any other right-handed one, to the same in these axes. Its own inverse."""
 
 
+def _covariance_signs(world: Array) -> Array:
+    both = np.concatenate([np.diag(world), np.linalg.det(world) * np.diag(world)])
+    return _constant(np.outer(both, both))
+
+
+_COVARIANCE_SIGNS = {axes: _covariance_signs(world) for axes, world in WORLD_FROM_RIGHT_HANDED.items()}
+"""(6, 6) by which `covariance_to` multiplies: products of the signs of two directions."""
+
+
 def pose_to(axes: Axes, world_from_camera: RigidTransform) -> RigidTransform:
     """A camera's pose, its camera in OpenCV's axes and its world right-handed, in other axes.
 
     The rotation is a proper one (determinant 1) for Unity, too, since world and camera are both mirrored.
     """
+    if axes is Axes.OPENCV:
+        return world_from_camera
     world = WORLD_FROM_RIGHT_HANDED[axes]
     rotation = world @ world_from_camera.rotation @ CV_FROM_CAMERA[axes]
     return RigidTransform(rotation, world @ world_from_camera.translation)
@@ -124,10 +135,7 @@ def covariance_to(axes: Axes, covariance: ArrayLike) -> Array:
     A rotation by the vector w, R' = Exp(w) R, is in a mirrored world M R' = Exp(det(M) M w) M R: a rotation vector does
     not only change its place, but its sense. Its own inverse.
     """
-    world = WORLD_FROM_RIGHT_HANDED[axes]
-    rotations = np.linalg.det(world) * world
-    both = np.concatenate([np.diag(world), np.diag(rotations)])
-    changed: Array = np.outer(both, both) * np.asarray(covariance, float)
+    changed: Array = _COVARIANCE_SIGNS[axes] * np.asarray(covariance, float)
     return changed
 
 

@@ -14,7 +14,7 @@ from google.protobuf.message import Message
 from .calls import asking, groups, health, localization
 from .calls import references as reference_calls
 from .errors import MaplessError, from_rpc_error
-from .exchange import Attempt, Exchange, Methods, Pages, Pause, attempts
+from .exchange import Attempt, Exchange, Heard, Methods, Pages, Pause, attempts
 from .options import ConnectOptions
 from .requests import NewReference
 from .results import Reference
@@ -44,6 +44,16 @@ def _paged(call: Callable[P, Pages[T]]) -> Callable[Concatenate[Client, P], Iter
             yield from items
             if not token:
                 return
+
+    return method
+
+
+def _followed(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P], Iterator[T]]:
+    """The method that yields what a call tells early, and its answer."""
+
+    @wraps(call)
+    def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> Iterator[T]:
+        return self._follow(call(*arguments, **named))
 
     return method
 
@@ -85,6 +95,7 @@ class Client:
     is_serving = _blocking(health.is_serving)
 
     localize = _blocking(localization.localize)
+    localize_progressively = _followed(localization.localize_progressively)
     localize_rig = _blocking(groups.localize_rig)
     localize_sequence = _blocking(groups.localize_sequence)
 
@@ -136,8 +147,7 @@ class Client:
             step = next(steps)
             while True:
                 if isinstance(step, Pause):
-                    if self._closed.wait(step.duration_s):
-                        raise step.error
+                    self._pause(step)
                     step = next(steps)
                 else:
                     step = steps.send(self._attempt(step))
@@ -145,12 +155,50 @@ class Client:
             value: T = end.value
             return value
 
+    def _follow(self, exchange: Exchange[T]) -> Iterator[T]:
+        """The same for calls that are answered by streams; what they tell early comes first."""
+        steps, heard = attempts(exchange, self.options), Heard()
+        try:
+            step = next(steps)
+            while True:
+                if isinstance(step, Pause):
+                    self._pause(step)
+                    step = next(steps)
+                else:
+                    for message in self._messages(step, heard):
+                        early: T | None = heard.hear(message)
+                        if early is not None:
+                            yield early
+                    step = steps.send(heard.outcome)
+        except StopIteration as end:
+            yield end.value
+
+    def _pause(self, pause: Pause) -> None:
+        if self._closed.wait(pause.duration_s):
+            raise pause.error
+
     def _attempt(self, attempt: Attempt) -> Message | MaplessError:
         method = self._methods.of(attempt.call)
+        metadata = self._metadata + attempt.call.metadata
         try:
-            response: Message = method(attempt.call.request, timeout=attempt.timeout_s, metadata=self._metadata)
+            response: Message = method(attempt.call.request, timeout=attempt.timeout_s, metadata=metadata)
         except grpc.RpcError as error:
             failure = from_rpc_error(error)
             failure.__cause__ = error
             return failure
         return response
+
+    def _messages(self, attempt: Attempt, heard: Heard) -> Iterator[Message]:
+        """What a stream says; whoever reads no further ends the call."""
+        method = self._methods.of(attempt.call)
+        heard.begin(attempt.call)
+        metadata = self._metadata + attempt.call.metadata
+        stream = method(attempt.call.request, timeout=attempt.timeout_s, metadata=metadata)
+        try:
+            yield from stream
+        except grpc.RpcError as error:
+            failure = from_rpc_error(error)
+            failure.__cause__ = error
+            heard.fail(failure)
+        finally:
+            stream.cancel()

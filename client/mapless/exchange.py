@@ -14,7 +14,8 @@ from __future__ import annotations
 import math
 import random
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
@@ -22,6 +23,7 @@ from google.protobuf.message import Message
 
 from .errors import DeadlineExceeded, Internal, MaplessError
 from .options import ConnectOptions
+from .routing import scene_metadata
 from .wire import FieldError
 
 T = TypeVar("T")
@@ -30,12 +32,15 @@ MALFORMED_ANSWER = "MALFORMED_ANSWER"
 """The reason of the error that an answer is which breaks its contract."""
 
 _JITTER = 0.2  # of a pause of ours, either way, as gRPC has it
+_LOST = frozenset({"UNAVAILABLE", "CANCELLED"})
+"""The server, or what is between, is gone. Nobody here cancels a call and waits for it: if it is said to be, then by a
+load balancer, whose server went in the middle of the answer."""
 _LATENESS = 0.25  # at most so much longer than the server asked for, never earlier: it refused many, and all will come
 
 
 @dataclass(frozen=True)
 class Call:
-    """One unary call.
+    """One call, of one request and one answer.
 
     Attributes:
         method: "package.Service/Method".
@@ -47,6 +52,8 @@ class Call:
         on_repeat: for calls that change something: an earlier try may have succeeded though its answer was lost, and
             then the next one fails as if somebody else had done it. Given the error, it raises it, or yields the calls
             that find out, and returns what the lost answer would have been. All of them have the deadline of this one.
+        early: for calls that are answered by a stream, whose last message is the response: what a message tells before
+            that; None if it is the last.
     """
 
     method: str
@@ -55,6 +62,12 @@ class Call:
     timeout_s: float | None = None
     is_upload: bool = False
     on_repeat: Callable[[MaplessError], Exchange[Any]] | None = None
+    early: Callable[[Any], Any] | None = None
+
+    @property
+    def metadata(self) -> tuple[tuple[str, str], ...]:
+        """What it carries besides what all calls do: which scene it concerns, for load balancers."""
+        return scene_metadata(self.request)
 
 
 Exchange = Generator[Call, Any, T]
@@ -94,7 +107,8 @@ class Methods:
     def of(self, call: Call) -> Callable[..., Any]:
         """What makes the call: takes the request, `timeout` in seconds and `metadata`."""
         if call.method not in self._by_name:
-            self._by_name[call.method] = self._channel.unary_unary(
+            make = self._channel.unary_unary if call.early is None else self._channel.unary_stream
+            self._by_name[call.method] = make(
                 f"/{call.method}",
                 request_serializer=type(call.request).SerializeToString,
                 response_deserializer=call.response_type.FromString,
@@ -115,9 +129,9 @@ def attempts(
 ) -> Generator[Attempt | Pause, Any, T]:
     """The exchange with retries: yields what is to be done, returns what the exchange does.
 
-    A call is tried again if the server is UNAVAILABLE, or RESOURCE_EXHAUSTED and says when to come back; never if
-    the pause before would outlast its deadline. A server that says when to come back is taken at its word until then;
-    other attempts are counted. An answer that the exchange cannot read is an error of the server, `Internal`.
+    A call is tried again if the server is UNAVAILABLE or lost, or RESOURCE_EXHAUSTED and says when to come back; never
+    if the pause before would outlast its deadline. A server that says when to come back is taken at its word until
+    then; other attempts are counted. An answer that the exchange cannot read is an error of the server, `Internal`.
 
     Args:
         exchange: the calls.
@@ -142,17 +156,63 @@ def attempts(
 
 
 def _answered(exchange: Exchange[Any], call: Call, response: Message) -> Call:
-    """The exchange's next call; what it cannot read in the response breaks the contract.
+    """The exchange's next call; what it cannot read in the response breaks the contract."""
+    with _reading(call, response):
+        return exchange.send(response)
+
+
+@contextmanager
+def _reading(call: Call, response: Message) -> Iterator[None]:
+    """What cannot be read in a response is an error of the server.
 
     `wire` calls that a FieldError, which in a request is the caller's fault and here the server's.
     """
     try:
-        return exchange.send(response)
+        yield
     except (ValueError, OverflowError) as error:
         field_path = error.field if isinstance(error, FieldError) else None
         message = f"the answer of {call.method} breaks its contract: {error}"
         request_id = getattr(getattr(response, "diagnostics", None), "request_id", "")
         raise Internal("INTERNAL", message, reason=MALFORMED_ANSWER, field=field_path, request_id=request_id) from error
+
+
+class Heard:
+    """What the streams of a call's attempts say: what is told early, once, and how each of them ends.
+
+    An attempt that breaks after it has told something is followed by another like any other, and that tells nothing but
+    the answer.
+
+    Attributes:
+        outcome: of the attempt at hand, for `attempts`.
+    """
+
+    outcome: Message | MaplessError
+
+    def __init__(self) -> None:
+        self._has_told = False
+
+    def begin(self, call: Call) -> None:
+        """Another attempt."""
+        self._call = call
+        message = f"the stream of {call.method} ended before the answer"
+        self.outcome = Internal("INTERNAL", message, reason=MALFORMED_ANSWER)
+
+    def hear(self, message: Message) -> Any | None:
+        """What a message tells early; None if it is the answer, or if so much has been told."""
+        assert self._call.early is not None
+        with _reading(self._call, message):
+            early = self._call.early(message)
+        if early is None:
+            self.outcome = message
+        elif not self._has_told:
+            self._has_told = True
+            return early
+        return None
+
+    def fail(self, error: MaplessError) -> None:
+        """The stream broke; after the answer that does not matter."""
+        if not isinstance(self.outcome, Message):
+            self.outcome = error
 
 
 def _with_retries(
@@ -175,7 +235,7 @@ def _with_retries(
         is_last = attempt >= options.max_attempts and (outcome.retry_after_s is None or options.max_attempts == 1)
         if pause_s is None or is_last or clock.now_s() + pause_s >= deadline_s:
             return outcome
-        may_be_done |= outcome.code == "UNAVAILABLE"
+        may_be_done |= outcome.code in _LOST
         yield Pause(pause_s, outcome)
 
 
@@ -201,7 +261,7 @@ def _pause_s(error: MaplessError, attempt: int, options: ConnectOptions, clock: 
     asked_s = error.retry_after_s
     backoff_s = min(options.initial_backoff_s * 2.0 ** min(attempt - 1, 30), options.max_backoff_s)
     backoff_s *= clock.uniform(1 - _JITTER, 1 + _JITTER)
-    if error.code == "UNAVAILABLE" and (asked_s is None or attempt == 1):
+    if error.code in _LOST and (asked_s is None or attempt == 1):
         return backoff_s  # the first time soon: behind one name there may be another server, which is not unavailable
     if error.code in {"UNAVAILABLE", "RESOURCE_EXHAUSTED"} and asked_s is not None:
         return max(options.initial_backoff_s, asked_s * clock.uniform(1, 1 + _LATENESS))

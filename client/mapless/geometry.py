@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -164,6 +165,10 @@ class RigidTransform:
 
     def quaternion(self) -> Quaternion:
         """The rotation as a quaternion with w >= 0."""
+        return self._quaternion
+
+    @cached_property
+    def _quaternion(self) -> Quaternion:
         return Quaternion.from_matrix(self.rotation)
 
     def inverse(self) -> RigidTransform:

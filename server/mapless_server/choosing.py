@@ -77,3 +77,7 @@ class ReferenceChooser:
             vector = self._descriptor.describe(view)
             ranked = rank_references(entries, vector, count, narrowing, frozenset(among) if among else None, options)
         return Choice(tuple(ranked), self._descriptor.name, entries.generation)
+
+    def tell_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
+        """Logs, once while the scene is held, that a reference that was chosen is not used because it is damaged."""
+        self.indexes.tell_damaged(scene_key, reference_id, error)

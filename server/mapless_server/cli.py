@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,9 +15,11 @@ import typer
 from . import __version__
 from .calibration.command import calibrate_command
 from .commands.audit import audit_command
+from .commands.replay import replay_command
 from .commands.store import store_app
 from .evaluation.cli import evaluate_command
 from .ingest.command import export_command, import_command
+from .libraries import configure_libraries
 from .load.command import load_app
 from .security.command import token_app
 from .settings import ConfigError, Settings, load_settings
@@ -41,6 +42,7 @@ app.add_typer(store_app, name="store")
 app.command("import")(import_command)
 app.command("export")(export_command)
 app.command("audit")(audit_command)
+app.command("replay")(replay_command)
 app.command("calibrate")(calibrate_command)
 app.command("evaluate")(evaluate_command)
 app.command("view")(view_command)
@@ -92,6 +94,11 @@ def serve_command(
     retrieval_cache_mib: Annotated[int | None, typer.Option(help=_help("retrieval_cache_mib"))] = None,
     reference_cache_mib: Annotated[int | None, typer.Option(help=_help("reference_cache_mib"))] = None,
     allow_watching: Annotated[bool | None, typer.Option(help=_help("allow_watching"))] = None,
+    capture_dir: Annotated[Path | None, typer.Option(help=_help("capture_dir"))] = None,
+    capture_hours: Annotated[float | None, typer.Option(help=_help("capture_hours"))] = None,
+    capture_mib: Annotated[int | None, typer.Option(help=_help("capture_mib"))] = None,
+    capture_share: Annotated[float | None, typer.Option(help=_help("capture_share"))] = None,
+    capture_tenants: Annotated[str | None, typer.Option(help=_help("capture_tenants"))] = None,
     warm_up: Annotated[bool | None, typer.Option(help=_help("warm_up"))] = None,
     drain_delay_s: Annotated[float | None, typer.Option(help=_help("drain_delay_s"))] = None,
     drain_grace_s: Annotated[float | None, typer.Option(help=_help("drain_grace_s"))] = None,
@@ -122,7 +129,7 @@ def serve_command(
     settings = loaded.settings
     configure_logging(settings)
     logging.getLogger(__name__).info("mapless-server %s\n%s", __version__, loaded)
-    _configure_libraries(settings)
+    configure_libraries(settings)
 
     from .serve import StartupError, serve
 
@@ -182,7 +189,7 @@ def bench_network_command(
 ) -> None:
     """Measure the networks beside what the arithmetic costs at least, and whole queries; on a CPU, what it can tell."""
     try:
-        _configure_libraries(load_settings({}).settings)
+        configure_libraries(load_settings({}).settings)
     except ConfigError as error:
         _fail(str(error))
 
@@ -258,23 +265,6 @@ def _weights_folder(weights_dir: Path | None) -> Iterator[Path]:
         _fail(str(error))
     except WeightsError as error:
         _fail(str(error), code=1)
-
-
-def _configure_libraries(settings: Settings) -> None:
-    """Sets what libraries read from the environment once, when they are imported; what is set already stays."""
-    environment = {
-        # Calls run side by side, and matching shares out its own work. The matrices are small, and BLAS threads wait
-        # for one another in a busy loop: with two, on two cores of which one was taken, a call took 1.9 s, not 0.4.
-        "OPENBLAS_NUM_THREADS": "1",
-        "MKL_NUM_THREADS": "1",
-        # Stands behind our own reading of headers.
-        "OPENCV_IO_MAX_IMAGE_PIXELS": str(round(settings.max_image_megapixels * 1_000_000)),
-        # What is wrong with a file or an address, we say ourselves.
-        "OPENCV_LOG_LEVEL": "SILENT",
-        "GRPC_VERBOSITY": "NONE",
-    }
-    for name, value in environment.items():
-        os.environ.setdefault(name, value)
 
 
 def _fail(message: str, code: int = 2) -> NoReturn:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 from .audit.coverage import Coverage
@@ -144,6 +144,7 @@ class Engine:
         caller: Caller,
         source: ReferenceSource | None = None,
         visits: list[Visit] | None = None,
+        tell_coarse: Callable[[Result], None] | None = None,
     ) -> tuple[Result, Sequence[Visit]]:
         """Localizes a photograph.
 
@@ -152,6 +153,9 @@ class Engine:
             caller: whose query it is.
             source: of the references; None for the store.
             visits: gets the stages that the query goes through, for who wants to know how far it came if it fails.
+            tell_coarse: told, on the event loop and before the answer, the pose that is known before it is refined,
+                where there is one: a localization of the first tier, checked by nothing. More than once if references
+                go while they are used. What is answered does not depend on whether somebody is told.
 
         Returns:
             The answer, and the stages that the query went through.
@@ -161,6 +165,8 @@ class Engine:
         """
         views = QueryViews(query.photo, self.options.image_limits)
         work = Work(query, source or self._library, views, caller.deadline_s)
+        if tell_coarse is not None:
+            work = replace(work, tell_coarse=_on_this_loop(tell_coarse))
         step = self._stages.first_step(work)
         with _as_request_errors():
             size_bytes = 0 if query.is_part else len(query.photo.image)  # which `hold` counts
@@ -301,6 +307,16 @@ class Engine:
         shared = {id(tier.pipeline.reconstructor): tier.pipeline.reconstructor for tier in self.tiers}
         for reconstructor in shared.values():
             reconstructor.close()
+
+
+def _on_this_loop(tell: Callable[[Result], None]) -> Callable[[Result], None]:
+    """What may be called from any thread, and has it told on the running event loop."""
+    loop = asyncio.get_running_loop()
+
+    def told(result: Result) -> None:
+        loop.call_soon_threadsafe(tell, result)
+
+    return told
 
 
 async def _unless_refused(submission: Awaitable[Any]) -> Refused | None:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Generic, Protocol, TypeVar
 
-from .choosing import ReferenceChooser
 from .errors import DataLoss, NotFound, Unavailable
 from .failures import failure_of
 from .library import Loaded, NotDescribedYet, load_usable
@@ -92,6 +91,27 @@ class ReferenceSource(Protocol):
         ...
 
 
+class Chooser(Protocol):
+    """Chooses references for photographs; see `ReferenceChooser`."""
+
+    def choose(
+        self,
+        scene_key: SceneKey,
+        views: QueryViews,
+        count: int,
+        narrowing: Narrowing,
+        among: Sequence[str],
+        turn: Turn,
+        options: RankOptions | None = None,
+    ) -> Choice:
+        """At most `count` references for a photograph."""
+        ...
+
+    def tell_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
+        """One that was chosen is not used."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Work:
     """A query in one tier.
@@ -107,6 +127,8 @@ class Work:
         start_s: when this tier began, `time.monotonic`.
         give_up_s: when `best` is answered, if this tier has no answer by then.
         listings: how often the scene was listed in this tier.
+        tell_coarse: told the first tier's coarse pose as soon as there is one, in the thread that computes; None where
+            nobody wants it before the answer.
     """
 
     query: Query
@@ -119,6 +141,7 @@ class Work:
     start_s: float = field(default_factory=time.monotonic)
     give_up_s: float = math.inf
     listings: int = 1
+    tell_coarse: Callable[[Result], None] | None = None
 
     @property
     def kind(self) -> str:
@@ -166,7 +189,7 @@ class QueryStages:
     def __init__(
         self,
         tiers: Sequence[Tier],
-        chooser: ReferenceChooser,
+        chooser: Chooser,
         escalation: EscalationOptions,
         method: Method | None = None,
     ) -> None:
@@ -277,7 +300,7 @@ class QueryStages:
         """Without those that are damaged, which were not the caller's choice; unless the caller named them."""
         if work.query.reference_ids:
             return self._load(work, reference_ids, tier, turn)
-        tell = partial(self._chooser.indexes.tell_damaged, work.query.scene_key)
+        tell = partial(self._chooser.tell_damaged, work.query.scene_key)
         return load_usable(lambda some: self._load(work, some, tier, turn), reference_ids, (DataLoss,), tell)
 
     def _load(self, work: Work, reference_ids: Sequence[str], tier: Tier, turn: Turn) -> Loaded:
@@ -292,11 +315,24 @@ class QueryStages:
         if isinstance(part, Answer):
             return self._conclude(work, found, part)
         step = Step(REFINE, work.kind, work.kind, Underway(work, found, part))
-        coarse = self._method.coarse_answer(part) if work.query.allow_coarse and work.best is None else None
+        coarse = self._coarse_result(work, found, part)
         if coarse is None:
             return self._next(work, step)
-        done = Done(self._result(work, self._attempt(work, found, coarse), found, coarse), Ending.DEGRADED)
+        if work.tell_coarse is not None and isinstance(coarse.attempt.answer.outcome, Localization):
+            work.tell_coarse(coarse)
+        if not work.query.allow_coarse:
+            return self._next(work, step)
+        done = Done(coarse, Ending.DEGRADED)
         return Next(step, Fallback(lambda: done, work.deadline_s - ANSWER_MARGIN_S))
+
+    def _coarse_result(self, work: Work, found: Found, part: Coarse) -> Result | None:
+        """The answer if no more is computed, where somebody may want it and the first tier has one."""
+        if work.best is not None or not (work.query.allow_coarse or work.tell_coarse is not None):
+            return None
+        coarse = self._method.coarse_answer(part)
+        if coarse is None or not _is_finite(coarse):
+            return None
+        return self._result(work, self._attempt(work, found, coarse), found, coarse)
 
     def _refine(self, underway: Underway[Coarse], job: Job) -> Verdict:
         answer = self._method.refine(underway.part, job.check)
@@ -359,13 +395,17 @@ def _ending(attempt: Attempt) -> Ending:
 
 def _check_finite(answer: Answer) -> None:
     """A pose of NaN must never leave the server: ArithmeticError."""
+    if not _is_finite(answer):
+        raise ArithmeticError(f"the method's answer is not finite: {answer.outcome}, {answer.scale}")
+
+
+def _is_finite(answer: Answer) -> bool:
     numbers = [] if answer.scale is None else [answer.scale.metres_per_unit, answer.scale.deviation]
     if isinstance(answer.outcome, Localization):
         outcome = answer.outcome
         covariance = [] if outcome.covariance is None else outcome.covariance.ravel().tolist()
         numbers += [*outcome.world_from_camera.matrix().ravel(), *covariance, outcome.reprojection_error_px]
-    if not all(map(math.isfinite, numbers)):
-        raise ArithmeticError(f"the method's answer is not finite: {answer.outcome}, {answer.scale}")
+    return all(map(math.isfinite, numbers))
 
 
 def _gated(answer: Answer, narrowing: Narrowing) -> Answer:

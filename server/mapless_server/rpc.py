@@ -8,14 +8,14 @@ import math
 import re
 import time
 import uuid
-from collections.abc import Callable, Coroutine, Iterable, Mapping
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Mapping
 from contextlib import aclosing, suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 from urllib.parse import unquote
 
 import grpc
-from google.protobuf.message import DecodeError, Message
+from google.protobuf.message import DecodeError
 from grpc_status import rpc_status
 
 from mapless.wire import FieldError
@@ -28,10 +28,12 @@ from .principal import Principal
 from .query import Caller
 from .receiving import Context, OpenMethods, Receiver
 from .scheduling.fair import Flow
-from .security.access import OPEN_METHODS
+from .security.access import ENDLESS_METHODS, OPEN_METHODS
 from .status import to_status
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 REQUEST_ID_KEY = "x-request-id"
 CLIENT_ID_KEY = "x-client-id"
@@ -71,6 +73,7 @@ class Call:
         principal: who calls.
         client: what tells callers apart: the id that they give, else the address of their connection.
         trail: what was told of it so far.
+        trailing: metadata that are to follow the answer.
     """
 
     request_id: str
@@ -79,6 +82,7 @@ class Call:
     principal: Principal = field(default_factory=Principal)
     client: str = ""
     trail: Trail = field(default_factory=Trail, repr=False, compare=False)
+    trailing: list[tuple[str, str]] = field(default_factory=list, repr=False, compare=False)
 
     @property
     def caller(self) -> Caller:
@@ -135,7 +139,7 @@ class CallGuard:
         self._active = 0
         self._idle = asyncio.Event()
         self._idle.set()
-        self._abandoned: set[asyncio.Task[Message]] = set()  # the loop itself would forget them
+        self._abandoned: set[asyncio.Task[Any]] = set()  # the loop itself would forget them
         self._receiver = Receiver()
         self._open = OpenMethods(self._receiver)
 
@@ -143,13 +147,13 @@ class CallGuard:
         """The handler of "/package.Service/Method" as it is to be served."""
         if method in OPEN_METHODS:
             return self._open.guarded(handler)
-        streams = handler.response_streaming
+        streams, is_endless = handler.response_streaming, method in ENDLESS_METHODS
 
         async def answer(_: object, context: Context) -> bytes | None:
-            if not streams:  # what may last for ever is not waited for
+            if not is_endless:
                 self._active += 1
                 self._idle.clear()
-            call = self._begin(context, streams)
+            call = self._begin(context, is_endless)
             span = self._tracer.begin(method, _metadata(context), call.arrived_s)
             if self._observer is not None:
                 self._observer.call_started(method)
@@ -159,7 +163,7 @@ class CallGuard:
                 self._who_calls(method, context)
                 self._check_door(method)
                 response = await (self._stream if streams else self._answer)(handler, method, call, context)
-                context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id),))
+                context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id), *call.trailing))
                 code = "OK"
                 return response
             except RequestError as error:
@@ -178,7 +182,7 @@ class CallGuard:
                 await _abort(context, call, RequestError(f"internal error, id={call.request_id}"))
                 raise
             finally:
-                self._active -= not streams
+                self._active -= not is_endless
                 if not self._active:
                     self._idle.set()
                 self._end(method, code, call, span)
@@ -199,10 +203,10 @@ class CallGuard:
             return Principal()
         return self._authenticate(_metadata(context), method, context.auth_context())
 
-    def _begin(self, context: Context, streams: bool) -> Call:
+    def _begin(self, context: Context, is_endless: bool) -> Call:
         now_s = time.monotonic()
         asked_s, margin_s = context.time_remaining(), 0.0
-        if streams:
+        if is_endless:
             given_s = math.inf if asked_s is None else asked_s
         else:
             given_s = min(self._default_deadline_s if asked_s is None else asked_s, self._max_deadline_s)
@@ -228,20 +232,16 @@ class CallGuard:
         return data
 
     async def _stream(self, handler: Any, method: str, call: Call, context: Context) -> None:
-        """Sends the servicer's messages as they come, until it or the caller ends, which grpc does at the deadline.
+        """Sends the servicer's messages as they come, until it or the caller ends, or the time is over.
 
-        The servicer's method is a coroutine that gives an iterator of messages, with `aclose`, when they can come; the
-        caller learns of that by the initial metadata.
+        The servicer's method is a coroutine that gives an iterator of messages, with `aclose`.
         """
         request, call = await self._request(handler, method, call, context)
+        messages = self._endless if method in ENDLESS_METHODS else self._finite
         sent_bytes = 0
         try:
-            async with aclosing(await handler.unary_stream(request, call)) as responses:
-                await context.send_initial_metadata(())
-                async for response in responses:
-                    # The token may have been revoked, or have expired, since.
-                    self._who_calls(method, context)
-                    data = bytes(handler.response_serializer(response))
+            async with aclosing(messages(handler, method, request, call, context)) as coming:
+                async for data in coming:
                     try:
                         await context.write(data)
                     except grpc.aio.BaseError as error:
@@ -253,10 +253,45 @@ class CallGuard:
         finally:
             call.note(bytes_out=sent_bytes)
 
+    async def _endless(
+        self, handler: Any, method: str, request: Any, call: Call, context: Context
+    ) -> AsyncGenerator[bytes, None]:
+        """A servicer's messages, each when the one before is sent; the caller learns when they can come."""
+        async with aclosing(await handler.unary_stream(request, call)) as responses:
+            await context.send_initial_metadata(())
+            async for response in responses:
+                # The token may have been revoked, or have expired, since.
+                self._who_calls(method, context)
+                yield bytes(handler.response_serializer(response))
+
+    async def _finite(
+        self, handler: Any, method: str, request: Any, call: Call, context: Context
+    ) -> AsyncGenerator[bytes, None]:
+        """A servicer's messages, a few, made in time and as fast as it can, however slowly the caller reads.
+
+        What is made in time may be sent later, as the answers of unary calls are.
+        """
+        made: asyncio.Queue[bytes | None] = asyncio.Queue()
+
+        async def make() -> None:
+            async with aclosing(await handler.unary_stream(request, call)) as responses:
+                async for response in responses:
+                    made.put_nowait(bytes(handler.response_serializer(response)))
+
+        making = asyncio.ensure_future(self._in_time(make, call.deadline_s))
+        making.add_done_callback(lambda _: made.put_nowait(None))
+        try:
+            while (data := await made.get()) is not None:
+                yield data
+            await making
+        finally:
+            making.cancel()
+            await asyncio.gather(making, return_exceptions=True)
+
     async def _request(self, handler: Any, method: str, call: Call, context: Context) -> tuple[Any, Call]:
         """The call's message, and the call with who makes it."""
         limit_s = call.deadline_s - time.monotonic()
-        if handler.response_streaming:  # which may have no deadline
+        if method in ENDLESS_METHODS:  # which may have no deadline
             limit_s = min(limit_s, self._default_deadline_s)
         data = await self._receiver.message(context, limit_s)
         call.note(bytes_in=len(data))
@@ -270,7 +305,7 @@ class CallGuard:
             raise InvalidArgument("the request is not a well-formed message", reason="MALFORMED_MESSAGE") from None
         return request, call
 
-    async def _in_time(self, answer: Callable[[], Coroutine[Any, Any, Message]], deadline_s: float) -> Message:
+    async def _in_time(self, answer: Callable[[], Coroutine[Any, Any, T]], deadline_s: float) -> T:
         """The answer, or DeadlineExceeded as soon as the time is over, however long it takes the servicer to stop.
 
         Neither asyncio.wait_for nor asyncio.timeout will do: before Python 3.12 the first forgets that the caller has
@@ -291,12 +326,12 @@ class CallGuard:
             self._abandon(task)
         raise DeadlineExceeded("the deadline passed before the answer was ready")
 
-    def _abandon(self, task: asyncio.Task[Message]) -> None:
+    def _abandon(self, task: asyncio.Task[Any]) -> None:
         self._abandoned.add(task)
         task.add_done_callback(self._bury)
         task.cancel()
 
-    def _bury(self, task: asyncio.Task[Message]) -> None:
+    def _bury(self, task: asyncio.Task[Any]) -> None:
         self._abandoned.discard(task)
         error = None if task.cancelled() else task.exception()
         if error is not None and not isinstance(error, RequestError | FieldError):

@@ -19,7 +19,7 @@ import grpc
 from . import __version__
 from .assembly import gpu_memory, make_descriptor, make_tiers, what_is_missing
 from .capture.errors import CaptureError
-from .capture.folder import CaptureFolder, Retention
+from .capture.opening import open_recorder
 from .capture.recorder import Recorder
 from .decode import ImageLimits
 from .engine import Engine, EngineOptions
@@ -37,6 +37,7 @@ from .security.reloading import keep_fresh
 from .services import Services
 from .settings import Settings
 from .store import Store, StoreError
+from .store_health import watch_store
 from .warm_up import warm_up
 from .weights import WeightsError, WeightsMissing
 
@@ -178,7 +179,7 @@ async def running_server(
         tracer = _make_tracer(settings)
         stack.push_async_callback(asyncio.to_thread, tracer.close, _TRACES_FLUSH_S)
         metrics_address = _serve_metrics(settings, metrics, store, protection, stack)
-        recorder = await asyncio.to_thread(_make_recorder, settings, store, metrics)
+        recorder = await _open_recorder(settings, store, metrics)
         if recorder is not None:
             stack.push_async_callback(asyncio.to_thread, recorder.close)
         authenticate = protection.authenticator.authenticate
@@ -197,6 +198,7 @@ async def running_server(
         engine.queue.on_fatal = lambda fatal: _announce_failure(fatal, failed, metrics)
         _keep(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
         _keep(stack, keep_fresh(protection.refreshable))
+        _keep(stack, watch_store(store, services.set_changeable))
         _keep(stack, _stop_serving(services, failed))
         await _warm_up(settings, engine, metrics)
         await services.open(engine)
@@ -249,6 +251,7 @@ async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
 
 
 async def end_broken() -> NoReturn:
+    """Ends the process when callers have been told; whoever supervises it starts it anew."""
     await asyncio.sleep(LAST_WORDS_S)
     logging.shutdown()
     os._exit(FATAL_EXIT_CODE)  # threads may hang, so none is waited for
@@ -306,24 +309,11 @@ def _watch_engine(engine: Engine, metrics: Metrics) -> None:
         metrics.watch_token_cache(lambda: cache.counters)
 
 
-def _make_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorder | None:
-    """What captures calls, if the settings ask for it; says so, since photographs are then kept."""
-    if settings.capture_dir is None:
-        return None
-    retention = Retention(3600 * settings.capture_hours, settings.capture_mib * 2**20)
+async def _open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorder | None:
     try:
-        folder = CaptureFolder(settings.capture_dir, retention)
+        return await asyncio.to_thread(open_recorder, settings, store, metrics)
     except CaptureError as error:
         raise StartupError(str(error)) from error
-    log.warning(
-        "calls are captured, photographs and all: %s, for %g hours, %d MiB at most",
-        settings.capture_dir,
-        settings.capture_hours,
-        settings.capture_mib,
-    )
-    metrics.watch_captures(lambda: folder.space_bytes)
-    tenants = frozenset(filter(None, settings.capture_tenants.split(",")))
-    return Recorder(folder, store, metrics, settings.capture_share, tenants)
 
 
 def _make_listener(listen: Listen, settings: Settings, services: Services, protection: Protection) -> Listener:

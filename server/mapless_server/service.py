@@ -5,21 +5,25 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import AsyncGenerator, Callable
+from dataclasses import dataclass, field
+from functools import partial
 
 from mapless import wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
 
+from .capture.recorder import Recorder, failures_of
 from .engine import Engine
 from .group_service import answer_rig, answer_sequence
-from .messages.answers import addressee_of, diagnostics_to_message, outcome_to_message
+from .messages.answers import Addressee, addressee_of, diagnostics_to_message, outcome_to_message
 from .messages.debug import debug_to_message
 from .messages.priors import needs_attributes
 from .messages.queries import query_from_message
 from .method.localize import Localization
 from .observability.metrics import LOCALIZED, Metrics
-from .query import Result
+from .progressive import TellCoarse, coarse_then_final
+from .query import Query, Result
 from .rpc import Call
 from .scheduling.jobs import Visit
 from .store import SceneAttributes, Store
@@ -27,55 +31,109 @@ from .tenancy import key_of
 from .watching import Watch, Watchers
 
 
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """A request of Localize, understood.
+
+    Attributes:
+        request: as it came.
+        query: what it asks.
+        addressee: whom the answer is made for.
+        visits: the stages of the queue that the query has been through; grows.
+    """
+
+    request: pb.LocalizeRequest
+    query: Query
+    addressee: Addressee
+    visits: list[Visit] = field(default_factory=list)
+
+    @property
+    def queued_s(self) -> float:
+        """How long it has waited, as far as that is over."""
+        return sum(visit.start_s - visit.queued_s for visit in self.visits)
+
+
 class LocalizationService(rpcs.LocalizationServiceServicer):
     """Says where a photograph was taken."""
 
-    def __init__(self, engine: Callable[[], Engine], metrics: Metrics, store: Store, watchers: Watchers) -> None:
-        """`engine` gives it, or raises Unavailable as long as there is none."""
+    def __init__(
+        self,
+        engine: Callable[[], Engine],
+        metrics: Metrics,
+        store: Store,
+        watchers: Watchers,
+        recorder: Recorder | None = None,
+    ) -> None:
+        """`engine` gives it, or raises Unavailable as long as there is none; a recorder captures the calls."""
         self._engine = engine
         self._metrics = metrics
         self._store = store
         self._watchers = watchers
+        self._recorder = recorder
 
     async def Localize(self, request: pb.LocalizeRequest, call: Call) -> pb.LocalizeResponse:
         """Implements LocalizationService.Localize."""
+        with failures_of(self._recorder, "Localize", request, call):
+            return await self._answer(await self._understand(request, call), call)
+
+    async def LocalizeProgressively(
+        self, request: pb.LocalizeRequest, call: Call
+    ) -> AsyncGenerator[pb.LocalizeProgressivelyResponse, None]:
+        """Implements LocalizationService.LocalizeProgressively."""
+        with failures_of(self._recorder, "Localize", request, call):
+            asked = await self._understand(request, call)
+
+        async def answer(tell_coarse: TellCoarse) -> pb.LocalizeResponse:
+            with failures_of(self._recorder, "Localize", request, call):
+                return await self._answer(asked, call, tell_coarse)
+
+        return coarse_then_final(answer, partial(self._coarse, asked, call))
+
+    async def _understand(self, request: pb.LocalizeRequest, call: Call) -> _Asked:
+        """What a request asks; what is wrong with it is a FieldError or a RequestError."""
         engine = self._engine()
         addressee = addressee_of(request)
         attributes = await self._attributes(request, call.principal.tenant)
         query = query_from_message(request, call.principal.tenant, engine.options, attributes)
         call.note(scene=query.scene_key, references=len(query.reference_ids))
-        visits: list[Visit] = []
+        return _Asked(request, query, addressee)
+
+    async def _answer(self, asked: _Asked, call: Call, tell_coarse: TellCoarse | None = None) -> pb.LocalizeResponse:
+        """The final answer; before it, what is known without refining is told to whom it may concern."""
+        request, query, visits = asked.request, asked.query, asked.visits
         try:
-            result, _ = await engine.localize(query, call.caller, visits=visits)
+            result, _ = await self._engine().localize(query, call.caller, visits=visits, tell_coarse=tell_coarse)
         finally:
             for visit in visits:
                 call.waited(visit.stage, visit.queued_s, visit.start_s)
                 if visit.jobs:
                     call.computed(visit.stage, visit.start_s, visit.end_s, batch=visit.batch, batch_size=visit.jobs)
-        response = outcome_to_message(result, query.options, addressee)
+        response = _to_message(result, asked, call)
         self._count(result, response, call)
-        for echoed in ("capture_time", "session_from_camera"):
-            if request.HasField(echoed):
-                getattr(response, echoed).CopyFrom(getattr(request, echoed))
-        response.diagnostics.CopyFrom(diagnostics_to_message(result, query.options))
-        response.diagnostics.request_id = call.request_id
-        response.diagnostics.queue_duration.FromNanoseconds(round(1e9 * (call.trail.queue_s or 0.0)))
-        response.diagnostics.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))
         debug, support = None, result.attempt.answer.support
         if support is not None and (request.options.include_debug or self._watchers.is_watched(query.scene_key)):
             debug = await asyncio.to_thread(debug_to_message, support)
         self._watchers.publish(query.scene_key, request, response, debug)
         if request.options.include_debug and debug is not None:
             response.debug.CopyFrom(debug)
+        if self._recorder is not None:
+            self._recorder.answered("Localize", request, response, call, [(query, result)])
+        return response
+
+    def _coarse(self, asked: _Asked, call: Call, result: Result) -> pb.LocalizeResponse:
+        """The coarse answer; log and metrics are told when it was there."""
+        response, seconds = _to_message(result, asked, call), time.monotonic() - call.arrived_s
+        call.note(coarse_ms=round(1000 * seconds, 1))
+        self._metrics.answered_coarsely(seconds)
         return response
 
     async def LocalizeRig(self, request: pb.LocalizeRigRequest, call: Call) -> pb.LocalizeRigResponse:
         """Implements LocalizationService.LocalizeRig."""
-        return await answer_rig(request, call, self._engine(), self._metrics)
+        return await answer_rig(request, call, self._engine(), self._metrics, self._recorder)
 
     async def LocalizeSequence(self, request: pb.LocalizeSequenceRequest, call: Call) -> pb.LocalizeSequenceResponse:
         """Implements LocalizationService.LocalizeSequence."""
-        return await answer_sequence(request, call, self._engine(), self._metrics)
+        return await answer_sequence(request, call, self._engine(), self._metrics, self._recorder)
 
     async def WatchQueries(self, request: pb.WatchQueriesRequest, call: Call) -> Watch:
         """Implements LocalizationService.WatchQueries."""
@@ -113,3 +171,16 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             scale_deviation=answer.scale.deviation if answer.scale else None,
             accuracy_radius_m=response.localization.accuracy.position_68_m if measured else None,
         )
+
+
+def _to_message(result: Result, asked: _Asked, call: Call) -> pb.LocalizeResponse:
+    """Message of an answer, as of now, without the matches it rests on."""
+    response = outcome_to_message(result, asked.query.options, asked.addressee)
+    for echoed in ("capture_time", "session_from_camera"):
+        if asked.request.HasField(echoed):
+            getattr(response, echoed).CopyFrom(getattr(asked.request, echoed))
+    response.diagnostics.CopyFrom(diagnostics_to_message(result, asked.query.options))
+    response.diagnostics.request_id = call.request_id
+    response.diagnostics.queue_duration.FromNanoseconds(round(1e9 * asked.queued_s))
+    response.diagnostics.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))
+    return response

@@ -60,7 +60,8 @@ class Services:
         self._metrics = metrics
         self._engine: Engine | None = None
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]
-        self._is_draining = False
+        self._is_serving = self._is_draining = False
+        self._is_changeable = True
         self._guard = CallGuard(
             settings.default_deadline_s,
             settings.max_deadline_s,
@@ -130,11 +131,19 @@ class Services:
         await asyncio.to_thread(self._references.close)
 
     async def set_serving(self, is_serving: bool) -> None:
-        """What health says from now on, of every service."""
+        """What health says from now on, of every service that can be."""
         status = health_pb2.HealthCheckResponse
+        self._is_serving = is_serving
         for service in ("", *SERVICE_NAMES):
-            await self._health.set(service, status.SERVING if is_serving else status.NOT_SERVING)
+            serves = is_serving and (self._is_changeable or service != SERVICE_NAMES[1])
+            await self._health.set(service, status.SERVING if serves else status.NOT_SERVING)
         self._metrics.set_serving(is_serving)
+
+    async def set_changeable(self, is_changeable: bool) -> None:
+        """What health says of the ReferenceService: a store that cannot be written serves queries all the same."""
+        self._is_changeable = is_changeable
+        if self._is_serving:
+            await self.set_serving(True)
 
     def _check_door(self, method: str) -> None:
         """Raises Unavailable while the server starts or stops, and Overloaded while it has no room for any query."""

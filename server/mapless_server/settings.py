@@ -49,7 +49,9 @@ def default_weights_dir() -> Path:
 class Settings(BaseSettings):
     """All settings of the server; frozen, and a name that is not here is an error wherever it stands."""
 
-    model_config = SettingsConfigDict(frozen=True, extra="forbid", env_prefix=PREFIX, validate_default=True)
+    model_config = SettingsConfigDict(
+        frozen=True, extra="forbid", env_prefix=PREFIX, validate_default=True, allow_inf_nan=False
+    )
 
     host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on; 0.0.0.0 for all.")
     port: int = Field(default=50051, ge=0, le=65535, description="Port to listen on; 0 for any free one.")
@@ -117,6 +119,20 @@ class Settings(BaseSettings):
         description="Whether WatchQueries may show callers' photographs to those with the role write. What waits for "
         "watchers, of whom there are 8 at most, takes the memory of 24 images.",
     )
+    capture_dir: Path | None = Field(
+        default=None,
+        description="Folder in which calls are kept for a time, photographs and all, to be replayed; without it, none.",
+    )
+    capture_hours: float = Field(default=24.0, gt=0, le=8784, description="How long a captured call is kept, hours.")
+    capture_mib: int = Field(
+        default=1024, ge=1, description="What captured calls may take on the disk; the oldest are deleted first, MiB."
+    )
+    capture_share: float = Field(
+        default=1.0, gt=0, le=1, description="Share of the calls that is captured, drawn by chance."
+    )
+    capture_tenants: str = Field(
+        default="", description="Tenants whose calls are captured, separated by commas; empty: of all."
+    )
     warm_up: bool = Field(default=True, description="Whether a localization is tried before the first call is taken.")
     drain_delay_s: float = Field(
         default=0.0,
@@ -165,6 +181,20 @@ class Settings(BaseSettings):
             raise ValueError("must be auto, cpu, cuda or cuda:N")
         return device
 
+    @field_validator("host", "metrics_host")
+    @classmethod
+    def _check_host(cls, host: str) -> str:
+        if not host.isprintable() or " " in host:
+            raise ValueError("must be a name or an address")
+        return host
+
+    @field_validator("data_dir", "weights_dir", "tls_certificate", "tls_key", "tls_client_ca", "tokens_file")
+    @classmethod
+    def _check_path(cls, path: Path | None) -> Path | None:
+        if path is not None and "\0" in str(path):
+            raise ValueError("must be a path")
+        return path
+
     @model_validator(mode="after")
     def _check_together(self) -> Settings:
         if self.max_image_mib > self.max_message_mib:
@@ -173,6 +203,8 @@ class Settings(BaseSettings):
             raise ValueError("tls_certificate and tls_key go together")
         if self.tls_client_ca is not None and self.tls_certificate is None:
             raise ValueError("tls_client_ca needs tls_certificate")
+        if self.capture_dir is not None and _overlap(self.capture_dir, self.data_dir):
+            raise ValueError("capture_dir and data_dir must be folders apart: what is captured is deleted by itself")
         return self
 
     @classmethod
@@ -235,12 +267,18 @@ def load_settings(flags: Mapping[str, Any], config: Path | None = None) -> Loade
         raise ConfigError("\n".join(_describe(fault, origins) for fault in error.errors())) from None
 
 
+def _overlap(first: Path, second: Path) -> bool:
+    """Whether one of two folders lies in the other, or is it."""
+    first, second = first.resolve(), second.resolve()
+    return first.is_relative_to(second) or second.is_relative_to(first)
+
+
 def _read_file(path: Path) -> dict[str, Any]:
     if not path.is_file():  # pydantic-settings passes over a missing file in silence
         raise ConfigError(f"{path}: no such file")
     try:
         return TomlConfigSettingsSource(Settings, path)()
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: {error}") from None
 
 
@@ -249,7 +287,7 @@ def _read_environment() -> dict[str, Any]:
     known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields} | {CONFIG_VARIABLE} | clients
     unknown = {name for name in os.environ if name.startswith(PREFIX) and not _SERVICE_LINKS.fullmatch(name)} - known
     if unknown:
-        raise ConfigError("\n".join(f"environment: {name} is not a setting" for name in sorted(unknown)))
+        raise ConfigError("\n".join(f"environment: {ascii(name)[1:-1]} is not a setting" for name in sorted(unknown)))
     values = EnvSettingsSource(Settings)()
     if str(values.get("port", "")).startswith(_SERVICE_LINK_VALUE):
         del values["port"]
@@ -257,5 +295,5 @@ def _read_environment() -> dict[str, Any]:
 
 
 def _describe(fault: Mapping[str, Any], origins: Mapping[str, str]) -> str:
-    name = ".".join(map(str, fault["loc"]))
+    name = ascii(".".join(map(str, fault["loc"])))[1:-1]  # in a file it may be anything
     return f"{name} ({origins.get(name, 'default')}): {fault['msg']}" if name else str(fault["msg"])

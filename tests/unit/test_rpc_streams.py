@@ -1,4 +1,7 @@
-"""Calls that are answered by a stream: counted once however they end, closed behind them, and waited for by nobody."""
+"""Calls that are answered by a stream: counted once however they end, and closed behind them.
+
+Those that could last for ever are waited for by nobody; those that come to an end are calls like all others.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,7 @@ from mapless_server.principal import Principal
 from mapless_server.rpc import Call, CallGuard
 
 METHOD = "/mapless.v1.LocalizationService/WatchQueries"
+FINITE = "/mapless.v1.LocalizationService/LocalizeProgressively"
 LIMIT_S = 30.0
 
 
@@ -31,7 +35,7 @@ class Counted:
     handled: list[str] = field(default_factory=list)
 
     def call_started(self, method: str) -> None:
-        assert method == METHOD
+        assert method in {METHOD, FINITE}
         self.started += 1
 
     def call_handled(self, method: str, code: str, seconds: float, trace_id: str) -> None:
@@ -66,7 +70,7 @@ class Numbers:
 async def serving(
     numbers: Numbers | Exception, counted: Counted, **options: Any
 ) -> AsyncIterator[tuple[Any, CallGuard]]:
-    """A channel to a server whose WatchQueries is answered so."""
+    """A channel to a server whose streams are answered so."""
 
     async def watch(request: pb.WatchQueriesRequest, call: Call) -> Numbers:
         if isinstance(numbers, Exception):
@@ -79,10 +83,8 @@ async def serving(
     method = grpc.unary_stream_rpc_method_handler(
         watch, pb.WatchQueriesRequest.FromString, pb.WatchQueriesResponse.SerializeToString
     )
-    handlers = grpc.method_handlers_generic_handler(
-        "mapless.v1.LocalizationService", {"WatchQueries": guard.guarded(METHOD, method)}
-    )
-    server.add_generic_rpc_handlers([handlers])
+    service = {name.rpartition("/")[2]: guard.guarded(name, method) for name in (METHOD, FINITE)}
+    server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("mapless.v1.LocalizationService", service)])
     port = server.add_insecure_port("127.0.0.1:0")
     await server.start()
     try:
@@ -92,9 +94,9 @@ async def serving(
         await server.stop(5)
 
 
-def watching(channel: Any, timeout: float | None = LIMIT_S) -> Any:
+def watching(channel: Any, timeout: float | None = LIMIT_S, method: str = METHOD) -> Any:
     request = pb.WatchQueriesRequest(scene="scenes/hall").SerializeToString()
-    return channel.unary_stream(METHOD)(request, timeout=timeout)
+    return channel.unary_stream(method)(request, timeout=timeout)
 
 
 async def read(call: Any, seen: list[int] | None = None) -> list[int]:
@@ -272,3 +274,97 @@ def test_a_caller_who_may_not_any_more_sees_nothing_more() -> None:
         assert (counted.handled, numbers.is_closed) == (["UNAUTHENTICATED"], True)
 
     asyncio.run(run())
+
+
+class Large(Numbers):
+    """Messages that are more together than a connection takes before somebody reads."""
+
+    async def __anext__(self) -> pb.WatchQueriesResponse:
+        message = await super().__anext__()
+        message.image = bytes(3_000_000)
+        return message
+
+
+class TestStreamsThatComeToAnEnd:
+    def test_all_that_is_sent_comes_and_they_are_counted(self) -> None:
+        async def run() -> None:
+            counted, numbers = Counted(), Numbers(2)
+            async with serving(numbers, counted) as (channel, _):
+                call = watching(channel, method=FINITE)
+                assert await read(call) == [1, 2]
+                assert "x-request-id" in dict(await call.trailing_metadata())
+            assert (counted.started, counted.handled, numbers.is_closed) == (1, ["OK"], True)
+
+        asyncio.run(run())
+
+    @pytest.mark.parametrize("options", [{"default_deadline_s": 0.3}, {"max_deadline_s": 0.3}])
+    def test_their_deadline_is_that_of_unary_calls(self, options: dict[str, float]) -> None:
+        async def run() -> None:
+            counted, numbers, seen = Counted(), Numbers(1, "wait"), list[int]()
+            async with serving(numbers, counted, **options) as (channel, _):
+                with pytest.raises(grpc.RpcError) as caught:
+                    await read(watching(channel, LIMIT_S if "max_deadline_s" in options else None, FINITE), seen)
+                failure = from_rpc_error(caught.value)
+                await until(lambda: numbers.is_closed)
+            assert (failure.code, failure.reason, seen) == ("DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED", [1])
+            assert failure.request_id
+            assert counted.handled == ["DEADLINE_EXCEEDED"]
+
+        asyncio.run(run())
+
+    def test_the_server_waits_for_their_end(self) -> None:
+        async def run() -> None:
+            numbers = Numbers(1, "wait")
+            async with serving(numbers, Counted()) as (channel, guard):
+                call = watching(channel, method=FINITE)
+                await call.read()
+                idle = asyncio.ensure_future(guard.wait_until_idle(LIMIT_S))
+                await asyncio.sleep(0.05)
+                assert not idle.done()
+                call.cancel()
+                await asyncio.wait_for(idle, LIMIT_S)
+                assert numbers.is_closed
+
+        asyncio.run(run())
+
+    def test_an_error_after_a_message_is_told_with_details(self) -> None:
+        async def run() -> None:
+            counted, seen = Counted(), list[int]()
+            async with serving(Numbers(1, FailedPrecondition("not now")), counted) as (channel, _):
+                with pytest.raises(grpc.RpcError) as caught:
+                    await read(watching(channel, method=FINITE), seen)
+            assert (from_rpc_error(caught.value).reason, seen) == ("FAILED_PRECONDITION", [1])
+
+        asyncio.run(run())
+
+    def test_what_was_made_in_time_waits_for_a_reader_who_takes_longer(self, caplog: pytest.LogCaptureFixture) -> None:
+        """The servicer is through with it long before, and the caller is told no other end later."""
+
+        async def run() -> None:
+            counted, numbers = Counted(), Large(8)
+            async with serving(numbers, counted, default_deadline_s=0.2) as (channel, _):
+                call = watching(channel, None, FINITE)
+                await call.initial_metadata()
+                await until(lambda: numbers.is_closed)
+                await asyncio.sleep(0.4)
+                assert not counted.handled
+                assert await read(call) == [*range(1, 9)]
+            assert counted.handled == ["OK"]
+
+        with caplog.at_level("WARNING"):
+            asyncio.run(run())
+        assert not caplog.records
+
+    def test_who_was_let_in_is_answered(self) -> None:
+        asked = []
+
+        def authenticate(*_: Any) -> Principal:
+            asked.append(1)
+            return Principal()
+
+        async def run() -> None:
+            async with serving(Numbers(2), Counted(), authenticate=authenticate) as (channel, _):
+                assert await read(watching(channel, method=FINITE)) == [1, 2]
+            assert len(asked) == 2  # at the door, and with the message
+
+        asyncio.run(run())

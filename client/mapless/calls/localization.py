@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import datetime
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 from .. import wire
 from ..answers import LocalizationResult, Rejected, answer_from_message
@@ -16,6 +19,9 @@ from ..v1 import localization_service_pb2 as pb
 from .naming import enum_value, reference_name, scene_name
 
 SERVICE = "mapless.v1.LocalizationService"
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 def localize(
@@ -84,3 +90,47 @@ def localize(
         request.session_from_camera.CopyFrom(wire.transform_to_message(session_from_camera))
     response = yield Call(f"{SERVICE}/Localize", request, pb.LocalizeResponse, timeout_s)
     return answer_from_message(response)
+
+
+def _asked_like(model: Callable[P, Any]) -> Callable[[Callable[..., T]], Callable[P, T]]:
+    """Makes a call that has the parameters of another."""
+
+    def with_parameters(call: Callable[..., T]) -> Callable[P, T]:
+        return wraps(model, ("__annotations__", "__type_params__"), ())(call)
+
+    return with_parameters
+
+
+@_asked_like(localize)
+def localize_progressively(*asked: Any, **named: Any) -> Exchange[LocalizationResult | Rejected]:
+    """Where a photograph was taken, coarsely as soon as that is known, and then as `localize` answers it.
+
+    Yields at most two answers. The first, if there is one, is a `LocalizationResult` with `pose_stage` "COARSE": a pose
+    that nothing has checked, without covariance, accuracy and trust. The last, with `is_final`, is what `localize`
+    would have answered, perhaps another pose altogether, or `Rejected`; errors are raised in its place.
+
+    Whoever stops reading before ends the call. If the connection breaks after the first answer, the call is made again
+    like any other, and only the last is yielded.
+
+    Args and deadline are those of `localize`, for both answers together.
+    """
+    unary = localize(*asked, **named)
+    call = replace(
+        next(unary),
+        method=f"{SERVICE}/LocalizeProgressively",
+        response_type=pb.LocalizeProgressivelyResponse,
+        early=_early_answer,
+    )
+    unary.close()
+    response: pb.LocalizeProgressivelyResponse = yield call
+    return answer_from_message(response.answer)
+
+
+def _early_answer(message: pb.LocalizeProgressivelyResponse) -> LocalizationResult | None:
+    """A coarse answer; None if it is the final one."""
+    if message.is_final:
+        return None
+    answer = answer_from_message(message.answer)
+    if isinstance(answer, Rejected):
+        raise ValueError("a rejection that is not final")
+    return replace(answer, is_final=False)

@@ -189,6 +189,9 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
     command.add_argument("--variant", default="", help="best, full, no_structure or coarse")
     command.add_argument("--scale-strategy", default="", help="two_stage, triangulation or trajectory")
     command.add_argument("--allow-coarse", action="store_true", help="a coarse pose will do if time runs out")
+    command.add_argument(
+        "--progressive", action="store_true", help="tell a coarse pose as soon as there is one, and then the answer"
+    )
     command.add_argument("--parallel", type=int, default=2, help="calls at a time for a folder (default: %(default)s)")
     shown = command.add_argument_group("output")
     shown.add_argument("--json", action="store_true", help="JSON on a terminal, too; for a folder a line each")

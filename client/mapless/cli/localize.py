@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import json
 import sys
 from collections.abc import Iterator
@@ -52,17 +53,22 @@ def run(client: Client, arguments: argparse.Namespace) -> int:
         arguments.draw.mkdir(parents=True, exist_ok=True)
     if not arguments.photo.is_dir():
         return _one(client, arguments)
+    if arguments.progressive:
+        raise ValueError("--progressive shows how one photograph is localized, not a folder of them")
     return _folder(client, arguments)
 
 
 def _one(client: Client, arguments: argparse.Namespace) -> int:
     photo = Photo(arguments.photo, arguments.photo.name, _camera_of(arguments.photo, arguments.camera))
-    answer = _ask(client, photo, arguments)
+    answers = _answers(client, photo, arguments)
+    first = next(answers)  # before there is a file that nothing is written to
+    indent = None if arguments.progressive else 2  # of several answers each is a line
     with _opened(arguments.output) as file:
-        if arguments.json or arguments.output or not sys.stdout.isatty():
-            print(json.dumps(output.plain(_told(answer, arguments)), indent=2), file=file, flush=True)
-        else:
-            print("\n".join(output.lines(answer)), file=file, flush=True)
+        for answer in itertools.chain([first], answers):
+            if arguments.json or arguments.output or not sys.stdout.isatty():
+                print(json.dumps(output.plain(_told(answer, arguments)), indent=indent), file=file, flush=True)
+            else:
+                print("\n".join(output.lines(answer)), file=file, flush=True)
     _tell_where(arguments)
     return EXIT_REJECTED if isinstance(answer, Rejected) else 0
 
@@ -162,26 +168,35 @@ def _is_everybodys(error: MaplessError) -> bool:
 
 
 def _ask(client: Client, photo: Photo, arguments: argparse.Namespace) -> LocalizationResult | Rejected:
-    answer = client.localize(
-        photo.path,
-        photo.camera,
-        arguments.scene,
-        arguments.reference,
-        priors=priors(arguments),
-        variant=arguments.variant,
-        allow_coarse=arguments.allow_coarse,
-        scale_strategy=arguments.scale_strategy,
-        reference_count=arguments.count,
-        rerank_references=arguments.rerank,
-        coverage=arguments.coverage,
-        axes=arguments.axes,
-        include_debug=arguments.debug or arguments.draw is not None,
-    )
+    """The answer alone."""
+    (answer,) = _answers(client, photo, arguments)
+    return answer
+
+
+def _answers(client: Client, photo: Photo, arguments: argparse.Namespace) -> Iterator[LocalizationResult | Rejected]:
+    """The answer; with --progressive, what is known before it comes first."""
+    asked: dict[str, Any] = {
+        "priors": priors(arguments),
+        "variant": arguments.variant,
+        "allow_coarse": arguments.allow_coarse,
+        "scale_strategy": arguments.scale_strategy,
+        "reference_count": arguments.count,
+        "rerank_references": arguments.rerank,
+        "coverage": arguments.coverage,
+        "axes": arguments.axes,
+        "include_debug": arguments.debug or arguments.draw is not None,
+    }
+    about = photo.path, photo.camera, arguments.scene, arguments.reference
+    if arguments.progressive:
+        for answer in client.localize_progressively(*about, **asked):
+            yield answer
+    else:
+        answer = client.localize(*about, **asked)
+        yield answer
     if arguments.draw is not None:
         page = arguments.draw / f"{photo.name.replace('/', '_')}.html"
         shown = _references(client, arguments.scene, answer)
         write_report(answer, photo.path, photo.camera, page, references=shown, title=photo.name)
-    return answer
 
 
 def _references(client: Client, scene: str, answer: LocalizationResult | Rejected) -> list[Reference]:

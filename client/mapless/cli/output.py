@@ -66,7 +66,7 @@ def lines(answer: LocalizationResult | Rejected) -> list[str]:
     x, y, z = pose.translation
     q = pose.quaternion()
     told = [
-        f"localized{'' if answer.trust is None else f', trust {answer.trust:.3f}'}{frame}",
+        f"{_outcome(answer)}{frame}",
         f"  position  {x:.3f}  {y:.3f}  {z:.3f} m{_radius(answer.accuracy, 'position', 'm')}",
         f"  rotation  x {q.x:.4f}  y {q.y:.4f}  z {q.z:.4f}  w {q.w:.4f}{_radius(answer.accuracy, 'rotation', 'deg')}",
     ]
@@ -74,11 +74,7 @@ def lines(answer: LocalizationResult | Rejected) -> list[str]:
         geo = answer.geo_pose
         told.append(f"  on earth  {geo.lat:.7f}, {geo.lon:.7f}, {geo.h:.2f} m")
     told += [f"  prior     {_checked(check)}" for check in answer.prior_checks]
-    used = sum(use.inlier_count > 0 for use in answer.diagnostics.references)
-    told.append(
-        f"  support   {answer.inlier_count} of {answer.match_count} matches, {used} references, "
-        f"{answer.diagnostics.total_s:.2f} s"
-    )
+    told.append(f"  support   {_support(answer)}, {answer.diagnostics.total_s:.2f} s")
     if answer.trust is not None and answer.trust < DOUBTFUL_TRUST:
         told.append(
             f"  warning   fewer than {100 * DOUBTFUL_TRUST:g} % of right answers look as doubtful: check the intrinsics"
@@ -100,6 +96,20 @@ def line(name: str, answer: LocalizationResult | Rejected) -> str:
 def heading(width: int) -> str:
     """Of the table whose names are so wide."""
     return f"{'photograph':{width}}  {'x':>9} {'y':>9} {'z':>9}    {'95 % within':>10} {'trust':>6}  {'inliers':>9}"
+
+
+def _outcome(answer: LocalizationResult) -> str:
+    if answer.pose_stage == "COARSE":
+        return "coarse pose" if answer.is_final else "coarse pose, the refined one is to come"
+    return "localized" if answer.trust is None else f"localized, trust {answer.trust:.3f}"
+
+
+def _support(answer: LocalizationResult) -> str:
+    """What a pose rests on."""
+    if answer.pose_stage == "COARSE":
+        return "checked by nothing"
+    used = sum(use.inlier_count > 0 for use in answer.diagnostics.references)
+    return f"{answer.inlier_count} of {answer.match_count} matches, {used} references"
 
 
 def _checked(check: PriorCheck) -> str:

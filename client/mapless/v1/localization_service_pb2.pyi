@@ -243,6 +243,14 @@ class LocalizeResponse(_message.Message):
     debug: Debug
     def __init__(self, localization: _Optional[_Union[Localization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., diagnostics: _Optional[_Union[Diagnostics, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., debug: _Optional[_Union[Debug, _Mapping]] = ...) -> None: ...
 
+class LocalizeProgressivelyResponse(_message.Message):
+    __slots__ = ("answer", "is_final")
+    ANSWER_FIELD_NUMBER: _ClassVar[int]
+    IS_FINAL_FIELD_NUMBER: _ClassVar[int]
+    answer: LocalizeResponse
+    is_final: bool
+    def __init__(self, answer: _Optional[_Union[LocalizeResponse, _Mapping]] = ..., is_final: bool = ...) -> None: ...
+
 class Localization(_message.Message):
     __slots__ = ("world_from_camera", "covariance", "accuracy", "pose_stage", "inlier_count", "match_count", "reprojection_error_px", "trust", "in_axes", "geo_pose", "prior_checks")
     WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]

@@ -36,6 +36,8 @@ class LocalizationServiceStub(object):
     makes one up otherwise, and where it is anything else. Diagnostics and errors carry it.
     * `x-client-id`: names the caller, 1 to 64 of the same characters. A tenant's callers share the server fairly, however
     many calls each of them makes; without it, each connection is one caller.
+    * `x-mapless-scene`: "scenes/{scene}", the scene that the call concerns, as the request itself says it. For load balancers
+    in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless") and, for INVALID_ARGUMENT, a BadRequest that
     names the field. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
@@ -52,6 +54,11 @@ class LocalizationServiceStub(object):
                 '/mapless.v1.LocalizationService/Localize',
                 request_serializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeRequest.SerializeToString,
                 response_deserializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeResponse.FromString,
+                _registered_method=True)
+        self.LocalizeProgressively = channel.unary_stream(
+                '/mapless.v1.LocalizationService/LocalizeProgressively',
+                request_serializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeRequest.SerializeToString,
+                response_deserializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeProgressivelyResponse.FromString,
                 _registered_method=True)
         self.LocalizeRig = channel.unary_unary(
                 '/mapless.v1.LocalizationService/LocalizeRig',
@@ -81,6 +88,8 @@ class LocalizationServiceServicer(object):
     makes one up otherwise, and where it is anything else. Diagnostics and errors carry it.
     * `x-client-id`: names the caller, 1 to 64 of the same characters. A tenant's callers share the server fairly, however
     many calls each of them makes; without it, each connection is one caller.
+    * `x-mapless-scene`: "scenes/{scene}", the scene that the call concerns, as the request itself says it. For load balancers
+    in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless") and, for INVALID_ARGUMENT, a BadRequest that
     names the field. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
@@ -88,7 +97,8 @@ class LocalizationServiceServicer(object):
     """
 
     def Localize(self, request, context):
-        """Localizes one photograph. Has no side effects and stores nothing; safe to retry.
+        """Localizes one photograph. Safe to retry. Stores nothing, unless the server's operator has it capture calls: then the
+        answer has the trailing metadata `x-mapless-captured: 1`, and the photograph is kept for a time.
 
         "I could not localize this" is an answer (Rejection), not an error. Errors:
 
@@ -101,6 +111,33 @@ class LocalizationServiceServicer(object):
         * UNAVAILABLE: the server starts or drains. Try again, at another server if there is one.
         * DATA_LOSS: a stored reference is damaged.
         * INTERNAL: a fault of the server, without detail; the log has it, under the error's request id.
+
+        buf:lint:ignore RPC_REQUEST_RESPONSE_UNIQUE
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def LocalizeProgressively(self, request, context):
+        """Localizes one photograph, and answers twice: at once with the coarse pose, as soon as there is one, and then with what
+        Localize would have answered. For callers who can do something with a pose that nothing has checked, before a better
+        one comes. The messages, in order:
+
+        * At most one coarse answer: a Localization with POSE_STAGE_COARSE, of the server's first features where it has several.
+        It comes only where the reconstruction gives a pose that no hard limit of the request's priors turns down; it is
+        never a rejection. See POSE_STAGE_COARSE for what it is worth, which is not said in numbers: it has no covariance,
+        accuracy or trust, and may turn out to be wrong, by another pose or by a rejection.
+        * Exactly one final answer, Localize's to the same request: the same numbers, bit for bit, but for the times and the id
+        in its Diagnostics. With LocalizeOptions.allow_coarse it may be a coarse one, too. Nothing comes after it.
+
+        Errors are Localize's, in the place of the final answer: a DEADLINE_EXCEEDED, for instance, may come after a coarse
+        answer, which then is all there is. The call waits, is computed and is charged as Localize is: the coarse answer neither
+        delays the final one nor is delayed by a caller that reads slowly. Whoever needs no more cancels the call, which ends the
+        computation. Without a deadline the server's default for unary calls holds, for both messages together.
+
+        The request is the same on purpose: either method can be asked the same question.
+        buf:lint:ignore RPC_REQUEST_STANDARD_NAME
+        buf:lint:ignore RPC_REQUEST_RESPONSE_UNIQUE
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -124,9 +161,10 @@ class LocalizationServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def WatchQueries(self, request, context):
-        """Shows a scene's calls of Localize as they are answered, with their photographs, until the caller has seen enough: for
-        whoever watches over a scene. Nothing is stored; a watcher that reads too slowly misses answers. Takes the role write.
-        FAILED_PRECONDITION unless the server is configured to allow it; RESOURCE_EXHAUSTED when too many watch.
+        """Shows a scene's calls of Localize, and of LocalizeProgressively by their final answers, as they are answered, with their
+        photographs, until the caller has seen enough: for whoever watches over a scene. Nothing is stored; a watcher that reads
+        too slowly misses answers. Takes the role write. FAILED_PRECONDITION unless the server is configured to allow it;
+        RESOURCE_EXHAUSTED when too many watch.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -139,6 +177,11 @@ def add_LocalizationServiceServicer_to_server(servicer, server):
                     servicer.Localize,
                     request_deserializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeRequest.FromString,
                     response_serializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeResponse.SerializeToString,
+            ),
+            'LocalizeProgressively': grpc.unary_stream_rpc_method_handler(
+                    servicer.LocalizeProgressively,
+                    request_deserializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeRequest.FromString,
+                    response_serializer=mapless_dot_v1_dot_localization__service__pb2.LocalizeProgressivelyResponse.SerializeToString,
             ),
             'LocalizeRig': grpc.unary_unary_rpc_method_handler(
                     servicer.LocalizeRig,
@@ -174,6 +217,8 @@ class LocalizationService(object):
     makes one up otherwise, and where it is anything else. Diagnostics and errors carry it.
     * `x-client-id`: names the caller, 1 to 64 of the same characters. A tenant's callers share the server fairly, however
     many calls each of them makes; without it, each connection is one caller.
+    * `x-mapless-scene`: "scenes/{scene}", the scene that the call concerns, as the request itself says it. For load balancers
+    in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless") and, for INVALID_ARGUMENT, a BadRequest that
     names the field. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
@@ -197,6 +242,33 @@ class LocalizationService(object):
             '/mapless.v1.LocalizationService/Localize',
             mapless_dot_v1_dot_localization__service__pb2.LocalizeRequest.SerializeToString,
             mapless_dot_v1_dot_localization__service__pb2.LocalizeResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def LocalizeProgressively(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/mapless.v1.LocalizationService/LocalizeProgressively',
+            mapless_dot_v1_dot_localization__service__pb2.LocalizeRequest.SerializeToString,
+            mapless_dot_v1_dot_localization__service__pb2.LocalizeProgressivelyResponse.FromString,
             options,
             channel_credentials,
             insecure,

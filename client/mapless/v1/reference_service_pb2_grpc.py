@@ -33,7 +33,8 @@ class ReferenceServiceStub(object):
     Anything else is INVALID_ARGUMENT; a well-formed name of something that does not exist is NOT_FOUND.
 
     A scene belongs to the tenant whose token created it; to every other tenant it does not exist, in any call or list, and
-    its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`.
+    its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`,
+    `x-mapless-scene`.
 
     Errors are google.rpc.Status with one ErrorInfo (domain "mapless"); INVALID_ARGUMENT carries a BadRequest that names
     the field. Beside what stands with each call, any of them may fail with
@@ -129,7 +130,8 @@ class ReferenceServiceServicer(object):
     Anything else is INVALID_ARGUMENT; a well-formed name of something that does not exist is NOT_FOUND.
 
     A scene belongs to the tenant whose token created it; to every other tenant it does not exist, in any call or list, and
-    its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`.
+    its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`,
+    `x-mapless-scene`.
 
     Errors are google.rpc.Status with one ErrorInfo (domain "mapless"); INVALID_ARGUMENT carries a BadRequest that names
     the field. Beside what stands with each call, any of them may fail with
@@ -324,7 +326,8 @@ class ReferenceService(object):
     Anything else is INVALID_ARGUMENT; a well-formed name of something that does not exist is NOT_FOUND.
 
     A scene belongs to the tenant whose token created it; to every other tenant it does not exist, in any call or list, and
-    its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`.
+    its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`,
+    `x-mapless-scene`.
 
     Errors are google.rpc.Status with one ErrorInfo (domain "mapless"); INVALID_ARGUMENT carries a BadRequest that names
     the field. Beside what stands with each call, any of them may fail with

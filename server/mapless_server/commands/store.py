@@ -145,6 +145,8 @@ def _report(found: Verification, verdict: str) -> None:
         print(f"damaged: {fault}")
     if found.faults:
         print(f"{len(found.faults)} faults; delete the references that are named and add them again")
+        if not found.is_file_whole:
+            print("the file itself is damaged: restore a backup, or export each scene and import it into a new store")
         raise typer.Exit(1)
     print(verdict)
 

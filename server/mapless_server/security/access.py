@@ -11,6 +11,7 @@ from .tokens import Tokens
 
 METHOD_ROLES: Mapping[str, Role] = {
     "/mapless.v1.LocalizationService/Localize": Role.LOCALIZE,
+    "/mapless.v1.LocalizationService/LocalizeProgressively": Role.LOCALIZE,
     "/mapless.v1.LocalizationService/LocalizeRig": Role.LOCALIZE,
     "/mapless.v1.LocalizationService/LocalizeSequence": Role.LOCALIZE,
     # Other callers' photographs are shown.
@@ -43,6 +44,10 @@ OPEN_METHODS = frozenset(
     }
 )
 """What anybody may call; nothing of it tells of scenes."""
+
+ENDLESS_METHODS = frozenset({"/mapless.v1.LocalizationService/WatchQueries"})
+"""Streams that last until their caller has seen enough: they have no deadline but the caller's own, nobody waits for
+their end, and whether the caller may is asked again before each message. All other calls end in time, streams too."""
 
 _KEY = "authorization"
 _SCHEME = "bearer"

@@ -159,7 +159,7 @@ def revoke_token(path: Path, name: str) -> None:
 def _describe(error: ValidationError) -> str:
     """The first fault, without what stands there: somebody may have put a token where its hash should be."""
     fault = error.errors()[0]
-    where = ".".join(map(str, fault["loc"]))
+    where = ascii(".".join(map(str, fault["loc"])))[1:-1]  # names in the file may be anything
     what = fault["msg"].removeprefix("Value error, ")
     return f"{where}: {what}" if where else what
 

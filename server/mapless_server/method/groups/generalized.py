@@ -11,8 +11,11 @@ for a match's ray from p_i in the direction d_i, in the frame's unit, and its po
 
 from __future__ import annotations
 
+import ctypes
 import math
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +25,9 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, RigidTransform, Similarity
 
 from ..pnp import PnpOptions, reprojection_errors_px
+
+_libc = ctypes.CDLL(None)
+_rand_lock = threading.Lock()
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,19 +78,20 @@ def rig_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> RigidTr
     cameras = _bounded(cameras, options.max_matches)
     if sum(len(camera.pixels) for camera in cameras) < 3:
         return None
-    pose, _ = poselib.estimate_generalized_absolute_pose(
-        [camera.pixels for camera in cameras],
-        [camera.x_in_world for camera in cameras],
-        [_poselib_pose(camera.rig_from_camera.inverse()) for camera in cameras],
-        [_poselib_camera(camera.camera) for camera in cameras],
-        {
-            "max_reproj_error": options.inlier_px,
-            "min_iterations": options.min_iterations,
-            "max_iterations": options.max_iterations,
-            "seed": 0,
-        },
-        {"loss_type": "CAUCHY", "loss_scale": options.loss_scale_px},
-    )
+    with _repeatable():
+        pose, _ = poselib.estimate_generalized_absolute_pose(
+            [camera.pixels for camera in cameras],
+            [camera.x_in_world for camera in cameras],
+            [_poselib_pose(camera.rig_from_camera.inverse()) for camera in cameras],
+            [_poselib_camera(camera.camera) for camera in cameras],
+            {
+                "max_reproj_error": options.inlier_px,
+                "min_iterations": options.min_iterations,
+                "max_iterations": options.max_iterations,
+                "seed": 0,
+            },
+            {"loss_type": "CAUCHY", "loss_scale": options.loss_scale_px},
+        )
     return _world_from_rig(pose)
 
 
@@ -119,13 +126,26 @@ def scaled_ransac(
         sample = random.choice(len(points), 4, replace=False)
         if len(np.unique(owner[sample])) < 2:
             continue
-        for pose, scale in zip(*poselib.gp4ps(starts[sample], rays[sample], points[sample], True), strict=True):
+        with _repeatable():
+            solutions = poselib.gp4ps(starts[sample], rays[sample], points[sample], True)
+        for pose, scale in zip(*solutions, strict=True):
             world_from_rig = _similarity(pose, scale)
             count = inlier_count(cameras, world_from_rig, options.inlier_px) if world_from_rig else 0
             if count > best_count:
                 best, best_count = world_from_rig, count
                 needed = _iterations_needed(count / len(points))
     return best
+
+
+@contextmanager
+def _repeatable() -> Iterator[None]:
+    """For PoseLib's solvers of generalized poses, which turn the problem by the C library's random numbers.
+
+    No seed of PoseLib's reaches these: without this, the same matches give poses that differ in their last digits.
+    """
+    with _rand_lock:
+        _libc.srand(0)
+        yield
 
 
 def _iterations_needed(inlier_share: float) -> int:

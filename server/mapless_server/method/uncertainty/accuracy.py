@@ -27,12 +27,14 @@ class Accuracy:
 
 def accuracy_from_covariance(covariance: Array) -> Accuracy:
     """Radii of a pose's covariance (6, 6): order x y z rx ry rz, metres and radians."""
-    position, rotation = covariance[:3, :3], covariance[3:, 3:]
+    shares = np.array([0.68, 0.95])
+    position_68_m, position_95_m = error_radii(covariance[:3, :3], shares).tolist()
+    rotation_68, rotation_95 = error_radii(covariance[3:, 3:], shares).tolist()
     return Accuracy(
-        position_68_m=error_radius(position, 0.68),
-        position_95_m=TAIL_95 * error_radius(position, 0.95),
-        rotation_68_deg=math.degrees(error_radius(rotation, 0.68)),
-        rotation_95_deg=TAIL_95 * math.degrees(error_radius(rotation, 0.95)),
+        position_68_m=position_68_m,
+        position_95_m=TAIL_95 * position_95_m,
+        rotation_68_deg=math.degrees(rotation_68),
+        rotation_95_deg=TAIL_95 * math.degrees(rotation_95),
     )
 
 

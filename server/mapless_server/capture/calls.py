@@ -1,0 +1,279 @@
+r"""What is kept of a call, as one file: all that decided the answer, but for the references' photographs and features.
+
+    bytes 0..16   "mapless capture\n"
+    bytes 16..20  length of the header, uint32, little-endian
+    header        JSON; floats as the shortest decimal that reads back as the same float64
+    request       the message
+    response      the message; empty for a call that failed
+    last 32       SHA-256 of everything before
+
+Photographs and features of references are blobs beside it, named by their SHA-256: many calls have them in common.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mapless.geometry import Camera, RigidTransform
+
+from ..retrieval.chosen import Choice
+from ..retrieval.ranking import RankedReference
+from ..store import SceneAttributes, codec
+from .errors import CaptureError, DamagedCapture
+
+FORMAT_VERSION = 1
+MAGIC = b"mapless capture\n"
+_LENGTH = struct.Struct("<I")
+_DIGEST_BYTES = 32
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedReference:
+    """A reference that a photograph was compared with.
+
+    Attributes:
+        reference_id: unique within its scene.
+        key: identifies this very reference for good.
+        camera: in pixels of its photograph.
+        world_from_camera: its pose, metric.
+        image_sha256: its photograph's blob.
+        views: blobs of its features, by the name of the extractor.
+    """
+
+    reference_id: str
+    key: str
+    camera: Camera
+    world_from_camera: RigidTransform
+    image_sha256: str
+    views: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedPart:
+    """What one photograph of a call was compared with.
+
+    Attributes:
+        field: path of the photograph in the request, "image" or "images[2].image".
+        generation: of the scene when its references were read.
+        references: all that it was compared with, those that were named or come into the choice.
+        choice: how they were chosen; None if they were used as they were named.
+    """
+
+    field: str
+    generation: int
+    references: tuple[CapturedReference, ...]
+    choice: Choice | None = None
+
+
+@dataclass(frozen=True)
+class CapturedFailure:
+    """The error that a call ended with."""
+
+    code: str
+    reason: str
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedCall:
+    """A call.
+
+    Attributes:
+        request_id: finds it in the log; callers may use one twice.
+        time_s: when it was answered, Unix seconds.
+        method: "Localize", "LocalizeRig" or "LocalizeSequence".
+        tenant: whose call.
+        scene_id: of the scene, as its tenant knows it.
+        scene_created_us: when the scene was made, Unix microseconds: another one of the same name is not this one.
+        circumstances: what else decides an answer, by name: versions, settings, weights.
+        attributes: of the scene.
+        parts: one for each photograph.
+        request: the message, as it was sent; empty for a call that failed.
+        response: likewise.
+        failure: how it failed; None if it was answered.
+    """
+
+    request_id: str
+    time_s: float
+    method: str
+    tenant: str
+    scene_id: str
+    scene_created_us: int
+    circumstances: Mapping[str, str] = field(default_factory=dict)
+    attributes: SceneAttributes = field(default_factory=SceneAttributes)
+    parts: tuple[CapturedPart, ...] = ()
+    request: bytes = b""
+    response: bytes = b""
+    failure: CapturedFailure | None = None
+
+    @property
+    def keys(self) -> frozenset[tuple[str, str]]:
+        """Id and key of every reference."""
+        return frozenset((it.reference_id, it.key) for part in self.parts for it in part.references)
+
+    @property
+    def blobs(self) -> frozenset[str]:
+        """Names of the blobs that belong to it."""
+        references = [it for part in self.parts for it in part.references]
+        return frozenset(name for it in references for name in (it.image_sha256, *it.views.values()))
+
+
+def encode_call(call: CapturedCall) -> bytes:
+    """The file of a call."""
+    header = {
+        "format": FORMAT_VERSION,
+        "request_id": call.request_id,
+        "time_s": call.time_s,
+        "method": call.method,
+        "tenant": call.tenant,
+        "scene_id": call.scene_id,
+        "scene_created_us": call.scene_created_us,
+        "circumstances": dict(call.circumstances),
+        "attributes": json.loads(codec.encode_attributes(call.attributes) or b"null"),
+        "parts": [_part_to_dict(part) for part in call.parts],
+        "failure": vars(call.failure) if call.failure else None,
+        "request_bytes": len(call.request),
+        "response_bytes": len(call.response),
+    }
+    text = json.dumps(header, separators=(",", ":")).encode()
+    body = b"".join([MAGIC, _LENGTH.pack(len(text)), text, call.request, call.response])
+    return body + hashlib.sha256(body).digest()
+
+
+def decode_call(data: bytes) -> CapturedCall:
+    """The call of a file.
+
+    Raises:
+        DamagedCapture: it is cut or changed.
+        CaptureError: its format is newer than this program.
+    """
+    header, start = _read_header(data)
+    if hashlib.sha256(data[:-_DIGEST_BYTES]).digest() != data[-_DIGEST_BYTES:]:
+        raise DamagedCapture("it is cut or damaged")
+    middle = start + header["request_bytes"]
+    return _call_of(header, data[start:middle], data[middle:-_DIGEST_BYTES])
+
+
+def decode_summary(head: bytes, size_bytes: int) -> CapturedCall:
+    """The same without its messages, from the file's beginning and size, the rest of it unread.
+
+    Args:
+        head: the file's first bytes, its header at least; see `header_end`.
+        size_bytes: of the file.
+
+    Raises:
+        DamagedCapture, CaptureError: as `decode_call`.
+    """
+    header, start = _read_header(head)
+    if start + header["request_bytes"] + header["response_bytes"] + _DIGEST_BYTES != size_bytes:
+        raise DamagedCapture("it is cut")
+    return _call_of(header, b"", b"")
+
+
+def header_end(head: bytes) -> int:
+    """Where the header ends, from a file's first 20 bytes; DamagedCapture if it is none of ours."""
+    if not head.startswith(MAGIC) or len(head) < len(MAGIC) + _LENGTH.size:
+        raise DamagedCapture("it is cut, or no captured call")
+    return len(MAGIC) + _LENGTH.size + int(_LENGTH.unpack_from(head, len(MAGIC))[0])
+
+
+HEAD_BYTES = len(MAGIC) + _LENGTH.size
+"""What `header_end` wants to see."""
+
+
+def _read_header(data: bytes) -> tuple[dict[str, Any], int]:
+    end = header_end(data)
+    try:
+        header = json.loads(data[HEAD_BYTES:end])
+        version = header["format"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DamagedCapture("its header is cut or damaged") from error
+    if version != FORMAT_VERSION:
+        raise CaptureError(f"its format {version} is another than this program's, {FORMAT_VERSION}")
+    return header, end
+
+
+def _call_of(header: Mapping[str, Any], request: bytes, response: bytes) -> CapturedCall:
+    try:
+        names = ("request_id", "time_s", "method", "tenant", "scene_id", "scene_created_us", "circumstances")
+        failure = header["failure"]
+        return CapturedCall(
+            **{name: header[name] for name in names},
+            attributes=_attributes_of(header["attributes"]),
+            parts=tuple(_part_of(it) for it in header["parts"]),
+            request=request,
+            response=response,
+            failure=CapturedFailure(**failure) if failure else None,
+        )
+    except (ValueError, KeyError, TypeError, codec.Damaged) as error:
+        raise DamagedCapture(f"its header is not one of ours: {error}") from error
+
+
+def _attributes_of(content: object) -> SceneAttributes:
+    if content is None:
+        return SceneAttributes()
+    data = json.dumps(content).encode()
+    return codec.decode_attributes("", data, codec.sha256_for("", data))
+
+
+def _part_to_dict(part: CapturedPart) -> dict[str, Any]:
+    choice = part.choice
+    return {
+        "field": part.field,
+        "generation": part.generation,
+        "references": [_reference_to_dict(it) for it in part.references],
+        "choice": choice
+        and {
+            "descriptor": choice.descriptor,
+            "generation": choice.generation,
+            "references": [
+                {"reference_id": it.reference_id, "key": it.key, "similarity": it.similarity, **_pose_to_dict(it)}
+                for it in choice.references
+            ],
+        },
+    }
+
+
+def _part_of(content: Mapping[str, Any]) -> CapturedPart:
+    references, choice = tuple(map(_reference_of, content["references"])), content["choice"]
+    if choice is not None:
+        ranked = tuple(
+            RankedReference(it["reference_id"], it["key"], it["similarity"], _pose_of(it))
+            for it in choice["references"]
+        )
+        choice = Choice(ranked, choice["descriptor"], choice["generation"])
+    return CapturedPart(content["field"], content["generation"], references, choice)
+
+
+def _reference_to_dict(reference: CapturedReference) -> dict[str, Any]:
+    return {
+        "reference_id": reference.reference_id,
+        "key": reference.key,
+        "image": reference.image_sha256,
+        "views": dict(reference.views),
+        **json.loads(codec.encode_geometry(reference.camera, reference.world_from_camera)),
+    }
+
+
+def _reference_of(content: Mapping[str, Any]) -> CapturedReference:
+    geometry = json.dumps({name: content[name] for name in ("camera", "world_from_camera")}).encode()
+    camera, world_from_camera = codec.decode_geometry("", geometry, codec.sha256_for("", geometry))
+    return CapturedReference(
+        content["reference_id"], content["key"], camera, world_from_camera, content["image"], content["views"]
+    )
+
+
+def _pose_to_dict(ranked: RankedReference) -> dict[str, Any]:
+    pose = ranked.world_from_camera
+    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+
+
+def _pose_of(content: Mapping[str, Any]) -> RigidTransform:
+    return RigidTransform(np.array(content["rotation"], float), np.array(content["translation"], float))

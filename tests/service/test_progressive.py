@@ -1,0 +1,493 @@
+"""Coarse first, refined after, through a real server: what comes when, what it is worth, and how it ends."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, cast
+
+import grpc
+import numpy as np
+import pytest
+from compare import assert_pose_close
+from corner import CAMERA as CORNER_CAMERA
+from corner import photograph
+from corner import pose as corner_pose
+from servers import (
+    CAMERA,
+    PHOTO,
+    StandInDescriptor,
+    StandInExtractor,
+    StandInMethod,
+    StandInReconstructor,
+    listening,
+    localize_request,
+    pose,
+    whole,
+)
+
+from mapless import Client, ConnectOptions, MaplessError, NewReference, RigidTransform, wire
+from mapless.errors import from_rpc_error
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless_server.engine import Engine
+from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless_server.method.pnp import PoseStage
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.observability.metrics import Metrics
+from mapless_server.query_stages import Method
+from mapless_server.scheduling.jobs import Over
+from mapless_server.security.rate import RateLimiter
+from mapless_server.security.tokens import create_token
+from mapless_server.serve import engine_options, make_engine
+from mapless_server.settings import Settings
+from mapless_server.store import Store
+from mapless_server.tiers import Tier
+
+LIMIT_S = 30.0
+COARSE_X_M = 7.0
+"""Where the stand-in's coarse pose is; the refined one is the first reference's, at 0 m."""
+
+
+@dataclass
+class Staged:
+    """A method with a coarse pose at once, which refines when it is let.
+
+    Attributes:
+        gate: refining ends when it is open.
+        refining: released by each that begins.
+        given_up: released by each that is ended because nobody wants its answer any more.
+        coarse: the coarse pose; None if there is none.
+        outcome: refined; None for the first reference's pose.
+        trust: of that pose.
+    """
+
+    gate: threading.Event = field(default_factory=threading.Event)
+    refining: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+    given_up: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+    coarse: RigidTransform | None = field(default_factory=lambda: pose(COARSE_X_M))
+    outcome: Rejection | None = None
+    trust: float = 0.9
+
+    def __post_init__(self) -> None:
+        self._stand_in = StandInMethod(trust=self.trust)
+        self._stand_in.gate.set()
+
+    def reset(self) -> None:
+        """As it was at first."""
+        self.gate.clear()
+        for counted in (self.refining, self.given_up):
+            while counted.acquire(blocking=False):
+                pass
+        self.coarse, self.outcome, self.trust = pose(COARSE_X_M), None, 0.9
+
+    def method(self) -> Method:
+        return replace(whole(self._refine), coarse_answer=self._coarse_answer)
+
+    def _refine(self, *asked: Any) -> Answer:
+        self.refining.release()
+        try:
+            while not self.gate.wait(0.005):
+                asked[-1]()
+        except Over:
+            self.given_up.release()
+            raise
+        self._stand_in.trust = self.trust
+        answer = self._stand_in(*asked)
+        return answer if self.outcome is None else replace(answer, outcome=self.outcome)
+
+    def _coarse_answer(self, coarse: Any) -> Answer | None:
+        if self.coarse is None:
+            return None
+        answer = whole(self._stand_in).refine(coarse, lambda: None)
+        found = Localization(self.coarse, None, PoseStage.COARSE, 0, 0, 0.0)
+        return replace(answer, outcome=found, stage_seconds={"coarse": 0.1})
+
+
+@dataclass
+class Serving:
+    """A running server and what its method does."""
+
+    address: str
+    method: Staged
+    engine: Engine
+    metrics: Metrics
+    stop: Callable[[], None]
+    stub: LocalizationServiceStub
+
+
+@contextmanager
+def serving(
+    data_dir: Path, token: str | None = None, features: Sequence[str] = ("stand-in",), **options: Any
+) -> Iterator[Serving]:
+    """A server with a scene "s" of three references, whose method refines when it is let."""
+    defaults = {"workers": 1, "metrics": False, "warm_up": False}
+    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, **(defaults | options))
+    staged, known = Staged(), list[Metrics]()
+
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+        known.append(metrics)
+        tiers = [Tier(StandInExtractor(name), Pipeline(cast(Any, StandInReconstructor()))) for name in features]
+        return Engine(store, tiers, engine_options(settings), metrics, quota, staged.method(), StandInDescriptor())
+
+    with listening(settings, Store.open(data_dir), make) as (running, stop):
+        with Client(running.address, ConnectOptions(token=token)) as client:
+            client.create_scene("s")
+            client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
+        with grpc.insecure_channel(running.address) as channel:
+            try:
+                yield Serving(running.address, staged, running.engine, known[0], stop, LocalizationServiceStub(channel))
+            finally:
+                staged.gate.set()
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
+    with serving(tmp_path_factory.mktemp("data"), allow_watching=True) as running:
+        yield running
+
+
+@pytest.fixture
+def server(shared: Serving) -> Iterator[Serving]:
+    shared.method.reset()
+    yield shared
+    shared.method.gate.set()
+    wait_until(lambda: shared.engine.queue.job_count == 0)
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.005)
+
+
+def asking(server: Serving, timeout: float | None = LIMIT_S, metadata: Any = (), **fields: Any) -> Any:
+    request = localize_request("s")
+    request.MergeFrom(pb.LocalizeRequest(**fields))
+    return server.stub.LocalizeProgressively(request, timeout=timeout, metadata=metadata)
+
+
+def ending(call: Any) -> MaplessError:
+    """The error that a call ends with."""
+    with pytest.raises(grpc.RpcError) as caught:
+        list(call)
+    return from_rpc_error(caught.value)
+
+
+def sample(server: Serving, name: str, **labels: str) -> float:
+    return server.metrics.registry.get_sample_value(name, labels) or 0.0
+
+
+def test_the_coarse_pose_comes_first_and_says_no_more_than_is_known(server: Serving) -> None:
+    session = wire.transform_to_message(pose(3.0))
+    asked: dict[str, Any] = {"session_from_camera": session, "options": pb.LocalizeOptions(axes=pb.AXES_UNITY)}
+    call = asking(server, **asked, metadata=(("x-request-id", "mine"),))
+    first = next(call)
+    assert server.method.refining.acquire(timeout=LIMIT_S)
+    assert server.engine.queue.job_count == 1
+    found = first.answer.localization
+    assert not first.is_final
+    assert found.pose_stage == pb.POSE_STAGE_COARSE
+    assert not any(found.HasField(it) for it in ("covariance", "accuracy", "trust"))
+    assert (found.inlier_count, found.match_count, len(found.prior_checks)) == (0, 0, 0)
+    assert not first.answer.HasField("debug")
+    assert_pose_close(
+        wire.transform_from_message(found.world_from_camera, ""), pose(COARSE_X_M), metres=1e-9, degrees=1e-6
+    )
+    assert found.in_axes.HasField("world_from_session")
+    assert first.answer.session_from_camera == session
+    assert first.answer.diagnostics.request_id == "mine"
+    assert [it.stage for it in first.answer.diagnostics.stages][-1] == "coarse"
+    server.method.gate.set()
+    last = next(call)
+    assert last.is_final
+    assert last.answer.localization.pose_stage == pb.POSE_STAGE_REFINED
+    refined = wire.transform_from_message(last.answer.localization.world_from_camera, "")
+    assert_pose_close(refined, pose(0), metres=1e-9, degrees=1e-6)
+    assert list(call) == []
+    assert call.code() is grpc.StatusCode.OK
+    assert dict(call.trailing_metadata())["x-request-id"] == "mine"
+
+
+def without_times(answer: pb.LocalizeResponse) -> bytes:
+    """All that a call is answered but how long it took and what it is called."""
+    kept = pb.LocalizeResponse()
+    kept.CopyFrom(answer)
+    for stage in kept.diagnostics.stages:
+        stage.ClearField("duration")
+    for field_name in ("request_id", "queue_duration", "total_duration"):
+        kept.diagnostics.ClearField(field_name)
+    return bytes(kept.SerializeToString(deterministic=True))
+
+
+ANGLES_DEG = (-24, -16, -8, 0, 8, 16, 24)
+
+
+@pytest.fixture(scope="module")
+def corner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalizationServiceStub]:
+    """A server as it is shipped, with a scene of a papered corner."""
+    folder = tmp_path_factory.mktemp("corner")
+    settings = Settings(host="127.0.0.1", port=0, data_dir=folder, workers=1, metrics=False, warm_up=False)
+    with listening(settings, Store.open(folder), make_engine) as (running, _), Client(running.address) as client:
+        client.create_scene("s")
+        poses = [corner_pose(angle) for angle in ANGLES_DEG]
+        client.add_references(
+            "s", [NewReference(f"r{i}", photograph(it), CORNER_CAMERA, it) for i, it in enumerate(poses)]
+        )
+        with grpc.insecure_channel(running.address) as channel:
+            yield LocalizationServiceStub(channel)
+
+
+def corner_request(world_from_camera: RigidTransform, **options: Any) -> pb.LocalizeRequest:
+    return pb.LocalizeRequest(
+        scene="scenes/s",
+        image=photograph(world_from_camera),
+        intrinsics=wire.camera_to_message(CORNER_CAMERA),
+        options=pb.LocalizeOptions(**options),
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        ({}, 2),
+        ({"axes": pb.AXES_ROS, "include_debug": True, "allow_coarse": True}, 2),
+        ({"variant": pb.VARIANT_FULL, "reference_count": 4}, 2),
+        ({"variant": pb.VARIANT_COARSE}, 1),
+    ],
+    ids=["default", "all that can be asked for", "the paper's", "coarse alone"],
+)
+def test_the_last_message_is_what_localize_answers_bit_for_bit(
+    corner: LocalizationServiceStub, options: dict[str, Any], count: int
+) -> None:
+    truth = corner_pose(3.0, -1.4)
+    request = corner_request(truth, **options)
+    plain = corner.Localize(request, timeout=LIMIT_S)
+    messages = list(corner.LocalizeProgressively(request, timeout=LIMIT_S))
+    assert [it.is_final for it in messages] == [False] * (count - 1) + [True]
+    assert without_times(messages[-1].answer) == without_times(plain)
+    assert plain.WhichOneof("outcome") == "localization"
+    for message in messages:
+        found = wire.transform_from_message(message.answer.localization.world_from_camera, "")
+        assert np.linalg.norm(found.translation - truth.translation) < 0.02
+
+
+def test_what_cannot_be_localized_is_rejected_once_as_localize_does(corner: LocalizationServiceStub) -> None:
+    request = corner_request(corner_pose(0))
+    request.image = PHOTO
+    request.intrinsics.CopyFrom(wire.camera_to_message(CAMERA))
+    (only,) = corner.LocalizeProgressively(request, timeout=LIMIT_S)
+    assert only.is_final
+    assert only.answer.WhichOneof("outcome") == "rejection"
+    assert without_times(only.answer) == without_times(corner.Localize(request, timeout=LIMIT_S))
+
+
+def test_a_coarse_pose_may_turn_out_to_be_none(server: Serving) -> None:
+    server.method.outcome = Rejection(RejectionReason.GATE, "planted")
+    server.method.gate.set()
+    first, last = asking(server)
+    assert first.answer.WhichOneof("outcome") == "localization"
+    assert last.is_final
+    assert last.answer.rejection.reason == pb.REJECTION_REASON_GATE
+
+
+@pytest.mark.parametrize("coarse", [None, RigidTransform(np.eye(3), np.full(3, np.nan))], ids=["none", "not finite"])
+def test_there_is_nothing_before_the_answer_where_nothing_is_known_before(
+    server: Serving, coarse: RigidTransform | None
+) -> None:
+    server.method.coarse = coarse
+    server.method.gate.set()
+    (only,) = asking(server)
+    assert only.is_final
+
+
+def test_a_coarse_pose_outside_a_hard_limit_is_not_told(server: Serving) -> None:
+    server.method.gate.set()
+    near = pb.PositionPrior(position_m=wire.transform_to_message(pose(0)).translation_m, radius_m=2.5)
+    (only,) = asking(server, position_prior=near)
+    assert only.is_final
+    assert only.answer.WhichOneof("outcome") == "localization"
+
+
+def test_who_has_seen_enough_frees_the_place_and_ends_the_refinement(server: Serving) -> None:
+    before = sample(server, "mapless_jobs_terminated_total", outcome="cancelled", stage="refine")
+    call = asking(server)
+    next(call)
+    assert server.method.refining.acquire(timeout=LIMIT_S)
+    call.cancel()
+    assert server.method.given_up.acquire(timeout=LIMIT_S)
+    wait_until(lambda: server.engine.queue.job_count == 0)
+    assert sample(server, "mapless_jobs_terminated_total", outcome="cancelled", stage="refine") == before + 1
+    server.method.gate.set()
+    assert len(list(asking(server))) == 2
+
+
+def test_a_deadline_after_the_coarse_answer_is_an_error_with_details(server: Serving) -> None:
+    call = asking(server, timeout=1.0)
+    assert not next(call).is_final
+    failure = ending(call)
+    assert (failure.code, failure.reason) == ("DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED")
+    assert failure.request_id
+    assert server.method.given_up.acquire(timeout=LIMIT_S)
+
+
+def test_where_a_coarse_pose_will_do_the_deadline_makes_it_final(server: Serving) -> None:
+    first, last = asking(server, timeout=1.0, options=pb.LocalizeOptions(allow_coarse=True))
+    assert (first.is_final, last.is_final) == (False, True)
+    assert last.answer.localization == first.answer.localization
+    assert last.answer.localization.pose_stage == pb.POSE_STAGE_COARSE
+
+
+def test_who_names_no_deadline_has_the_servers(tmp_path: Path) -> None:
+    with serving(tmp_path, default_deadline_s=0.7) as short:
+        call = asking(short, timeout=None)
+        assert not next(call).is_final
+        assert ending(call).code == "DEADLINE_EXCEEDED"
+
+
+def test_a_full_server_refuses_before_anything_is_computed_and_says_when_to_come_back(tmp_path: Path) -> None:
+    with serving(tmp_path, max_queued_s=0.001) as full:
+        first = asking(full)
+        next(first)
+        failure = ending(asking(full))
+        assert (failure.code, failure.reason) == ("RESOURCE_EXHAUSTED", "QUEUE_FULL")
+        assert failure.retry_after_s is not None
+        full.method.gate.set()
+        assert next(first).is_final
+
+
+def test_what_is_wrong_with_a_request_is_told_as_localize_tells_it(server: Serving) -> None:
+    def both(request: pb.LocalizeRequest) -> tuple[MaplessError, MaplessError]:
+        with pytest.raises(grpc.RpcError) as caught:
+            server.stub.Localize(request, timeout=LIMIT_S)
+        return from_rpc_error(caught.value), ending(server.stub.LocalizeProgressively(request, timeout=LIMIT_S))
+
+    absent, bad_image, bad_camera = localize_request("absent"), localize_request("s"), localize_request("s")
+    bad_image.image = b"GIF89a"
+    bad_camera.intrinsics.focal_x_px = -1
+    for request in (absent, bad_image, bad_camera):
+        plain, progressive = both(request)
+        assert progressive.field is not None
+        assert [getattr(plain, it) for it in ("code", "reason", "field", "message")] == [
+            getattr(progressive, it) for it in ("code", "reason", "field", "message")
+        ]
+
+
+def test_who_does_not_read_holds_up_nobody(server: Serving) -> None:
+    """There is one worker, and the answer that nobody reads is computed and out of its way."""
+    unread = asking(server)
+    assert server.method.refining.acquire(timeout=LIMIT_S)
+    server.method.gate.set()
+    for _ in range(3):
+        assert server.stub.Localize(localize_request("s"), timeout=LIMIT_S).HasField("localization")
+    assert server.engine.queue.job_count == 0
+    assert [it.is_final for it in unread] == [False, True]
+
+
+def test_a_server_that_stops_waits_for_the_refined_answer(tmp_path: Path) -> None:
+    with serving(tmp_path, drain_grace_s=60) as leaving:
+        call = asking(leaving)
+        next(call)
+        assert leaving.method.refining.acquire(timeout=LIMIT_S)
+        leaving.stop()
+
+        def refuses() -> bool:
+            try:
+                asking(leaving, timeout=0.05, scene="scenes/absent").next()
+            except grpc.RpcError as error:
+                return from_rpc_error(error).reason == "DRAINING"
+            raise AssertionError("there is no such scene")
+
+        wait_until(refuses)
+        leaving.method.gate.set()
+        assert next(call).is_final
+        assert list(call) == []
+
+
+def test_it_takes_the_role_that_localizing_takes(tmp_path: Path) -> None:
+    tokens = tmp_path / "tokens.json"
+
+    def holding(tenant: str, role: str) -> Any:
+        return (("authorization", f"Bearer {create_token(tokens, f'{tenant}-{role}', tenant, role, None)}"),)
+
+    owner = create_token(tokens, "owner", "acme", "write", None)
+    reader, robot, stranger = holding("acme", "read"), holding("acme", "localize"), holding("other", "localize")
+    with serving(tmp_path / "data", owner, tokens_file=tokens) as guarded:
+        guarded.method.gate.set()
+        assert ending(asking(guarded)).reason == "TOKEN_MISSING"
+        assert ending(asking(guarded, metadata=reader)).reason == "ROLE_TOO_LOW"
+        assert len(list(asking(guarded, metadata=robot))) == 2
+        failure = ending(asking(guarded, metadata=stranger))
+        assert (failure.code, failure.field) == ("NOT_FOUND", "scene")
+
+
+def test_watchers_see_the_answer_once_and_it_counts_once(server: Serving) -> None:
+    answered = sample(server, "mapless_answers_total", outcome="localized")
+    seen = server.stub.WatchQueries(pb.WatchQueriesRequest(scene="scenes/s"), timeout=LIMIT_S)
+    seen.initial_metadata()
+    server.method.gate.set()
+    for name in ("first", "second"):
+        assert len(list(asking(server, metadata=(("x-request-id", name),)))) == 2
+    shown = [next(seen) for _ in range(2)]
+    assert [it.answer.diagnostics.request_id for it in shown] == ["first", "second"]
+    assert [it.answer.localization.pose_stage for it in shown] == [pb.POSE_STAGE_REFINED] * 2
+    assert sample(server, "mapless_answers_total", outcome="localized") == answered + 2
+    seen.cancel()
+
+
+def test_of_two_kinds_of_features_the_first_gives_the_coarse_pose_and_the_better_one_the_answer(tmp_path: Path) -> None:
+    with serving(tmp_path, features=("cheap", "strong")) as both:
+        both.method.trust = 0.01  # doubtful, so the stronger features try again
+        both.method.gate.set()
+        messages = list(asking(both))
+    assert [it.is_final for it in messages] == [False, True]
+    assert messages[0].answer.diagnostics.features == "cheap"
+    assert messages[1].answer.diagnostics.features == "strong"
+
+
+def test_the_log_says_when_the_coarse_answer_was_there(server: Serving, caplog: pytest.LogCaptureFixture) -> None:
+    counted = sample(server, "mapless_coarse_answer_seconds_count")
+    with caplog.at_level("INFO", "mapless_server.rpc"):
+        call = asking(server, metadata=(("x-request-id", "logged"),))
+        next(call)
+        server.method.gate.set()
+        assert len(list(call)) == 1
+        wait_until(lambda: any(record.getMessage() == "LocalizeProgressively OK" for record in caplog.records))
+    (line,) = (it for it in caplog.records if it.getMessage() == "LocalizeProgressively OK")
+    told: Any = vars(line)
+    assert told["request_id"] == "logged"
+    assert 0 < told["coarse_ms"] <= told["duration_ms"]
+    assert sample(server, "mapless_coarse_answer_seconds_count") == counted + 1
+    assert {"prepare", "coarse", "refine"} == set(told["stages_ms"])
+    assert (told["outcome"], told["pose_stage"], told["code"]) == ("localized", "refined", "OK")
+    assert told["bytes_out"] > 0
+
+
+def test_who_goes_through_the_log_finds_no_fault(server: Serving, caplog: pytest.LogCaptureFixture) -> None:
+    """However its callers leave."""
+    with caplog.at_level("WARNING"):
+        for leave in ("cancel", "deadline", "close"):
+            with grpc.insecure_channel(server.address) as channel:
+                request = localize_request("s")
+                timeout = 0.3 if leave == "deadline" else LIMIT_S
+                call = LocalizationServiceStub(channel).LocalizeProgressively(request, timeout=timeout)
+                next(call)
+                if leave == "cancel":
+                    call.cancel()
+                elif leave == "deadline":
+                    assert ending(call).code == "DEADLINE_EXCEEDED"
+        wait_until(lambda: server.engine.queue.job_count == 0)
+    assert not caplog.records
+
+
+def test_many_at_a_time_get_two_answers_each_in_order(server: Serving) -> None:
+    server.method.gate.set()
+    with ThreadPoolExecutor(8) as threads:
+        streams = list(threads.map(lambda i: list(asking(server, metadata=(("x-client-id", f"c{i % 4}"),))), range(40)))
+    assert {tuple(it.is_final for it in messages) for messages in streams} == {(False, True)}

@@ -1,0 +1,293 @@
+"""What the clients make of streams: what is told early is told once, broken calls are made again, errors come last."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent import futures
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+from clients import Awaiting, status
+from servers import CAMERA, PHOTO, pose
+
+from mapless import (
+    Client,
+    ConnectOptions,
+    Internal,
+    InvalidArgument,
+    LocalizationResult,
+    MaplessError,
+    Rejected,
+    Unavailable,
+    aio,
+    wire,
+)
+from mapless.__main__ import main
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.v1.localization_service_pb2_grpc import (
+    LocalizationServiceServicer,
+    add_LocalizationServiceServicer_to_server,
+)
+
+FAST = ConnectOptions(timeout_s=20.0, initial_backoff_s=0.01, max_backoff_s=0.02)
+LIMIT_S = 20.0
+
+Attempt = tuple[Sequence[pb.LocalizeProgressivelyResponse], grpc.Status | None]
+"""What a call is told, and how it then fails."""
+
+
+def localized(x_m: float, is_final: bool = False) -> pb.LocalizeProgressivelyResponse:
+    stage = pb.POSE_STAGE_REFINED if is_final else pb.POSE_STAGE_COARSE
+    found = pb.Localization(world_from_camera=wire.transform_to_message(pose(x_m)), pose_stage=stage)
+    return pb.LocalizeProgressivelyResponse(answer=pb.LocalizeResponse(localization=found), is_final=is_final)
+
+
+def rejected(is_final: bool = True) -> pb.LocalizeProgressivelyResponse:
+    answer = pb.LocalizeResponse(rejection=pb.Rejection(reason=pb.REJECTION_REASON_GATE))
+    return pb.LocalizeProgressivelyResponse(answer=answer, is_final=is_final)
+
+
+COARSE, FINAL = localized(1.0), localized(2.0, is_final=True)
+
+
+@dataclass
+class Played(LocalizationServiceServicer):
+    """Answers each call with the next attempt; the last is repeated.
+
+    Attributes:
+        attempts: these.
+        left_s: to the deadline of each call that came.
+        requests: what they asked.
+        gone: set when a call ended that waits for ever, which one without messages and end does.
+    """
+
+    attempts: list[Attempt]
+    left_s: list[float] = field(default_factory=list)
+    requests: list[pb.LocalizeRequest] = field(default_factory=list)
+    gone: threading.Event = field(default_factory=threading.Event)
+
+    def LocalizeProgressively(  # noqa: N802
+        self, request: pb.LocalizeRequest, context: grpc.ServicerContext
+    ) -> Iterator[pb.LocalizeProgressivelyResponse]:
+        self.left_s.append(context.time_remaining())
+        self.requests.append(request)
+        messages, end = self.attempts.pop(0) if len(self.attempts) > 1 else self.attempts[0]
+        waits = end is None and not (messages and (messages[-1].is_final or len(messages) == 3))
+        waits &= not (messages and messages[-1].answer.WhichOneof("outcome") != "localization")
+        if waits:
+            context.add_callback(self.gone.set)  # before the caller has read anything, and may go
+        yield from messages
+        if end is not None:
+            context.abort_with_status(end)
+        if waits:
+            self.gone.wait(LIMIT_S)
+
+
+@contextmanager
+def playing(*attempts: Attempt) -> Iterator[tuple[str, Played]]:
+    servicer = Played(list(attempts))
+    with futures.ThreadPoolExecutor(4) as pool:
+        server = grpc.server(pool)
+        add_LocalizationServiceServicer_to_server(servicer, server)
+        port = server.add_insecure_port("127.0.0.1:0")
+        server.start()
+        try:
+            yield f"127.0.0.1:{port}", servicer
+        finally:
+            servicer.gone.set()
+            server.stop(None).wait()
+
+
+@pytest.fixture(params=[Client, Awaiting], ids=["blocking", "asyncio"])
+def kind(request: pytest.FixtureRequest) -> Any:
+    return request.param
+
+
+def told(kind: Any, address: str, **asked: Any) -> tuple[list[LocalizationResult | Rejected], MaplessError | None]:
+    """All that a call yields, and the error that it ends with."""
+    answers: list[LocalizationResult | Rejected] = []
+
+    async def collect(client: aio.Client) -> None:
+        async for answer in client.localize_progressively(PHOTO, CAMERA, "s", **asked):
+            answers.append(answer)  # noqa: PERF401  it may end by an error
+
+    with kind(address, FAST) as client:
+        try:
+            if isinstance(client, Awaiting):
+                client.wait(collect(client.client))
+            else:
+                for answer in client.localize_progressively(PHOTO, CAMERA, "s", **asked):
+                    answers.append(answer)  # noqa: PERF402  it may end by an error
+        except MaplessError as error:
+            return answers, error
+    return answers, None
+
+
+def test_the_coarse_answer_is_told_and_then_the_final_one(kind: Any) -> None:
+    with playing(([COARSE, FINAL], None)) as (address, played):
+        (first, last), error = told(kind, address, variant="full", axes="unity")
+    assert error is None
+    assert isinstance(first, LocalizationResult)
+    assert isinstance(last, LocalizationResult)
+    assert (first.pose_stage, first.is_final, last.pose_stage, last.is_final) == ("COARSE", False, "REFINED", True)
+    np.testing.assert_allclose(first.world_from_camera.translation, pose(1.0).translation)
+    np.testing.assert_allclose(last.world_from_camera.translation, pose(2.0).translation)
+    (request,) = played.requests
+    assert (request.scene, request.image) == ("scenes/s", PHOTO)
+    assert (request.options.variant, request.options.axes) == (pb.VARIANT_FULL, pb.AXES_UNITY)
+
+
+def test_a_rejection_is_final(kind: Any) -> None:
+    with playing(([COARSE, rejected()], None)) as (address, _):
+        (first, last), error = told(kind, address)
+    assert error is None
+    assert (first.is_final, last.is_final) == (False, True)
+    assert isinstance(last, Rejected)
+
+
+BROKEN, FULL = status("UNAVAILABLE"), status("RESOURCE_EXHAUSTED", retry_after_s=0.01)
+
+
+@pytest.mark.parametrize(
+    ("attempts", "expected_m"),
+    [
+        ([([FINAL], None)], [2.0]),
+        ([([], BROKEN), ([], FULL), ([COARSE, FINAL], None)], [1.0, 2.0]),
+        ([([COARSE], BROKEN), ([localized(5.0), FINAL], None)], [1.0, 2.0]),
+        ([([COARSE], BROKEN), ([], BROKEN), ([FINAL], None)], [1.0, 2.0]),
+        ([([COARSE, FINAL], BROKEN)], [1.0, 2.0]),
+    ],
+    ids=["none is coarse", "before the first", "after it", "after it and again", "when all is said"],
+)
+def test_a_call_that_breaks_is_made_again_and_tells_a_coarse_answer_once(
+    kind: Any, attempts: list[Attempt], expected_m: list[float]
+) -> None:
+    with playing(*attempts) as (address, played):
+        answers, error = told(kind, address)
+    assert error is None
+    assert [it.world_from_camera.translation[0] for it in answers if isinstance(it, LocalizationResult)] == expected_m
+    assert [it.is_final for it in answers] == [False] * (len(expected_m) - 1) + [True]
+    assert len(played.left_s) == len(attempts)
+
+
+@pytest.mark.parametrize(
+    ("end", "error_type", "tries"),
+    [(status("INVALID_ARGUMENT"), InvalidArgument, 1), (BROKEN, Unavailable, FAST.max_attempts)],
+)
+@pytest.mark.parametrize("messages", [[], [COARSE]], ids=["before", "after"])
+def test_an_error_comes_last(
+    kind: Any,
+    messages: list[pb.LocalizeProgressivelyResponse],
+    end: grpc.Status,
+    error_type: type[MaplessError],
+    tries: int,
+) -> None:
+    with playing((messages, end)) as (address, played):
+        answers, error = told(kind, address)
+    assert type(error) is error_type
+    assert len(answers) == len(messages)
+    assert len(played.left_s) == tries
+
+
+def test_the_deadline_is_that_of_all(kind: Any) -> None:
+    later = status("RESOURCE_EXHAUSTED", retry_after_s=0.3)
+    with playing(([], later), ([COARSE], None)) as (address, played):
+        answers, error = told(kind, address, timeout_s=1.0)
+    assert error is not None
+    assert (len(answers), error.code) == (1, "DEADLINE_EXCEEDED")
+    first_s, second_s = played.left_s
+    assert second_s < 0.75 < first_s < 1.05
+
+
+@pytest.mark.parametrize(
+    "messages",
+    [[COARSE, COARSE, COARSE], [rejected(is_final=False)], [pb.LocalizeProgressivelyResponse()]],
+    ids=["no end", "a rejection first", "nothing"],
+)
+def test_what_breaks_the_contract_is_the_servers_fault(
+    kind: Any, messages: list[pb.LocalizeProgressivelyResponse]
+) -> None:
+    with playing((messages, None)) as (address, _):
+        answers, error = told(kind, address)
+    assert isinstance(error, Internal)
+    assert error.reason == "MALFORMED_ANSWER"
+    assert len(answers) == (len(messages) == 3)
+
+
+def test_who_reads_no_further_ends_the_call() -> None:
+    with playing(([COARSE], None)) as (address, played), Client(address, FAST) as client:
+        answers = client.localize_progressively(PHOTO, CAMERA, "s")
+        assert not next(answers).is_final
+        assert not played.gone.is_set()
+        answers.close()  # type: ignore[attr-defined]  # it is a generator
+        assert played.gone.wait(LIMIT_S)
+
+
+def test_who_reads_no_further_ends_the_call_in_asyncio_too() -> None:
+    async def read_one(address: str) -> None:
+        async with aio.Client(address, FAST) as client:
+            answers = client.localize_progressively(PHOTO, CAMERA, "s")
+            assert not (await anext(answers)).is_final
+            await answers.aclose()  # type: ignore[attr-defined]  # it is a generator
+
+    with playing(([COARSE], None)) as (address, played):
+        asyncio.run(read_one(address))
+        assert played.gone.wait(LIMIT_S)
+
+
+CAMERA_NUMBERS = "80,81,47.5,31.5"
+
+
+def command(capsys: pytest.CaptureFixture[str], address: str, *arguments: str) -> tuple[int, list[str], str]:
+    """Exit code, lines printed, and what was complained about."""
+    with pytest.raises(SystemExit) as ended:
+        main(["--address", address, "localize", "s", *arguments, "--camera", CAMERA_NUMBERS, "--progressive"])
+    printed = capsys.readouterr()
+    return int(ended.value.code or 0), printed.out.splitlines(), printed.err
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> str:
+    path = tmp_path / "photo.png"
+    path.write_bytes(PHOTO)
+    return str(path)
+
+
+@pytest.mark.parametrize(("last", "code"), [(FINAL, 0), (rejected(), 3)], ids=["localized", "rejected"])
+def test_the_command_prints_a_line_for_each_answer(
+    capsys: pytest.CaptureFixture[str], photo: str, last: pb.LocalizeProgressivelyResponse, code: int
+) -> None:
+    with playing(([COARSE, last], None)) as (address, _):
+        exit_code, lines, _ = command(capsys, address, photo)
+    assert exit_code == code
+    assert [json.loads(line)["is_final"] for line in lines] == [False, True]
+
+
+def test_a_person_is_told_which_is_which(
+    capsys: pytest.CaptureFixture[str], photo: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    with playing(([COARSE, FINAL], None)) as (address, _):
+        exit_code, lines, _ = command(capsys, address, photo)
+    assert exit_code == 0
+    assert [line for line in lines if line[0] != " "] == ["coarse pose, the refined one is to come", "localized"]
+
+
+def test_what_fails_leaves_no_file_and_a_folder_is_refused(
+    capsys: pytest.CaptureFixture[str], photo: str, tmp_path: Path
+) -> None:
+    with playing(([], status("INVALID_ARGUMENT"))) as (address, _):
+        assert command(capsys, address, photo, "--output", str(tmp_path / "answers.json"))[0] == 1
+        assert not (tmp_path / "answers.json").exists()
+        exit_code, _, complaint = command(capsys, address, str(tmp_path))
+    assert exit_code == 2
+    assert "--progressive shows how one photograph is localized" in complaint

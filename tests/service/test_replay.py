@@ -1,0 +1,248 @@
+"""What is captured can be computed again, exactly: a real server's answers, and another process that has the folder.
+
+The law: with the same program and settings every replayed answer is the answer, to the last bit; whatever was planted
+into the folder is found, and named.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import corner
+import numpy as np
+import pytest
+from images import encode, textured
+from programs import wait_until
+
+from mapless import (
+    Client,
+    GravityPrior,
+    InvalidArgument,
+    LocalizationResult,
+    NewReference,
+    NotFound,
+    PositionPrior,
+    Priors,
+    Rejected,
+    RigImage,
+    SequenceFrame,
+)
+from mapless.geometry import RigidTransform as Pose
+from mapless_server.capture.calls import CapturedCall, decode_call, encode_call
+from mapless_server.capture.files import calls_of
+from mapless_server.child import child_server
+
+pytestmark = pytest.mark.slow
+
+ANGLES = range(-24, 25, 8)
+QUERIES = [corner.pose(angle, height) for angle, height in ((3.3, -1.5), (-14.0, -1.7), (20.0, -1.55))]
+PHOTOS = [corner.photograph(it) for it in QUERIES]
+NAMED = ["r3", "r4", "r5", "r6"]
+BLANK = encode(".png", np.full((384, 512, 3), 90, np.uint8))
+ELSEWHERE = encode(".png", textured(512, 384, seed=9))
+
+
+def known_of(pose: Pose) -> Priors:
+    """What is true, and neither exact nor certain."""
+    down = pose.rotation.T @ [0.02, 1.0, 0.01]
+    return Priors(
+        position=PositionPrior(pose.translation + 0.3, radius_m=5.0, covariance_m2=np.eye(3)),
+        gravity=GravityPrior(down, sigma_deg=2.0),
+    )
+
+
+def calls(client: Client) -> list[Callable[[], Any]]:
+    """One of each kind, which succeed, or are rejected."""
+    rig = [RigImage(photo, corner.CAMERA, it) for photo, it in zip(PHOTOS, QUERIES, strict=True)]
+    walk = [SequenceFrame(photo, corner.CAMERA, it) for photo, it in zip(PHOTOS, QUERIES, strict=True)]
+
+    def localize(photo: bytes, *arguments: Any, **options: Any) -> Callable[[], Any]:
+        return lambda: client.localize(photo, corner.CAMERA, "corner", *arguments, **options)
+
+    return [
+        *(localize(photo) for photo in PHOTOS),
+        localize(PHOTOS[0], NAMED),
+        localize(PHOTOS[0], NAMED, include_debug=True, axes="unity", session_from_camera=corner.pose(1.0)),
+        localize(PHOTOS[1], [f"r{i}" for i in range(len(ANGLES))], rerank_references=True, reference_count=4),
+        localize(PHOTOS[2], variant="full"),
+        localize(PHOTOS[2], variant="coarse"),
+        localize(PHOTOS[0], priors=known_of(QUERIES[0])),
+        localize(PHOTOS[0], NAMED, priors=Priors(position=PositionPrior(np.array([50.0, 0, 0]), radius_m=1.0))),
+        localize(PHOTOS[0], priors=Priors(position=PositionPrior(np.array([50.0, 0, 0]), radius_m=1.0))),
+        localize(BLANK),
+        localize(ELSEWHERE),
+        localize(PHOTOS[0], ["r0"]),
+        lambda: client.localize_rig(rig, "corner"),
+        lambda: client.localize_sequence(walk, "corner", estimate_session_scale=True),
+    ]
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two calls of each kind: one by itself, and one among others."""
+    folder = tmp_path_factory.mktemp("captured")
+    flags = {"--capture-dir": str(folder / "calls"), "--workers": "2"}
+    environment = {"MAPLESS_WARM_UP": "false", "MAPLESS_CAPTURE_HOURS": "1"}
+    with (
+        child_server(folder / "data", flags, environment) as server,
+        Client(server.address) as client,
+        ThreadPoolExecutor(4) as pool,
+    ):
+        client.create_scene("corner")
+        poses = [corner.pose(angle) for angle in ANGLES]
+        photos = map(corner.photograph, poses)
+        references = [NewReference(f"r{i}", it, corner.CAMERA, poses[i]) for i, it in enumerate(photos)]
+        client.add_references("corner", references)
+        client.update_scene("corner", down_in_world=(0, 1, 0))
+        answers = [call() for call in calls(client)]
+        assert sum(isinstance(it, LocalizationResult) for it in answers) == 9
+        assert sum(isinstance(it, Rejected) for it in answers) == 5
+        list(pool.map(lambda call: call(), calls(client)))
+        with pytest.raises(NotFound):
+            client.localize(PHOTOS[0], corner.CAMERA, "nowhere")
+        with pytest.raises(InvalidArgument):
+            client.localize(PHOTOS[0][:5000], corner.CAMERA, "corner")
+        wait_until(lambda: len(list(calls_of(folder / "calls"))) == 2 * len(answers) + 2)
+    return folder / "calls"
+
+
+def replay(folder: Path, *arguments: str, **environment: str) -> tuple[int, dict[str, Any]]:
+    """Exit code and report of the command, which runs on its own, far from the store."""
+    command = [sys.executable, "-m", "mapless_server", "replay", str(folder), "--json", *arguments]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=100, cwd=folder.parent, env={**os.environ, **environment}
+    )
+    assert not done.stderr
+    return done.returncode, json.loads(done.stdout)
+
+
+def test_every_answer_is_computed_again_to_the_last_bit(captured: Path, tmp_path: Path) -> None:
+    """Retrieved and named references, priors, every kind of rejection, rigs, walks, alone and side by side."""
+    copy = shutil.copytree(captured, tmp_path / "elsewhere")
+    code, report = replay(copy)
+    different = [call for call in report["calls"] if call["verdict"] == "changed"]
+    assert not different
+    assert [call["verdict"] for call in report["calls"]].count("identical") == 32
+    outcomes = {call["outcome_now"] for call in report["calls"]}
+    assert {"localized", "low_texture", "prior_conflict", "no_usable_references"} <= outcomes
+    assert {call["method"] for call in report["calls"]} == {"Localize", "LocalizeRig", "LocalizeSequence"}
+    failures = [call["error"] for call in report["calls"] if call["verdict"] == "failed"]
+    assert len(failures) == 2
+    assert failures[0].startswith("NOT_FOUND")
+    assert failures[1].startswith("INVALID_ARGUMENT IMAGE_UNDECODABLE")
+    assert report["circumstances"] == report["unreadable"] == []
+    assert code == 0
+
+
+def only(captured: Path, folder: Path, wanted: Callable[[CapturedCall], bool]) -> tuple[Path, CapturedCall]:
+    """A copy of the folder with one call in it, which fits."""
+    copy = shutil.copytree(captured, folder)
+    found = None
+    for path in sorted(calls_of(copy)):
+        call = decode_call(path.read_bytes())
+        if found is None and wanted(call):
+            found = path, call
+        else:
+            path.unlink()
+    assert found is not None
+    return found
+
+
+def is_named(call: CapturedCall) -> bool:
+    return [part.choice for part in call.parts] == [None] and len(call.parts[0].references) == len(NAMED)
+
+
+def test_a_reference_that_stands_elsewhere_is_found_out(captured: Path, tmp_path: Path) -> None:
+    path, call = only(captured, tmp_path / "copy", is_named)
+    (part,) = call.parts
+    first = part.references[0]
+    moved = Pose(first.world_from_camera.rotation, first.world_from_camera.translation + [0.002, 0, 0])
+    planted = replace(part, references=(replace(first, world_from_camera=moved), *part.references[1:]))
+    path.write_bytes(encode_call(replace(call, parts=(planted,))))
+    code, report = replay(tmp_path / "copy")
+    (replayed,) = report["calls"]
+    assert code == 1
+    assert replayed["verdict"] == "changed"
+    assert 1e-4 < replayed["apart_cm"] < 1
+    assert replayed["apart_deg"] < 0.2
+    assert any(it["field"].startswith("localization.world_from_camera") for it in replayed["changes"])
+
+
+def test_what_is_computed_with_is_compared_too(captured: Path, tmp_path: Path) -> None:
+    """Another version then, and another coverage now, under which the pose is not trusted."""
+    path, call = only(captured, tmp_path / "copy", is_named)
+    path.write_bytes(encode_call(replace(call, circumstances={**call.circumstances, "mapless": "0.0.1"})))
+    code, report = replay(tmp_path / "copy", MAPLESS_COVERAGE="0.000001")
+    told = {it["field"]: (it["then"], it["now"]) for it in report["circumstances"]}
+    assert told["mapless"][0] == "0.0.1"
+    assert told["coverage"] == ("0.99", "1e-06")
+    (replayed,) = report["calls"]
+    assert (replayed["outcome_then"], replayed["outcome_now"]) == ("localized", "gate")
+    assert code == 1
+
+
+def test_a_person_reads_what_has_changed(captured: Path, tmp_path: Path) -> None:
+    path, call = only(captured, tmp_path / "copy", is_named)
+    path.write_bytes(encode_call(replace(call, circumstances={**call.circumstances, "mapless": "0.0.1"})))
+    command = [sys.executable, "-m", "mapless_server", "replay", str(tmp_path / "copy"), "--last", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
+    assert "mapless: then 0.0.1, now " in done.stdout
+    assert f"{call.request_id} Localize default/corner: identical, localized" in done.stdout
+    assert done.stdout.endswith("1 identical\n")
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "blob"])
+def test_damage_is_named_and_nothing_is_said_to_be_identical(captured: Path, tmp_path: Path, damage: str) -> None:
+    path, call = only(captured, tmp_path / "copy", is_named)
+    data = bytearray(path.read_bytes())
+    if damage == "cut":
+        path.write_bytes(data[:-1])
+    elif damage == "flipped":
+        data[-100] ^= 1
+        path.write_bytes(data)
+    else:
+        view = next(iter(call.parts[0].references[0].views.values()))
+        (tmp_path / "copy" / "tenants" / "default" / "blobs" / view).unlink()
+    code, report = replay(tmp_path / "copy")
+    assert code == 1
+    assert "identical" not in {it["verdict"] for it in report["calls"]}
+    told = [*report["unreadable"], *(it["error"] for it in report["calls"])]
+    assert len(told) == 1
+    assert "No such file" in told[0] if damage == "blob" else "cut" in told[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--id", "nobody"], "holds no such calls"),
+        (["--backend", "pi4"], "pi4"),
+        (["--last", "0"], "--last"),
+    ],
+)
+def test_what_cannot_be_done_is_said(captured: Path, arguments: list[str], message: str) -> None:
+    command = [sys.executable, "-m", "mapless_server", "replay", str(captured), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_folder_that_is_none_is_refused(tmp_path: Path) -> None:
+    for folder, message in ((tmp_path / "absent", "no capture folder"), (tmp_path, "no capture folder")):
+        command = [sys.executable, "-m", "mapless_server", "replay", str(folder)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+        assert (done.returncode, message in done.stderr) == (2, True)
+    (tmp_path / "mapless-capture.json").write_text('{"format": 99}')
+    done = subprocess.run(
+        [sys.executable, "-m", "mapless_server", "replay", str(tmp_path)], capture_output=True, text=True, timeout=100
+    )
+    assert (done.returncode, "has format 99" in done.stderr) == (2, True)

@@ -1,0 +1,262 @@
+"""The limits of a capture folder hold at every moment, and nothing outlives what it was made of; by planted files."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapless.geodesy import Datum
+from mapless.geometry import Camera, RadialTangential, RigidTransform, rotation_from_vector
+from mapless_server.capture import folder as folder_module
+from mapless_server.capture.calls import (
+    CapturedCall,
+    CapturedFailure,
+    CapturedPart,
+    CapturedReference,
+    decode_call,
+    encode_call,
+)
+from mapless_server.capture.errors import CaptureError, DamagedCapture
+from mapless_server.capture.files import write_whole
+from mapless_server.capture.folder import CaptureFolder, Retention
+from mapless_server.capture.opening import open_recorder
+from mapless_server.observability.metrics import Metrics
+from mapless_server.retrieval.chosen import Choice
+from mapless_server.retrieval.ranking import RankedReference
+from mapless_server.settings import ConfigError, load_settings
+from mapless_server.store import SceneAttributes, Store
+
+NOW_S = 1_800_000_000.0
+POSE = RigidTransform(rotation_from_vector([0.1, 0.2, 0.3]), np.array([1 / 3, 2e6, -0.1]))
+CAMERA = Camera(640, 480, 500.1, 500.2, 319.7, 239.3, RadialTangential(0.1, 0.01, 1e-4, 2e-4, 1e-3))
+ROOM = Retention(3600.0, 2**20)
+IMAGES = {f"{i:064x}": bytes([i]) * 30_000 for i in range(8)}
+
+
+def reference(number: int) -> CapturedReference:
+    return CapturedReference(f"r{number}", f"key-{number}", CAMERA, POSE, f"{number:064x}", {})
+
+
+def a_call(
+    number: int = 0, references: tuple[int, ...] = (0, 1), time_s: float = NOW_S, size: int = 1000
+) -> CapturedCall:
+    part = CapturedPart("image", 7, tuple(map(reference, references)))
+    request = np.random.default_rng(number).bytes(size)
+    return CapturedCall(f"id-{number}", time_s, "Localize", "acme", "hall", 5, parts=(part,), request=request)
+
+
+def blobs_of(call: CapturedCall) -> dict[str, bytes]:
+    return {name: IMAGES[name] for name in call.blobs}
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted(it for it in folder.rglob("*") if it.is_file() and it.name not in ("lock", "mapless-capture.json"))
+
+
+def opened(path: Path, retention: Retention = ROOM, clock: Callable[[], float] = lambda: NOW_S) -> CaptureFolder:
+    return CaptureFolder(path, retention, clock)
+
+
+def test_a_call_is_read_as_it_was_written() -> None:
+    """To the last bit, NaN among the similarities too."""
+    ranked = tuple(RankedReference(f"r{i}", f"key-{i}", value, POSE) for i, value in enumerate((1 / 3, float("nan"))))
+    attributes = SceneAttributes(Datum(47.1, 8.2, 400.3), (0.0, 0.0, -1.0))
+    parts = (CapturedPart("images[0].image", 3, (reference(1),), Choice(ranked, "vlad-1", 3)), CapturedPart("b", 4, ()))
+    call = replace(a_call(), attributes=attributes, parts=parts, circumstances={"mapless": "1"}, response=b"\x00\xff")
+    data = encode_call(call)
+    read = decode_call(data)
+    assert encode_call(read) == data
+    assert (read.request, read.response, read.attributes) == (call.request, call.response, attributes)
+    first = read.parts[0].references[0]
+    assert first.camera == CAMERA
+    np.testing.assert_array_equal(first.world_from_camera.matrix(), POSE.matrix())
+    failed = replace(a_call(), failure=CapturedFailure("NOT_FOUND", "NOT_FOUND", "gone"), request=b"", parts=())
+    assert decode_call(encode_call(failed)).failure == failed.failure
+
+
+@pytest.mark.parametrize("end", [0, 3, 17, 60, -33, -1])
+def test_a_call_that_is_cut_is_damaged(end: int) -> None:
+    with pytest.raises(DamagedCapture):
+        decode_call(encode_call(a_call())[:end])
+
+
+def test_a_call_with_a_bit_changed_is_damaged() -> None:
+    data = encode_call(a_call(size=50))
+    for position in range(0, len(data), 7):
+        changed = bytearray(data)
+        changed[position] ^= 4
+        with pytest.raises(CaptureError):
+            decode_call(bytes(changed))
+
+
+def test_references_are_kept_once_and_go_with_the_last_call_that_needs_them(tmp_path: Path) -> None:
+    folder = opened(tmp_path / "c")
+    for number, references in enumerate([(0, 1), (1, 2), (1, 2)]):
+        call = a_call(number, references)
+        missing = {name: data for name, data in blobs_of(call).items() if not folder.has_blob("acme", name)}
+        assert len(missing) == (2, 1, 0)[number]
+        assert folder.add(call, missing)
+    assert len(files(tmp_path / "c")) == 3 + 3
+    for count, left in ((5, 2), (3, 1), (0, 0)):
+        folder.remove(folder.held()[0])
+        assert (len(files(tmp_path / "c")), len(folder)) == ((2 + 2, 1 + 2, 0)[2 - left], left), count
+    assert folder.space_bytes == 0
+    folder.close()
+
+
+def test_only_the_owner_may_read(tmp_path: Path) -> None:
+    (tmp_path / "c").mkdir(mode=0o755)
+    folder = opened(tmp_path / "c")
+    call = a_call()
+    folder.add(call, blobs_of(call))
+    assert {stat.S_IMODE(it.stat().st_mode) for it in files(tmp_path / "c")} == {0o600}
+    assert stat.S_IMODE((tmp_path / "c").stat().st_mode) == 0o700
+    folder.close()
+
+
+def test_the_limit_of_size_holds_at_every_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Looked at after each file that is written, unfinished ones and whole blocks counted; the oldest go first."""
+    limit, most = 300_000, []
+
+    def watched(path: Path, data: bytes) -> None:
+        write_whole(path, data)
+        most.append(sum(-(-it.stat().st_size // 4096) * 4096 for it in files(tmp_path / "c")))
+
+    monkeypatch.setattr(folder_module, "write_whole", watched)
+    folder = opened(tmp_path / "c", Retention(3600.0, limit))
+    random = np.random.default_rng(1)
+    for number in range(60):
+        references = tuple(random.choice(8, 3, replace=False).tolist())
+        call = a_call(number, references, size=int(random.integers(100, 60_000)))
+        missing = {name: data for name, data in blobs_of(call).items() if not folder.has_blob("acme", name)}
+        assert folder.add(call, missing)
+        assert folder.space_bytes == most[-1]
+    assert max(most) <= limit
+    kept = [decode_call(it.path.read_bytes()).request_id for it in folder.held()]
+    assert kept == [f"id-{number}" for number in range(60 - len(kept), 60)]
+    assert 2 <= len(kept) < 60
+    before = files(tmp_path / "c")
+    too_large = a_call(99, size=limit)
+    assert not folder.add(too_large, blobs_of(too_large))
+    assert files(tmp_path / "c") == before
+    folder.close()
+
+
+def test_what_is_too_old_goes_while_nothing_comes_and_at_the_start(tmp_path: Path) -> None:
+    now_s = [NOW_S]
+    folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
+    for number in range(3):
+        call = a_call(number, (number,), now_s[0])
+        folder.add(call, blobs_of(call))
+        now_s[0] += 40
+    assert len(folder) == 3
+    assert folder.expire() == pytest.approx(20, abs=1)  # the first is 120 s old, the second 80
+    assert len(folder) == 2
+    folder.close()
+    now_s[0] += 30
+    folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
+    assert [it.references for it in folder.held()] == [{("r2", "key-2")}]
+    assert len(files(tmp_path / "c")) == 2
+    folder.close()
+    now_s[0] -= 10_000  # the clock is set back: nobody knows how old it is
+    folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
+    assert files(tmp_path / "c") == []
+    folder.close()
+
+
+def test_what_a_crash_left_and_what_is_damaged_is_deleted_at_the_start(tmp_path: Path) -> None:
+    """Unfinished files, blobs without a call, calls without a blob, and calls that are cut; but no foreign files."""
+    folder = opened(tmp_path / "c")
+    for number in range(3):
+        call = a_call(number, (number,))
+        folder.add(call, blobs_of(call))
+    first, second, third = folder.held()
+    folder.close()
+    first.path.write_bytes(first.path.read_bytes()[:-1])
+    next(iter(second.blobs)).unlink()
+    third.path.with_name("x.call.tmp").write_bytes(b"half")
+    (next(iter(third.blobs)).parent / f"{77:064x}").write_bytes(b"orphan")
+    (tmp_path / "c" / "notes.txt").write_text("of the operator")
+    folder = opened(tmp_path / "c")
+    assert [it.path for it in folder.held()] == [third.path]
+    assert set(files(tmp_path / "c")) == {third.path, *third.blobs, tmp_path / "c" / "notes.txt"}
+    folder.close()
+
+
+def test_what_somebody_deleted_by_hand_is_forgotten(tmp_path: Path) -> None:
+    folder = opened(tmp_path / "c")
+    for number in range(2):
+        call = a_call(number, (number,))
+        folder.add(call, blobs_of(call))
+    folder.held()[0].path.unlink()
+    next(iter(folder.held()[1].blobs)).unlink()
+    folder.expire()
+    assert (len(folder), folder.space_bytes, files(tmp_path / "c")) == (0, 0, [])
+    assert folder.add(call, blobs_of(call))
+    folder.close()
+
+
+def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = opened(tmp_path / "c")
+
+    def full(path: Path, data: bytes) -> None:
+        if path.suffix:
+            raise OSError(28, "No space left on device")
+        write_whole(path, data)
+
+    monkeypatch.setattr(folder_module, "write_whole", full)
+    with pytest.raises(OSError, match="No space"):
+        folder.add(a_call(), blobs_of(a_call()))
+    assert (files(tmp_path / "c"), folder.space_bytes, len(folder)) == ([], 0, 0)
+    folder.close()
+
+
+def test_folders_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
+    folder = opened(tmp_path / "c")
+    with pytest.raises(CaptureError, match="in use by another server"):
+        opened(tmp_path / "c")
+    folder.close()
+    (tmp_path / "c" / "mapless-capture.json").write_text(json.dumps({"format": 2}))
+    with pytest.raises(CaptureError, match="has format 2"):
+        opened(tmp_path / "c")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("years of work")
+    with pytest.raises(CaptureError, match="holds something else"):
+        opened(tmp_path / "full")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CaptureError, match="cannot be used"):
+        opened(tmp_path / "file")
+    if os.geteuid():
+        (tmp_path / "locked").mkdir(mode=0o500)
+        with pytest.raises(CaptureError, match="cannot be used"):
+            opened(tmp_path / "locked")
+
+
+@pytest.mark.parametrize(("capture", "data"), [("d/c", "d"), ("d", "d"), ("d", "d/c"), ("d/../d/c", "d")])
+def test_the_store_and_what_is_captured_are_apart(tmp_path: Path, capture: str, data: str) -> None:
+    with pytest.raises(ConfigError, match="folders apart"):
+        load_settings({"capture_dir": tmp_path / capture, "data_dir": tmp_path / data})
+
+
+@pytest.mark.parametrize("flags", [{"capture_hours": 0}, {"capture_mib": 0}])
+def test_senseless_settings_are_refused(flags: dict[str, object]) -> None:
+    with pytest.raises(ConfigError):
+        load_settings(flags)
+
+
+def test_what_is_no_tenant_is_refused(tmp_path: Path) -> None:
+    settings = load_settings({"capture_dir": tmp_path / "captured", "capture_tenants": "a,../b"}).settings
+    with pytest.raises(CaptureError, match="capture_tenants"), Store.open(tmp_path / "store") as store:
+        open_recorder(settings, store, Metrics())
+    assert not (tmp_path / "captured").exists()
+
+
+def test_nothing_is_captured_unless_it_is_asked_for() -> None:
+    assert load_settings({}).settings.capture_dir is None
