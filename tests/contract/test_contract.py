@@ -49,7 +49,9 @@ ABOVE = {
         "cli",
         "serve",
         "service",
+        "services",
         "group_service",
+        "progressive",
         "reference_service",
         "watching",
         "rpc",
@@ -58,7 +60,7 @@ ABOVE = {
         "receiving",
     ),
     *("commands", "messages", "security", "observability", "demo", "ingest", "evaluation", "bench", "load"),
-    *("calibration", "view"),
+    *("calibration", "capture", "view"),
 }
 BELOW = sorted(
     {path.stem for path in SERVER.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()} - ABOVE

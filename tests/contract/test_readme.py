@@ -112,6 +112,7 @@ def test_the_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
             "down_in_camera": np.array([0.0, 1.0, 0.0]),
             "rig_from_left": RigidTransform.identity(),
             "rig_from_right": pose(0.5),
+            "tracked": pose(0.0),
             "walk": [("a.jpg", pose(0.0)), ("b.jpg", pose(1.0))],
         }
         exec(first.replace("localhost:50051", server.address), known)

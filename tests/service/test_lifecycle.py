@@ -211,7 +211,7 @@ def test_a_product_is_computed_by_one_thread_unless_told_otherwise(environment: 
         import sys
         from mapless_server import cli
         assert not {"numpy", "scipy", "cv2", "grpc"} & {*sys.modules}
-        cli._configure_libraries(cli.Settings())
+        cli.configure_libraries(cli.Settings())
         import os
         print(os.environ["OPENBLAS_NUM_THREADS"])
     """

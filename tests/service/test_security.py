@@ -101,6 +101,7 @@ def requests_on(scene_id: str) -> dict[str, Message]:
     reference = reference_pb.CreateReferenceRequest(scene=scene, reference_id="r", reference=_reference())
     requests: dict[str, Message] = {
         "LocalizationService/Localize": localize_request(scene_id),
+        "LocalizationService/LocalizeProgressively": localize_request(scene_id),
         "LocalizationService/LocalizeRig": localization_pb.LocalizeRigRequest(scene=scene, images=[_image()]),
         "LocalizationService/LocalizeSequence": localization_pb.LocalizeSequenceRequest(
             scene=scene, frames=[_frame(), _frame()]

@@ -39,6 +39,19 @@ def test_what_hardly_any_right_answer_looks_like_is_warned_of() -> None:
         assert not [line for line in lines(localized(trust=trust)) if "warning" in line]
 
 
+@pytest.mark.parametrize(
+    ("is_final", "first"), [(False, "coarse pose, the refined one is to come"), (True, "coarse pose")]
+)
+def test_a_coarse_pose_is_not_called_localized(is_final: bool, first: str) -> None:
+    coarse = localized(
+        pose_stage="COARSE", covariance=None, accuracy=None, trust=None, prior_checks=(), is_final=is_final
+    )
+    told = lines(coarse)
+    assert told[0] == first
+    assert told[-1] == "  support   checked by nothing, 0.30 s"
+    assert not [line for line in told if "within" in line]
+
+
 def test_a_rejection_names_the_reference_that_shares_most() -> None:
     assert lines(rejected())[-1] == "  shares most with reference a"
     hint = rejected().hint

@@ -78,6 +78,15 @@ def test_laws(outcomes: list[float | None], code: str, timeout_s: float, dice: f
         assert code == "UNAVAILABLE" or pause_s >= asked_s > 0
 
 
+def test_a_call_that_somebody_between_cancelled_is_tried_again_as_one_that_may_be_done() -> None:
+    """A load balancer says so whose server went in the middle of the answer."""
+    cancelled = MaplessError("CANCELLED", "CANCELLED")
+    played = Played(asking(timeout_s=10.0), [cancelled, Empty()], ConnectOptions())
+    assert played.result == Empty()
+    played = Played(asking(on_repeat=found), [cancelled, TAKEN, Empty()], ConnectOptions())
+    assert played.result == "found after ALREADY_EXISTS"
+
+
 def test_a_message_over_the_limit_is_not_sent_again() -> None:
     played = Played(asking(), [full(None)], ConnectOptions())
     assert (len(played.tries), played.pauses) == (1, [])

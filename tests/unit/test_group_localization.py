@@ -50,7 +50,12 @@ class Toy(Engine):
         self.queue = WorkQueue(stages, [Lane("host", 2)], WorkQueueOptions(schedule), Observer())
 
     async def localize(
-        self, query: Query, caller: Caller, source: object = None, visits: list[Visit] | None = None
+        self,
+        query: Query,
+        caller: Caller,
+        source: object = None,
+        visits: list[Visit] | None = None,
+        tell_coarse: object = None,
     ) -> tuple[Result, Sequence[Visit]]:
         def compute(_: None, check: object) -> None:
             number = next(self._numbers)

@@ -49,6 +49,7 @@ def record(fate: Fate = Fate.ANSWERED, at_s: float = 0.0, took_s: float = 0.1, s
         Fate.BAD_REQUEST: ("INVALID_ARGUMENT", "IMAGE_FORMAT", Kind.BAD_IMAGE),
         Fate.HUNG_UP: ("CANCELLED", "", Kind.CANCELLED),
         Fate.OVERDUE: ("DEADLINE_EXCEEDED", "", Kind.QUERY),
+        Fate.TOO_HURRIED: ("DEADLINE_EXCEEDED", "", Kind.HURRIED),
         Fate.FAILED: ("INTERNAL", "INTERNAL", Kind.QUERY),
     }[fate]
     return CallRecord(kind, 0, at_s, at_s + sent_late_s, at_s + took_s, 1.0, code, detail)

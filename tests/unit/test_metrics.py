@@ -69,6 +69,7 @@ HISTOGRAMS = {
     "mapless_stage_seconds": {"stage", "tier"},
     "mapless_batch_size": {"stage"},
     "mapless_batch_seconds": {"stage"},
+    "mapless_coarse_answer_seconds": set(),
     "mapless_inliers": set(),
     "mapless_inlier_ratio": set(),
     "mapless_reprojection_error_px": set(),
@@ -218,6 +219,14 @@ def test_how_long_somebody_watches_is_counted_as_a_call_and_as_no_latency(metric
         if name.startswith("grpc_server_handling") and ("grpc_method", "WatchQueries") in labels
     }
     assert not watched
+
+
+def test_a_stream_that_ends_by_itself_has_a_latency_and_its_first_answer_another(metrics: Metrics) -> None:
+    before, method = samples_of(metrics), "/mapless.v1.LocalizationService/LocalizeProgressively"
+    metrics.answered_coarsely(0.25)
+    metrics.call_handled(method, "OK", 0.5, "")
+    sums = {name: value for (name, _), value in changed(before, samples_of(metrics)).items() if name.endswith("_sum")}
+    assert sums == {"mapless_coarse_answer_seconds_sum": 0.25, "grpc_server_handling_seconds_sum": 0.5}
 
 
 def test_a_batch_adds_to_size_time_and_business(metrics: Metrics) -> None:

@@ -32,12 +32,12 @@ class Raw:
     """A database as it is before any of ours has opened it."""
 
     def __init__(self, place: Place) -> None:
-        from mapless_server.store.postgresql import _create_engine, _parse
+        from mapless_server.store.postgresql import _create_engine, parse_url
         from mapless_server.store.sqlite import create_sqlite_engine
 
         if isinstance(place, Shared):
             # As text: reflection does not read what is sent in binary.
-            self.engine = _create_engine(_parse(place.url), cursors_are_binary=False)
+            self.engine = _create_engine(parse_url(place.url), cursors_are_binary=False)
         else:
             assert isinstance(place, Folder)
             place.data_dir.mkdir(exist_ok=True)

@@ -9,11 +9,6 @@ from ray.serve import Application
 
 from .replica import MaplessReplica
 
-REPLICA_ENVIRONMENT = {
-    # The replica lives in the event loop in which its gRPC server calls it.
-    "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD": "0",
-}
-
 DRAIN_GRACE_S = 60.0
 """For calls that run when a replica is to go, beyond the time in which load balancers forget it."""
 
@@ -24,11 +19,15 @@ def build(settings: dict[str, Any]) -> Application:
     Args:
         settings: the config's `args`: settings of mapless by name. Secrets belong into the environment instead.
     """
+    return deployed(MaplessReplica, settings)
+
+
+def deployed(replica: type[MaplessReplica], settings: dict[str, Any]) -> Application:
+    """The application whose replicas are of that class."""
     deployment = serve.deployment(
         name="mapless",
-        ray_actor_options={"runtime_env": {"env_vars": REPLICA_ENVIRONMENT}},
         graceful_shutdown_timeout_s=DRAIN_GRACE_S,
         health_check_period_s=2.0,
         health_check_timeout_s=10.0,
-    )(MaplessReplica)
+    )(replica)
     return deployment.bind(settings)

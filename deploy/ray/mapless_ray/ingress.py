@@ -10,6 +10,7 @@ there it meets here.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable, Coroutine
 from typing import Any, Protocol
 
 import grpc
@@ -18,25 +19,36 @@ from grpc_status import rpc_status
 
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 from mapless_server.errors import Unavailable
+from mapless_server.serve import StartupError
 from mapless_server.services import Services
 from mapless_server.settings import Settings
 from mapless_server.status import to_status
 
+Stop = Callable[["float | None"], Coroutine[Any, Any, None]]
+
+_HEALTH = health_pb2.DESCRIPTOR.services_by_name["Health"]
 _SERVICES = (
     localization_service_pb2.DESCRIPTOR.services_by_name["LocalizationService"],
     reference_service_pb2.DESCRIPTOR.services_by_name["ReferenceService"],
-    health_pb2.DESCRIPTOR.services_by_name["Health"],
+    _HEALTH,
 )
 
 
 class ServeServer(Protocol):
     """What is used of Serve's gRPC server, a grpc.aio.Server."""
 
+    async def stop(self, grace: float | None) -> None:
+        """Serve calls this when HAProxy has had time to forget the replica; running calls get `grace` seconds."""
+
     def add_passthrough_service(self, service_name: str) -> None:
         """The service's handlers, which are added after this, are not replaced by Serve's."""
 
     def add_generic_rpc_handlers(self, handlers: Any) -> None:
         """As of grpc.aio.Server."""
+
+
+_LAST_BYTES_S = 5.0
+"""For answers that are on their way when the last call has ended; to wait costs nothing, since others are served."""
 
 
 class Ingress:
@@ -51,7 +63,7 @@ class Ingress:
 
     def __init__(self, settings: Settings, services: Services, credentials: grpc.ServerCredentials | None) -> None:
         if credentials is not None:
-            raise ValueError("Serve's gRPC server knows no TLS: unset tls_certificate, and end TLS at the gateway")
+            raise StartupError("Serve's gRPC server knows no TLS: unset tls_certificate, and end TLS at the gateway")
         self.services = services
         self.loop = asyncio.get_running_loop()
 
@@ -60,7 +72,16 @@ class Ingress:
         Ingress.current = self
 
     async def stop(self) -> None:
-        """Serve has stopped its server, and waited for running calls, before it lets the replica go."""
+        """Serve has stopped its server before it lets the replica go."""
+
+    def drained(self, stop: Stop) -> Stop:
+        """A server's way to stop, with the services drained first: streams without end would hold it up."""
+
+        async def drain_and_stop(grace_s: float | None) -> None:
+            await self.services.drain(0.0, grace_s or 0.0)
+            await stop(_LAST_BYTES_S)
+
+        return drain_and_stop
 
     async def close(self) -> None:
         """Nothing is left to close."""
@@ -68,31 +89,34 @@ class Ingress:
 
 
 def add_services(_: object, server: ServeServer) -> None:
-    """What Serve's `grpc_servicer_functions` names: called with each gRPC server that Serve makes, in its event loop.
-
-    Raises:
-        RuntimeError: the replica lives in another event loop than its gRPC server.
-    """
+    """The function that Serve's config names; called with each gRPC server that Serve makes, in its event loop."""
     ingress = Ingress.current
     if ingress is None:
         _add_refusals(server)
         return
     if asyncio.get_running_loop() is not ingress.loop:
-        raise RuntimeError("a replica needs RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD=0, which mapless_ray.app sets")
+        raise AssertionError("the replica lives in another event loop than its gRPC server: see `environment`")
     for service in ingress.services.handlers:
         server.add_passthrough_service(service)
     ingress.services.add_to(server)
+    server.stop = ingress.drained(server.stop)  # type: ignore[assignment,method-assign]
 
 
 def _add_refusals(server: ServeServer) -> None:
-    """In Serve's proxies, to which calls come when no replica is ready."""
+    """In Serve's proxies, to which calls come when no replica is ready; health says so rather than fail."""
     error = Unavailable("no replica is ready", reason="STARTING", retry_after_s=1.0)
     status = rpc_status.to_status(to_status(error))
 
     async def refuse(_: object, context: Any) -> None:
         await context.abort(status.code, status.details, status.trailing_metadata)
 
+    async def is_healthy(_: bytes, __: object) -> bytes:
+        response = health_pb2.HealthCheckResponse
+        return bytes(response(status=response.NOT_SERVING).SerializeToString())
+
     for service in _SERVICES:
         server.add_passthrough_service(service.full_name)
-        refusals = {method.name: grpc.stream_unary_rpc_method_handler(refuse) for method in service.methods}
-        server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(service.full_name, refusals),))
+        answers = {method.name: grpc.stream_unary_rpc_method_handler(refuse) for method in service.methods}
+        if service is _HEALTH:
+            answers["Check"] = grpc.unary_unary_rpc_method_handler(is_healthy)
+        server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(service.full_name, answers),))

@@ -12,9 +12,10 @@ from typing import Any
 import ray
 
 from mapless_server.observability.logs import configure_logging
-from mapless_server.serve import SWITCH_INTERVAL_S, end_broken, running_server
+from mapless_server.serve import SWITCH_INTERVAL_S, MakeEngine, end_broken, make_engine, running_server
 from mapless_server.settings import Settings, load_settings
 
+from .environment import check_environment
 from .ingress import Ingress
 from .scaling import Reporter
 
@@ -31,7 +32,13 @@ HEARTBEAT_LIMIT_S = 5.0
 
 
 class MaplessReplica:
-    """Serve's deployment class; its calls do not come through it but through `ingress`."""
+    """Serve's deployment class; its calls do not come through it but through `ingress`.
+
+    Attributes:
+        make: makes the engine; those of tests and measurements compute other things.
+    """
+
+    make: MakeEngine = staticmethod(make_engine)
 
     async def __init__(self, settings: dict[str, Any]) -> None:  # type: ignore[misc]  # Serve awaits it
         """Returns when the first localization has succeeded; only then does Serve send calls.
@@ -44,13 +51,15 @@ class MaplessReplica:
         """
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         loaded = load_settings({**settings, "host": SERVE_HOST})
+        check_environment(loaded.settings)
         configure_logging(loaded.settings)
         log.info("mapless on Ray Serve %s\n%s", ray.__version__, loaded)
         # Serve itself keeps a replica that is to go reachable for a while.
-        update = {"metrics_port": _free_port(loaded.settings), "drain_delay_s": 0.0}
+        port, self._claim = claim_metrics_port(loaded.settings)
+        update = {"metrics_port": port, "drain_delay_s": 0.0}
         own = loaded.settings.model_copy(update=update)
         async with AsyncExitStack() as stack:
-            self._running = await stack.enter_async_context(running_server(own, listen=Ingress))
+            self._running = await stack.enter_async_context(running_server(own, self.make, listen=Ingress))
             self._stack = stack.pop_all()
         self._reporter = Reporter(self._running.engine.queue)
         self._failing = asyncio.ensure_future(self._end_when_broken())
@@ -75,11 +84,22 @@ class MaplessReplica:
         await self._stack.aclose()
 
 
-def _free_port(settings: Settings) -> int:
-    """The first port from `metrics_port` on that no other replica of this machine has."""
+def claim_metrics_port(settings: Settings) -> tuple[int, socket.socket | None]:
+    """The first port from `metrics_port` on that nobody has, and what keeps it from other replicas until it is closed.
+
+    A socket without a file is claimed, since several replicas may look at a moment when none of them listens yet.
+    """
+    if not settings.metrics_port:
+        return 0, None
     for port in range(settings.metrics_port, settings.metrics_port + METRICS_PORTS):
+        claim = socket.socket(socket.AF_UNIX)
+        try:
+            claim.bind(f"\0mapless-metrics-{port}")
+        except OSError:
+            claim.close()
+            continue
         with closing(socket.socket()) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             if probe.connect_ex(("127.0.0.1", port)):
-                return port
-    return settings.metrics_port
+                return port, claim
+        claim.close()
+    return settings.metrics_port, None

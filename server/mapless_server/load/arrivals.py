@@ -23,6 +23,8 @@ class Kind(str, Enum):
     CANCELLED = "cancelled"
     """A good query whose caller hangs up at a random moment."""
     BAD_IMAGE = "bad_image"
+    HURRIED = "hurried"
+    """A good query that is given less time than most answers take."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,17 +44,22 @@ class Mix:
         bad_share: of calls with a bad image.
         cancel_within_s: a cancelled call is cancelled at any moment up to so long after it was sent; at twice what
             an answer takes, about half of them come too late, so that both sides of the race are run.
+        hurried_share: of calls with a short deadline.
+        hurry_s: a short deadline is anything up to so long.
     """
 
     cancelled_share: float = 0.0
     bad_share: float = 0.0
     cancel_within_s: float = 1.0
+    hurried_share: float = 0.0
+    hurry_s: float = 0.2
 
     def __post_init__(self) -> None:
-        if min(self.cancelled_share, self.bad_share) < 0 or self.cancelled_share + self.bad_share > 1:
+        shares = (self.cancelled_share, self.bad_share, self.hurried_share)
+        if min(shares) < 0 or sum(shares) > 1:
             raise ValueError("shares must be at least 0 and together at most 1")
-        if not self.cancel_within_s > 0:
-            raise ValueError("cancel_within_s must be above 0")
+        if not min(self.cancel_within_s, self.hurry_s) > 0:
+            raise ValueError("cancel_within_s and hurry_s must be above 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +72,7 @@ class PlannedCall:
         kind: what kind of call it is.
         request: what is sent.
         cancel_after_s: when the caller hangs up, seconds after sending; None if it waits.
+        deadline_s: that it is given; None for what all others are given.
     """
 
     at_s: float
@@ -72,6 +80,7 @@ class PlannedCall:
     kind: Kind
     request: bytes
     cancel_after_s: float | None = None
+    deadline_s: float | None = None
 
 
 def poisson_times(rate_per_s: float, duration_s: float, random: np.random.Generator) -> Array:
@@ -111,6 +120,8 @@ def _planned(at_s: float, client: int, requests: Requests, mix: Mix, random: np.
     request = _any_of(requests.good, random)
     if draw < mix.bad_share + mix.cancelled_share:
         return PlannedCall(at_s, client, Kind.CANCELLED, request, random.uniform(0.0, mix.cancel_within_s))
+    if draw >= 1 - mix.hurried_share:
+        return PlannedCall(at_s, client, Kind.HURRIED, request, deadline_s=random.uniform(0.01, 1.0) * mix.hurry_s)
     return PlannedCall(at_s, client, Kind.QUERY, request)
 
 

@@ -57,13 +57,18 @@ def soak_command(
     data: Data = None,
     minutes: Minutes = 10.0,
     quick: Quick = False,
+    rate_per_s: Annotated[
+        float | None, typer.Option(help="Queries a second; default: nine tenths of what the server can do.")
+    ] = None,
+    churn: Annotated[float, typer.Option(help="Pace of what goes on beside the queries; 0: nothing.")] = 1.0,
     deadline_s: Deadline = 5.0,
     clients: Clients = 8,
     seed: Seed = 0,
     output: Output = OUTPUT,
 ) -> None:
-    """Nine tenths of the load for long, with calls cancelled and bad images: what grows, what is unaccounted for."""
-    _finish(_soak(data, quick, output, minutes=minutes, deadline_s=deadline_s, clients=clients, seed=seed))
+    """Everything that callers do, well and badly, for long: what grows, what is unaccounted for; draws it."""
+    given = {"minutes": minutes, "rate_per_s": rate_per_s, "churn": churn, "deadline_s": deadline_s}
+    _finish(_soak(data, quick, output, clients=clients, seed=seed, **given))
 
 
 @load_app.command("all")
@@ -107,15 +112,18 @@ def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Ch
     from ..evaluation.command import usage_errors
     from .report import step_lines
     from .requests import place_of
-    from .soak import SoakOptions, measure_soak, soak_checks, soak_json
+    from .soak import SoakOptions, measure_soak, soak_checks, soak_json, soak_lines
+    from .soak_chart import draw_soak
 
-    brief = {"minutes": 0.25, "ramp_s": 4.0, "sample_every_s": 0.5} if quick else {}
+    brief = {"minutes": 0.25, "ramp_s": 4.0, "sample_every_s": 0.5, "churn": 4.0} if quick else {}
     with _measuring() as progress:
         with usage_errors():
             options, place = SoakOptions(**(given | brief)), place_of(data)
         result = measure_soak(place, options, progress)
     checks = soak_checks(result)
-    lines = [f"{result.scene}:", "", *step_lines([result.unloaded, *result.ramp, result.soak])]
+    lines = [f"{result.scene}:", "", *step_lines([*result.before, result.soak]), *soak_lines(result)]
+    output.mkdir(parents=True, exist_ok=True)
+    (output / "soak.svg").write_text(draw_soak(result.states, result.slopes), encoding="utf-8")
     _report(output, "soak", lines, checks, soak_json(result))
     return checks
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import socket
 import tempfile
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,18 +37,22 @@ class LoadedServer:
         address: of its services.
         under_load: its process and metrics.
         requests: that are ready to be sent.
+        data_dir: its store.
     """
 
     address: str
     under_load: ServerUnderLoad
     requests: Requests
+    data_dir: Path
 
 
 @contextmanager
-def server_with_scene(place: Place, progress: Progress) -> Iterator[LoadedServer]:
+def server_with_scene(
+    place: Place, progress: Progress, environment: Mapping[str, str] | None = None
+) -> Iterator[LoadedServer]:
     """A server of its own with the references of a place stored, that has answered every query once.
 
-    Settings of the environment hold for it.
+    Settings of the environment hold for it, and `environment` is added to it.
 
     Raises:
         ServerFailed: it did not start.
@@ -57,14 +61,15 @@ def server_with_scene(place: Place, progress: Progress) -> Iterator[LoadedServer
     port = free_port()
     with tempfile.TemporaryDirectory(prefix="mapless-load-") as data_dir:
         flags = {"--metrics-port": str(port), "--metrics-host": "127.0.0.1"}
-        with child_server(Path(data_dir), flags) as server:
+        with child_server(Path(data_dir), flags, environment) as server:
             with Client(server.address, CONNECT) as client:
                 progress("storing references", 0, len(place.references))
                 store_references(client, place.references)
                 progress("first answers", 0, len(place.queries))
                 requests = requests_for(client, place.queries)
             with going_first(server.process_id):
-                yield LoadedServer(server.address, ServerUnderLoad(server.process_id, f"127.0.0.1:{port}"), requests)
+                under_load = ServerUnderLoad(server.process_id, f"127.0.0.1:{port}")
+                yield LoadedServer(server.address, under_load, requests, Path(data_dir))
 
 
 def free_port() -> int:
@@ -124,12 +129,15 @@ async def open_step(
     seed: int,
     mix: Mix | None = None,
     sample_every_s: float = 1.0,
+    requests: Requests | None = None,
+    beside: Callable[[], AbstractAsyncContextManager[object]] = nullcontext,
 ) -> Step:
-    """A step of Poisson arrivals."""
-    plan = plan_calls(rate_per_s, seconds, len(target.methods), server.requests, mix or Mix(), seed)
+    """A step of Poisson arrivals, of the server's requests or of others; `beside` goes on meanwhile."""
+    plan = plan_calls(rate_per_s, seconds, len(target.methods), requests or server.requests, mix or Mix(), seed)
 
     async def send() -> list[CallRecord]:
-        return await send_open_loop(target, plan)
+        async with beside():
+            return await send_open_loop(target, plan)
 
     return await run_step(
         name,

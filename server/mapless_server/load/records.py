@@ -24,6 +24,8 @@ class Fate(str, Enum):
     """Told that its image is bad, which it was."""
     HUNG_UP = "hung up"
     """The caller cancelled it before there was an answer."""
+    TOO_HURRIED = "too hurried"
+    """Its caller gave it less time than an answer takes, and heard in that time that there is none."""
     OVERDUE = "overdue"
     """Neither refused nor answered by its deadline: computing was spent on it, or promised, for nothing."""
     FAILED = "failed"
@@ -77,6 +79,8 @@ class CallRecord:
         if self.code in REFUSING_CODES and self.detail:
             return Fate.REFUSED
         if self.code == "DEADLINE_EXCEEDED":
+            if self.kind is Kind.HURRIED:
+                return Fate.TOO_HURRIED
             return Fate.REFUSED if self.detail == INFEASIBLE else Fate.OVERDUE
         if self.code == "CANCELLED" and self.kind is Kind.CANCELLED:
             return Fate.HUNG_UP

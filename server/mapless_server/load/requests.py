@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
+import numpy as np
+
 from mapless import Client, NewReference, wire
 from mapless.geometry import Camera
 from mapless.names import reference_name, scene_name
@@ -44,6 +47,22 @@ def requests_for(client: Client, queries: Sequence[Photograph]) -> Requests:
     first = queries[0]
     bad_images = [b"this is not a photograph", first.data[: len(first.data) // 2]]
     return Requests(good, [photo_request(image, first.camera, ()) for image in bad_images])
+
+
+def mixed_requests(named: Requests, queries: Sequence[Photograph]) -> Requests:
+    """All kinds of good requests: with names, without, so that the server chooses, and some that it can only reject.
+
+    Args:
+        named: requests with names, and bad ones.
+        queries: what else is asked with.
+    """
+    chosen = [photo_request(query.data, query.camera, ()) for query in queries]
+    camera = queries[0].camera
+    blank = np.full((camera.height_px, camera.width_px, 3), 127, np.uint8)
+    elsewhere = np.random.default_rng(0).integers(0, 256, (camera.height_px // 8, camera.width_px // 8, 3))
+    noise = cv2.resize(elsewhere.astype(np.uint8), (camera.width_px, camera.height_px), interpolation=cv2.INTER_CUBIC)
+    rejected = [photo_request(bytes(cv2.imencode(".jpg", it)[1]), camera, ()) for it in (blank, noise)]
+    return Requests([*named.good, *chosen, *rejected], named.bad)
 
 
 def photo_request(image: bytes, camera: Camera, references: Sequence[str]) -> bytes:

@@ -51,6 +51,17 @@ class Scrape:
 
 
 @dataclass(frozen=True)
+class Series:
+    """All values of a metrics page, by the name of their series; labels are left out, and the values added up."""
+
+    values: Mapping[str, float]
+
+    def total(self, name: str) -> float:
+        """Of a series, over all its labels; 0 if there is none."""
+        return self.values.get(name, 0.0)
+
+
+@dataclass(frozen=True)
 class Reconciliation:
     """The client's account against the server's.
 
@@ -74,6 +85,17 @@ class Reconciliation:
     def complete(self) -> bool:
         """Whether every call is accounted for."""
         return not self.missing and self.surplus == 0 and self.running == 0 and self.unseen >= 0
+
+
+def read_series(address: str) -> Series:
+    """Scrapes the server for everything; OSError if it does not answer."""
+    with urllib.request.urlopen(f"http://{address}/metrics", timeout=TIMEOUT_S) as response:
+        page = response.read().decode()
+    values: dict[str, float] = {}
+    for family in text_string_to_metric_families(page):
+        for sample in family.samples:
+            values[sample.name] = values.get(sample.name, 0.0) + sample.value
+    return Series(values)
 
 
 def read_metrics(address: str) -> Scrape | None:

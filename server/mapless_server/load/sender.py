@@ -118,7 +118,8 @@ async def send_closed_loop(
 async def _call(target: Target, planned: PlannedCall, begin_s: float) -> CallRecord:
     loop = asyncio.get_running_loop()
     sent_s = loop.time()
-    call = target.methods[planned.client % len(target.methods)](planned.request, timeout=target.deadline_s)
+    deadline_s = target.deadline_s if planned.deadline_s is None else planned.deadline_s
+    call = target.methods[planned.client % len(target.methods)](planned.request, timeout=deadline_s)
     hang_up = None
     if planned.cancel_after_s is not None:
         hang_up = loop.call_later(planned.cancel_after_s, call.cancel)
@@ -143,7 +144,7 @@ async def _call(target: Target, planned: PlannedCall, begin_s: float) -> CallRec
         planned.at_s,
         sent_s - begin_s,
         ended_s - begin_s,
-        target.deadline_s,
+        deadline_s,
         code,
         detail,
     )

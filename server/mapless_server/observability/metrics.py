@@ -8,6 +8,7 @@ start, because a series that appears with its first event hides that event from 
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Generic, TypeVar
@@ -21,10 +22,14 @@ from mapless.v1 import localization_service_pb2, reference_service_pb2
 
 from ..method.rejection import RejectionReason
 from ..scheduling.observer import Ending, Observer, Refusal
+from ..security.access import ENDLESS_METHODS
 from .scraped import CacheCounts, Scraped, TokenCacheCounts
 
 STAGES = ("prepare", "coarse", "refine", "join", "describe", "retrieve", "audit", "coverage")
 """Stages of the queue."""
+
+CAPTURE_DROPS = ("queue", "size", "disk", "deleted", "store", "fault")
+"""Why a call was not captured."""
 
 LOCALIZED = "localized"
 """The outcome of an answer that is a pose."""
@@ -127,7 +132,7 @@ class Metrics(Observer):
         """A call ended with a gRPC status; the trace's id becomes the exemplar."""
         service_and_name = self._methods.get(method, (_OTHER, _OTHER))
         self._handled(*service_and_name, code).inc()
-        if method in self._streaming:
+        if method in ENDLESS_METHODS:
             return  # it lasts as long as its caller wants to watch, which is no latency
         exemplar = {"trace_id": trace_id} if trace_id else None
         self._handling(*service_and_name).observe(seconds, exemplar)
@@ -180,6 +185,10 @@ class Metrics(Observer):
             extractor, _, stage = name.rpartition("/")
             self._stage_seconds(stage, "1" if extractor else "0").observe(seconds)
 
+    def answered_coarsely(self, seconds: float) -> None:
+        """A call got a coarse answer, to be refined, so long after it arrived."""
+        self._coarse_answer.observe(seconds)
+
     def answered(
         self,
         outcome: str,
@@ -230,6 +239,19 @@ class Metrics(Observer):
         """Something is broken that ends the process."""
         self._fatal.inc()
 
+    def captured(self) -> None:
+        """A call is kept."""
+        self._captured.inc()
+
+    def capture_dropped(self, reason: str) -> None:
+        """A call that was to be kept is not."""
+        self._capture_dropped(reason).inc()
+
+    def watch_captures(self, read: Callable[[], int]) -> None:
+        """Calls are captured; asks, at every scrape, what they take on the disk, bytes."""
+        self._capture_enabled.set(1)
+        self._capture_bytes.set_function(read)
+
     def set_serving(self, is_serving: bool) -> None:
         """What health says of the server as a whole."""
         self.is_serving = is_serving
@@ -275,14 +297,8 @@ class Metrics(Observer):
             for service in services
             for method in service.methods
         }
-        self._streaming = frozenset(
-            f"/{service.full_name}/{method.name}"
-            for service in services
-            for method in service.methods
-            if method.server_streaming
-        )
         known = list(self._methods.values())
-        unary = [labelled for method, labelled in self._methods.items() if method not in self._streaming]
+        finite = [labelled for method, labelled in self._methods.items() if method not in ENDLESS_METHODS]
         self._started = _Children(self._counter("grpc_server_started", "Calls that arrived.", labels), known)
         self._handled = _Children(
             self._counter("grpc_server_handled", "Calls that ended, by status.", [*labels, "grpc_code"]),
@@ -290,9 +306,12 @@ class Metrics(Observer):
         )
         self._handling = _Children(
             self._histogram(
-                "grpc_server_handling_seconds", "Time from arrival to answer; of streams none.", CALL_BUCKETS, labels
+                "grpc_server_handling_seconds",
+                "Time from arrival to answer; of endless streams none.",
+                CALL_BUCKETS,
+                labels,
             ),
-            unary,
+            finite,
         )
 
     def _make_queue_metrics(self) -> None:
@@ -337,6 +356,9 @@ class Metrics(Observer):
         self._stage_seconds = _Children(
             histogram("mapless_stage_seconds", "Time of a stage of the method.", STAGE_BUCKETS, ["stage", "tier"])
         )
+        self._coarse_answer = histogram(
+            "mapless_coarse_answer_seconds", "Time from arrival to a coarse answer that is to be refined.", CALL_BUCKETS
+        )
         self._inliers = histogram("mapless_inliers", "2D-3D matches that agree with a pose.", INLIER_BUCKETS)
         self._inlier_ratio = histogram("mapless_inlier_ratio", "Inliers of all 2D-3D matches.", RATIO_BUCKETS)
         self._reprojection_error = histogram(
@@ -358,8 +380,19 @@ class Metrics(Observer):
         self._store_errors = counter("mapless_store_errors", "Operations of the store that failed by a fault of ours.")
         self._oom = counter("mapless_gpu_oom", "Batches that the device had no memory for.")
         self._fatal = counter("mapless_fatal", "Faults that end the process.")
+        self._capture_enabled = gauge(
+            "mapless_capture_enabled", "1 if calls are captured, photographs and all, else 0."
+        )
+        self._capture_bytes = gauge("mapless_capture_bytes", "What captured calls take on the disk.")
+        self._captured = counter("mapless_captured", "Calls that were captured.")
+        self._capture_dropped = _Children(
+            counter("mapless_capture_dropped", "Calls that were to be captured and were not, by reason.", ["reason"]),
+            [(reason,) for reason in CAPTURE_DROPS],
+        )
         self._serving = gauge("mapless_health_serving", "1 if health says SERVING, else 0.")
         self._warm_up = gauge("mapless_warmup_seconds", "Time of the warm-up; 0 if there was none.")
+        blocks = gauge("mapless_python_allocated_blocks", "Pieces of memory that Python's objects hold.")
+        blocks.set_function(sys.getallocatedblocks)
         self._build = gauge("mapless_build_info", "1; what runs.", ["version", "backend", "features", "weights_sha256"])
 
     def _counter(self, name: str, text: str, labels: Iterable[str] = ()) -> Counter:

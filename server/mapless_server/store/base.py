@@ -8,12 +8,15 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection
 
+from mapless_server.errors import RequestError
 from mapless_server.store.cache import LruCache
 from mapless_server.store.database import Database
 from mapless_server.store.observed import StoreObserver, Unobserved
 from mapless_server.store.records import DescribedReference, SceneAttributes
 
 NAME_CACHE_BYTES = 16 * 2**20
+UNWRITABLE = frozenset({"STORE_READ_ONLY", "STORE_FULL", "STORE_UNAVAILABLE"})
+"""Reasons of faults after which the next change would most likely fail, too."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,11 @@ class Attributes:
 
 
 class BaseStore:
-    """A database and what is remembered of it."""
+    """A database and what is remembered of it.
+
+    Attributes:
+        write_fault: why the last change could not be written, one of `UNWRITABLE`; empty if it could.
+    """
 
     def __init__(self, database: Database, described: LruCache[DescribedReference]) -> None:
         self._database = database
@@ -52,6 +59,7 @@ class BaseStore:
         self._resolved: LruCache[Resolved] = LruCache(NAME_CACHE_BYTES)
         self._attributes: LruCache[Attributes] = LruCache(NAME_CACHE_BYTES)
         self._state = object()
+        self.write_fault = ""
 
     @contextmanager
     def _changing(self) -> Iterator[Connection]:
@@ -59,5 +67,10 @@ class BaseStore:
         try:
             with self._database.write() as connection:
                 yield connection
+            self.write_fault = ""
+        except RequestError as error:
+            if error.reason in UNWRITABLE:
+                self.write_fault = error.reason
+            raise
         finally:
             self._state = object()

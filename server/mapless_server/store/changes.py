@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
-from sqlalchemy import Connection, Select, and_, select
+from sqlalchemy import Connection, Row, Select, and_, select
 
 from mapless_server.store import queries, rows
+from mapless_server.store.damage import unless_damaged
 from mapless_server.store.records import IndexedReference, SceneChanges
 from mapless_server.store.tables import global_descriptor, reference, removed_reference
 from mapless_server.tenancy import SceneKey
 
 _ROWS_AT_A_TIME = 2000
 """A few megabytes, so that a scene that is read whole is not in memory twice."""
+
+_Found = tuple[tuple[IndexedReference, ...], tuple[str, ...]]
 
 
 def read_changes(
@@ -33,10 +38,16 @@ def read_changes(
     return SceneChanges(generation, added, frozenset(connection.scalars(gone)), False, damaged)
 
 
-def _read(
-    connection: Connection, scene_key: SceneKey, after_generation: int, descriptor_name: str
-) -> tuple[tuple[IndexedReference, ...], tuple[str, ...]]:
+def _read(connection: Connection, scene_key: SceneKey, after_generation: int, descriptor_name: str) -> _Found:
     """References that changed, by id, and the ids of those that are damaged."""
+    return unless_damaged(
+        connection,
+        lambda: _read_together(connection, scene_key, after_generation, descriptor_name),
+        lambda: _read_each(connection, scene_key, after_generation, descriptor_name),
+    )
+
+
+def _read_together(connection: Connection, scene_key: SceneKey, after_generation: int, descriptor_name: str) -> _Found:
     statement = _select_indexed(descriptor_name).where(
         reference.c.scene_id == scene_key, reference.c.generation > after_generation
     )
@@ -48,6 +59,30 @@ def _read(
         found += references
         damaged += damaged_ids
     return tuple(sorted(found, key=lambda it: it.reference_id)), tuple(sorted(damaged))
+
+
+def _read_each(connection: Connection, scene_key: SceneKey, after_generation: int, descriptor_name: str) -> _Found:
+    """The same one by one, where some lie on pages that cannot be read."""
+    column = reference.c
+    changed = select(column.reference_id, column.key).where(
+        column.scene_id == scene_key, column.generation > after_generation
+    )
+    found: list[IndexedReference] = []
+    damaged: list[str] = []
+    for row in connection.execute(changed.order_by(column.reference_id)).all():
+        statement = _select_indexed(descriptor_name).where(column.key == row.key)
+        read = unless_damaged(connection, partial(_all_of, connection, statement), lambda: None)
+        if read is None:
+            damaged.append(row.reference_id)
+            continue
+        references, damaged_ids = rows.indexed_references(read, descriptor_name)
+        found += references
+        damaged += damaged_ids
+    return tuple(found), tuple(damaged)
+
+
+def _all_of(connection: Connection, statement: Select[Any]) -> Sequence[Row[Any]]:
+    return connection.execute(statement).all()
 
 
 def _select_indexed(descriptor_name: str) -> Select[Any]:

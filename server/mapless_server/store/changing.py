@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import delete, insert, select, update
+from sqlalchemy import Connection, delete, insert, select, update
 
 from mapless.geodesy import Datum
 from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
@@ -17,6 +17,7 @@ from mapless_server.errors import AlreadyExists
 from mapless_server.method.views import View
 from mapless_server.store import queries, removing, rows, tables
 from mapless_server.store.base import BaseStore
+from mapless_server.store.damage import DamagedPages
 from mapless_server.store.observed import observed
 from mapless_server.store.records import NewReference, ReferenceRecord, SceneAttributes, SceneRecord
 from mapless_server.tenancy import SceneKey, scene_id_of
@@ -89,19 +90,41 @@ class ChangingStore(BaseStore):
         Raises:
             NotFound: there is no such scene.
         """
+        try:
+            self._begin_deleting(scene_key, REFERENCES_DELETED_AT_A_TIME)
+        except DamagedPages:
+            self._begin_deleting(scene_key, -1)
+        self._delete_what_is_left()
+
+    def _begin_deleting(self, scene_key: SceneKey, at_once: int) -> None:
+        """The scene is gone; with all its references if they are so few."""
         column = tables.scene.c
         with self._changing() as connection:
             queries.begin_change(connection, scene_key)
             self._database.take_your_time(connection)
             count = connection.execute(select(column.reference_count).where(column.scene_id == scene_key)).scalar_one()
-            if count > REFERENCES_DELETED_AT_A_TIME:
+            if count > at_once:
                 removing.set_apart(connection, scene_key)
             else:
                 connection.execute(delete(tables.scene).where(column.scene_id == scene_key))
-        is_more = True
+
+    def _delete_what_is_left(self) -> None:
+        """Of deleted scenes; references on pages that cannot be freed are put aside."""
+        is_more, count = True, REFERENCES_DELETED_AT_A_TIME
         while is_more:
+            is_more, is_damaged = self._delete_portion(count)
+            if is_damaged and count == 1:
+                with self._database.write() as connection:
+                    removing.set_next_aside(connection)
+            count = 1 if is_damaged and count > 1 else REFERENCES_DELETED_AT_A_TIME
+
+    def _delete_portion(self, count: int) -> tuple[bool, bool]:
+        """Whether there may be more, and whether damaged pages kept it from being deleted."""
+        try:
             with self._database.write() as connection:  # changes nothing that anybody sees
-                is_more = removing.delete_portion(connection, REFERENCES_DELETED_AT_A_TIME)
+                return removing.delete_portion(connection, count), False
+        except DamagedPages:
+            return True, True
 
     @observed
     def add_references(self, scene_key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
@@ -186,18 +209,33 @@ class ChangingStore(BaseStore):
 
     @observed
     def delete_reference(self, scene_key: SceneKey, reference_id: str) -> None:
-        """Delete a reference with its image and features; works on a damaged one, too.
+        """Delete a reference with its image and features; works on a damaged one, too, whose pages then stay lost.
 
         Raises:
             NotFound: there is no such scene or reference.
         """
+        try:
+            self._delete_reference(scene_key, reference_id, removing.delete_one)
+        except DamagedPages:
+            self._delete_reference(scene_key, reference_id, removing.set_aside)
+
+    def _delete_reference(
+        self, scene_key: SceneKey, reference_id: str, remove: Callable[[Connection, str], None]
+    ) -> None:
         with self._changing() as connection:
             generation = queries.begin_change(connection, scene_key, -1)
             key = queries.find_key(connection, scene_key, reference_id)
-            connection.execute(delete(tables.reference).where(tables.reference.c.key == key))
+            remove(connection, key)
             tombstone = {"scene_id": scene_key, "generation": generation, "reference_key": key}
             connection.execute(insert(tables.removed_reference).values(tombstone))
             queries.forget_removals(connection, scene_key, generation - GENERATIONS_REMEMBERED)
+
+    @observed
+    def try_writing(self) -> None:
+        """Write what changes nothing, to see whether it can be written; raises as every change does if not."""
+        version = tables.store_version
+        with self._changing() as connection:
+            connection.execute(update(version).values(schema_version=version.c.schema_version))
 
 
 def _now() -> datetime:

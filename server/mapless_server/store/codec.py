@@ -18,7 +18,8 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import datetime
 from typing import Any
@@ -69,15 +70,16 @@ def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, Rigid
     """The camera and pose that ``encode_geometry`` was given; read-only arrays.
 
     Raises:
-        Damaged: the checksum does not match.
+        Damaged: the checksum does not match, or it was made of something else.
     """
     check(owner, data, sha256, "camera and pose")
-    content = json.loads(data)
-    pose = content["world_from_camera"]
-    rotation, translation = np.array(pose["rotation"], float), np.array(pose["translation"], float)
-    rotation.setflags(write=False)
-    translation.setflags(write=False)
-    return _camera_from_dict(content["camera"]), RigidTransform(rotation, translation)
+    with _of_known_form("camera and pose"):
+        content = json.loads(data)
+        pose = content["world_from_camera"]
+        rotation, translation = np.array(pose["rotation"], float), np.array(pose["translation"], float)
+        rotation.setflags(write=False)
+        translation.setflags(write=False)
+        return _camera_from_dict(content["camera"]), RigidTransform(rotation, translation)
 
 
 def encode_attributes(attributes: SceneAttributes) -> bytes | None:
@@ -94,21 +96,22 @@ def decode_attributes(owner: str, data: bytes | None, sha256: str | None) -> Sce
     """What ``encode_attributes`` was given.
 
     Raises:
-        Damaged: the checksum does not match.
+        Damaged: the checksum does not match, or it was made of something else.
     """
     if data is None and sha256 is None:
         return SceneAttributes()
     check(owner, data, sha256 or "", "datum, down and calibration")
     assert data is not None
-    content = json.loads(data)
-    datum, down, calibration = content["datum"], content["down_in_world"], content["calibration"]
-    if calibration and calibration["create_time"]:
-        calibration["create_time"] = datetime.fromisoformat(calibration["create_time"])
-    return SceneAttributes(
-        Datum(**{**datum, "enu_from_world": Quaternion(**datum["enu_from_world"])}) if datum else None,
-        tuple(down) if down else None,
-        Calibration(**calibration) if calibration else None,
-    )
+    with _of_known_form("datum, down and calibration"):
+        content = json.loads(data)
+        datum, down, calibration = content["datum"], content["down_in_world"], content["calibration"]
+        if calibration and calibration["create_time"]:
+            calibration["create_time"] = datetime.fromisoformat(calibration["create_time"])
+        return SceneAttributes(
+            Datum(**{**datum, "enu_from_world": Quaternion(**datum["enu_from_world"])}) if datum else None,
+            tuple(down) if down else None,
+            Calibration(**calibration) if calibration else None,
+        )
 
 
 def encode_view(view: View) -> bytes:
@@ -135,16 +138,17 @@ def decode_view(owner: str, blob: bytes, sha256: str) -> View:
         Damaged: the checksum does not match, or the format is unknown.
     """
     check(owner, blob, sha256, "features")
-    version, header_length = _PREFIX.unpack_from(blob)
-    if version != VIEW_FORMAT_VERSION:
-        raise Damaged(f"features (format {version} is unknown)")
-    offset = _PREFIX.size + header_length
-    header = json.loads(blob[_PREFIX.size : offset])
-    count, dimension = header["count"], header["dimension"]
-    floats = np.frombuffer(blob, _FLOAT32, offset=offset)
-    keypoints, sizes_px, descriptors = np.split(floats, [2 * count, 3 * count])
-    features = Features(keypoints.reshape(count, 2), descriptors.reshape(count, dimension), sizes_px)
-    return View(_camera_from_dict(header["camera"]), features)
+    with _of_known_form("features"):
+        version, header_length = _PREFIX.unpack_from(blob)
+        if version != VIEW_FORMAT_VERSION:
+            raise Damaged(f"features (format {version} is unknown)")
+        offset = _PREFIX.size + header_length
+        header = json.loads(blob[_PREFIX.size : offset])
+        count, dimension = header["count"], header["dimension"]
+        floats = np.frombuffer(blob, _FLOAT32, offset=offset)
+        keypoints, sizes_px, descriptors = np.split(floats, [2 * count, 3 * count])
+        features = Features(keypoints.reshape(count, 2), descriptors.reshape(count, dimension), sizes_px)
+        return View(_camera_from_dict(header["camera"]), features)
 
 
 def decode_poses(geometries: Sequence[bytes]) -> list[RigidTransform]:
@@ -189,6 +193,15 @@ def check(owner: str, data: object, sha256: str, what: str) -> None:
     # One flipped bit can make SQLite take a blob for text, so the type is as little to be trusted as the content.
     if not isinstance(data, bytes) or sha256_for(owner, data) != sha256:
         raise Damaged(what)
+
+
+@contextmanager
+def _of_known_form(what: str) -> Iterator[None]:
+    """What another program wrote, with a checksum that is right, is Damaged too."""
+    try:
+        yield
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError, struct.error) as error:
+        raise Damaged(f"{what} (of an unknown form)") from error
 
 
 def _to_json(content: dict[str, Any]) -> bytes:

@@ -19,7 +19,8 @@ from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
-from mapless_server.errors import DataLoss, Overloaded, RequestError, Unavailable
+from mapless_server.errors import Overloaded, RequestError, Unavailable
+from mapless_server.store.damage import DamagedPages, is_damage
 from mapless_server.store.database import StoreError
 from mapless_server.store.migrations import migrate, read_version
 from mapless_server.store.tables import SCHEMA_VERSION
@@ -56,7 +57,6 @@ _UNLIMITED = ("statement_timeout", "lock_timeout", "idle_in_transaction_session_
 
 # By the class of their SQLSTATE or by all of it: https://www.postgresql.org/docs/current/errcodes-appendix.html
 _FULL = ("53100",)
-_DAMAGED = ("XX001", "XX002")
 _BUSY = ("40001", "40P01", "55P03", "57014")
 _AWAY = ("08", "25006", "25P03", "53", "57P")
 
@@ -94,7 +94,7 @@ class PostgresqlDatabase:
 
     @staticmethod
     def _opened(database_url: str, migrates: bool) -> PostgresqlDatabase:
-        url = _parse(database_url)
+        url = parse_url(database_url)
         database = PostgresqlDatabase(_create_engine(url), f"{url.host or 'local'}:{url.port or 5432}/{url.database}")
         try:
             database._prepare(migrates)
@@ -145,7 +145,8 @@ class PostgresqlDatabase:
             migrate(connection)
 
 
-def _parse(database_url: str) -> URL:
+def parse_url(database_url: str) -> URL:
+    """What a text says of a database; StoreError, which repeats nothing of it, if it is no address of one."""
     try:
         url = make_url(database_url)
     except (ArgumentError, ValueError):
@@ -219,8 +220,8 @@ def _answer_to(error: DBAPIError) -> RequestError | None:
     state: str = getattr(error.orig, "sqlstate", None) or ""
     if state.startswith(_FULL):
         return Overloaded("the store's disk is full", reason="STORE_FULL")
-    if state.startswith(_DAMAGED):
-        return DataLoss("the store is damaged")
+    if is_damage(error):
+        return DamagedPages()
     if state.startswith(_BUSY):
         return Unavailable("the store is busy", reason="STORE_UNAVAILABLE", retry_after_s=RETRY_AFTER_S)
     # The library's own faults have no state: it cannot connect, or the connection broke.

@@ -198,6 +198,14 @@ def find_scene_key(connection: Connection, key: str) -> SceneKey:
     return SceneKey(scene_key)
 
 
+def find_reference_id(connection: Connection, key: str) -> str:
+    """Id of the reference with this key. Raises NotFound if it was deleted."""
+    reference_id: str | None = connection.scalar(select(reference.c.reference_id).where(_is_there(key)))
+    if reference_id is None:
+        raise reference_deleted()
+    return reference_id
+
+
 def find_image(connection: Connection, key: str) -> Row[Any]:
     """Columns ``reference_id``, ``image_sha256`` and ``data`` of a reference. Raises NotFound if it was deleted."""
     statement: Select[Any] = (

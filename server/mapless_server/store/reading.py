@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, NoReturn
 
-from sqlalchemy import select
+from sqlalchemy import Connection, Row, select
 
 from mapless_server.store import queries, rows, tables
 from mapless_server.store.base import Attributes, BaseStore, Resolved
 from mapless_server.store.changes import read_changes
+from mapless_server.store.damage import DamagedPages, unless_damaged
 from mapless_server.store.observed import observed
 from mapless_server.store.records import (
     DescribedReference,
@@ -110,7 +113,10 @@ class ReadingStore(BaseStore):
             DataLoss: the bytes are damaged.
         """
         with self._database.read() as connection:
-            row = queries.find_image(connection, queries.find_key(connection, scene_key, reference_id))
+            key = queries.find_key(connection, scene_key, reference_id)
+            row = unless_damaged(connection, lambda: queries.find_image(connection, key), lambda: None)
+        if row is None:
+            raise rows.data_loss(reference_id, "image")
         return rows.image(row)
 
     @observed
@@ -122,7 +128,9 @@ class ReadingStore(BaseStore):
             DataLoss: the bytes are damaged.
         """
         with self._database.read() as connection:
-            row = queries.find_image(connection, key)
+            row = unless_damaged(connection, lambda: queries.find_image(connection, key), lambda: None)
+            if row is None:
+                raise rows.data_loss(queries.find_reference_id(connection, key), "image")
         return rows.image(row)
 
     @observed
@@ -195,7 +203,9 @@ class ReadingStore(BaseStore):
             wanted = [keys[reference_id] for reference_id in reference_ids]
             remembered |= {key: self._described.get((key, extractor)) for key in wanted if key not in remembered}
             described = {key: it for key, it in remembered.items() if it is not None}
-            found = queries.features_by_key(connection, [key for key in wanted if key not in described], extractor)
+            unknown = {key: reference_id for reference_id, key in keys.items() if key not in described}
+            unknown = {key: unknown[key] for key in wanted if key in unknown}
+            found = _features(connection, unknown, extractor)
             lacking = [key for key in wanted if key not in described and key not in found]
             undescribed = queries.rows_by_key(connection, lacking)
         if names is not None:
@@ -233,3 +243,33 @@ class ReadingStore(BaseStore):
         in_memory = tuple(it for it in map(remembered.get, resolved.keys) if it is not None)
         is_all = len(in_memory) == len(resolved.keys)
         return remembered, SceneSnapshot(resolved.generation, in_memory) if is_all else None
+
+
+def _features(connection: Connection, ids: Mapping[str, str], extractor: str) -> dict[str, Row[Any]]:
+    """Rows of `queries.features_by_key`, by key; DataLoss names the first of the references that cannot be read.
+
+    Args:
+        connection: its transaction is gone on with.
+        ids: of the references, by their keys.
+        extractor: whose features.
+    """
+
+    def read(keys: Sequence[str]) -> dict[str, Row[Any]]:
+        return queries.features_by_key(connection, keys, extractor)
+
+    def blame() -> dict[str, Row[Any]]:
+        found: dict[str, Row[Any]] = {}
+        for key, reference_id in ids.items():
+            row = unless_damaged(connection, partial(read, [key]), lambda: None)
+            if row is None:
+                unless_damaged(connection, partial(queries.rows_by_key, connection, [key]), _blame_nobody)
+                raise rows.data_loss(reference_id, "features")
+            found |= row
+        return found
+
+    return unless_damaged(connection, lambda: read(list(ids)), blame) if ids else {}
+
+
+def _blame_nobody() -> NoReturn:
+    """It is not what belongs to one reference that is damaged, but where references are looked up."""
+    raise DamagedPages

@@ -6,6 +6,7 @@ Each statement runs in the caller's transaction.
 from __future__ import annotations
 
 import uuid
+from collections.abc import Sequence
 
 from sqlalchemy import ColumnElement, Connection, delete, insert, select, update
 
@@ -16,6 +17,8 @@ _REMOVED = "-/"
 """What keys of deleted scenes begin with: no tenant's name is a hyphen."""
 _END_OF_REMOVED = "-0"
 """The first text, by code point, after all of them."""
+_DAMAGED = f"{_REMOVED}damaged"
+"""The key of what was deleted and whose pages cannot be freed, since the database cannot read them."""
 
 
 def set_apart(connection: Connection, scene_key: SceneKey) -> str:
@@ -34,20 +37,44 @@ def set_apart(connection: Connection, scene_key: SceneKey) -> str:
     return key
 
 
+def set_aside(connection: Connection, key: str) -> None:
+    """Put a reference where nobody finds it, for ever, since its damaged pages keep it from being deleted."""
+    if connection.scalar(select(scene.c.scene_id).where(scene.c.scene_id == _DAMAGED)) is None:
+        connection.execute(insert(scene).values(scene_id=_DAMAGED, create_time_us=0))
+    column = reference.c
+    connection.execute(update(reference).where(column.key == key).values(scene_id=_DAMAGED, reference_id=key))
+
+
 def delete_portion(connection: Connection, count: int) -> bool:
     """Delete some of what was set apart, by whomever; whether there may be more.
 
     What another server is deleting at this moment is left to it.
     """
     column = reference.c
-    portion = select(column.key).where(is_set_apart(column.scene_id)).limit(count)
-    keys = connection.scalars(portion.with_for_update(skip_locked=True)).all()
+    keys = _portion(connection, count)
     if keys:
         connection.execute(delete(reference).where(column.key.in_(keys)))
         return True
     is_empty = ~select(column.key).where(column.scene_id == scene.c.scene_id).exists()
     connection.execute(delete(scene).where(is_set_apart(scene.c.scene_id), is_empty))
     return False
+
+
+def set_next_aside(connection: Connection) -> None:
+    """Put aside what `delete_portion` would delete next if it were to delete one."""
+    for key in _portion(connection, 1):
+        set_aside(connection, key)
+
+
+def delete_one(connection: Connection, key: str) -> None:
+    """Delete one reference with everything that belongs to it."""
+    connection.execute(delete(reference).where(reference.c.key == key))
+
+
+def _portion(connection: Connection, count: int) -> Sequence[str]:
+    column = reference.c
+    portion = select(column.key).where(is_set_apart(column.scene_id), column.scene_id != _DAMAGED)
+    return connection.scalars(portion.order_by(column.key).limit(count).with_for_update(skip_locked=True)).all()
 
 
 def forget_removed(connection: Connection) -> None:

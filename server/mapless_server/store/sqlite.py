@@ -1,11 +1,12 @@
 """Everything that is particular to SQLite: which library, how each connection is set, who may write.
 
-The file lies on a local disk (network file systems break SQLite's locks) and belongs to one server at a time.
+The file lies on a local disk (network file systems break SQLite's locks) and belongs to one server at a time. On a disk
+that can only be read any number of servers may read it.
 """
 
 from __future__ import annotations
 
-import fcntl
+import errno
 import importlib
 import logging
 import os
@@ -20,17 +21,21 @@ from urllib.parse import quote
 from sqlalchemy import URL, Connection, Engine, create_engine, event
 from sqlalchemy.exc import DBAPIError
 
-from mapless_server.errors import DataLoss, Overloaded, RequestError, Unavailable
+from mapless_server.errors import FailedPrecondition, RequestError
+from mapless_server.store.damage import is_damage
 from mapless_server.store.database import StoreError
+from mapless_server.store.folder_lock import FolderLock
 from mapless_server.store.migrations import migrate, read_version
+from mapless_server.store.sqlite_faults import faults_translated
 from mapless_server.store.tables import SCHEMA_VERSION
 
 logger = logging.getLogger(__name__)
 
 DATABASE_FILE = "mapless.sqlite3"
-LOCK_FILE = "mapless.lock"
 BUSY_TIMEOUT_MS = 5000
 """How long a connection waits for another's lock. Our writers queue before SQLite does; this is for tools beside us."""
+ROOM_TO_OPEN_BYTES = 64 * 1024
+"""What SQLite needs beside the file to open it."""
 
 _URI_PREFIX = "file:"
 _BEGIN_OPTION = "sqlite_begin_statement"
@@ -50,7 +55,7 @@ class SqliteDatabase:
 
     is_shared = False
 
-    def __init__(self, engine: Engine, folder_lock: int | None) -> None:
+    def __init__(self, engine: Engine, folder_lock: FolderLock | None, only_reads: bool = False) -> None:
         self.name = str(engine.url.database).removeprefix(_URI_PREFIX)
         self._engine = engine
         # BEGIN IMMEDIATE takes the write lock at once. A transaction that reads first and then wants to write would be
@@ -58,21 +63,50 @@ class SqliteDatabase:
         self._writing_engine = engine.execution_options(**{_BEGIN_OPTION: "BEGIN IMMEDIATE"})
         # SQLite lets writers poll for its lock, in no order; here they queue.
         self._write_lock = threading.Lock()
-        self._folder_lock: int | None = folder_lock
+        self._folder_lock = folder_lock
+        self._only_reads = only_reads
 
     @staticmethod
     def open(folder: Path) -> SqliteDatabase:
         """Open the database of a data folder; both are created if missing.
 
+        A database on a disk that can only be read is read, and every change of it is refused.
+
         Raises:
             StoreError: the folder or file cannot be used, is in use, or holds something else than our store.
         """
+        path = folder / DATABASE_FILE
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            folder_lock = _lock_folder(folder)
+            folder_lock = FolderLock.take(folder, DATABASE_FILE)
         except OSError as error:
+            if error.errno == errno.EROFS and path.is_file():
+                return SqliteDatabase._open_to_read(path)
             raise StoreError(f"data folder {folder} cannot be used: {error.strerror}") from error
-        return SqliteDatabase._opened(folder / DATABASE_FILE, folder_lock)
+        return SqliteDatabase._opened(path, folder_lock)
+
+    @staticmethod
+    def _open_to_read(path: Path) -> SqliteDatabase:
+        """A database that nobody can write, not even SQLite the files beside it that it shares with other processes."""
+        left = [it for it in (path.with_name(f"{path.name}-wal"), path.with_name(f"{path.name}-journal")) if _holds(it)]
+        if left:
+            raise StoreError(
+                f"database {path} cannot be opened: it was not closed in order, and the disk can only be read, so that "
+                f"what {left[0].name} holds cannot be put in its place"
+            )
+        try:
+            folder_lock = FolderLock.share(path)
+        except OSError as error:
+            raise StoreError(f"database {path} cannot be read: {error.strerror}") from error
+        database = SqliteDatabase(create_sqlite_engine(path, only_reads=True, never_changes=True), folder_lock, True)
+        with database._faults_at_opening(), database.read() as connection:
+            version = read_version(connection)
+            if version != SCHEMA_VERSION:
+                raise ValueError(
+                    f"its schema is of version {version}, must be {SCHEMA_VERSION}, and the disk can only be read"
+                )
+        logger.warning("the disk of %s can only be read: queries are answered, and changes refused", path)
+        return database
 
     @staticmethod
     def open_scratch(path: Path, version: int = SCHEMA_VERSION) -> SqliteDatabase:
@@ -100,7 +134,7 @@ class SqliteDatabase:
 
     @staticmethod
     def _opened(
-        path: Path, folder_lock: int | None, version: int = SCHEMA_VERSION, is_scratch: bool = False
+        path: Path, folder_lock: FolderLock | None, version: int = SCHEMA_VERSION, is_scratch: bool = False
     ) -> SqliteDatabase:
         database = SqliteDatabase(create_sqlite_engine(path, is_scratch=is_scratch), folder_lock)
         with database._faults_at_opening():
@@ -113,10 +147,11 @@ class SqliteDatabase:
             yield
         except DBAPIError as error:
             self.close()
-            raise StoreError(f"database {self.name} cannot be opened: {error.orig}") from error
+            raise StoreError(f"database {self.name} cannot be opened: {_why(error, self.name)}") from error
         except RequestError as error:
             self.close()
-            raise StoreError(f"database {self.name} cannot be opened: {error}") from error
+            cause = _why(error.__cause__, self.name) if isinstance(error.__cause__, DBAPIError) else error
+            raise StoreError(f"database {self.name} cannot be opened: {cause}") from error
         except ValueError as error:
             self.close()
             raise StoreError(f"database {self.name} cannot be used: {error}") from error
@@ -140,13 +175,17 @@ class SqliteDatabase:
     @contextmanager
     def read(self) -> Iterator[Connection]:
         """Implements Database."""
-        with _database_faults_translated(), self._engine.begin() as connection:
+        # Ended by rolling back, as closing does: SQLite that has met a damaged page refuses to commit even nothing.
+        with faults_translated(), self._engine.connect() as connection:
+            connection.begin()
             yield connection
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
         """Implements Database."""
-        with _database_faults_translated(), self._write_lock, self._writing_engine.begin() as connection:
+        if self._only_reads:
+            raise FailedPrecondition("the store can only be read", reason="STORE_READ_ONLY")
+        with faults_translated(), self._write_lock, self._writing_engine.begin() as connection:
             yield connection
 
     def take_your_time(self, connection: Connection) -> None:
@@ -156,25 +195,8 @@ class SqliteDatabase:
         """Close all connections and let other servers in; nothing may be reading or writing."""
         self._engine.dispose()
         if self._folder_lock is not None:
-            os.close(self._folder_lock)
+            self._folder_lock.release()
             self._folder_lock = None
-
-
-def _lock_folder(folder: Path) -> int:
-    """A file descriptor that holds the folder's lock until it is closed, by us or by our death."""
-    lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o600)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.truncate(lock, 0)
-        os.write(lock, str(os.getpid()).encode())
-    except BlockingIOError as error:
-        holder = os.read(lock, 20).decode(errors="replace")
-        os.close(lock)
-        raise StoreError(f"data folder {folder} is in use by another server (process {holder})") from error
-    except BaseException:
-        os.close(lock)
-        raise
-    return lock
 
 
 def _execute(connection: Connection, statement: str) -> None:
@@ -184,13 +206,33 @@ def _execute(connection: Connection, statement: str) -> None:
     driver_connection.execute(statement)
 
 
-def create_sqlite_engine(path: Path, only_reads: bool = False, is_scratch: bool = False) -> Engine:
+def _holds(path: Path) -> bool:
+    """Whether there is a file with something in it."""
+    return path.is_file() and path.stat().st_size > 0
+
+
+def _why(error: DBAPIError, name: str) -> str:
+    """The database's text, and what an operator can do where it does not say so itself."""
+    fault = str(error.orig)
+    if is_damage(error):
+        return f"{fault}; restore a backup into a new folder"
+    with suppress(OSError):
+        disk = os.statvfs(Path(name).parent)
+        if "disk I/O error" in fault and disk.f_bavail * disk.f_frsize < ROOM_TO_OPEN_BYTES:
+            return f"{fault}: the disk is full"
+    return fault
+
+
+def create_sqlite_engine(
+    path: Path, only_reads: bool = False, is_scratch: bool = False, never_changes: bool = False
+) -> Engine:
     """Connections to a file, each set as a store that must not lose anything needs it.
 
     Args:
         path: the file, created if missing.
         only_reads: the file must be there, and is left as it is.
         is_scratch: the file may be lost.
+        never_changes: nobody writes it, so that no lock is taken, and nothing made beside it.
     """
     library = choose_library()
     safe_mode = has_wal_reset_bug(library.sqlite_version_info)
@@ -207,6 +249,8 @@ def create_sqlite_engine(path: Path, only_reads: bool = False, is_scratch: bool 
     if only_reads:
         # As a URI, a file that is missing is not created. It may be written all the same: readers share WAL's index.
         url = URL.create("sqlite", database=f"{_URI_PREFIX}{quote(str(path))}", query={"mode": "rw", "uri": "true"})
+    if never_changes:
+        url = url.update_query_dict({"mode": "ro", "immutable": "1"})
     engine = create_engine(
         url,
         module=library,
@@ -251,20 +295,3 @@ def choose_library() -> ModuleType:
     with suppress(ImportError):
         libraries.insert(0, importlib.import_module("pysqlite3.dbapi2"))
     return next((it for it in libraries if not has_wal_reset_bug(it.sqlite_version_info)), libraries[0])
-
-
-@contextmanager
-def _database_faults_translated() -> Iterator[None]:
-    """Turn the faults of the database that a caller can act on into answers; the rest is INTERNAL."""
-    try:
-        yield
-    except DBAPIError as error:
-        # Error codes reach Python only from 3.11 on; these texts have not changed in decades.
-        fault = str(error.orig)
-        if "is locked" in fault:
-            raise Unavailable("the store is busy", retry_after_s=1.0) from error
-        if "is full" in fault:
-            raise Overloaded("the store's disk is full", reason="STORE_FULL") from error
-        if "malformed" in fault or "not a database" in fault or "Could not decode" in fault:
-            raise DataLoss("the store is damaged") from error
-        raise

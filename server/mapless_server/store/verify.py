@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from sqlalchemy import Connection, Row, Select, Table, func, select
+from sqlalchemy.exc import DBAPIError
 
 from mapless_server.errors import DataLoss
 from mapless_server.store import codec, queries, removing, rows
+from mapless_server.store.damage import is_damage, unless_damaged
 from mapless_server.store.migrations import read_version
 from mapless_server.store.tables import features, global_descriptor, image, reference, scene
 from mapless_server.tenancy import SceneKey, scene_id_of, tenant_of
 
 BLOBS_AT_A_TIME = 16
 """Images are megabytes each."""
+
+PAGE_FAULTS_TOLD = 20
+"""Pages that a damaged one has led to are told of one by one, and there may be thousands."""
 
 Progress = Callable[[str, int, int], None]
 """Hears what is being done, how much of it is done, and how much there is."""
@@ -29,12 +35,30 @@ class Verification:
     Attributes:
         version: of the schema.
         counts: of scenes, references and their parts, by table.
-        faults: one line each; none if every byte is as it was stored.
+        faults: one line each; none if every byte is as it was stored. Those of the file as a whole begin with
+            "database: ".
     """
 
     version: int
     counts: dict[str, int]
     faults: tuple[str, ...]
+
+    @property
+    def is_file_whole(self) -> bool:
+        """Whether what is damaged can be told by name, deleted, and stored again."""
+        return not any(fault.startswith(f"{_DATABASE}: ") for fault in self.faults)
+
+
+@dataclass(frozen=True)
+class _Unreadable:
+    """A reference in whose place there are damaged pages."""
+
+    scene_id: str
+    reference_id: str
+
+
+_Check = Callable[[Connection, dict[str, int], Progress], Iterator[str]]
+_DATABASE = "database"
 
 
 def ignore_progress(what: str, done: int, total: int) -> None:
@@ -48,15 +72,12 @@ def verify(connection: Connection, on_progress: Progress = ignore_progress) -> V
 
     Raises:
         ValueError: it is no store, or one of a newer program.
-        DataLoss: the database itself is damaged, so that not even its rows can be read.
+        DataLoss: the database itself is damaged, so that not even its version can be read.
     """
     version = read_version(connection)
     if version is None:
         raise ValueError("it is empty")
     faults: list[str] = []
-    if connection.dialect.name == "sqlite":
-        found = [row[0] for row in connection.exec_driver_sql("PRAGMA integrity_check")]
-        faults += [f"database: {it}" for it in found if it != "ok"]
     tables = [scene, reference, image, features]
     checks = [_check_references, _check_features]
     if version >= 2:
@@ -64,10 +85,27 @@ def verify(connection: Connection, on_progress: Progress = ignore_progress) -> V
         checks += [_check_descriptors, _check_counts]
     if version >= 3:
         checks.append(_check_attributes)
-    counts = {table.name: connection.scalar(select(func.count()).select_from(table)) or 0 for table in tables}
+    counts = {table.name: unless_damaged(connection, partial(_count, connection, table), lambda: 0) for table in tables}
     for check in checks:
-        faults += check(connection, counts, on_progress)
-    return Verification(version, counts, tuple(faults))
+        all_of_them = partial(_all_faults, check, connection, counts, on_progress)
+        faults += unless_damaged(connection, all_of_them, lambda: [f"{_DATABASE}: not even its rows can be read"])
+    if connection.dialect.name == "sqlite":
+        # Last, because who reads the faults can do most about those that have a name.
+        faults += unless_damaged(connection, lambda: _damaged_pages(connection), lambda: [f"{_DATABASE}: its pages"])
+    return Verification(version, counts, tuple(dict.fromkeys(faults)))
+
+
+def _damaged_pages(connection: Connection) -> list[str]:
+    found = [str(row[0]) for row in connection.exec_driver_sql(f"PRAGMA integrity_check({PAGE_FAULTS_TOLD})")]
+    return [f"{_DATABASE}: {line}" for text in found for line in text.splitlines() if line != "ok"]
+
+
+def _count(connection: Connection, table: Table) -> int:
+    return connection.scalar(select(func.count()).select_from(table)) or 0
+
+
+def _all_faults(check: _Check, connection: Connection, counts: dict[str, int], on_progress: Progress) -> list[str]:
+    return list(check(connection, counts, on_progress))
 
 
 def _check_references(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:
@@ -85,6 +123,9 @@ def _check_references(connection: Connection, counts: dict[str, int], on_progres
     ).outerjoin(image, image.c.reference_key == column.key)
     statement = statement.where(~removing.is_set_apart(column.scene_id))
     for row in _stream(connection, statement, "references", counts[reference.name], on_progress):
+        if isinstance(row, _Unreadable):
+            yield f"{_name(row)}: image, or camera and pose, on damaged pages"
+            continue
         yield from _fault(
             _name(row), "camera and pose", codec.decode_geometry, row.key, row.geometry, row.geometry_sha256
         )
@@ -100,6 +141,9 @@ def _check_features(connection: Connection, counts: dict[str, int], on_progress:
     )
     statement = statement.where(~removing.is_set_apart(reference.c.scene_id))
     for row in _stream(connection, statement, "features", counts[features.name], on_progress):
+        if isinstance(row, _Unreadable):
+            yield f"{_name(row)}: features, on damaged pages"
+            continue
         owner = rows.features_owner(row.key, row.extractor)
         yield from _fault(_name(row), f"features of {row.extractor}", codec.decode_view, owner, row.data, row.sha256)
     yield from _orphans(connection, features)
@@ -111,6 +155,9 @@ def _check_descriptors(connection: Connection, counts: dict[str, int], on_progre
     ).join(reference, reference.c.key == global_descriptor.c.reference_key)
     statement = statement.where(~removing.is_set_apart(reference.c.scene_id))
     for row in _stream(connection, statement, "descriptors", counts[global_descriptor.name], on_progress):
+        if isinstance(row, _Unreadable):
+            yield f"{_name(row)}: global descriptor, on damaged pages"
+            continue
         owner, what = rows.descriptor_owner(row.key, row.name), f"global descriptor {row.name}"
         yield from _fault(_name(row), what, codec.check, owner, row.data, row.sha256, what)
     yield from _orphans(connection, global_descriptor)
@@ -120,7 +167,7 @@ def _check_counts(connection: Connection, counts: dict[str, int], on_progress: P
     references = select(reference.c.scene_id, reference.c.generation)
     references = references.where(~removing.is_set_apart(reference.c.scene_id))
     found, latest = Counter[str](), dict[str, int]()
-    for row in _stream(connection, references, "scenes", counts[reference.name], on_progress):
+    for row in _rows(connection, references, "scenes", counts[reference.name], on_progress):
         found[row.scene_id] += 1
         latest[row.scene_id] = max(row.generation, latest.get(row.scene_id, 0))
     generations = queries.read_generations(connection)
@@ -141,7 +188,7 @@ def _check_counts(connection: Connection, counts: dict[str, int], on_progress: P
 def _check_attributes(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:
     column = scene.c
     statement: Select[Any] = select(column.scene_id, column.attributes, column.attributes_sha256)
-    for row in _stream(connection, statement, "scenes", counts[scene.name], on_progress):
+    for row in _rows(connection, statement, "scenes", counts[scene.name], on_progress):
         yield from _fault(_scene(row.scene_id), "its datum, down and calibration", rows.scene_attributes, row)
 
 
@@ -153,6 +200,33 @@ def _fault(whose: str, what: str, check: Callable[..., object], *arguments: obje
 
 
 def _stream(
+    connection: Connection, statement: Select[Any], what: str, total: int, on_progress: Progress
+) -> Iterator[Row[Any] | _Unreadable]:
+    """Rows of references and what belongs to them; one by one where some lie on damaged pages."""
+    try:
+        yield from _rows(connection, statement, what, total, on_progress)
+        return
+    except DBAPIError as error:
+        if not is_damage(error):
+            raise
+    column = reference.c
+    listed = select(column.key, column.scene_id, column.reference_id).where(~removing.is_set_apart(column.scene_id))
+    for done, row in enumerate(connection.execute(listed).all(), 1):
+        one = statement.where(column.key == row.key)
+        there = _Unreadable(row.scene_id, row.reference_id)
+        yield from unless_damaged(connection, partial(_all_of, connection, one), partial(_alone, there))
+        on_progress(f"checking {what} one by one", done, total)
+
+
+def _alone(reference: _Unreadable) -> Sequence[Row[Any] | _Unreadable]:
+    return [reference]
+
+
+def _all_of(connection: Connection, statement: Select[Any]) -> Sequence[Row[Any] | _Unreadable]:
+    return connection.execute(statement).all()
+
+
+def _rows(
     connection: Connection, statement: Select[Any], what: str, total: int, on_progress: Progress
 ) -> Iterator[Row[Any]]:
     done = 0
@@ -170,7 +244,7 @@ def _orphans(connection: Connection, table: Table) -> Iterator[str]:
         yield f"database: {count} rows of {table.name} belong to no reference"
 
 
-def _name(row: Row[Any]) -> str:
+def _name(row: Row[Any] | _Unreadable) -> str:
     return f"{_scene(row.scene_id)}, reference {row.reference_id!r}"
 
 

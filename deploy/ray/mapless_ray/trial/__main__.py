@@ -1,0 +1,95 @@
+"""`python -m mapless_ray.trial overhead|throughput|failover|redeploys|all`: tables on the screen, figures as JSON."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from mapless_server.load.report import Check, check_lines, machine, update_json
+from mapless_server.load.requests import place_of
+from mapless_server.progress import Progress, progress_bars
+from mapless_server.signals import terminable
+
+from .cluster import ClusterFailed
+from .database import NoDatabase
+from .failover import failover_checks, failover_lines, measure_failover
+from .overhead import OverheadOptions, measure_overhead, overhead_checks, overhead_json, overhead_lines
+from .redeploys import measure_redeploys, redeploys_checks, redeploys_lines
+from .throughput import (
+    ThroughputOptions,
+    measure_throughput,
+    throughput_checks,
+    throughput_json,
+    throughput_lines,
+)
+
+KILLS, REDEPLOYS = 10, 20
+Part = tuple[list[str], list[Check], dict[str, Any]]
+"""What is printed, the bars, and the figures for programs."""
+
+
+def overhead(given: argparse.Namespace, progress: Progress) -> Part:
+    """Of the ingress."""
+    options = OverheadOptions(rounds=2, unloaded_s=0.5, saturated_s=0.5) if given.quick else OverheadOptions()
+    ways = measure_overhead(options, progress)
+    return overhead_lines(ways, options), overhead_checks(ways), overhead_json(ways, options)
+
+
+def throughput(given: argparse.Namespace, progress: Progress) -> Part:
+    """Of two replicas against one."""
+    options = ThroughputOptions(rounds=1, step_s=5.0) if given.quick else ThroughputOptions()
+    place = place_of(given.data)
+    rounds = measure_throughput(place, options, progress)
+    return throughput_lines(rounds, place, options), throughput_checks(rounds), throughput_json(rounds, options)
+
+
+def failover(given: argparse.Namespace, progress: Progress) -> Part:
+    """When a replica is killed."""
+    result = measure_failover(given.count or (2 if given.quick else KILLS), progress)
+    return failover_lines(result), failover_checks(result), asdict(result)
+
+
+def redeploys(given: argparse.Namespace, progress: Progress) -> Part:
+    """When all replicas are replaced."""
+    result = measure_redeploys(given.count or (1 if given.quick else REDEPLOYS), progress)
+    return redeploys_lines(result), redeploys_checks(result), asdict(result)
+
+
+PARTS: dict[str, Callable[[argparse.Namespace, Progress], Part]] = {
+    "overhead": overhead,
+    "throughput": throughput,
+    "failover": failover,
+    "redeploys": redeploys,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit code 1 if a bar was missed or a cluster did not come up."""
+    parser = argparse.ArgumentParser(prog="python -m mapless_ray.trial", description=__doc__)
+    parser.add_argument("part", choices=[*PARTS, "all"])
+    parser.add_argument("--count", type=int, help=f"kills or redeploys; default: {KILLS} and {REDEPLOYS}")
+    parser.add_argument("--data", type=Path, help="folder with images/ and cameras.json; default: a rendered room")
+    parser.add_argument("--quick", action="store_true", help="to see that it runs; not for figures")
+    parser.add_argument("--output", type=Path, default=Path("load-output"), help="folder for the figures")
+    given = parser.parse_args(arguments)
+    is_met = True
+    try:
+        with terminable(), progress_bars() as progress:
+            for name in PARTS if given.part == "all" else (given.part,):
+                lines, checks, figures = PARTS[name](given, progress)
+                print("\n".join([f"## {name}", "", machine(), "", *lines, *check_lines(checks)]), flush=True)
+                given.output.mkdir(parents=True, exist_ok=True)
+                update_json(given.output / "load-ray.json", name, figures, checks)
+                is_met &= all(check.met for check in checks)
+    except (ClusterFailed, NoDatabase, ValueError) as error:
+        print(f"mapless_ray.trial: {error}", file=sys.stderr)
+        return 1
+    return 0 if is_met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

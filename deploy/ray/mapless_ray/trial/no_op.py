@@ -1,0 +1,23 @@
+"""Replicas that compute nothing: what is left is what serving costs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ray.serve import Application
+
+from mapless_server.load.no_op import make_no_op_engine
+
+from ..app import deployed
+from ..replica import MaplessReplica
+
+
+class NoOpReplica(MaplessReplica):
+    """The same but for the engine."""
+
+    make = staticmethod(make_no_op_engine)
+
+
+def build(settings: dict[str, Any]) -> Application:
+    """As `mapless_ray.app.build`."""
+    return deployed(NoOpReplica, {"warm_up": False, **settings})

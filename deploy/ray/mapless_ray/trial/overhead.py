@@ -1,0 +1,161 @@
+"""What the ingress costs a call: the same replica asked through HAProxy and at its own port, by turns."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+from mapless import Client
+from mapless_server.child import child_module
+from mapless_server.load import no_op
+from mapless_server.load.report import Check
+from mapless_server.load.requests import METHOD, SCENE, photo_request, read_answer
+from mapless_server.load.sender import Target, connected, send_closed_loop
+from mapless_server.load.step import ServerUnderLoad, Step, run_step
+from mapless_server.progress import Progress
+
+from .callers import Scenes
+from .cluster import application, running_cluster
+from .database import VARIABLE, database_url
+from .failover import NO_OP
+
+MAX_OVERHEAD_MS = 3.0
+THROUGH, DIRECT, PLAIN = "through HAProxy", "replica's own port", "plain server"
+WORKERS = 2
+_EXPECTED = {"OK rejected LOW_TEXTURE"}
+
+
+@dataclass(frozen=True)
+class OverheadOptions:
+    """Options of the comparison.
+
+    Attributes:
+        message_bytes: size of the photograph; 0.3 MB is a phone's at 1024 px.
+        rounds: the ways take turns so often, so that what else the machine does hits all alike.
+        unloaded_s: calls one after the other, a round.
+        saturated_s: calls side by side, a round.
+        concurrency: of these.
+    """
+
+    message_bytes: int = 300_000
+    rounds: int = 10
+    unloaded_s: float = 2.0
+    saturated_s: float = 2.0
+    concurrency: int = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """A way to be called: its steps, one a round."""
+
+    name: str
+    unloaded: list[Step]
+    saturated: list[Step]
+
+    @property
+    def p50s_ms(self) -> list[float]:
+        """Each round's median latency of one call at a time."""
+        return [step.account.answers.p50_ms or 0.0 for step in self.unloaded]
+
+
+def measure_overhead(options: OverheadOptions, progress: Progress) -> list[Way]:
+    """Starts a replica with its ingress, and the plain server on the same database, and calls them by turns."""
+    photo = no_op.padded_photo(options.message_bytes)
+    names = ["r0", "r1"]
+    request = photo_request(photo, no_op.CAMERA, names)
+    with database_url() as url, running_cluster({VARIABLE: url}) as cluster:
+        cluster.deploy(application({"insecure": True, "workers": WORKERS}, 1, import_path=NO_OP))
+        with child_module("mapless_ray.trial.plain", str(WORKERS), environment={VARIABLE: url}) as plain:
+            with Client(cluster.address) as client:
+                client.create_scene(SCENE)
+                client.add_references(SCENE, [Scenes(photo=photo).reference(name) for name in names])
+            (replica,) = cluster.replicas()
+            places = {
+                THROUGH: (cluster.address, replica.process_id),
+                DIRECT: (replica.address, replica.process_id),
+                PLAIN: (plain.address, plain.process_id),
+            }
+            return asyncio.run(_compare(places, request, options, progress))
+
+
+def overhead_checks(ways: list[Way]) -> list[Check]:
+    """The bar."""
+    by_name = {way.name: way.p50s_ms for way in ways}
+    rounds = [a - b for a, b in zip(by_name[THROUGH], by_name[DIRECT], strict=True)]
+    overhead = median(rounds)
+    return [
+        Check(
+            "p50 overhead of the ingress, one call at a time",
+            f"{overhead:.2f} ms (rounds {min(rounds):.2f} to {max(rounds):.2f})",
+            f"at most {MAX_OVERHEAD_MS:g} ms",
+            overhead <= MAX_OVERHEAD_MS,
+        )
+    ]
+
+
+def overhead_lines(ways: list[Way], options: OverheadOptions) -> list[str]:
+    """A table with a row a way."""
+    lines = [
+        f"Messages of {options.message_bytes / 1e6:g} MB to a server that computes nothing, {options.rounds} rounds by "
+        f"turns; load average {os.getloadavg()[0]:.1f}:",
+        "",
+        "| called | p50 of one at a time, ms | p99 of it, ms | calls/s with 16 side by side | generator's core |",
+        "|---|---|---|---|---|",
+    ]
+    for way in ways:
+        p99 = median(step.account.answers.p99_ms or 0.0 for step in way.unloaded)
+        per_s = median(step.account.completed_per_s for step in way.saturated)
+        own = median(step.own_share for step in way.saturated)
+        lines.append(f"| {way.name} | {median(way.p50s_ms):.2f} | {p99:.2f} | {per_s:.0f} | {100 * own:.0f} % |")
+    return [*lines, ""]
+
+
+def overhead_json(ways: list[Way], options: OverheadOptions) -> dict[str, Any]:
+    """For programs."""
+    return {
+        "options": vars(options),
+        "ways": [
+            {
+                "name": way.name,
+                "unloaded": [step.as_json() for step in way.unloaded],
+                "saturated": [step.as_json() for step in way.saturated],
+            }
+            for way in ways
+        ],
+    }
+
+
+async def _compare(
+    places: dict[str, tuple[str, int]], request: bytes, options: OverheadOptions, progress: Progress
+) -> list[Way]:
+    ways = {name: Way(name, [], []) for name in places}
+    async with AsyncExitStack() as stack:
+        targets: dict[str, Target] = {}
+        for name, (address, process_id) in places.items():
+            targets[name] = await stack.enter_async_context(connected(address, METHOD, 4, 30.0, read_answer))
+            await _step(name, process_id, targets[name], request, 4, 0.5)  # what happens once, happens now
+        for done in range(options.rounds):
+            progress("overhead, rounds", done, options.rounds)
+            for name, (_, process_id) in places.items():
+                ways[name].unloaded.append(await _step(name, process_id, targets[name], request, 1, options.unloaded_s))
+            for name, (_, process_id) in places.items():
+                ways[name].saturated.append(
+                    await _step(name, process_id, targets[name], request, options.concurrency, options.saturated_s)
+                )
+    return list(ways.values())
+
+
+async def _step(name: str, process_id: int, target: Target, request: bytes, at_a_time: int, duration_s: float) -> Step:
+    step = await run_step(
+        f"{name}, {at_a_time} at a time",
+        ServerUnderLoad(process_id),
+        lambda: send_closed_loop(target, [request], at_a_time, duration_s),
+        duration_s,
+    )
+    if set(step.account.outcomes) != _EXPECTED:
+        raise RuntimeError(f"{step.name}: calls ended as {dict(step.account.outcomes)}")
+    return step

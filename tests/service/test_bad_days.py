@@ -1,0 +1,387 @@
+"""A disk that is full, read-only, slow or damaged; two servers on one file; a scene that is deleted while it is asked.
+
+What can be answered is answered, what cannot says why, nothing is mixed up, and when the fault is gone all works again
+without a restart.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+from disks import fail, failing_disk, mount, small_disk
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from images import encode
+from programs import wait_until
+from servers import CAMERA, PHOTO, StandInMethod, pose, serving
+from sqlalchemy import Connection
+
+from mapless import (
+    Client,
+    ConnectOptions,
+    DataLoss,
+    DeadlineExceeded,
+    LocalizationResult,
+    MaplessError,
+    NewReference,
+    NotFound,
+    Rejected,
+    Unavailable,
+)
+from mapless.geometry import Camera
+from mapless_server import serve
+from mapless_server.method.localize import Answer
+from mapless_server.method.views import PosedView, View
+from mapless_server.services import SERVICE_NAMES
+from mapless_server.store import StoreError
+from mapless_server.store.folder_lock import LOCK_FILE
+from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
+from mapless_server.store.verify import verify
+from mapless_server.store_health import watch_store
+
+ONCE = ConnectOptions(max_attempts=1, timeout_s=30)
+LARGE = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
+PAGE_BYTES = 4096
+
+
+def large_photo(seed: int) -> bytes:
+    """Some 230 kB, which lie on many pages."""
+    return encode(".png", np.random.default_rng(seed).integers(0, 256, (240, 320, 3)).astype(np.uint8))
+
+
+def large(i: int) -> NewReference:
+    return NewReference(f"r{i}", large_photo(i), LARGE, pose(i))
+
+
+def error_of(call: Callable[[], object]) -> MaplessError | None:
+    try:
+        call()
+    except MaplessError as error:
+        return error
+    return None
+
+
+class HealthClient(Client):
+    """One that also asks for the health of each service."""
+
+    def __init__(self, address: str) -> None:
+        super().__init__(address, ONCE)
+        self.address = address
+
+
+def health_of(client: HealthClient) -> tuple[bool, ...]:
+    """Of the server, of LocalizationService, and of ReferenceService."""
+    with grpc.insecure_channel(client.address) as channel:
+        check = health_pb2_grpc.HealthStub(channel).Check
+        answers = [check(health_pb2.HealthCheckRequest(service=name), timeout=30) for name in ("", *SERVICE_NAMES)]
+    return tuple(it.status == health_pb2.HealthCheckResponse.SERVING for it in answers)
+
+
+@pytest.fixture(autouse=True)
+def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At its store, the server."""
+    monkeypatch.setattr(serve, "watch_store", partial(watch_store, every_s=0.02))
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[HealthClient]:
+    with serving(folder) as server:
+        client = HealthClient(server.address)
+        with client:
+            yield client
+
+
+def fill(client: Client, count: int = 3) -> None:
+    client.create_scene("s")
+    for i in range(count):
+        client.add_reference("s", large(i))
+
+
+def is_answered(client: Client, *references: str) -> bool:
+    return isinstance(client.localize(PHOTO, CAMERA, "s", references), LocalizationResult)
+
+
+def faults_of(folder: Path) -> tuple[str, ...]:
+    with closing(SqliteDatabase.look_at(folder / DATABASE_FILE)) as database, database.read() as connection:
+        return verify(connection).faults
+
+
+class TestDisk:
+    def test_one_that_is_full_costs_changes_alone_and_works_again_when_there_is_room(self, tmp_path: Path) -> None:
+        with small_disk(tmp_path / "disk", 4) as disk:
+            with served(disk / "data") as client:
+                fill(client, 1)
+                stored = {"r0"}
+                for i in range(1, 60):
+                    error = error_of(partial(client.add_reference, "s", large(i)))
+                    if error is not None:
+                        break
+                    stored.add(f"r{i}")
+                assert error is not None
+                assert (error.code, error.reason, error.retry_after_s) == ("RESOURCE_EXHAUSTED", "STORE_FULL", None)
+                assert len(stored) > 3
+                assert is_answered(client, "r0")
+                assert is_answered(client)
+                assert client.get_reference("s", "r0", include_image=True).image == large_photo(0)
+                assert health_of(client)[:2] == (True, True)
+                assert mount("-o", "remount,size=40m", str(disk)) == 0
+                client.add_reference("s", NewReference("late", large_photo(99), LARGE, pose(9)))
+                wait_until(lambda: health_of(client) == (True, True, True))
+                assert {it.reference_id for it in client.list_references("s")} == stored | {"late"}
+            assert faults_of(disk / "data") == ()
+
+    def test_one_that_can_only_be_read_from_the_start_serves_queries(self, tmp_path: Path) -> None:
+        with small_disk(tmp_path / "disk", 16) as disk:
+            with served(disk / "data") as client:
+                fill(client)
+            assert mount("-o", "remount,ro", str(disk)) == 0
+            with served(disk / "data") as client, served(disk / "data") as other:
+                for each in (client, other):
+                    self.serves_queries_alone(each)
+            assert mount("-o", "remount,rw", str(disk)) == 0
+            with served(disk / "data") as client:
+                client.create_scene("t")
+                assert health_of(client) == (True, True, True)
+
+    def serves_queries_alone(self, client: HealthClient) -> None:
+        assert is_answered(client)
+        assert is_answered(client, "r1", "r2")
+        assert client.get_reference("s", "r0", include_image=True).image == large_photo(0)
+        wait_until(lambda: health_of(client) == (True, True, False))
+        for change in (
+            lambda: client.create_scene("t"),
+            lambda: client.delete_reference("s", "r0"),
+            lambda: client.add_reference("s", large(9)),
+        ):
+            error = error_of(change)
+            assert error is not None
+            assert (error.code, error.reason) == ("FAILED_PRECONDITION", "STORE_READ_ONLY")
+
+    def test_one_that_can_only_be_read_and_was_not_closed_in_order_is_refused(self, tmp_path: Path) -> None:
+        with small_disk(tmp_path / "disk", 16) as disk:
+            with served(disk / "data") as client:
+                fill(client, 1)
+            (disk / "data" / f"{DATABASE_FILE}-wal").write_bytes(b"what was acknowledged last")
+            assert mount("-o", "remount,ro", str(disk)) == 0
+            with pytest.raises(StoreError, match="not closed in order"), served(disk / "data"):
+                pass
+
+    @pytest.mark.slow
+    def test_one_that_fails_under_a_running_server_serves_what_it_can(self, tmp_path: Path) -> None:
+        with failing_disk(tmp_path / "disk", 32) as disk, served(disk / "data") as client:
+            fill(client)
+            fail(disk)
+            error = error_of(lambda: client.create_scene("t"))
+            assert error is not None
+            assert (error.code, error.reason) == ("UNAVAILABLE", "STORE_UNAVAILABLE")
+            assert error.retry_after_s is not None
+            wait_until(lambda: health_of(client) == (True, True, False))
+            assert is_answered(client, "r1", "r2")
+            assert is_answered(client)
+            assert client.get_reference("s", "r0", include_image=True).image == large_photo(0)
+
+    def test_one_that_is_slow_holds_up_nobody_whose_answer_is_in_memory(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        slow, meets = threading.Event(), threading.Event()
+        real_read = SqliteDatabase.read
+
+        @contextmanager
+        def read(database: SqliteDatabase) -> Iterator[Connection]:
+            if slow.is_set():
+                meets.set()
+                time.sleep(3.0)
+            with real_read(database) as connection:
+                yield connection
+
+        monkeypatch.setattr(SqliteDatabase, "read", read)
+        with served(tmp_path) as client, ThreadPoolExecutor(4) as pool:
+            fill(client)
+            assert is_answered(client, "r0", "r1")
+            slow.set()
+            listed = [pool.submit(lambda: list(client.list_references("s"))) for _ in range(2)]
+            late = pool.submit(error_of, lambda: client.get_scene("s", timeout_s=0.5))
+            assert meets.wait(30)
+            assert client.is_serving()
+            assert is_answered(client, "r0", "r1")
+            assert not any(it.done() for it in listed), "what is in memory waited for the disk"
+            assert isinstance(late.result(30), DeadlineExceeded)
+            assert [len(it.result(60)) for it in listed] == [3, 3]
+
+
+class TestDamagedPages:
+    def damage(self, folder: Path, photo: bytes) -> None:
+        """Zeroes a page in the middle of a photograph: its link to the next page is gone, too."""
+        path = folder / DATABASE_FILE
+        content = path.read_bytes()
+        at = content.find(photo[100_000:100_016])
+        assert at > 0
+        with path.open("r+b") as file:
+            file.seek(at // PAGE_BYTES * PAGE_BYTES)
+            file.write(bytes(PAGE_BYTES))
+
+    def test_one_costs_the_reference_that_lies_there_which_is_named_and_can_be_stored_anew(
+        self, tmp_path: Path
+    ) -> None:
+        with served(tmp_path) as client:
+            fill(client)
+        self.damage(tmp_path, large_photo(1))
+        assert any("'r1': image" in fault for fault in faults_of(tmp_path))
+        assert not any("'r0'" in fault or "'r2'" in fault for fault in faults_of(tmp_path))
+        with served(tmp_path) as client:
+            with pytest.raises(DataLoss, match="'r1' is damaged") as caught:
+                client.get_reference("s", "r1", include_image=True)
+            assert caught.value.code == "DATA_LOSS"
+            for other in ("r0", "r2"):
+                assert len(client.get_reference("s", other, include_image=True).image or b"") > 100_000
+                assert is_answered(client, other, "r1")
+            assert is_answered(client)
+            client.delete_reference("s", "r1")
+            client.add_reference("s", large(1))
+            assert client.get_reference("s", "r1", include_image=True).image == large_photo(1)
+            assert client.get_scene("s").reference_count == 3
+            assert is_answered(client)
+        assert not any("reference" in fault for fault in faults_of(tmp_path))
+
+    def test_its_scene_can_be_deleted_and_made_anew(self, tmp_path: Path) -> None:
+        with served(tmp_path) as client:
+            fill(client)
+        self.damage(tmp_path, large_photo(1))
+        with served(tmp_path) as client:
+            client.delete_scene("s")
+            with pytest.raises(NotFound):
+                client.get_scene("s")
+            fill(client)
+            assert client.get_reference("s", "r1", include_image=True).image == large_photo(1)
+            client.delete_scene("s")
+
+    def test_those_of_the_schema_keep_a_server_from_starting_which_says_what_helps(self, tmp_path: Path) -> None:
+        with served(tmp_path) as client:
+            fill(client, 1)
+        with (tmp_path / DATABASE_FILE).open("r+b") as file:
+            file.seek(100)
+            file.write(bytes(range(256)) * 15)
+        with pytest.raises(StoreError, match=r"malformed; restore a backup into a new folder$"), served(tmp_path):
+            pass
+
+
+class TestTwoServers:
+    """On one SQLite file, whatever it is called."""
+
+    def opened_by_another(self, *folders: Path) -> list[str]:
+        """What a process says that opens the store in each folder; empty where it can."""
+        code = """if True:
+            import sys
+            from pathlib import Path
+            from mapless_server.store import Store, StoreError
+            for folder in sys.argv[1:]:
+                try:
+                    Store.open(Path(folder)).close()
+                    print()
+                except StoreError as error:
+                    print(error)
+        """
+        command = [sys.executable, "-c", code, *map(str, folders)]
+        return subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout.splitlines()
+
+    def test_the_second_is_refused_under_every_name_until_the_first_has_gone(self, tmp_path: Path) -> None:
+        data = tmp_path / "data"
+        link, soft, hard = (tmp_path / name for name in ("link", "soft", "hard"))
+        link.symlink_to(data)
+        relative = Path(os.path.relpath(data))
+        with served(data):
+            for folder in (soft, hard):
+                folder.mkdir()
+            (soft / DATABASE_FILE).symlink_to(data / DATABASE_FILE)
+            os.link(data / DATABASE_FILE, hard / DATABASE_FILE)
+            *by_folder, by_soft, by_hard = self.opened_by_another(data, link, relative, soft, hard)
+            assert all(f"in use by another server (process {os.getpid()})" in told for told in by_folder)
+            assert all("in use by another server, under another name" in told for told in (by_soft, by_hard))
+            # Somebody tidies up: the file's own lock is still there.
+            (data / LOCK_FILE).unlink()
+            (told,) = self.opened_by_another(data)
+            assert "in use by another server" in told
+        assert self.opened_by_another(data) == [""]
+
+    def test_a_lock_file_that_is_left_of_a_server_that_was_killed_keeps_nobody_out(self, tmp_path: Path) -> None:
+        code = """if True:
+            import os, sys
+            from pathlib import Path
+            from mapless_server.store import Store
+            Store.open(Path(sys.argv[1]))
+            os.kill(os.getpid(), 9)
+        """
+        killed = subprocess.run([sys.executable, "-c", code, str(tmp_path)], timeout=60)
+        assert killed.returncode == -9
+        assert (tmp_path / LOCK_FILE).read_text().isdigit()
+        with served(tmp_path) as client:
+            client.create_scene("s")
+
+
+class TestScenesThatGo:
+    @pytest.mark.slow
+    def test_one_deleted_and_made_anew_while_it_is_asked_gives_no_mixed_answer(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """In its n-th life all its references, which are called the same in all lives, stand at x = n."""
+        life, lives, stop = [0], 12, threading.Event()
+        together: set[frozenset[float]] = set()
+        real_call = StandInMethod.__call__
+
+        def call(method: StandInMethod, query: View, references: Sequence[PosedView], *more: Any) -> Answer:
+            together.add(frozenset(float(it.world_from_camera.translation[0]) for it in references))
+            return real_call(method, query, references, *more)
+
+        monkeypatch.setattr(StandInMethod, "__call__", call)
+
+        def make(client: Client) -> None:
+            client.create_scene("s")
+            news = [NewReference(f"r{i}", PHOTO, CAMERA, pose(float(life[0]))) for i in range(3)]
+            client.add_references("s", news)
+
+        def ask(address: str, asked: tuple[str, ...]) -> Iterator[str]:
+            with Client(address, ONCE) as client:
+                while not stop.is_set():
+                    began = life[0]
+                    try:
+                        answer = client.localize(PHOTO, CAMERA, "s", asked)
+                    except (NotFound, Unavailable) as error:
+                        yield error.code
+                        continue
+                    if isinstance(answer, Rejected):  # between its creation and its references
+                        yield str(answer.reason)
+                        continue
+                    assert began <= answer.world_from_camera.translation[0] <= life[0]
+                    yield "OK"
+
+        with serving(tmp_path, workers=2) as server, Client(server.address, ONCE) as client, ExitStack() as stack:
+            make(client)
+            pool = stack.enter_context(ThreadPoolExecutor(6))
+            stack.callback(stop.set)
+            kinds = [("r2", "r0"), ()] * 3
+            asking = [pool.submit(list, ask(server.address, kind)) for kind in kinds]
+            for number in range(1, lives):
+                time.sleep(0.05)
+                client.delete_scene("s")
+                life[0] = number
+                make(client)
+            answers = server.method.call_count
+            wait_until(lambda: server.method.call_count > answers + len(kinds))
+            stop.set()
+            seen = {code for it in asking for code in it.result(60)}
+        assert "OK" in seen
+        assert seen <= {"OK", "NOT_FOUND", "UNAVAILABLE", "NO_USABLE_REFERENCES"}
+        assert all(len(it) == 1 for it in together), "references of several lives in one answer"
+        assert len(together) > 1

@@ -1,0 +1,477 @@
+"""mapless on a real Ray cluster with Serve's real ingress and a real PostgreSQL: what holds for one server holds here.
+
+Two replicas. They answer as the plain server does, bit for bit, with its errors and limits, and callers with the
+client's usual retries notice nothing when replicas are replaced, killed, or broken.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent import futures
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+from postgres import Cluster as Database
+from postgres import require
+from pydantic import SecretStr
+from servers import CAMERA, PHOTO, localize_request, pose, serving
+
+from mapless import (
+    Client,
+    ConnectOptions,
+    DeadlineExceeded,
+    InvalidArgument,
+    LocalizationResult,
+    MaplessError,
+    NewReference,
+    NotFound,
+    RigidTransform,
+    Unavailable,
+    wire,
+)
+from mapless.errors import from_rpc_error
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless_server.child import child_server
+from mapless_server.demo import room
+from mapless_server.demo.run import Photograph, Place, real_place
+from mapless_server.load.requests import photo_request
+from mapless_server.security.tokens import create_token
+from mapless_server.services import SERVICE_NAMES
+from mapless_server.store import Store
+
+pytest.importorskip("ray.serve", reason="needs Ray Serve: the extra `ray`")
+
+from ray_app import FAILS, HANGS, SECRET
+
+from mapless_ray.trial.callers import Calls, Scenes, calling
+from mapless_ray.trial.cluster import Cluster, Replica, application, running_cluster
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
+DATA = Path(os.environ.get("TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
+LIMIT_S = 60.0
+SCENES = [f"scene-{i}" for i in range(16)]
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
+AT_ONCE: dict[str, Any] = {"rolling_update_percentage": 1.0}
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    """Returns when it holds, and fails where it never does."""
+    give_up_s = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < give_up_s
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    require()
+    database = Database()
+    try:
+        yield database.fresh_url()
+    finally:
+        database.remove()
+
+
+@pytest.fixture(scope="module")
+def cluster(url: str) -> Iterator[Cluster]:
+    """A cluster whose replicas find the database in their environment, where its password belongs."""
+    environment = {"MAPLESS_DATABASE_URL": url, "PYTHONPATH": str(Path(__file__).parents[1])} | ONE_THREAD
+    with running_cluster(environment) as running:
+        yield running
+
+
+# The same answers
+
+
+@pytest.fixture(scope="module")
+def real(cluster: Cluster) -> Cluster:
+    """Replicas as they are deployed."""
+    cluster.deploy(application({"workers": 1, "insecure": True}))
+    return cluster
+
+
+def rendered() -> Place:
+    """A corner of the room that the project renders: six photographs along a walk, two of which are asked for."""
+    _, surfaces = room._lit_room(0)
+    photos = [room.take(surfaces, station) for station in room.walk(0, 16)[:6]]
+    own = [Photograph(it.name, room.jpeg(it.image), it.camera, it.world_from_camera) for it in photos]
+    return Place("a corner", [own[i] for i in (0, 1, 4, 5)], [own[2], own[3]], metric=True)
+
+
+def photographed() -> Place:
+    if not (DATA / "fountain-P11" / "cameras.json").is_file():
+        pytest.skip(f"needs real photographs, {DATA} has none")
+    return real_place(DATA / "fountain-P11")
+
+
+def asked(place: Place) -> list[bytes]:
+    """Requests with references named and with none, so that the server chooses; and two that it must reject."""
+    first, second = place.queries[:2]
+    names = [reference.name for reference in place.references[:5]]
+    grey = np.full((first.camera.height_px, first.camera.width_px, 3), 127, np.uint8)
+    return [
+        photo_request(first.data, first.camera, names),
+        photo_request(first.data, first.camera, ()),
+        photo_request(second.data, second.camera, ()),
+        photo_request(room.jpeg(grey), first.camera, ()),
+        photo_request(first.data, first.camera, names[:1]),
+    ]
+
+
+def answered(address: str, request: bytes) -> bytes:
+    """All of an answer that is not time or the call's own name."""
+    with grpc.insecure_channel(address, [("grpc.max_send_message_length", -1)]) as channel:
+        data = channel.unary_unary("/mapless.v1.LocalizationService/Localize")(request, timeout=LIMIT_S)
+    answer = pb.LocalizeResponse.FromString(data)
+    assert answer.diagnostics.request_id
+    for own in ("request_id", "stages", "queue_duration", "total_duration"):
+        answer.diagnostics.ClearField(own)
+    return bytes(answer.SerializeToString(deterministic=True))
+
+
+@pytest.mark.parametrize("make_place", [rendered, photographed])
+def test_answers_are_those_of_the_plain_server_bit_for_bit(
+    url: str, real: Cluster, make_place: Callable[[], Place]
+) -> None:
+    place = make_place()
+    with Client(real.address) as client:
+        client.create_scene("load")
+        references = [NewReference(p.name, p.data, p.camera, p.world_from_camera) for p in place.references[:10]]
+        client.add_references("load", references)
+    ways = [real.address, *(replica.address for replica in real.replicas())]
+    assert len(ways) == 3
+    outcomes = set()
+    with child_server(SecretStr(url), {"--workers": "1"}, ONE_THREAD) as plain:
+        for request in asked(place):
+            expected = answered(plain.address, request)
+            assert [answered(way, request) for way in ways] == [expected] * 3
+            outcomes.add(pb.LocalizeResponse.FromString(expected).WhichOneof("outcome"))
+    assert outcomes == {"localization", "rejection"}
+    with Client(real.address) as client:
+        client.delete_scene("load")
+
+
+# The same errors and limits
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """Replicas whose method does as it is told, and that ask for tokens.
+
+    Attributes:
+        cluster: they are in.
+        tokens: by tenant and role.
+        tokens_file: that they read.
+    """
+
+    cluster: Cluster
+    tokens: dict[str, str]
+    tokens_file: Path
+
+    def options(self, caller: str = "writer") -> ConnectOptions:
+        return ConnectOptions(token=self.tokens[caller])
+
+    def client(self, caller: str = "writer", **options: Any) -> Client:
+        return Client(self.cluster.address, replace(self.options(caller), **options))
+
+    def metadata(self, *more: tuple[str, str]) -> list[tuple[str, str]]:
+        return [("authorization", f"Bearer {self.tokens['writer']}"), *more]
+
+    def application(self, **settings: Any) -> dict[str, Any]:
+        given = {"workers": 2, "tokens_file": str(self.tokens_file), "stall_limit_s": 4.0, "allow_watching": True}
+        return application(given | settings, import_path="ray_app:build", **AT_ONCE)
+
+    @contextmanager
+    def stub(self, address: str | None = None) -> Iterator[LocalizationServiceStub]:
+        options = [("grpc.max_send_message_length", -1)]
+        with grpc.insecure_channel(address or self.cluster.address, options) as channel:
+            yield LocalizationServiceStub(channel)
+
+
+CALLERS = {"writer": ("acme", "write"), "robot": ("acme", "localize"), "stranger": ("other", "write")}
+
+
+def behaving(x_s: float, how: float = 0.0) -> RigidTransform:
+    """A pose by which the stand-in method takes so long, and ends so."""
+    return RigidTransform(np.eye(3), np.array([x_s, how, 0.0]))
+
+
+def fill(client: Client, scene: str, x_s: float = 0.0, how: float = 0.0) -> None:
+    client.create_scene(scene)
+    client.add_reference(scene, NewReference("r", PHOTO, CAMERA, behaving(x_s, how)))
+
+
+@pytest.fixture(scope="module")
+def guarded(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Guarded:
+    tokens_file = tmp_path_factory.mktemp("tokens") / "tokens.json"
+    tokens = {caller: create_token(tokens_file, caller, *held, None) for caller, held in CALLERS.items()}
+    running = Guarded(cluster, tokens, tokens_file)
+    cluster.deploy(running.application())
+    with running.client() as client:
+        for scene in SCENES:
+            fill(client, scene)
+        fill(client, "slow", 1.5)
+        fill(client, "faulty", how=FAILS)
+    return running
+
+
+@pytest.fixture
+def client(guarded: Guarded) -> Iterator[Client]:
+    with guarded.client() as connected:
+        yield connected
+
+
+def who(client: Client, scene: str) -> int:
+    """The process that answers."""
+    answer = client.localize(PHOTO, CAMERA, scene)
+    assert isinstance(answer, LocalizationResult)
+    return answer.inlier_count
+
+
+FAILING: dict[str, tuple[type[MaplessError], Callable[[Client], Any]]] = {
+    "unknown scene": (NotFound, lambda client: client.localize(PHOTO, CAMERA, "nowhere")),
+    "unknown reference": (NotFound, lambda client: client.localize(PHOTO, CAMERA, SCENES[0], ("r", "lost"))),
+    "bad image": (InvalidArgument, lambda client: client.localize(b"no image", CAMERA, SCENES[0])),
+    "bad camera": (InvalidArgument, lambda client: client.localize(PHOTO, replace(CAMERA, width_px=97), SCENES[0])),
+    "bad name": (InvalidArgument, lambda client: client.get_scene("no name")),
+}
+
+
+def test_errors_are_those_of_the_plain_server_with_all_their_details(
+    url: str, guarded: Guarded, tmp_path: Path
+) -> None:
+    with (
+        serving(tmp_path, store=Store.connect(url), tokens_file=guarded.tokens_file) as plain,
+        Client(plain.address, guarded.options()) as direct,
+        guarded.client() as through,
+    ):
+        for what, (expected, call) in FAILING.items():
+            with pytest.raises(expected) as here:
+                call(direct)
+            with pytest.raises(expected) as there:
+                call(through)
+            for name in ("code", "reason", "message", "field", "retry_after_s"):
+                assert getattr(there.value, name) == getattr(here.value, name), what
+            assert there.value.request_id
+
+
+def test_faults_are_internal_without_a_word_of_the_exception(guarded: Guarded) -> None:
+    with guarded.stub() as stub, pytest.raises(grpc.RpcError) as caught:
+        stub.Localize(localize_request("faulty"), timeout=30, metadata=guarded.metadata(("x-request-id", "mine")))
+    assert from_rpc_error(caught.value).code == "INTERNAL"
+    failure: Any = caught.value
+    assert failure.details() == "internal error, id=mine"
+    assert SECRET not in repr(failure.trailing_metadata())
+
+
+def test_a_request_id_is_taken_over(guarded: Guarded) -> None:
+    with guarded.stub() as stub:
+        answer, call = stub.Localize.with_call(
+            localize_request(SCENES[0]), timeout=30, metadata=guarded.metadata(("x-request-id", "mine"))
+        )
+    assert answer.diagnostics.request_id == "mine"
+    assert dict(call.trailing_metadata())["x-request-id"] == "mine"
+
+
+def test_callers_without_a_good_token_and_of_other_tenants_are_kept_out(guarded: Guarded) -> None:
+    with Client(guarded.cluster.address) as nobody, pytest.raises(MaplessError) as caught:
+        nobody.get_scene(SCENES[0])
+    assert caught.value.code == "UNAUTHENTICATED"
+    with guarded.client("robot") as robot, pytest.raises(MaplessError) as caught:
+        robot.create_scene("mine")
+    assert caught.value.code == "PERMISSION_DENIED"
+    with guarded.client("stranger") as stranger, pytest.raises(NotFound):
+        stranger.get_scene(SCENES[0])
+
+
+def test_the_callers_deadline_comes_along(guarded: Guarded, client: Client) -> None:
+    """The replica itself says that it passed; and refuses at once what it knows to take longer."""
+    begin_s = time.monotonic()
+    with pytest.raises(DeadlineExceeded) as caught:
+        client.localize(PHOTO, CAMERA, "slow", timeout_s=0.8)
+    assert caught.value.request_id
+    assert time.monotonic() - begin_s < 1.5
+    for _ in range(3):
+        client.localize(PHOTO, CAMERA, "slow")
+
+    def refused(_: int) -> str:
+        with guarded.client() as own, pytest.raises(MaplessError) as caught:
+            own.localize(PHOTO, CAMERA, "slow", timeout_s=1.6)
+        return str(caught.value.reason)
+
+    with futures.ThreadPoolExecutor(12) as pool:
+        assert "DEADLINE_INFEASIBLE" in set(pool.map(refused, range(12)))
+
+
+def test_too_much_is_refused_with_the_time_to_come_back(guarded: Guarded) -> None:
+    with guarded.client(max_attempts=1) as once, futures.ThreadPoolExecutor(32) as pool:
+        calls = [pool.submit(once.localize, PHOTO, CAMERA, "slow", timeout_s=30) for _ in range(32)]
+        errors = [error for call in calls if (error := call.exception(LIMIT_S)) is not None]
+    assert 0 < len(errors) < 32
+    for error in errors:
+        assert isinstance(error, MaplessError)
+        assert (error.code, error.reason) == ("RESOURCE_EXHAUSTED", "QUEUE_FULL")
+        assert error.retry_after_s
+
+
+@pytest.mark.parametrize(("size_mib", "expected"), [(20, "INVALID_ARGUMENT"), (33, "RESOURCE_EXHAUSTED")])
+def test_the_limit_of_messages_is_that_of_the_settings(guarded: Guarded, size_mib: int, expected: str) -> None:
+    request = pb.LocalizeRequest(
+        scene=f"scenes/{SCENES[0]}", image=bytes(size_mib * 2**20), intrinsics=wire.camera_to_message(CAMERA)
+    )
+    with guarded.stub() as stub, pytest.raises(grpc.RpcError) as caught:
+        stub.Localize(request, timeout=LIMIT_S, metadata=guarded.metadata())
+    assert from_rpc_error(caught.value).code == expected
+
+
+def test_health_and_reflection_are_the_standard_ones(guarded: Guarded) -> None:
+    with grpc.insecure_channel(guarded.cluster.address) as channel:
+        for name in ("", *SERVICE_NAMES):
+            request = health_pb2.HealthCheckRequest(service=name)
+            assert health_pb2_grpc.HealthStub(channel).Check(request, timeout=30).status == 1
+        ask = reflection_pb2.ServerReflectionRequest(list_services="")
+        (told,) = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(iter([ask]), timeout=30)
+    listed = [service.name for service in told.list_services_response.service]
+    assert set(SERVICE_NAMES) < set(listed)
+    assert len(listed) == len(set(listed))
+
+
+# Which replica answers
+
+
+def test_calls_of_a_scene_come_to_one_replica_and_scenes_to_both(guarded: Guarded, client: Client) -> None:
+    at = {scene: who(client, scene) for scene in SCENES}
+    assert set(at.values()) == {replica.process_id for replica in guarded.cluster.replicas()}
+    with guarded.client() as another:
+        assert {scene: who(another, scene) for scene in SCENES} == at
+
+
+def test_calls_that_name_no_scene_come_to_both_by_turns(guarded: Guarded) -> None:
+    with guarded.stub() as stub:
+        request = localize_request(SCENES[0])
+        answers = [stub.Localize(request, timeout=30, metadata=guarded.metadata()) for _ in range(20)]
+    counts = [answer.localization.inlier_count for answer in answers]
+    assert min(counts.count(replica.process_id) for replica in guarded.cluster.replicas()) >= 8
+
+
+def test_what_is_added_through_one_replica_the_other_uses_at_once(guarded: Guarded) -> None:
+    with ExitStack() as stack:
+        one, other = (
+            stack.enter_context(Client(replica.address, guarded.options())) for replica in guarded.cluster.replicas()
+        )
+        one.create_scene("fresh")
+        for number in range(3):
+            one.add_reference("fresh", NewReference(f"r{number}", PHOTO, CAMERA, pose(number)))
+            answer = other.localize(PHOTO, CAMERA, "fresh", (f"r{number}",))
+            assert isinstance(answer, LocalizationResult)
+            assert [use.name.rpartition("/")[2] for use in answer.diagnostics.references] == [f"r{number}"]
+        one.delete_scene("fresh")
+        with pytest.raises(NotFound):
+            other.localize(PHOTO, CAMERA, "fresh")
+
+
+# Replicas come and go
+
+
+@contextmanager
+def called(guarded: Guarded) -> Iterator[Calls]:
+    """Callers of all kinds meanwhile; at the end no call has failed and nothing that was acknowledged is lost."""
+    scenes = Scenes(4, PHOTO, CAMERA)
+    made: list[Calls] = []
+
+    def long(client: Client, _: int) -> None:
+        client.localize(PHOTO, CAMERA, "slow")
+
+    with guarded.client() as client:
+        scenes.remove(client)
+        scenes.store(client)
+    kinds = [scenes.localize, scenes.get, long, scenes.adding(lambda: made[0], "added")]
+    with calling(guarded.cluster.address, kinds, 0.02, guarded.options()) as calls:
+        made.append(calls)
+        wait_until(lambda: len(calls.ended) > 20)
+        yield calls
+        begin_s = time.monotonic()
+        wait_until(lambda: min(sum(it.caller == i and it.begin_s > begin_s for it in calls.ended) for i in range(4)))
+    assert calls.failed == []
+    assert len(calls.acknowledged) > 0
+    with guarded.client() as client:
+        assert scenes.lost(client, calls) == set()
+
+
+def replaced(cluster: Cluster, gone: set[Replica]) -> bool:
+    now = set(cluster.replicas())
+    return len(now) == 2 and not now & gone
+
+
+def test_a_replica_that_is_killed_costs_retries_and_no_call(guarded: Guarded) -> None:
+    victim = guarded.cluster.replicas()[0]
+    with called(guarded):
+        os.kill(victim.process_id, signal.SIGKILL)
+        wait_until(lambda: replaced(guarded.cluster, {victim}))
+
+
+def test_a_replica_whose_queue_hangs_ends_and_is_replaced(guarded: Guarded, client: Client) -> None:
+    fill(client, "hanging", how=HANGS)
+    victim = guarded.cluster.replicas()[0]
+    with Client(victim.address, replace(guarded.options(), max_attempts=1)) as direct, called(guarded):
+        with pytest.raises(MaplessError):
+            direct.localize(PHOTO, CAMERA, "hanging", timeout_s=20)
+        wait_until(lambda: replaced(guarded.cluster, {victim}))
+    assert not Path(f"/proc/{victim.process_id}").exists()
+
+
+def test_a_redeploy_costs_no_call_and_ends_streams_that_have_no_end(guarded: Guarded) -> None:
+    """Not even a retry: calls that run are finished, and new ones come to the replicas that are left."""
+    before = set(guarded.cluster.replicas())
+    ended: list[str] = []
+
+    def watch(stub: LocalizationServiceStub) -> None:
+        request = pb.WatchQueriesRequest(scene=f"scenes/{SCENES[0]}")
+        call = stub.WatchQueries(request, timeout=LIMIT_S, metadata=guarded.metadata())
+        call.initial_metadata()
+        with pytest.raises(grpc.RpcError) as caught:
+            list(call)
+        ended.append(from_rpc_error(caught.value).code)
+
+    application = guarded.application(max_queued_s=3.0)
+    del application["deployments"][0]["rolling_update_percentage"]  # one after the other
+    with guarded.stub() as stub, called(guarded):
+        watching = threading.Thread(target=watch, args=(stub,))
+        watching.start()
+        guarded.cluster.deploy(application)
+        watching.join(LIMIT_S)
+    assert ended == ["UNAVAILABLE"]
+    assert not before & set(guarded.cluster.replicas())
+
+
+def test_without_any_replica_callers_are_told_to_come_back(guarded: Guarded) -> None:
+    with guarded.client(max_attempts=1, timeout_s=5.0) as once, guarded.client() as patient:
+        for replica in guarded.cluster.replicas():
+            os.kill(replica.process_id, signal.SIGKILL)
+        told = []
+
+        def is_refused() -> bool:
+            try:
+                once.get_scene(SCENES[0])
+            except Unavailable as error:
+                told.append(error)
+            return bool(told) and told[-1].retry_after_s is not None
+
+        wait_until(is_refused)
+        assert (told[-1].reason, told[-1].retry_after_s) == ("STARTING", 1.0)
+        assert not once.is_serving()
+        # Who does as told need not know.
+        assert patient.get_scene(SCENES[0]).scene_id == SCENES[0]
