@@ -421,6 +421,19 @@ class TestMemory:
                     plain.append(held)
             assert cache.used_bytes == sum(entry[1] for entry in plain) <= capacity
 
+    def test_what_is_deleted_takes_no_memory(self, store: Store) -> None:
+        for scene in ("kept", "gone"):
+            store.create_scene(SceneKey(scene))
+            store.add_references(SceneKey(scene), [make_reference(it) for it in "abc"])
+            store.load_references(SceneKey(scene), None, EXTRACTOR)
+        full = store.reference_cache.used_bytes
+        store.delete_scene(SceneKey("gone"))
+        assert store.reference_cache.used_bytes == full / 2
+        store.delete_reference(SceneKey("kept"), "b")
+        assert store.reference_cache.used_bytes == full / 3
+        assert len(store.load_references(SceneKey("kept"), None, EXTRACTOR).references) == 2
+        assert store.reference_cache.evictions == 0
+
     def test_negative_capacity_is_refused(self) -> None:
         with pytest.raises(ValueError, match="negative"):
             LruCache(-1)

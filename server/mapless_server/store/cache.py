@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from typing import Generic, TypeVar
 
 Value = TypeVar("Value")
@@ -43,6 +43,14 @@ class LruCache(Generic[Value]):
             self.hits += 1
             self._entries.move_to_end(key)
             return entry[0]
+
+    def forget(self, is_gone: Callable[[Value], bool]) -> None:
+        """Forget values that nobody will ask for any more; not counted as evictions. Looks at each."""
+        with self._lock:
+            gone = [key for key, (value, _) in self._entries.items() if is_gone(value)]
+            for key in gone:
+                _, size_bytes = self._entries.pop(key)
+                self._used_bytes -= size_bytes
 
     def put(self, key: Hashable, value: Value, size_bytes: int) -> None:
         """Hold a value, unless it is larger than the whole cache."""
