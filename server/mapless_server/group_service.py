@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from mapless.v1 import localization_service_pb2 as pb
 
+from .call import Call
 from .capture.recorder import Recorder, failures_of
 from .engine import Engine
 from .group_localization import (
@@ -29,7 +30,6 @@ from .messages.groups import (
 from .method.rejection import Rejection
 from .observability.metrics import LOCALIZED, Metrics
 from .query import Query
-from .rpc import Call
 from .scheduling.jobs import Visit
 
 

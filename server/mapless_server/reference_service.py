@@ -16,6 +16,7 @@ from mapless.v1 import reference_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
 
 from .auditing import Viewpoint
+from .call import Call
 from .engine import Engine
 from .errors import AlreadyExists
 from .messages.naming import reference_ids_from_names, reference_key_from_name, scene_key_from_name
@@ -25,7 +26,6 @@ from .messages.priors import narrowing_from_message
 from .messages.references import audit_to_message, choice_to_message, coverage_to_message, reference_to_message
 from .messages.scenes import attributes_from_message, changes_from_message, scene_to_message
 from .query import DEFAULT_REFERENCE_COUNT, Photo
-from .rpc import Call
 from .store import ContradictingDown, NewReference, ReferenceRecord, Store
 from .tenancy import SceneKey, key_of, scene_id_of
 

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
-import re
 import time
-import uuid
 from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Mapping
 from contextlib import aclosing, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, Protocol, TypeVar
-from urllib.parse import unquote
 
 import grpc
 from google.protobuf.message import DecodeError
@@ -20,30 +16,18 @@ from grpc_status import rpc_status
 
 from mapless.wire import FieldError
 
+from .call import REQUEST_ID_KEY, Call, Deadlines, begin_call, metadata_of
 from .errors import DeadlineExceeded, InvalidArgument, RequestError, Unavailable
 from .observability.logs import as_extra
 from .observability.tracing import CallSpan, Metadata, NoTracer, Tracer
-from .observability.trail import Trail
 from .principal import Principal
-from .query import Caller
 from .receiving import Context, OpenMethods, Receiver
-from .scheduling.fair import Flow
 from .security.access import ENDLESS_METHODS, OPEN_METHODS
 from .status import to_status
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-
-REQUEST_ID_KEY = "x-request-id"
-CLIENT_ID_KEY = "x-client-id"
-ANSWER_MARGIN_SHARE = 0.02
-"""Of the time given, the answer leaves this early: gRPC rounds the time up when it sends it, by 1 % at most."""
-ANSWER_MARGIN_S = 0.01
-"""And at least so early, because the answer has to be written and sent as well ..."""
-_MAX_MARGIN_SHARE = 0.1
-"""... where there is time for that."""
-_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it enters the log: no line breaks, no escapes
 
 Authenticate = Callable[[Metadata, str, Mapping[str, Iterable[bytes]]], Principal]
 """Who calls a method ("/package.Service/Method"), from the call's metadata and the connection's auth_context.
@@ -60,48 +44,6 @@ class CallObserver(Protocol):
 
     def call_handled(self, method: str, code: str, seconds: float, trace_id: str) -> None:
         """It ended with a gRPC status; told once, whatever happened. The id is empty if it is not traced."""
-
-
-@dataclass(frozen=True)
-class Call:
-    """What a servicer may know of the call it answers, and what it tells of it.
-
-    Attributes:
-        request_id: identifies it in the log; the caller's own if it sent a well-formed one.
-        arrived_s: when its headers arrived, `time.monotonic`; its message may take longer.
-        deadline_s: when the servicer must have answered, `time.monotonic`.
-        principal: who calls.
-        client: what tells callers apart: the id that they give, else the address of their connection.
-        trail: what was told of it so far.
-        trailing: metadata that are to follow the answer.
-    """
-
-    request_id: str
-    arrived_s: float
-    deadline_s: float
-    principal: Principal = field(default_factory=Principal)
-    client: str = ""
-    trail: Trail = field(default_factory=Trail, repr=False, compare=False)
-    trailing: list[tuple[str, str]] = field(default_factory=list, repr=False, compare=False)
-
-    @property
-    def caller(self) -> Caller:
-        """Who asks, as the engine knows it."""
-        return Caller(Flow(self.principal.tenant, self.client), self.deadline_s)
-
-    def note(self, **fields: object) -> None:
-        """Adds fields to the call's line in the log and to its trace; those that every line has cannot be changed."""
-        self.trail.notes.update(fields)
-
-    def waited(self, stage: str, start_s: float, end_s: float) -> None:
-        """It waited for a stage of the queue, `time.monotonic`."""
-        self.trail.waited(stage, start_s, end_s)
-
-    def computed(
-        self, stage: str, start_s: float, end_s: float, part_seconds: Mapping[str, float] | None = None, **about: object
-    ) -> None:
-        """A stage was computed for it, `time.monotonic`; the parts that it consisted of followed each other."""
-        self.trail.computed(stage, start_s, end_s, part_seconds or {}, **about)
 
 
 class CallGuard:
@@ -130,8 +72,7 @@ class CallGuard:
             observer: counts calls.
             tracer: traces them; closed by whoever made it.
         """
-        self._default_deadline_s = default_deadline_s
-        self._max_deadline_s = max_deadline_s
+        self._deadlines = Deadlines(default_deadline_s, max_deadline_s)
         self._authenticate = authenticate
         self._check_door = check_door
         self._observer = observer
@@ -153,8 +94,8 @@ class CallGuard:
             if not is_endless:
                 self._active += 1
                 self._idle.clear()
-            call = self._begin(context, is_endless)
-            span = self._tracer.begin(method, _metadata(context), call.arrived_s)
+            call = begin_call(context, self._deadlines, is_endless)
+            span = self._tracer.begin(method, metadata_of(context), call.arrived_s)
             if self._observer is not None:
                 self._observer.call_started(method)
             log.debug("%s begins", method, extra={"request_id": call.request_id})
@@ -201,24 +142,7 @@ class CallGuard:
     def _who_calls(self, method: str, context: Context) -> Principal:
         if self._authenticate is None:
             return Principal()
-        return self._authenticate(_metadata(context), method, context.auth_context())
-
-    def _begin(self, context: Context, is_endless: bool) -> Call:
-        now_s = time.monotonic()
-        asked_s, margin_s = context.time_remaining(), 0.0
-        if is_endless:
-            given_s = math.inf if asked_s is None else asked_s
-        else:
-            given_s = min(self._default_deadline_s if asked_s is None else asked_s, self._max_deadline_s)
-        if math.isfinite(given_s):
-            margin_s = min(max(ANSWER_MARGIN_S, ANSWER_MARGIN_SHARE * given_s), _MAX_MARGIN_SHARE * given_s)
-        metadata = _metadata(context)
-        request_id = _well_formed(metadata, REQUEST_ID_KEY) or uuid.uuid4().hex
-        client = _well_formed(metadata, CLIENT_ID_KEY) or unquote(context.peer())
-        call = Call(request_id, now_s, now_s + given_s - margin_s, client=client)
-        if math.isfinite(given_s):
-            call.note(deadline_ms=round(1000 * given_s))
-        return call
+        return self._authenticate(metadata_of(context), method, context.auth_context())
 
     async def _answer(self, handler: Any, method: str, call: Call, context: Context) -> bytes:
         """The servicer's answer; whatever is wrong with the request is a RequestError."""
@@ -292,7 +216,7 @@ class CallGuard:
         """The call's message, and the call with who makes it."""
         limit_s = call.deadline_s - time.monotonic()
         if method in ENDLESS_METHODS:  # which may have no deadline
-            limit_s = min(limit_s, self._default_deadline_s)
+            limit_s = min(limit_s, self._deadlines.default_deadline_s)
         data = await self._receiver.message(context, limit_s)
         call.note(bytes_in=len(data))
         call = replace(call, principal=self._who_calls(method, context))
@@ -352,16 +276,6 @@ class CallGuard:
             fields["stages_ms"] = {name: _ms(spent_s) for name, spent_s in trail.stage_seconds.items()}
         fields |= {"method": method, "code": code, "duration_ms": _ms(seconds)}
         log.info("%s %s", method.rpartition("/")[2], code, extra=as_extra(fields))
-
-
-def _metadata(context: Context) -> Metadata:
-    return context.invocation_metadata() or ()
-
-
-def _well_formed(metadata: Metadata, wanted: str) -> str:
-    """The metadata's value; empty if there is none or it is not fit for the log."""
-    given = next((str(value) for key, value in metadata if key == wanted), "")
-    return given if _ID.fullmatch(given) else ""
 
 
 def _ms(seconds: float) -> float:

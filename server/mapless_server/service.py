@@ -13,6 +13,7 @@ from mapless import wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
 
+from .call import Call
 from .capture.recorder import Recorder, failures_of
 from .engine import Engine
 from .group_service import answer_rig, answer_sequence
@@ -24,7 +25,6 @@ from .method.localize import Localization
 from .observability.metrics import LOCALIZED, Metrics
 from .progressive import TellCoarse, coarse_then_final
 from .query import Query, Result
-from .rpc import Call
 from .scheduling.jobs import Visit
 from .store import SceneAttributes, Store
 from .tenancy import key_of

@@ -18,8 +18,9 @@ from typing import Any
 import grpc
 
 from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.call import CLIENT_ID_KEY, REQUEST_ID_KEY, Call
 from mapless_server.observability.logs import JsonFormatter, TextFormatter
-from mapless_server.rpc import CLIENT_ID_KEY, REQUEST_ID_KEY, Call, CallGuard
+from mapless_server.rpc import CallGuard
 from mapless_server.security.access import METHOD_ROLES, Authenticator
 from mapless_server.security.errors import SecurityError
 from mapless_server.security.tokens import Token, Tokens, read_tokens, sha256_of

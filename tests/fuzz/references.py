@@ -27,6 +27,7 @@ from mapless.v1 import reference_service_pb2 as pb
 from mapless_server import reference_service
 from mapless_server.audit.coverage import Coverage, CoverageVerdict
 from mapless_server.auditing import Viewpoint
+from mapless_server.call import Call
 from mapless_server.describing import Description
 from mapless_server.engine import EngineOptions
 from mapless_server.messages.pages import MAX_PAGE_SIZE
@@ -35,7 +36,6 @@ from mapless_server.principal import Principal
 from mapless_server.query import Caller, Photo
 from mapless_server.retrieval.chosen import Choice
 from mapless_server.retrieval.narrowing import Narrowing
-from mapless_server.rpc import Call
 from mapless_server.store import (
     NewReference,
     ReferenceRecord,

@@ -15,6 +15,7 @@ from typing import Any, cast
 import pytest
 from servers import CAMERA
 
+from mapless_server.call import Call
 from mapless_server.engine import JOIN, Engine, EngineOptions
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError
 from mapless_server.group_localization import localize_each
@@ -23,7 +24,6 @@ from mapless_server.method.localize import LocalizeOptions
 from mapless_server.query import Caller, Photo, Query, Result
 from mapless_server.query_stages import PREPARE
 from mapless_server.retrieval.narrowing import Narrowing
-from mapless_server.rpc import Call
 from mapless_server.scheduling.admission import ScheduleOptions
 from mapless_server.scheduling.fair import Flow
 from mapless_server.scheduling.items import Items, work_off

@@ -17,13 +17,13 @@ from servers import CAMERA, PHOTO, localize_request, pose, serving
 
 from mapless import Client, NewReference
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless_server.call import Call
 from mapless_server.capture import recorder as recorder_module
 from mapless_server.capture.calls import CapturedFailure, decode_call
 from mapless_server.capture.files import calls_of
 from mapless_server.capture.folder import CaptureFolder, Retention
 from mapless_server.capture.recorder import CAPTURED_KEY, Recorder
 from mapless_server.principal import Principal
-from mapless_server.rpc import Call
 from mapless_server.store import Store
 
 

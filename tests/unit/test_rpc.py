@@ -19,10 +19,11 @@ from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server import receiving
+from mapless_server.call import ANSWER_MARGIN_SHARE, Call
 from mapless_server.errors import NotFound, Overloaded, PermissionDenied, Unauthenticated
 from mapless_server.observability.trail import MAX_STEPS, Step
 from mapless_server.principal import Principal, Role
-from mapless_server.rpc import ANSWER_MARGIN_SHARE, Call, CallGuard
+from mapless_server.rpc import CallGuard
 
 CHECK, WATCH = "/grpc.health.v1.Health/Check", "/grpc.health.v1.Health/Watch"
 METHOD = "/mapless.v1.LocalizationService/Localize"

@@ -18,9 +18,10 @@ import pytest
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
+from mapless_server.call import Call
 from mapless_server.errors import FailedPrecondition, Unauthenticated
 from mapless_server.principal import Principal
-from mapless_server.rpc import Call, CallGuard
+from mapless_server.rpc import CallGuard
 
 METHOD = "/mapless.v1.LocalizationService/WatchQueries"
 FINITE = "/mapless.v1.LocalizationService/LocalizeProgressively"

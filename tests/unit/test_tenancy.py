@@ -23,6 +23,7 @@ from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1.geometry_pb2 import Vector3
 from mapless.wire import FieldError
 from mapless_server.audit.coverage import Coverage, CoverageVerdict
+from mapless_server.call import Call
 from mapless_server.decode import ImageLimits
 from mapless_server.describing import Description
 from mapless_server.errors import NotFound, RequestError
@@ -30,7 +31,6 @@ from mapless_server.method.views import Features, View
 from mapless_server.principal import DEFAULT_TENANT, Principal
 from mapless_server.reference_service import ReferenceService
 from mapless_server.retrieval.chosen import Choice
-from mapless_server.rpc import Call
 from mapless_server.store import Store
 from mapless_server.tenancy import SceneKey, check_tenant, end_of_keys, key_of, scene_id_of, tenant_of
 

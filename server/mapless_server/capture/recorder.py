@@ -24,9 +24,9 @@ from mapless.names import parse_scene_name
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 
+from ..call import Call
 from ..errors import DataLoss, DeadlineExceeded, InvalidArgument, NotFound, Overloaded, RequestError, Unavailable
 from ..query import Query, Result
-from ..rpc import Call
 from ..settings import Settings
 from ..store import Store
 from ..store.rows import time_us

@@ -16,6 +16,7 @@ from typing import Any, TypeVar, cast
 
 from mapless.v1 import localization_service_pb2 as pb
 
+from ..call import Call
 from ..engine import Engine, EngineOptions
 from ..method.localize import Answer, Coarse, coarse_answer, refine
 from ..observability.metrics import Metrics
@@ -23,7 +24,6 @@ from ..principal import Principal
 from ..query import Caller, Query, Result
 from ..query_stages import COARSE, PREPARE, REFINE, Method, QueryStages, Work
 from ..query_views import QueryViews
-from ..rpc import Call
 from ..scheduling.fair import Flow
 from ..scheduling.jobs import Done, Job, Visit
 from ..service import LocalizationService
