@@ -22,12 +22,13 @@ from typing import Any, cast
 
 from servers import StandInExtractor, StandInMethod, StandInReconstructor, whole
 
+from mapless_server.assembly import engine_options
 from mapless_server.engine import Engine
 from mapless_server.method.localize import Answer, Pipeline
 from mapless_server.observability.logs import configure_logging
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.rate import RateLimiter
-from mapless_server.serve import engine_options, serve
+from mapless_server.serve import serve
 from mapless_server.settings import Settings, load_settings
 from mapless_server.store import Store
 from mapless_server.tiers import Tier

@@ -1,4 +1,4 @@
-"""From settings to tiers: which features, matchers and backend serve, and what does without where something is missing.
+"""From settings to an engine and its store: what serves, and what does without where something is missing.
 
 Nothing here imports torch unless the settings ask for a network.
 """
@@ -7,17 +7,25 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Callable
 
+from .decode import ImageLimits
+from .engine import Engine, EngineOptions
 from .extras import install_hint
 from .method.coarse.make import make_reconstructor
 from .method.correspond import Matcher, make_matcher
 from .method.features import FEATURES, FeatureExtractor, make_extractor
 from .method.localize import Pipeline
+from .observability.metrics import Metrics
 from .retrieval.descriptor import GlobalDescriptor
 from .retrieval.vlad import VladDescriptor
+from .scheduling.admission import ScheduleOptions
+from .scheduling.work_queue import WorkQueueOptions
+from .security.rate import RateLimiter
 from .settings import Settings, available_cores
+from .store import Store, StoreError
 from .tiers import Tier
-from .weights import CATALOGUE, WeightsMissing, find_weights
+from .weights import CATALOGUE, WeightsError, WeightsMissing, find_weights
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +41,58 @@ only 53 need it. On a GPU the second is as quick as the first, and answers alone
 RETRIEVAL = ("auto", "vlad", "megaloc")
 
 WITH_WEIGHTS = frozenset(entry.name for entry in CATALOGUE)
+
+
+class StartupError(Exception):
+    """The server cannot start; the message is one sentence for the operator."""
+
+
+def image_limits(settings: Settings) -> ImageLimits:
+    """The limits of images that the settings ask for."""
+    return ImageLimits(
+        max_bytes=settings.max_image_mib * 2**20, max_pixels=round(settings.max_image_megapixels * 1_000_000)
+    )
+
+
+def engine_options(settings: Settings) -> EngineOptions:
+    """The engine's options that the settings ask for."""
+    return EngineOptions(
+        workers=settings.workers,
+        max_batch=settings.max_batch,
+        index_cache_bytes=settings.retrieval_cache_mib * 2**20,
+        image_limits=image_limits(settings),
+        coverage=settings.coverage,
+        queue=WorkQueueOptions(
+            ScheduleOptions(max_queued_s=settings.max_queued_s, max_bytes=settings.max_queued_mib * 2**20),
+            stall_limit_s=settings.stall_limit_s,
+        ),
+    )
+
+
+def open_store(settings: Settings) -> Store:
+    """The store of the settings' database or data folder; StartupError if it cannot be opened."""
+    cache_bytes = settings.reference_cache_mib * 2**20
+    try:
+        if settings.database_url is not None:
+            return Store.connect(settings.database_url.get_secret_value(), cache_bytes)
+        return Store.open(settings.data_dir, cache_bytes)
+    except StoreError as error:
+        raise StartupError(str(error)) from error
+
+
+MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], Engine]
+
+
+def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+    """The engine that the settings ask for; StartupError if they name what is not known or not there."""
+    try:
+        tiers = make_tiers(settings)
+        descriptor = make_descriptor(settings, tiers[0].extractor)
+        return Engine(store, tiers, engine_options(settings), metrics, quota, descriptor=descriptor)
+    except (ImportError, WeightsMissing) as error:
+        raise StartupError(what_is_missing(error)) from error
+    except (ValueError, WeightsError) as error:
+        raise StartupError(str(error)) from error
 
 
 def feature_names(features: str, device: str) -> tuple[str, ...]:

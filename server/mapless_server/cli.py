@@ -131,7 +131,8 @@ def serve_command(
     logging.getLogger(__name__).info("mapless-server %s\n%s", __version__, loaded)
     configure_libraries(settings)
 
-    from .serve import StartupError, serve
+    from .assembly import StartupError
+    from .serve import serve
 
     try:
         asyncio.run(serve(settings))

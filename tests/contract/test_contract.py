@@ -48,6 +48,7 @@ ABOVE = {
         "__main__",
         "cli",
         "serve",
+        "running",
         "service",
         "services",
         "group_service",

@@ -13,7 +13,7 @@ from servers import listening
 from wall import wall
 
 from mapless import Camera, Client, InvalidArgument, NewReference, NotFound, RigidTransform
-from mapless_server.serve import make_engine
+from mapless_server.assembly import make_engine
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_server.tenancy import SceneKey

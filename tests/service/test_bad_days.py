@@ -41,7 +41,7 @@ from mapless import (
     Unavailable,
 )
 from mapless.geometry import Camera
-from mapless_server import serve
+from mapless_server import running
 from mapless_server.method.localize import Answer
 from mapless_server.method.views import PosedView, View
 from mapless_server.services import SERVICE_NAMES
@@ -92,7 +92,7 @@ def health_of(client: HealthClient) -> tuple[bool, ...]:
 @pytest.fixture(autouse=True)
 def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
     """At its store, the server."""
-    monkeypatch.setattr(serve, "watch_store", partial(watch_store, every_s=0.02))
+    monkeypatch.setattr(running, "watch_store", partial(watch_store, every_s=0.02))
 
 
 @contextmanager

@@ -45,13 +45,13 @@ from mapless import (
 from mapless.errors import from_rpc_error
 from mapless.geometry import Camera, RigidTransform
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless_server.assembly import engine_options
 from mapless_server.engine import Engine
 from mapless_server.method.localize import Answer, Localization, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.query_stages import Method
 from mapless_server.security.rate import RateLimiter
-from mapless_server.serve import engine_options
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_server.tiers import Tier

@@ -35,6 +35,7 @@ from mapless import Client, ConnectOptions, MaplessError, NewReference, RigidTra
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless_server.assembly import engine_options, make_engine
 from mapless_server.engine import Engine
 from mapless_server.method.localize import Answer, Localization, Pipeline
 from mapless_server.method.pnp import PoseStage
@@ -44,7 +45,6 @@ from mapless_server.query_stages import Method
 from mapless_server.scheduling.jobs import Over
 from mapless_server.security.rate import RateLimiter
 from mapless_server.security.tokens import create_token
-from mapless_server.serve import engine_options, make_engine
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_server.tiers import Tier

@@ -10,10 +10,16 @@ from pathlib import Path
 import pytest
 
 from mapless_server import assembly
-from mapless_server.assembly import choose_device, feature_names, make_first_features, make_tiers
+from mapless_server.assembly import (
+    StartupError,
+    choose_device,
+    feature_names,
+    make_engine,
+    make_first_features,
+    make_tiers,
+)
 from mapless_server.method.features import make_extractor
 from mapless_server.observability.metrics import Metrics
-from mapless_server.serve import StartupError, make_engine
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_server.weights import WeightsMissing

@@ -26,8 +26,8 @@ from mapless.errors import from_rpc_error
 from mapless_ray import ingress, replica, scaling
 from mapless_ray.environment import check_environment, variables
 from mapless_ray.ingress import Ingress, add_services
+from mapless_server.assembly import StartupError
 from mapless_server.observability.metrics import Metrics
-from mapless_server.serve import StartupError
 from mapless_server.services import SERVICE_NAMES, Services
 from mapless_server.settings import Settings
 from mapless_server.store import Store

@@ -37,7 +37,7 @@ from mapless.geometry import RigidTransform
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
-from mapless_server.assembly import make_tiers
+from mapless_server.assembly import MakeEngine, StartupError, engine_options, make_tiers
 from mapless_server.engine import Engine, EngineOptions
 from mapless_server.method.localize import Answer, Localization, Pipeline
 from mapless_server.method.pnp import PoseStage
@@ -46,7 +46,6 @@ from mapless_server.observability.metrics import Metrics
 from mapless_server.query import Caller, Query, Result
 from mapless_server.scheduling.costs import Costs
 from mapless_server.security.rate import RateLimiter
-from mapless_server.serve import MakeEngine, StartupError, engine_options
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_server.tiers import Tier

@@ -18,8 +18,8 @@ from grpc_health.v1 import health_pb2
 from grpc_status import rpc_status
 
 from mapless.v1 import localization_service_pb2, reference_service_pb2
+from mapless_server.assembly import StartupError
 from mapless_server.errors import Unavailable
-from mapless_server.serve import StartupError
 from mapless_server.services import Services
 from mapless_server.settings import Settings
 from mapless_server.status import to_status

@@ -15,6 +15,7 @@ from mapless import Client
 from mapless.names import check_id
 from mapless.scenes import Calibration
 
+from ..assembly import image_limits
 from ..child import child_server
 from ..dataset import Dataset, Frame
 from ..evaluation.command import usage_errors
@@ -24,7 +25,6 @@ from ..formats import read_dataset
 from ..ingest.connection import Connection, connected
 from ..output_files import write_json
 from ..progress import Progress, progress_bars
-from ..serve import image_limits
 from ..settings import Settings, load_settings
 from ..signals import terminable
 from .factors import Factors

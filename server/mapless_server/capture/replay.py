@@ -10,10 +10,9 @@ from pathlib import Path
 
 from mapless.wire import FieldError
 
-from ..assembly import make_tiers, what_is_missing
+from ..assembly import engine_options, make_tiers, what_is_missing
 from ..engine import EngineOptions
 from ..errors import RequestError
-from ..serve import engine_options
 from ..settings import Settings
 from ..tiers import Tier
 from ..weights import WeightsError, WeightsMissing

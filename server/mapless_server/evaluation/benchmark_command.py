@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..assembly import image_limits
 from ..dataset import Dataset
 from ..formats import ReadOptions, read_dataset
 from ..progress import Progress, progress_bars
-from ..serve import image_limits
 from ..settings import Settings, load_settings
 from ..signals import terminable
 from .averages import groups_of

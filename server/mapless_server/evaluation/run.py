@@ -14,13 +14,12 @@ import numpy as np
 from mapless import Client, ConnectOptions, LocalizationResult, NewReference, Rejected, RigidTransform
 from mapless.names import parse_reference_name
 
-from ..assembly import make_first_features
+from ..assembly import image_limits, make_first_features
 from ..child import child_server
 from ..dataset import Dataset, Frame
 from ..method.correspond import OPTIONS
 from ..method.features import FeatureExtractor
 from ..progress import Progress
-from ..serve import image_limits
 from ..settings import Settings
 from ..weights import WeightsError
 from .metrics import QueryResult, pose_error, trajectory_radius

@@ -14,10 +14,10 @@ from pathlib import Path
 
 from mapless import Client, MaplessError
 
+from ..assembly import image_limits
 from ..child import ServerFailed, child_server
 from ..dataset import Dataset, Frame
 from ..progress import Progress
-from ..serve import image_limits
 from ..settings import Settings
 from .benchmarks import ScenePlace
 from .journal import Identity, Journal

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera
 
+from ..assembly import engine_options
 from ..engine import Engine
 from ..method.localize import Answer, Coarse, Pipeline, Prepared
 from ..method.rejection import Rejection, RejectionReason
@@ -28,7 +29,7 @@ from ..observability.logs import configure_logging
 from ..observability.metrics import Metrics
 from ..query_stages import Method
 from ..security.rate import RateLimiter
-from ..serve import engine_options, serve
+from ..serve import serve
 from ..settings import Settings, load_settings
 from ..store import Store
 from ..tiers import Tier
