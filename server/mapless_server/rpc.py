@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Mapping
-from contextlib import aclosing, suppress
-from dataclasses import replace
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Iterator, Mapping
+from contextlib import aclosing, contextmanager, suppress
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
 
 import grpc
@@ -36,6 +36,14 @@ Raises Unauthenticated or PermissionDenied; called on the event loop.
 """
 
 
+SEND_LIMIT_S = 10.0
+"""For the caller of a stream that comes to an end to read a message that was made in time. Answers of unary calls wait
+in grpc, and cost nothing but themselves; a stream that nobody reads is a call that goes on."""
+
+Making = Coroutine[Any, Any, AsyncGenerator[Any, None]]
+"""A servicer's method of a stream: gives an iterator of messages."""
+
+
 class CallObserver(Protocol):
     """Counts calls; called on the event loop, so it must return at once and never raise."""
 
@@ -44,6 +52,19 @@ class CallObserver(Protocol):
 
     def call_handled(self, method: str, code: str, seconds: float, trace_id: str) -> None:
         """It ended with a gRPC status; told once, whatever happened. The id is empty if it is not traced."""
+
+
+@dataclass
+class _Account:
+    """What is to be said of a call at its end.
+
+    Attributes:
+        span: of its trace.
+        code: its gRPC status.
+    """
+
+    span: CallSpan
+    code: str = "UNKNOWN"
 
 
 class CallGuard:
@@ -88,51 +109,60 @@ class CallGuard:
         """The handler of "/package.Service/Method" as it is to be served."""
         if method in OPEN_METHODS:
             return self._open.guarded(handler)
-        streams, is_endless = handler.response_streaming, method in ENDLESS_METHODS
+        streams = handler.response_streaming
+        reply = self._stream if streams else self._answer
 
         async def answer(_: object, context: Context) -> bytes | None:
-            if not is_endless:
-                self._active += 1
-                self._idle.clear()
-            call = begin_call(context, self._deadlines, is_endless)
-            span = self._tracer.begin(method, metadata_of(context), call.arrived_s)
-            if self._observer is not None:
-                self._observer.call_started(method)
-            log.debug("%s begins", method, extra={"request_id": call.request_id})
-            code = "UNKNOWN"
-            try:
-                self._who_calls(method, context)
-                self._check_door(method)
-                response = await (self._stream if streams else self._answer)(handler, method, call, context)
-                context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id), *call.trailing))
-                code = "OK"
-                return response
-            except RequestError as error:
-                code = error.code
-                call.note(reason=error.reason, error=str(error))
-                await _abort(context, call, error)
-                raise  # not reached: abort raises
-            except asyncio.CancelledError:
-                # Where the caller's deadline passes, it may be grpc that notices first.
-                code = "CANCELLED" if time.monotonic() < call.deadline_s else "DEADLINE_EXCEEDED"
-                raise
-            except Exception as error:
-                code = "INTERNAL"
-                call.note(reason=type(error).__name__)
-                log.exception("%s failed", method, extra={"request_id": call.request_id, "trace_id": span.trace_id})
-                await _abort(context, call, RequestError(f"internal error, id={call.request_id}"))
-                raise
-            finally:
-                self._active -= not is_endless
-                if not self._active:
-                    self._idle.set()
-                self._end(method, code, call, span)
+            call = begin_call(context, self._deadlines, method in ENDLESS_METHODS)
+            with self._accounted(method, call, context) as account:
+                try:
+                    self._who_calls(method, context)
+                    self._check_door(method)
+                    response = await reply(handler, method, call, context)
+                    context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id), *call.trailing))
+                    account.code = "OK"
+                    return response
+                except RequestError as error:
+                    account.code = error.code
+                    call.note(reason=error.reason, error=str(error))
+                    await _abort(context, call, error)
+                    raise  # not reached: abort raises
+                except asyncio.CancelledError:
+                    # Where the caller's deadline passes, it may be grpc that notices first.
+                    account.code = "CANCELLED" if time.monotonic() < call.deadline_s else "DEADLINE_EXCEEDED"
+                    raise
+                except Exception as error:
+                    account.code = "INTERNAL"
+                    call.note(reason=type(error).__name__)
+                    ids = {"request_id": call.request_id, "trace_id": account.span.trace_id}
+                    log.exception("%s failed", method, extra=ids)
+                    await _abort(context, call, RequestError(f"internal error, id={call.request_id}"))
+                    raise
 
         # Not as a unary method, whose message grpc receives first: what is refused shall cost nothing, and who sends no
         # message shall not hold a place. Without a deserializer a malformed message is answered here, too.
         if streams:
             return grpc.stream_stream_rpc_method_handler(answer, None, None)
         return grpc.stream_unary_rpc_method_handler(answer, None, None)
+
+    @contextmanager
+    def _accounted(self, method: str, call: Call, context: Context) -> Iterator[_Account]:
+        """Counts a call, traces it, and writes its line when it has ended, with the status that the account says."""
+        is_awaited = method not in ENDLESS_METHODS
+        self._active += is_awaited
+        if self._active:
+            self._idle.clear()
+        account = _Account(self._tracer.begin(method, metadata_of(context), call.arrived_s))
+        if self._observer is not None:
+            self._observer.call_started(method)
+        log.debug("%s begins", method, extra={"request_id": call.request_id})
+        try:
+            yield account
+        finally:
+            self._active -= is_awaited
+            if not self._active:
+                self._idle.set()
+            self._end(method, account.code, call, account.span)
 
     async def wait_until_idle(self, limit_s: float) -> None:
         """Returns when no call is being answered, or the time is over."""
@@ -160,57 +190,63 @@ class CallGuard:
 
         The servicer's method is a coroutine that gives an iterator of messages, with `aclose`.
         """
+        is_endless = method in ENDLESS_METHODS
         request, call = await self._request(handler, method, call, context)
-        messages = self._endless if method in ENDLESS_METHODS else self._finite
+        making = handler.unary_stream(request, call)
+        del request  # a photograph, which shall not wait for who reads slowly
+        messages = (
+            self._endless(making, method, handler, context) if is_endless else self._finite(making, handler, call)
+        )
         sent_bytes = 0
         try:
-            async with aclosing(messages(handler, method, request, call, context)) as coming:
+            async with aclosing(messages) as coming:
                 async for data in coming:
-                    try:
-                        await context.write(data)
-                    except grpc.aio.BaseError as error:
-                        # Who leaves while it is being sent, or is not heard of any more, has ended the call.
-                        raise asyncio.CancelledError("nobody reads any more") from error
+                    await self._send(data, context, None if is_endless else SEND_LIMIT_S)
                     sent_bytes += len(data)
         except FieldError as error:
             raise InvalidArgument(str(error), field=error.field) from None
         finally:
             call.note(bytes_out=sent_bytes)
 
+    async def _send(self, data: bytes, context: Context, limit_s: float | None) -> None:
+        """Returns when there is room for it on the way; who does not read in time, or has left, has ended the call."""
+        writing = asyncio.ensure_future(context.write(data))
+        writing.add_done_callback(_retrieve)
+        # Never cancelled: grpc still reads from where it was told to. It ends with the call at the latest.
+        await asyncio.wait({writing}, timeout=limit_s)
+        if not writing.done() or isinstance(writing.exception(), grpc.aio.BaseError):
+            raise asyncio.CancelledError("nobody reads any more")
+        writing.result()
+
     async def _endless(
-        self, handler: Any, method: str, request: Any, call: Call, context: Context
+        self, making: Making, method: str, handler: Any, context: Context
     ) -> AsyncGenerator[bytes, None]:
         """A servicer's messages, each when the one before is sent; the caller learns when they can come."""
-        async with aclosing(await handler.unary_stream(request, call)) as responses:
+        async with aclosing(await making) as responses:
             await context.send_initial_metadata(())
             async for response in responses:
                 # The token may have been revoked, or have expired, since.
                 self._who_calls(method, context)
                 yield bytes(handler.response_serializer(response))
 
-    async def _finite(
-        self, handler: Any, method: str, request: Any, call: Call, context: Context
-    ) -> AsyncGenerator[bytes, None]:
-        """A servicer's messages, a few, made in time and as fast as it can, however slowly the caller reads.
-
-        What is made in time may be sent later, as the answers of unary calls are.
-        """
+    async def _finite(self, making: Making, handler: Any, call: Call) -> AsyncGenerator[bytes, None]:
+        """A servicer's messages, a few, made in time and as fast as it can, however slowly the caller reads."""
         made: asyncio.Queue[bytes | None] = asyncio.Queue()
 
         async def make() -> None:
-            async with aclosing(await handler.unary_stream(request, call)) as responses:
+            async with aclosing(await making) as responses:
                 async for response in responses:
                     made.put_nowait(bytes(handler.response_serializer(response)))
 
-        making = asyncio.ensure_future(self._in_time(make, call.deadline_s))
-        making.add_done_callback(lambda _: made.put_nowait(None))
+        task = asyncio.ensure_future(self._in_time(make, call.deadline_s))
+        task.add_done_callback(lambda _: made.put_nowait(None))
         try:
             while (data := await made.get()) is not None:
                 yield data
-            await making
+            await task
         finally:
-            making.cancel()
-            await asyncio.gather(making, return_exceptions=True)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
 
     async def _request(self, handler: Any, method: str, call: Call, context: Context) -> tuple[Any, Call]:
         """The call's message, and the call with who makes it."""
@@ -276,6 +312,11 @@ class CallGuard:
             fields["stages_ms"] = {name: _ms(spent_s) for name, spent_s in trail.stage_seconds.items()}
         fields |= {"method": method, "code": code, "duration_ms": _ms(seconds)}
         log.info("%s %s", method.rpartition("/")[2], code, extra=as_extra(fields))
+
+
+def _retrieve(task: asyncio.Task[None]) -> None:
+    if not task.cancelled():
+        task.exception()  # of a call that has ended: nobody waits for it
 
 
 def _ms(seconds: float) -> float:

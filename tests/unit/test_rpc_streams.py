@@ -18,6 +18,7 @@ import pytest
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
+from mapless_server import rpc
 from mapless_server.call import Call
 from mapless_server.errors import FailedPrecondition, Unauthenticated
 from mapless_server.principal import Principal
@@ -351,6 +352,25 @@ class TestStreamsThatComeToAnEnd:
                 assert not counted.handled
                 assert await read(call) == [*range(1, 9)]
             assert counted.handled == ["OK"]
+
+        with caplog.at_level("WARNING"):
+            asyncio.run(run())
+        assert not caplog.records
+
+    def test_who_never_reads_has_no_call_for_long(
+        self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        """No deadline ends it: its messages were made in time, and the caller gave none."""
+        monkeypatch.setattr(rpc, "SEND_LIMIT_S", 0.2)
+
+        async def run() -> None:
+            counted, numbers = Counted(), Large(8)
+            async with serving(numbers, counted) as (channel, guard):
+                call = watching(channel, None, FINITE)
+                await call.initial_metadata()
+                await until(lambda: len(counted.handled) == 1)
+                await guard.wait_until_idle(LIMIT_S)
+            assert (counted.handled, numbers.is_closed) == (["CANCELLED"], True)
 
         with caplog.at_level("WARNING"):
             asyncio.run(run())
