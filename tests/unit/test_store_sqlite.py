@@ -106,6 +106,22 @@ class TestOpening:
 
             assert list(pool.map(look, range(3))) == [expected] * 3
 
+    @pytest.mark.parametrize("what", ["reference", "scene"])
+    def test_what_is_deleted_is_not_left_in_the_file(self, store: Store, data_dir: Path, what: str) -> None:
+        reference, kept = make_reference("a", seed=1), make_reference("b", seed=2)
+        pieces = [reference.image[i : i + 16] for i in range(0, 4096, 64)]
+
+        def found() -> int:
+            data = b"".join(path.read_bytes() for path in data_dir.iterdir() if path.suffix != ".lock")
+            return sum(piece in data for piece in pieces)
+
+        store.create_scene(OFFICE)
+        store.add_references(OFFICE, [reference, kept])
+        assert found() > len(pieces) // 2  # one may lie across two pages
+        store.delete_reference(OFFICE, "a") if what == "reference" else store.delete_scene(OFFICE)
+        store.close()  # which empties the journal
+        assert found() == 0
+
     def test_transactions_really_begin(self, store: Store, data_dir: Path) -> None:
         with store._database.write() as writer:
             assert writer.connection.driver_connection.in_transaction  # type: ignore[union-attr]

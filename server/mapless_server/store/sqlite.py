@@ -269,6 +269,7 @@ def create_sqlite_engine(
             "trusted_schema=OFF",
             "cell_size_check=ON",
             "mmap_size=0",
+            "secure_delete=ON",  # else deleted photographs lie in the file until something else is written there
         ):
             cursor.execute(f"PRAGMA {setting}")
         if only_reads:
