@@ -97,7 +97,6 @@ def serve_command(
     capture_dir: Annotated[Path | None, typer.Option(help=_help("capture_dir"))] = None,
     capture_hours: Annotated[float | None, typer.Option(help=_help("capture_hours"))] = None,
     capture_mib: Annotated[int | None, typer.Option(help=_help("capture_mib"))] = None,
-    capture_share: Annotated[float | None, typer.Option(help=_help("capture_share"))] = None,
     capture_tenants: Annotated[str | None, typer.Option(help=_help("capture_tenants"))] = None,
     warm_up: Annotated[bool | None, typer.Option(help=_help("warm_up"))] = None,
     drain_delay_s: Annotated[float | None, typer.Option(help=_help("drain_delay_s"))] = None,

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from mapless.v1 import localization_service_pb2 as pb
 
 from .call import Call
-from .capture.recorder import Recorder, failures_of
+from .capture.recorder import Recorder
 from .engine import Engine
 from .group_localization import (
     MAX_FRAMES,
@@ -37,13 +37,6 @@ async def answer_rig(
     request: pb.LocalizeRigRequest, call: Call, engine: Engine, metrics: Metrics, recorder: Recorder | None = None
 ) -> pb.LocalizeRigResponse:
     """Implements LocalizationService.LocalizeRig; a recorder captures the call."""
-    with failures_of(recorder, "LocalizeRig", request, call):
-        return await _answer_rig(request, call, engine, metrics, recorder)
-
-
-async def _answer_rig(
-    request: pb.LocalizeRigRequest, call: Call, engine: Engine, metrics: Metrics, recorder: Recorder | None
-) -> pb.LocalizeRigResponse:
     bounds = (1, MAX_RIG_IMAGES)
     queries = queries_from_message(request, "images", bounds, call.principal.tenant, engine.options)
     rig_from_camera = poses_from_message(request.images, "images", "rig_from_camera")
@@ -54,7 +47,8 @@ async def _answer_rig(
     response = rig_to_message(outcome, group, queries, request, session_from_rig)
     _conclude(response, outcome, group, call, metrics)
     if recorder is not None:
-        recorder.answered("LocalizeRig", request, response, call, list(zip(queries, group.results, strict=True)))
+        parts = list(zip(queries, group.results, strict=True))
+        recorder.answered("LocalizeRig", request, response, call, parts, engine.tiers)
     return response
 
 
@@ -62,13 +56,6 @@ async def answer_sequence(
     request: pb.LocalizeSequenceRequest, call: Call, engine: Engine, metrics: Metrics, recorder: Recorder | None = None
 ) -> pb.LocalizeSequenceResponse:
     """Implements LocalizationService.LocalizeSequence; a recorder captures the call."""
-    with failures_of(recorder, "LocalizeSequence", request, call):
-        return await _answer_sequence(request, call, engine, metrics, recorder)
-
-
-async def _answer_sequence(
-    request: pb.LocalizeSequenceRequest, call: Call, engine: Engine, metrics: Metrics, recorder: Recorder | None
-) -> pb.LocalizeSequenceResponse:
     bounds = (MIN_FRAMES, MAX_FRAMES)
     queries = queries_from_message(request, "frames", bounds, call.principal.tenant, engine.options)
     axes, session_from_camera = session_poses_from_message(request)
@@ -79,7 +66,8 @@ async def _answer_sequence(
     response = sequence_to_message(outcome, group, queries, request, axes)
     _conclude(response, outcome, group, call, metrics)
     if recorder is not None:
-        recorder.answered("LocalizeSequence", request, response, call, list(zip(queries, group.results, strict=True)))
+        parts = list(zip(queries, group.results, strict=True))
+        recorder.answered("LocalizeSequence", request, response, call, parts, engine.tiers)
     return response
 
 

@@ -13,6 +13,9 @@ from .scheduling.fair import Flow
 from .tenancy import SceneKey
 from .tiers import Attempt
 
+UNFINISHED = "/unfinished"
+"""Ends the name of a stage: its tier came to no answer, see `Result`."""
+
 DEFAULT_REFERENCE_COUNT = 10
 """References that are chosen where the caller does not say how many."""
 

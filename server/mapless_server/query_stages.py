@@ -27,7 +27,7 @@ from .method.retrieve import spread_choice
 from .method.support import Support
 from .method.trust.hints import hinted
 from .method.views import PosedView, View
-from .query import Query, Result
+from .query import UNFINISHED, Query, Result
 from .query_views import QueryViews
 from .retrieval.chosen import Choice
 from .retrieval.narrowing import Narrowing
@@ -368,7 +368,7 @@ class QueryStages:
 
     def _unfinished(self, work: Work) -> Done:
         assert work.best is not None
-        unfinished = {f"{self._tiers[work.tier].extractor.name}/unfinished": time.monotonic() - work.start_s}
+        unfinished = {f"{self._tiers[work.tier].extractor.name}{UNFINISHED}": time.monotonic() - work.start_s}
         return Done(Result(work.best, work.seconds_before | unfinished), _ending(work.best))
 
     def _attempt(self, work: Work, found: Found, answer: Answer) -> Attempt:

@@ -127,8 +127,6 @@ async def running_server(
         stack.push_async_callback(engine.close)
         failed: asyncio.Future[Fatal] = asyncio.get_running_loop().create_future()
         _watch_engine(engine, metrics)
-        if recorder is not None:
-            recorder.describe(settings, engine.tiers)
         engine.queue.on_fatal = lambda fatal: _announce_failure(fatal, failed, metrics)
         _keep(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
         _keep(stack, keep_fresh(protection.refreshable))

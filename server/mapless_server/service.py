@@ -14,7 +14,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
 
 from .call import Call
-from .capture.recorder import Recorder, failures_of
+from .capture.recorder import Recorder
 from .engine import Engine
 from .group_service import answer_rig, answer_sequence
 from .messages.answers import Addressee, addressee_of, diagnostics_to_message, outcome_to_message
@@ -73,19 +73,16 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
 
     async def Localize(self, request: pb.LocalizeRequest, call: Call) -> pb.LocalizeResponse:
         """Implements LocalizationService.Localize."""
-        with failures_of(self._recorder, "Localize", request, call):
-            return await self._answer(await self._understand(request, call), call)
+        return await self._answer(await self._understand(request, call), call)
 
     async def LocalizeProgressively(
         self, request: pb.LocalizeRequest, call: Call
     ) -> AsyncGenerator[pb.LocalizeProgressivelyResponse, None]:
         """Implements LocalizationService.LocalizeProgressively."""
-        with failures_of(self._recorder, "Localize", request, call):
-            asked = await self._understand(request, call)
+        asked = await self._understand(request, call)
 
         async def answer(tell_coarse: TellCoarse) -> pb.LocalizeResponse:
-            with failures_of(self._recorder, "Localize", request, call):
-                return await self._answer(asked, call, tell_coarse)
+            return await self._answer(asked, call, tell_coarse)
 
         return coarse_then_final(answer, partial(self._coarse, asked, call))
 
@@ -117,7 +114,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         if request.options.include_debug and debug is not None:
             response.debug.CopyFrom(debug)
         if self._recorder is not None:
-            self._recorder.answered("Localize", request, response, call, [(query, result)])
+            self._recorder.answered("Localize", request, response, call, [(query, result)], self._engine().tiers)
         return response
 
     def _coarse(self, asked: _Asked, call: Call, result: Result) -> pb.LocalizeResponse:

@@ -127,9 +127,6 @@ class Settings(BaseSettings):
     capture_mib: int = Field(
         default=1024, ge=1, description="What captured calls may take on the disk; the oldest are deleted first, MiB."
     )
-    capture_share: float = Field(
-        default=1.0, gt=0, le=1, description="Share of the calls that is captured, drawn by chance."
-    )
     capture_tenants: str = Field(
         default="", description="Tenants whose calls are captured, separated by commas; empty: of all."
     )

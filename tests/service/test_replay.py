@@ -6,6 +6,7 @@ into the folder is found, and named.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -26,7 +27,6 @@ from programs import wait_until
 from mapless import (
     Client,
     GravityPrior,
-    InvalidArgument,
     LocalizationResult,
     NewReference,
     NotFound,
@@ -37,9 +37,14 @@ from mapless import (
     SequenceFrame,
 )
 from mapless.geometry import RigidTransform as Pose
+from mapless_server.capture import report as report_module
 from mapless_server.capture.calls import CapturedCall, decode_call, encode_call
-from mapless_server.capture.files import calls_of
+from mapless_server.capture.errors import CaptureError
+from mapless_server.capture.files import blob_path, calls_of
+from mapless_server.capture.recompute import recompute
+from mapless_server.capture.report import Report, Selection, select
 from mapless_server.child import child_server
+from mapless_server.settings import load_settings
 
 pytestmark = pytest.mark.slow
 
@@ -49,6 +54,10 @@ PHOTOS = [corner.photograph(it) for it in QUERIES]
 NAMED = ["r3", "r4", "r5", "r6"]
 BLANK = encode(".png", np.full((384, 512, 3), 90, np.uint8))
 ELSEWHERE = encode(".png", textured(512, 384, seed=9))
+
+
+CAPTURED = 16 + 4
+"""Calls that are captured: of each kind, and every fifth again."""
 
 
 def known_of(pose: Pose) -> Priors:
@@ -88,7 +97,7 @@ def calls(client: Client) -> list[Callable[[], Any]]:
 
 @pytest.fixture(scope="module")
 def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with two calls of each kind: one by itself, and one among others."""
+    """A folder with a call of each kind, by itself, and some of them once more, side by side."""
     folder = tmp_path_factory.mktemp("captured")
     flags = {"--capture-dir": str(folder / "calls"), "--workers": "2"}
     environment = {"MAPLESS_WARM_UP": "false", "MAPLESS_CAPTURE_HOURS": "1"}
@@ -106,12 +115,10 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
         answers = [call() for call in calls(client)]
         assert sum(isinstance(it, LocalizationResult) for it in answers) == 9
         assert sum(isinstance(it, Rejected) for it in answers) == 5
-        list(pool.map(lambda call: call(), calls(client)))
-        with pytest.raises(NotFound):
+        list(pool.map(lambda call: call(), calls(client)[::5]))
+        with pytest.raises(NotFound):  # of which nothing is kept
             client.localize(PHOTOS[0], corner.CAMERA, "nowhere")
-        with pytest.raises(InvalidArgument):
-            client.localize(PHOTOS[0][:5000], corner.CAMERA, "corner")
-        wait_until(lambda: len(list(calls_of(folder / "calls"))) == 2 * len(answers) + 2)
+        wait_until(lambda: len(list(calls_of(folder / "calls"))) == CAPTURED)
     return folder / "calls"
 
 
@@ -131,14 +138,10 @@ def test_every_answer_is_computed_again_to_the_last_bit(captured: Path, tmp_path
     code, report = replay(copy)
     different = [call for call in report["calls"] if call["verdict"] == "changed"]
     assert not different
-    assert [call["verdict"] for call in report["calls"]].count("identical") == 32
+    assert [call["verdict"] for call in report["calls"]].count("identical") == CAPTURED
     outcomes = {call["outcome_now"] for call in report["calls"]}
     assert {"localized", "low_texture", "prior_conflict", "no_usable_references"} <= outcomes
     assert {call["method"] for call in report["calls"]} == {"Localize", "LocalizeRig", "LocalizeSequence"}
-    failures = [call["error"] for call in report["calls"] if call["verdict"] == "failed"]
-    assert len(failures) == 2
-    assert failures[0].startswith("NOT_FOUND")
-    assert failures[1].startswith("INVALID_ARGUMENT IMAGE_UNDECODABLE")
     assert report["circumstances"] == report["unreadable"] == []
     assert code == 0
 
@@ -220,10 +223,79 @@ def test_damage_is_named_and_nothing_is_said_to_be_identical(captured: Path, tmp
     assert "No such file" in told[0] if damage == "blob" else "cut" in told[0]
 
 
+def test_features_of_an_unknown_form_are_found_anew_and_it_is_said(captured: Path, tmp_path: Path) -> None:
+    """Of another version, whose features are alike; so the answer is, too."""
+    path, call = only(captured, tmp_path / "copy", is_named)
+    (part,) = call.parts
+    first = part.references[0]
+    (extractor,) = first.views
+    data = b"of another version"
+    name = hashlib.sha256(data).hexdigest()
+    blob_path(tmp_path / "copy", call.tenant, name).write_bytes(data)
+    planted = replace(part, references=(replace(first, views={extractor: name}), *part.references[1:]))
+    path.write_bytes(encode_call(replace(call, parts=(planted,))))
+    code, report = replay(tmp_path / "copy")
+    (replayed,) = report["calls"]
+    assert (code, replayed["verdict"], replayed["found_anew"]) == (0, "identical", 1)
+
+
+def test_a_call_that_cannot_be_computed_is_a_row_and_the_others_are_told(captured: Path, tmp_path: Path) -> None:
+    """A method of another version, and a request that is no message; a third one is as it was."""
+    path, call = only(captured, tmp_path / "copy", is_named)
+    for name, planted in {
+        "1-1-1": replace(call, method="LocalizeTwice", request_id="unknown"),
+        "1-1-2": replace(call, request=b"\xff\xff", request_id="garbage"),
+    }.items():
+        path.with_name(f"{name}.call").write_bytes(encode_call(planted))
+    code, report = replay(tmp_path / "copy")
+    told = {it["request_id"]: (it["verdict"], it["error"]) for it in report["calls"]}
+    assert code == 1
+    assert told["unknown"] == ("changed", "error: this program knows no method LocalizeTwice")
+    assert told["garbage"][0] == "changed"
+    assert told["garbage"][1].startswith("error: DecodeError: ")
+    assert told[call.request_id] == ("identical", "")
+
+
+def test_only_what_was_asked_for_is_judged(captured: Path, tmp_path: Path) -> None:
+    """Another tenant's file that cannot be read is nobody else's fault; an id that is not there is said to be so."""
+    _, call = only(captured, tmp_path / "copy", is_named)
+    theirs = tmp_path / "copy" / "tenants" / "other" / "calls" / "z" / "00000000000001-1-1.call"
+    theirs.parent.mkdir(parents=True)
+    theirs.write_bytes(b"junk")
+
+    def report_on(**options: Any) -> Report:
+        return report_module.replay(tmp_path / "copy", Selection(**options), load_settings({}).settings)
+
+    for options in ({"tenant": "default"}, {"request_ids": frozenset({call.request_id})}, {"last": 1}):
+        report = report_on(**options)
+        assert (report.is_identical, len(report.calls), report.unreadable) == (True, 1, ())
+    report = report_on()
+    assert (report.is_identical, len(report.calls), len(report.unreadable)) == (False, 1, 1)
+    with pytest.raises(CaptureError, match="holds no call of id absent; 1 files cannot be read"):
+        select(tmp_path / "copy", Selection(frozenset({"absent"})), [])
+
+
+def test_what_its_server_deletes_meanwhile_is_left_out(
+    captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The call first, and then its blobs, as a server does."""
+    path, _ = only(captured, tmp_path / "copy", is_named)
+
+    def deleted_meanwhile(*arguments: Any) -> Any:
+        path.unlink()
+        shutil.rmtree(tmp_path / "copy" / "tenants" / "default" / "blobs")
+        return recompute(*arguments)
+
+    monkeypatch.setattr(report_module, "recompute", deleted_meanwhile)
+    report = report_module.replay(tmp_path / "copy", Selection(), load_settings({}).settings)
+    assert (report.calls, report.unreadable, report.is_identical) == ((), (), True)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--id", "nobody"], "holds no such calls"),
+        (["--id", "nobody"], "holds no call of id nobody"),
+        (["--tenant", "nobody"], "holds no such calls"),
         (["--backend", "pi4"], "pi4"),
         (["--last", "0"], "--last"),
     ],

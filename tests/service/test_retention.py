@@ -14,6 +14,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -46,6 +47,7 @@ from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless_server.capture.files import blobs_of, calls_of
 from mapless_server.decode import ImageLimits, decode_image
 from mapless_server.method.features import make_extractor
 
@@ -299,6 +301,39 @@ def test_the_search_finds_what_is_captured(tmp_path: Path, search: Search) -> No
         wait_until(lambda: len(search.files(tmp_path)) >= 7)
         assert "calls are captured, photographs and all" in server.log
     assert {Path(it).parts[0] for it in search.files(tmp_path)} == {"captured"}
+
+
+def capture_one(server: Program, captured: Path, search: Search) -> Path:
+    """The file of a call that the server has just captured."""
+    with Client(server.address) as client:
+        client.create_scene("corner")
+        photo = marked(corner.photograph(corner.pose(0)), "r0")
+        client.add_reference("corner", NewReference("r0", photo, corner.CAMERA, corner.pose(0)))
+        client.localize(GOOD[0], corner.CAMERA, "corner")
+    wait_until(lambda: list(calls_of(captured)))
+    assert search.files(captured)
+    return next(calls_of(captured))
+
+
+def test_what_is_captured_goes_when_its_time_is_over_though_nobody_calls(tmp_path: Path, search: Search) -> None:
+    captured = tmp_path / "captured"
+    with served(tmp_path / "server", capture_dir=captured, capture_hours=4 / 3600) as server:
+        capture_one(server, captured, search)
+        wait_until(lambda: not [*calls_of(captured), *blobs_of(captured)])
+        assert search.files(captured) == []
+
+
+@pytest.mark.slow
+def test_what_was_to_go_while_the_server_was_down_is_gone_when_it_listens(tmp_path: Path, search: Search) -> None:
+    captured = tmp_path / "captured"
+    with served(tmp_path / "first", capture_dir=captured) as server:
+        written_s = capture_one(server, captured, search).stat().st_mtime
+    assert search.files(captured)
+    wait_until(lambda: time.time() > written_s + 0.5)
+    with served(tmp_path / "second", capture_dir=captured, capture_hours=0.5 / 3600) as server:
+        assert server.address
+        assert [*calls_of(captured), *blobs_of(captured)] == []
+        assert search.files(captured) == []
 
 
 @pytest.mark.parametrize("what", ["photograph", "comment", "pixels", "descriptors"])

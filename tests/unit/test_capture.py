@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import stat
@@ -17,13 +18,12 @@ from mapless.geometry import Camera, RadialTangential, RigidTransform, rotation_
 from mapless_server.capture import folder as folder_module
 from mapless_server.capture.calls import (
     CapturedCall,
-    CapturedFailure,
     CapturedPart,
     CapturedReference,
     decode_call,
     encode_call,
 )
-from mapless_server.capture.errors import CaptureError, DamagedCapture
+from mapless_server.capture.errors import BlobGone, CaptureError, DamagedCapture
 from mapless_server.capture.files import write_whole
 from mapless_server.capture.folder import CaptureFolder, Retention
 from mapless_server.capture.opening import open_recorder
@@ -77,8 +77,6 @@ def test_a_call_is_read_as_it_was_written() -> None:
     first = read.parts[0].references[0]
     assert first.camera == CAMERA
     np.testing.assert_array_equal(first.world_from_camera.matrix(), POSE.matrix())
-    failed = replace(a_call(), failure=CapturedFailure("NOT_FOUND", "NOT_FOUND", "gone"), request=b"", parts=())
-    assert decode_call(encode_call(failed)).failure == failed.failure
 
 
 @pytest.mark.parametrize("end", [0, 3, 17, 60, -33, -1])
@@ -197,10 +195,89 @@ def test_what_somebody_deleted_by_hand_is_forgotten(tmp_path: Path) -> None:
         folder.add(call, blobs_of(call))
     folder.held()[0].path.unlink()
     next(iter(folder.held()[1].blobs)).unlink()
-    folder.expire()
+    folder.forget_deleted()
     assert (len(folder), folder.space_bytes, files(tmp_path / "c")) == (0, 0, [])
     assert folder.add(call, blobs_of(call))
     folder.close()
+
+
+def test_one_file_that_cannot_be_deleted_keeps_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither a call nor a blob; it stays counted, is told of, and goes when it can be deleted."""
+    now_s = [NOW_S]
+    folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
+    for number in range(4):
+        call = a_call(number, (number,))
+        folder.add(call, blobs_of(call))
+    held = folder.held()
+    stuck = {held[0].path, next(iter(held[2].blobs))}
+    unlink = Path.unlink
+
+    def refused(path: Path, missing_ok: bool = False) -> None:
+        if path in stuck:
+            raise PermissionError(1, "Operation not permitted")
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", refused)
+    now_s[0] += 101
+    for _ in range(2):
+        with pytest.raises(PermissionError):
+            folder.expire()
+        assert set(files(tmp_path / "c")) == {*stuck, *held[0].blobs}
+        assert folder.space_bytes == sum(-(-it.stat().st_size // 4096) * 4096 for it in files(tmp_path / "c"))
+    monkeypatch.undo()
+    folder.expire()
+    assert (files(tmp_path / "c"), folder.space_bytes, len(folder)) == ([], 0, 0)
+    folder.close()
+
+
+@pytest.mark.parametrize("content", [b"", IMAGES[f"{0:064x}"][:-1]])
+def test_a_blob_that_was_cut_is_written_anew(tmp_path: Path, content: bytes) -> None:
+    """As a power failure leaves it; what was kept with it cannot be replayed, and goes."""
+    data = IMAGES[f"{0:064x}"]
+    name = hashlib.sha256(data).hexdigest()
+    part = CapturedPart("image", 7, (replace(reference(0), image_sha256=name),))
+    first, second = (replace(a_call(number), parts=(part,)) for number in range(2))
+    folder = opened(tmp_path / "c")
+    folder.add(first, {name: data})
+    (path,) = folder.held()[0].blobs
+    folder.close()
+    path.write_bytes(content)
+    folder = opened(tmp_path / "c")
+    assert not folder.has_blob("acme", name)
+    assert len(folder) == 0
+    folder.add(second, {name: data})
+    assert path.read_bytes() == data
+    folder.close()
+    folder = opened(tmp_path / "c")
+    assert folder.has_blob("acme", name)
+    assert len(folder) == 1
+    folder.close()
+
+
+def test_a_blob_that_went_meanwhile_is_asked_for_again(tmp_path: Path) -> None:
+    folder = opened(tmp_path / "c")
+    call = a_call()
+    with pytest.raises(BlobGone):
+        folder.add(call, {})
+    assert (files(tmp_path / "c"), folder.space_bytes) == ([], 0)
+    assert folder.add(call, blobs_of(call))
+    folder.close()
+
+
+def test_what_cannot_be_read_at_the_start_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = opened(tmp_path / "c")
+    folder.add(a_call(), blobs_of(a_call()))
+    folder.close()
+
+    def refused(path: Path) -> bytes:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    read = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda it: refused(it) if it.suffix == ".call" else read(it))
+    with pytest.raises(CaptureError, match=r"cannot be used: .*\.call: Permission denied"):
+        opened(tmp_path / "c")
+    monkeypatch.undo()
+    opened(tmp_path / "c").close()
 
 
 def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

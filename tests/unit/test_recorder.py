@@ -2,29 +2,42 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import threading
 import time
+import weakref
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import datetime, timezone
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import grpc
+import numpy as np
 import pytest
-from programs import wait_until
+from programs import LIMIT_S, wait_until
 from servers import CAMERA, PHOTO, localize_request, pose, serving
 
 from mapless import Client, NewReference
+from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.call import Call
 from mapless_server.capture import recorder as recorder_module
-from mapless_server.capture.calls import CapturedFailure, decode_call
+from mapless_server.capture.calls import CapturedCall, CapturedPart, CapturedReference, decode_call
 from mapless_server.capture.files import calls_of
 from mapless_server.capture.folder import CaptureFolder, Retention
 from mapless_server.capture.recorder import CAPTURED_KEY, Recorder
+from mapless_server.capture.staleness import Staleness
+from mapless_server.errors import Unavailable
+from mapless_server.method.views import Features, PosedView, View
 from mapless_server.principal import Principal
-from mapless_server.store import Store
+from mapless_server.store import SceneAttributes, SceneRecord, Store, reading
+from mapless_server.store.reading import ReadingStore
+from mapless_server.tenancy import SceneKey, key_of
 
 
 @dataclass
@@ -43,6 +56,11 @@ class Counts:
 
 def captured_in(folder: Path) -> list[Path]:
     return sorted(calls_of(folder))
+
+
+def scenes_in(folder: Path) -> list[str]:
+    """Of the calls there, by their files' places: the server may delete them at any moment."""
+    return [it.parent.name for it in captured_in(folder)]
 
 
 @pytest.fixture
@@ -71,6 +89,17 @@ def test_callers_are_told(served: tuple[Client, LocalizationServiceStub, Path]) 
     assert kept.request_id == answer.diagnostics.request_id
 
 
+def test_callers_who_ask_for_the_coarse_pose_first_are_told_too(
+    served: tuple[Client, LocalizationServiceStub, Path],
+) -> None:
+    _, stub, folder = served
+    call = stub.LocalizeProgressively(localize_request("s"), timeout=30)
+    final = list(call)[-1].answer
+    assert (CAPTURED_KEY, "1") in [tuple(it) for it in call.trailing_metadata()]
+    wait_until(lambda: captured_in(folder))
+    assert decode_call(captured_in(folder)[0].read_bytes()).response == final.SerializeToString()
+
+
 @pytest.mark.parametrize("deleted", ["scene", "reference", "scene made anew"])
 def test_what_was_made_of_a_deleted_scene_or_reference_goes(
     served: tuple[Client, LocalizationServiceStub, Path], deleted: str
@@ -88,71 +117,232 @@ def test_what_was_made_of_a_deleted_scene_or_reference_goes(
         client.delete_scene("s")
     if deleted == "scene made anew":
         client.create_scene("s")
-    wait_until(lambda: [decode_call(it.read_bytes()).scene_id for it in captured_in(folder)] == ["other"])
+    wait_until(lambda: scenes_in(folder) == ["other"])
 
 
-def recorder_of(folder: Path, counts: Counts, **options: Any) -> Recorder:
-    captured = CaptureFolder(folder / "captured", Retention(3600.0, 2**20))
-    return Recorder(captured, Store.open(folder / "data"), counts, **options)
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    """A store with the scene "s" of each of three tenants."""
+    with Store.open(tmp_path / "data") as store:
+        for tenant in ("default", "acme", "other"):
+            store.create_scene(key_of(tenant, "s"))
+        yield store
 
 
-def a_call(tenant: str = "default") -> Call:
-    return Call("id", time.monotonic(), math.inf, Principal(tenant=tenant))
+@contextmanager
+def recording(folder: Path, store: Store, counts: Counts, **options: Any) -> Iterator[Recorder]:
+    keep_s = options.pop("keep_s", 3600.0)
+    captured = CaptureFolder(folder / "captured", Retention(keep_s, 2**20))
+    recorder = Recorder(captured, store, counts, **options)
+    try:
+        yield recorder
+    finally:
+        recorder.close()
 
 
-FAILURE = CapturedFailure("NOT_FOUND", "NOT_FOUND", "no such scene")
+def answer(recorder: Recorder, tenant: str = "default") -> Call:
+    """A call that was answered without any reference."""
+    call = Call("id", time.monotonic(), math.inf, Principal(tenant=tenant))
+    query = SimpleNamespace(photo=SimpleNamespace(field="image"))
+    attempt = SimpleNamespace(choice=None, references=(), generation=1, attributes=SceneAttributes())
+    part = cast(Any, (query, SimpleNamespace(attempt=attempt)))
+    recorder.answered("Localize", localize_request("s"), pb.LocalizeResponse(), call, [part], ())
+    return call
 
 
-def test_a_slow_disk_holds_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_disk_holds_up_nobody(tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """What does not fit into the queue is dropped at once, and counted."""
     counts = Counts()
-    recorder = recorder_of(tmp_path, counts)
-    monkeypatch.setattr(recorder.folder, "add", lambda *_: time.sleep(0.2))
-    for _ in range(recorder_module.MAX_WAITING + 10):
-        recorder.failed("Localize", localize_request("s"), a_call(), FAILURE)
-    assert counts.dropped["queue"] >= 9
-    monkeypatch.undo()
-    recorder.close()
+    with recording(tmp_path, store, counts) as recorder:
+        monkeypatch.setattr(recorder.folder, "add", lambda *_: time.sleep(0.2))
+        for _ in range(recorder_module.MAX_WAITING + 10):
+            answer(recorder)
+        assert counts.dropped["queue"] >= 9
+        monkeypatch.undo()
 
 
 def test_a_full_disk_pauses_and_fails_no_call(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     counts = Counts()
-    recorder = recorder_of(tmp_path, counts)
 
     def full(*_: object) -> bool:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(recorder.folder, "add", full)
-    recorder.failed("Localize", localize_request("s"), a_call(), FAILURE)
-    wait_until(lambda: counts.dropped["disk"] == 1)
-    recorder.failed("Localize", localize_request("s"), a_call(), FAILURE)
-    assert counts.dropped["disk"] == 2
-    assert "nothing is captured for 60 s: [Errno 28] No space left on device" in caplog.text
-    recorder.close()
+    with recording(tmp_path, store, counts) as recorder:
+        monkeypatch.setattr(recorder.folder, "add", full)
+        answer(recorder)
+        wait_until(lambda: counts.dropped["disk"] == 1)
+        answer(recorder)
+        assert counts.dropped["disk"] == 2
+        assert "nothing is captured for 60 s: [Errno 28] No space left on device" in caplog.text
 
 
-def test_only_the_tenants_that_are_named_are_captured(tmp_path: Path) -> None:
-    recorder = recorder_of(tmp_path, Counts(), tenants=frozenset({"acme"}))
-    for tenant in ("default", "acme", "other"):
-        recorder.failed("Localize", localize_request("s"), a_call(tenant), FAILURE)
-    recorder.close()
-    kept = [decode_call(it.read_bytes()).tenant for it in captured_in(tmp_path / "captured")]
-    assert kept == ["acme"]
+def test_only_the_tenants_that_are_named_are_captured(tmp_path: Path, store: Store) -> None:
+    with recording(tmp_path, store, Counts(), tenants=frozenset({"acme"})) as recorder:
+        told = [bool(answer(recorder, tenant).trailing) for tenant in ("default", "acme", "other")]
+    assert told == [False, True, False]
+    assert [decode_call(it.read_bytes()).tenant for it in captured_in(tmp_path / "captured")] == ["acme"]
 
 
-def test_a_share_of_the_calls_is_captured(tmp_path: Path) -> None:
-    """One in two, within five standard deviations; told by what is dropped, since nothing of these calls exists."""
-    counts = Counts()
-    recorder = recorder_of(tmp_path, counts, share=0.5)
-    told = 0
-    for _ in range(400):
-        call = a_call()
-        request, part = localize_request("s"), cast(Any, None)
-        recorder.answered("Localize", request, cast(Any, request), call, part)
-        told += bool(call.trailing)
-        wait_until(lambda: not recorder._waiting)
-    recorder.close()
-    assert 150 < told < 250
-    assert sum(counts.dropped.values()) == told
+@pytest.mark.parametrize("fault", ["unexpected", "hanging"])
+def test_the_time_limit_holds_whatever_the_store_does(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, fault: str
+) -> None:
+    """A fault that nobody thought of, at every check; and a database that does not answer, with a call that waits."""
+    counts, checks, let_go = Counts(), [0], threading.Event()
+    with recording(tmp_path, store, counts, keep_s=0.5) as recorder:
+        answer(recorder)
+        wait_until(lambda: counts.kept == 1)
+
+        def broken(*_: object) -> Any:
+            checks[0] += 1
+            if fault == "hanging":
+                let_go.wait(LIMIT_S)
+            raise RuntimeError("no such table")
+
+        monkeypatch.setattr(ReadingStore, "get_scene", broken)
+        answer(recorder)
+        wait_until(lambda: checks[0] == 1)
+        wait_until(lambda: len(recorder.folder) == 0)
+        assert captured_in(tmp_path / "captured") == []
+        let_go.set()
+        wait_until(lambda: counts.dropped["fault"] == 1)
+        monkeypatch.undo()
+        answer(recorder)
+        wait_until(lambda: counts.kept == 2)
+
+
+def test_a_fault_of_the_store_ends_no_check(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What was deleted goes when the store is well again; the log tells of the fault once."""
+    monkeypatch.setattr(recorder_module, "STORE_CHECK_S", 0.01)
+    counts, checks = Counts(), [0]
+
+    def broken(*_: object) -> Any:
+        checks[0] += 1
+        raise RuntimeError("no such table")
+
+    with recording(tmp_path, store, counts) as recorder:
+        answer(recorder)
+        wait_until(lambda: counts.kept == 1)
+        with monkeypatch.context() as patch:
+            patch.setattr(ReadingStore, "get_scene", broken)
+            wait_until(lambda: checks[0] >= 5)
+        store.delete_scene(key_of("default", "s"))
+        wait_until(lambda: len(recorder.folder) == 0)
+    assert caplog.text.count("captured calls cannot be compared with the store: no such table") == 1
+
+
+def test_the_start_waits_for_no_store_and_a_store_that_is_away_is_asked_once_a_round(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, let_go = [0], threading.Event()
+
+    def away(*_: object) -> Any:
+        asked[0] += 1
+        let_go.wait(LIMIT_S)
+        raise Unavailable("the store is away")
+
+    with recording(tmp_path, store, Counts()) as recorder:
+        for tenant in ("default", "acme", "other"):
+            answer(recorder, tenant)
+    assert len(captured_in(tmp_path / "captured")) == 3
+    monkeypatch.setattr(ReadingStore, "get_scene", away)
+    with recording(tmp_path, store, Counts()) as recorder:  # returns, although nobody lets the store go
+        wait_until(lambda: asked[0] == 1)
+        assert len(recorder.folder) == 3
+        let_go.set()
+    assert asked[0] == 1
+
+
+class CountingStore:
+    """Counts what is asked of a scene that never changes."""
+
+    def __init__(self, keys: dict[str, str]) -> None:
+        self.keys, self.asked = keys, Counter[str]()
+
+    def get_scene(self, scene_key: SceneKey) -> SceneRecord:
+        self.asked["get_scene"] += 1
+        return SceneRecord(scene_key, 3, len(self.keys), datetime.fromtimestamp(0, timezone.utc))
+
+    def find_keys(self, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
+        self.asked["find_keys"] += 1
+        return {it: self.keys[it] for it in reference_ids if it in self.keys}
+
+
+def test_a_scene_that_does_not_change_is_asked_for_its_references_once(tmp_path: Path) -> None:
+    """However many calls come and go; and what is not there is found out all the same."""
+    folder, counting = CaptureFolder(tmp_path / "c", Retention(3600.0, 2**24)), CountingStore({"r0": "k0", "r1": "k1"})
+    staleness = Staleness(cast(Store, counting))
+
+    def add(number: int, key: str) -> None:
+        reference = CapturedReference(f"r{number % 2}", key, CAMERA, pose(0), "0" * 64, {})
+        part = CapturedPart("image", 3, (reference,))
+        folder.add(CapturedCall(f"{number}", time.time(), "Localize", "acme", "s", 0, parts=(part,)), {"0" * 64: b"x"})
+
+    for number in range(20):
+        add(number, f"k{number % 2}")
+        assert staleness.delete_stale(folder) == 0
+        if number > 10:
+            folder.remove(folder.held()[0])
+    assert counting.asked == {"get_scene": 20, "find_keys": 2}
+    add(20, "another key")
+    assert staleness.delete_stale(folder) == 1
+    folder.close()
+
+
+def test_what_the_folder_has_is_not_read_again_and_queries_keep_their_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Features of each of two extractors are read once for all calls, and neither hits nor misses are counted."""
+    read, features = Counter[str](), reading._features
+
+    def counted(connection: Any, ids: Any, extractor: str) -> Any:
+        read[threading.current_thread().name] += len(ids)
+        return features(connection, ids, extractor)
+
+    monkeypatch.setattr(reading, "_features", counted)
+    store = Store.open(tmp_path / "data")
+    folder = tmp_path / "captured"
+    with (
+        serving(tmp_path / "data", store=store, features=("cheap", "strong"), workers=1, capture_dir=folder) as server,
+        Client(server.address) as client,
+    ):
+        client.create_scene("s")
+        client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(5)])
+        client.localize(PHOTO, CAMERA, "s", [f"r{i}" for i in range(5)])
+        wait_until(lambda: len(captured_in(folder)) == 1)
+        before = read["capture"]
+        for count in range(2, 6):
+            client.localize(PHOTO, CAMERA, "s", [f"r{i}" for i in range(5)])
+            wait_until(lambda count=count: len(captured_in(folder)) == count)  # type: ignore[misc]
+        kept = decode_call(captured_in(folder)[-1].read_bytes())
+        views = [set(it.views) for it in kept.parts[0].references]
+        described = sum(len(it) for it in views)
+        assert {"cheap"} <= set.intersection(*views)
+        # What has no features of an extractor yet may have them the next time: only that is looked for.
+        assert read["capture"] - before == 4 * (10 - described)
+        hits_and_misses = store.reference_cache.hits + store.reference_cache.misses
+        assert hits_and_misses <= 5 * 10
+
+
+def test_what_waits_holds_no_features(tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reference's view that was used is free as soon as the call is answered, however long the disk takes."""
+    let_go = threading.Event()
+    with recording(tmp_path, store, Counts()) as recorder:
+        monkeypatch.setattr(recorder.folder, "add", lambda *_: let_go.wait(LIMIT_S))
+        view = View(CAMERA, Features(*(np.zeros(shape, np.float32) for shape in ((1, 2), (1, 4), (1,)))))
+        held = weakref.ref(view)
+        posed = PosedView("k", "scenes/s/references/r0", view, pose(0))
+        attempt = SimpleNamespace(choice=None, references=(posed,), generation=1, attributes=SceneAttributes())
+        query = SimpleNamespace(photo=SimpleNamespace(field="image"))
+        call = Call("id", time.monotonic(), math.inf, Principal())
+        part = cast(Any, (query, SimpleNamespace(attempt=attempt)))
+        answer(recorder)
+        recorder.answered("Localize", localize_request("s"), pb.LocalizeResponse(), call, [part], ())
+        del view, posed, attempt, part
+        gc.collect()
+        assert held() is None
+        let_go.set()

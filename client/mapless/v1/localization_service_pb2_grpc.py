@@ -97,8 +97,9 @@ class LocalizationServiceServicer(object):
     """
 
     def Localize(self, request, context):
-        """Localizes one photograph. Safe to retry. Stores nothing, unless the server's operator has it capture calls: then the
-        answer has the trailing metadata `x-mapless-captured: 1`, and the photograph is kept for a time.
+        """Localizes one photograph. Safe to retry. Stores nothing, unless the server's operator has it capture calls of this and
+        the next three methods: then the answer has the trailing metadata `x-mapless-captured: 1`, and its photographs are to be
+        kept for a time.
 
         "I could not localize this" is an answer (Rejection), not an error. Errors:
 

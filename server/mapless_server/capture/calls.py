@@ -1,11 +1,9 @@
-r"""What is kept of a call, as one file: all that decided the answer, but for the references' photographs and features.
+"""What is kept of a call, as one file: all that decided the answer, but for the references' photographs and features.
 
-    bytes 0..16   "mapless capture\n"
-    bytes 16..20  length of the header, uint32, little-endian
-    header        JSON; floats as the shortest decimal that reads back as the same float64
-    request       the message
-    response      the message; empty for a call that failed
-    last 32       SHA-256 of everything before
+    first 32   SHA-256 of everything after
+    header     one line of JSON; floats as the shortest decimal that reads back as the same float64
+    request    the message
+    response   the message
 
 Photographs and features of references are blobs beside it, named by their SHA-256: many calls have them in common.
 """
@@ -14,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -29,8 +26,6 @@ from ..store import SceneAttributes, codec
 from .errors import CaptureError, DamagedCapture
 
 FORMAT_VERSION = 1
-MAGIC = b"mapless capture\n"
-_LENGTH = struct.Struct("<I")
 _DIGEST_BYTES = 32
 
 
@@ -72,18 +67,9 @@ class CapturedPart:
     choice: Choice | None = None
 
 
-@dataclass(frozen=True)
-class CapturedFailure:
-    """The error that a call ended with."""
-
-    code: str
-    reason: str
-    message: str
-
-
 @dataclass(frozen=True, eq=False)
 class CapturedCall:
-    """A call.
+    """A call that was answered.
 
     Attributes:
         request_id: finds it in the log; callers may use one twice.
@@ -95,9 +81,8 @@ class CapturedCall:
         circumstances: what else decides an answer, by name: versions, settings, weights.
         attributes: of the scene.
         parts: one for each photograph.
-        request: the message, as it was sent; empty for a call that failed.
+        request: the message, as it was sent.
         response: likewise.
-        failure: how it failed; None if it was answered.
     """
 
     request_id: str
@@ -111,7 +96,6 @@ class CapturedCall:
     parts: tuple[CapturedPart, ...] = ()
     request: bytes = b""
     response: bytes = b""
-    failure: CapturedFailure | None = None
 
     @property
     def keys(self) -> frozenset[tuple[str, str]]:
@@ -138,13 +122,10 @@ def encode_call(call: CapturedCall) -> bytes:
         "circumstances": dict(call.circumstances),
         "attributes": json.loads(codec.encode_attributes(call.attributes) or b"null"),
         "parts": [_part_to_dict(part) for part in call.parts],
-        "failure": vars(call.failure) if call.failure else None,
         "request_bytes": len(call.request),
-        "response_bytes": len(call.response),
     }
-    text = json.dumps(header, separators=(",", ":")).encode()
-    body = b"".join([MAGIC, _LENGTH.pack(len(text)), text, call.request, call.response])
-    return body + hashlib.sha256(body).digest()
+    body = b"".join([json.dumps(header, separators=(",", ":")).encode(), b"\n", call.request, call.response])
+    return hashlib.sha256(body).digest() + body
 
 
 def decode_call(data: bytes) -> CapturedCall:
@@ -154,63 +135,21 @@ def decode_call(data: bytes) -> CapturedCall:
         DamagedCapture: it is cut or changed.
         CaptureError: its format is newer than this program.
     """
-    header, start = _read_header(data)
-    if hashlib.sha256(data[:-_DIGEST_BYTES]).digest() != data[-_DIGEST_BYTES:]:
-        raise DamagedCapture("it is cut or damaged")
-    middle = start + header["request_bytes"]
-    return _call_of(header, data[start:middle], data[middle:-_DIGEST_BYTES])
-
-
-def decode_summary(head: bytes, size_bytes: int) -> CapturedCall:
-    """The same without its messages, from the file's beginning and size, the rest of it unread.
-
-    Args:
-        head: the file's first bytes, its header at least; see `header_end`.
-        size_bytes: of the file.
-
-    Raises:
-        DamagedCapture, CaptureError: as `decode_call`.
-    """
-    header, start = _read_header(head)
-    if start + header["request_bytes"] + header["response_bytes"] + _DIGEST_BYTES != size_bytes:
-        raise DamagedCapture("it is cut")
-    return _call_of(header, b"", b"")
-
-
-def header_end(head: bytes) -> int:
-    """Where the header ends, from a file's first 20 bytes; DamagedCapture if it is none of ours."""
-    if not head.startswith(MAGIC) or len(head) < len(MAGIC) + _LENGTH.size:
-        raise DamagedCapture("it is cut, or no captured call")
-    return len(MAGIC) + _LENGTH.size + int(_LENGTH.unpack_from(head, len(MAGIC))[0])
-
-
-HEAD_BYTES = len(MAGIC) + _LENGTH.size
-"""What `header_end` wants to see."""
-
-
-def _read_header(data: bytes) -> tuple[dict[str, Any], int]:
-    end = header_end(data)
+    digest, body = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
+    if hashlib.sha256(body).digest() != digest:
+        raise DamagedCapture("it is cut or damaged, or no captured call")
+    text, _, messages = body.partition(b"\n")
     try:
-        header = json.loads(data[HEAD_BYTES:end])
-        version = header["format"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DamagedCapture("its header is cut or damaged") from error
-    if version != FORMAT_VERSION:
-        raise CaptureError(f"its format {version} is another than this program's, {FORMAT_VERSION}")
-    return header, end
-
-
-def _call_of(header: Mapping[str, Any], request: bytes, response: bytes) -> CapturedCall:
-    try:
+        header = json.loads(text)
+        if header["format"] != FORMAT_VERSION:
+            raise CaptureError(f"its format {header['format']} is another than this program's, {FORMAT_VERSION}")
         names = ("request_id", "time_s", "method", "tenant", "scene_id", "scene_created_us", "circumstances")
-        failure = header["failure"]
         return CapturedCall(
             **{name: header[name] for name in names},
             attributes=_attributes_of(header["attributes"]),
             parts=tuple(_part_of(it) for it in header["parts"]),
-            request=request,
-            response=response,
-            failure=CapturedFailure(**failure) if failure else None,
+            request=messages[: header["request_bytes"]],
+            response=messages[header["request_bytes"] :],
         )
     except (ValueError, KeyError, TypeError, codec.Damaged) as error:
         raise DamagedCapture(f"its header is not one of ours: {error}") from error

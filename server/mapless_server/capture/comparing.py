@@ -18,8 +18,9 @@ from mapless.geometry import rotation_angle_deg
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
 
+from ..query import UNFINISHED
+from .recompute import diagnostics_of
 from .recorder import Response
-from .replaying import UNFINISHED, diagnostics_of
 
 DESCRIBE = "describe"
 """The stage in which a server finds features once and for all: a replay has them."""

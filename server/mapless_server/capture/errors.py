@@ -9,3 +9,7 @@ class CaptureError(Exception):
 
 class DamagedCapture(CaptureError):
     """What is kept of a call is not what was written: cut, changed, or a part of it is gone."""
+
+
+class BlobGone(Exception):
+    """A blob that the folder had when it was asked has been deleted since."""

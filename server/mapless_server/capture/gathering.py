@@ -3,38 +3,72 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from mapless.names import parse_reference_name
 
 from ..errors import DataLoss, NotFound
 from ..query import Query, Result
-from ..store import DescribedReference, ReferenceRecord, Store, codec
+from ..retrieval.chosen import Choice
+from ..store import ReferenceRecord, SceneRecord, Store, codec
 from ..tenancy import SceneKey, tenant_of
 from .calls import CapturedPart, CapturedReference
 from .folder import CaptureFolder
 
-_REMEMBERED_VIEWS = 100_000
+_REMEMBERED = 100_000
 
 
 class Gone(Exception):
     """A reference that was used has been deleted since, so what was made of it is not to be kept either."""
 
 
+@dataclass(frozen=True, eq=False)
+class Used:
+    """What a photograph was compared with, by name: nothing large is held on to while it waits to be gathered.
+
+    Attributes:
+        field: path of the photograph in the request.
+        generation: of the scene when its references were read.
+        used: keys of those that the answer rests on.
+        wanted: keys by id of those that were named, or that come into the choice.
+        choice: how they were chosen; None if they were used as they were named.
+    """
+
+    field: str
+    generation: int
+    used: frozenset[str]
+    wanted: Mapping[str, str]
+    choice: Choice | None
+
+
+def used_of(query: Query, result: Result) -> Used:
+    """What is to be gathered of an answered photograph."""
+    attempt, choice = result.attempt, result.attempt.choice
+    if choice is not None:
+        wanted = {it.reference_id: it.key for it in choice.references}
+    else:
+        wanted = {parse_reference_name(it.name)[1]: it.key for it in attempt.references}
+    used = frozenset(it.key for it in attempt.references)
+    return Used(query.photo.field, attempt.generation, used, wanted, choice)
+
+
 class Gatherer:
     """Reads references from the store; what the folder has already is not read again. For one thread."""
 
     def __init__(self, store: Store, folder: CaptureFolder) -> None:
+        """A store that is `uncached`, since queries want to remember other references than captures."""
         self._store = store
         self._folder = folder
+        self._records: dict[str, ReferenceRecord] = {}  # by key; references never change
         self._views: dict[tuple[str, str], str] = {}  # blobs by the reference's key and the extractor's name
 
-    def part(self, query: Query, result: Result, extractors: Sequence[str], blobs: dict[str, bytes]) -> CapturedPart:
+    def part(self, scene: SceneRecord, used: Used, extractors: Sequence[str], blobs: dict[str, bytes]) -> CapturedPart:
         """What a photograph was compared with.
 
         Args:
-            query: the photograph.
-            result: what was made of it.
+            scene: as it is now.
+            used: the photograph's.
             extractors: names of all that the server has: a replay may try each of them.
             blobs: gets those that the folder lacks.
 
@@ -43,64 +77,70 @@ class Gatherer:
             DataLoss: it is damaged.
             Unavailable: the store is not there.
         """
-        attempt = result.attempt
-        if attempt.choice is not None:
-            wanted = {it.reference_id: it.key for it in attempt.choice.references}
-        else:
-            wanted = {parse_reference_name(it.name)[1]: it.key for it in attempt.references}
-        references = self._references(query.scene_key, wanted, extractors, blobs)
-        if not {it.key for it in attempt.references} <= {it.key for it in references}:
-            raise Gone
-        return CapturedPart(query.photo.field, attempt.generation, tuple(references), attempt.choice)
-
-    def _references(
-        self, scene_key: SceneKey, wanted: dict[str, str], extractors: Sequence[str], blobs: dict[str, bytes]
-    ) -> list[CapturedReference]:
-        views: dict[str, dict[str, str]] = {key: {} for key in wanted.values()}
-        records: dict[str, ReferenceRecord] = {}
+        wanted = dict(used.wanted)
+        read_at = {used.generation, used.generation if used.choice is None else used.choice.generation}
+        if read_at != {scene.generation}:
+            there = self._store.find_keys(scene.scene_key, list(wanted))
+            wanted = {it: key for it, key in wanted.items() if there.get(it) == key}
+        if max(len(self._records), len(self._views)) > _REMEMBERED:
+            self._records.clear()
+            self._views.clear()
         for extractor in extractors:
-            described, undescribed = self._load(scene_key, list(wanted), extractor)
-            records |= {it.key: it for it in (*(one.record for one in described), *undescribed)}
-            for one in described:
-                if one.record.key in views:
-                    views[one.record.key][extractor] = self._view(scene_key, one, extractor, blobs)
-        for key in wanted.values():
-            if key in records:
-                self._image(scene_key, records[key], blobs)
-        return [
-            CapturedReference(it.reference_id, key, it.camera, it.world_from_camera, it.image_sha256, views[key])
-            for key in wanted.values()
-            if (it := records.get(key)) is not None
+            self._read(scene.scene_key, wanted, extractor, blobs)
+        known = {key: self._records[key] for key in wanted.values() if key in self._records}
+        if not used.used <= known.keys():
+            raise Gone
+        for record in known.values():
+            self._image(record, blobs)
+        references = [
+            CapturedReference(
+                it.reference_id,
+                key,
+                it.camera,
+                it.world_from_camera,
+                it.image_sha256,
+                {name: self._views[key, name] for name in extractors if (key, name) in self._views},
+            )
+            for key, it in known.items()
         ]
+        return CapturedPart(used.field, used.generation, tuple(references), used.choice)
 
-    def _load(
-        self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: str
-    ) -> tuple[list[DescribedReference], list[ReferenceRecord]]:
-        """References that have features of an extractor, and those that have none; without those that are not there."""
+    def _read(self, scene_key: SceneKey, wanted: Mapping[str, str], extractor: str, blobs: dict[str, bytes]) -> None:
+        """Features of an extractor, of those references that have them and whose blob is not there yet."""
+        tenant = tenant_of(scene_key)
+
+        def is_there(key: str) -> bool:
+            name = self._views.get((key, extractor))
+            return name is not None and (name in blobs or self._folder.has_blob(tenant, name))
+
+        missing = [reference_id for reference_id, key in wanted.items() if not is_there(key)]
+        for reference_id in missing:
+            self._views.pop((wanted[reference_id], extractor), None)
+        self._load(scene_key, missing, extractor, blobs)
+
+    def _load(self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: str, blobs: dict[str, bytes]) -> None:
+        """All at once, or, where one of them is damaged or gone, each that is there."""
+        if not reference_ids:
+            return
         try:
             snapshot = self._store.load_references(scene_key, reference_ids, extractor)
-            return list(snapshot.references), list(snapshot.undescribed)
         except (NotFound, DataLoss) as error:
-            if error.field == "scene" or len(reference_ids) <= 1:
-                return [], []
-        each = [self._load(scene_key, [it], extractor) for it in reference_ids]
-        return [it for described, _ in each for it in described], [it for _, rest in each for it in rest]
-
-    def _view(self, scene_key: SceneKey, described: DescribedReference, extractor: str, blobs: dict[str, bytes]) -> str:
-        tenant, known = tenant_of(scene_key), (described.record.key, extractor)
-        name = self._views.get(known)
-        if name is None or not (name in blobs or self._folder.has_blob(tenant, name)):
-            data = codec.encode_view(described.view)
+            if error.field != "scene" and len(reference_ids) > 1:
+                for it in reference_ids:
+                    self._load(scene_key, [it], extractor, blobs)
+            return
+        for one in snapshot.references:
+            data = codec.encode_view(one.view)
             name = hashlib.sha256(data).hexdigest()
-            blobs[name] = data
-            if len(self._views) >= _REMEMBERED_VIEWS:
-                self._views.clear()
-            self._views[known] = name
-        return name
+            if not self._folder.has_blob(tenant_of(scene_key), name):
+                blobs[name] = data
+            self._views[one.record.key, extractor] = name
+        for record in (*(it.record for it in snapshot.references), *snapshot.undescribed):
+            self._records[record.key] = record
 
-    def _image(self, scene_key: SceneKey, record: ReferenceRecord, blobs: dict[str, bytes]) -> None:
+    def _image(self, record: ReferenceRecord, blobs: dict[str, bytes]) -> None:
         name = record.image_sha256
-        if name in blobs or self._folder.has_blob(tenant_of(scene_key), name):
+        if name in blobs or self._folder.has_blob(tenant_of(record.scene_key), name):
             return
         try:
             blobs[name] = self._store.read_image_of(record.key)

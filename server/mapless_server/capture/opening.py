@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 
 from ..observability.metrics import Metrics
 from ..settings import Settings
 from ..store import Store
 from ..tenancy import check_tenant
+from .circumstances import circumstances_of
 from .errors import CaptureError
 from .folder import CaptureFolder, Retention
 from .recorder import Recorder
@@ -35,4 +37,4 @@ def open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorde
         settings.capture_mib,
     )
     metrics.watch_captures(lambda: folder.space_bytes)
-    return Recorder(folder, store, metrics, settings.capture_share, tenants)
+    return Recorder(folder, store, metrics, partial(circumstances_of, settings), tenants)

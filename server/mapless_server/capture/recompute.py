@@ -21,7 +21,7 @@ from ..engine import Engine, EngineOptions
 from ..method.localize import Answer, Coarse, coarse_answer, refine
 from ..observability.metrics import Metrics
 from ..principal import Principal
-from ..query import Caller, Query, Result
+from ..query import UNFINISHED, Caller, Query, Result
 from ..query_stages import COARSE, PREPARE, REFINE, Method, QueryStages, Work
 from ..query_views import QueryViews
 from ..scheduling.fair import Flow
@@ -32,12 +32,11 @@ from ..tenancy import SceneKey
 from ..tiers import Tier
 from ..watching import Watchers
 from .calls import CapturedCall
-from .recorded import RETRIEVAL, Blobs, RecordedChooser, RecordedSource
+from .errors import CaptureError
 from .recorder import Response
+from .stand_ins import RETRIEVAL, Blobs, RecordedChooser, RecordedSource
 
 Joined = TypeVar("Joined")
-
-UNFINISHED = "/unfinished"
 
 MESSAGES: dict[str, tuple[Any, Any]] = {
     "Localize": (pb.LocalizeRequest, pb.LocalizeResponse),
@@ -48,7 +47,9 @@ MESSAGES: dict[str, tuple[Any, Any]] = {
 
 
 def response_of(call: CapturedCall) -> Response:
-    """What was answered."""
+    """What was answered; CaptureError if it is of a method that this program does not know."""
+    if call.method not in MESSAGES:
+        raise CaptureError(f"this program knows no method {call.method}")
     return cast(Response, MESSAGES[call.method][1].FromString(call.response))
 
 
@@ -62,11 +63,11 @@ def recompute(call: CapturedCall, blobs: Blobs, tiers: Sequence[Tier], options: 
         options: limits and defaults of now.
 
     Raises:
-        DamagedCapture: a part of what was captured is gone.
+        CaptureError: a part of what was captured is gone, or its method is not known.
         RequestError, FieldError: the call is refused now.
     """
-    request = MESSAGES[call.method][0].FromString(call.request)
     then = response_of(call)
+    request = MESSAGES[call.method][0].FromString(call.request)
     engine = cast(Engine, _Recomputing(call, request, then, blobs, tiers, options))
     service = LocalizationService(lambda: engine, Metrics(), cast(Store, _Attributes(call)), Watchers(False))
     now = Call(call.request_id, time.monotonic(), math.inf, Principal(tenant=call.tenant))

@@ -1,41 +1,37 @@
 """Takes calls from the services, and keeps them, in a thread of its own: it never delays a call and never fails one.
 
 What it cannot keep it counts. Calls wait for the disk in a queue that is bounded in number and bytes. What is too old
-goes on time, whether calls come or not; what was made of a scene or of references that have been deleted since, by
-whatever server, goes within `STORE_CHECK_S`.
+goes on time, whether calls come or not and whether the store answers or not: a second thread sees to that alone. What
+was made of a scene or of references that have been deleted since, by whatever server, goes within `STORE_CHECK_S`.
+Neither thread ends before the recorder is closed.
 """
 
 from __future__ import annotations
 
 import logging
-import random
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from google.protobuf.message import Message
 
 from mapless.names import parse_scene_name
 from mapless.v1 import localization_service_pb2 as pb
-from mapless.wire import FieldError
 
 from ..call import Call
-from ..errors import DataLoss, DeadlineExceeded, InvalidArgument, NotFound, Overloaded, RequestError, Unavailable
+from ..errors import DataLoss, NotFound, Unavailable
 from ..query import Query, Result
-from ..settings import Settings
-from ..store import Store
+from ..store import SceneAttributes, Store
 from ..store.rows import time_us
 from ..tenancy import key_of
 from ..tiers import Tier
-from .calls import CapturedCall, CapturedFailure
-from .circumstances import circumstances_of
+from .calls import CapturedCall
+from .errors import BlobGone
 from .folder import CaptureFolder
-from .gathering import Gatherer, Gone
+from .gathering import Gatherer, Gone, Used, used_of
 from .staleness import Staleness
 
 log = logging.getLogger(__name__)
@@ -49,16 +45,16 @@ MAX_WAITING_BYTES = 64 * 2**20
 """Of their messages."""
 STORE_CHECK_S = 30.0
 """How long after a scene or a reference was deleted what was made of it is there at most."""
+EXPIRY_CHECK_S = 1.0
+"""How late a call may go, where the clock has been set; else it goes on time."""
 FAULT_PAUSE_S = 60.0
-"""After the disk has failed nothing is captured for so long; and of what is dropped the log tells no more often."""
+"""After the disk has failed nothing is captured for so long; and of what fails the log tells no more often."""
 CLOSING_LIMIT_S = 5.0
 """For what waits to be written when the server stops."""
+_MIN_PAUSE_S = 0.01
 
 Request = pb.LocalizeRequest | pb.LocalizeRigRequest | pb.LocalizeSequenceRequest
 Response = pb.LocalizeResponse | pb.LocalizeRigResponse | pb.LocalizeSequenceResponse
-
-NO_SCENE = "_"
-"""Stands for the scene of a call whose scene has no well-formed name."""
 
 
 class CaptureObserver(Protocol):
@@ -73,17 +69,35 @@ class CaptureObserver(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Waiting:
-    """A call that waits to be kept: what is known of it, its messages, and what was made of its photographs."""
+    """A call that waits to be kept: its messages, and by name what its photographs were compared with.
 
-    call: CapturedCall
+    Attributes:
+        call: whose it is.
+        scene_id: where.
+        time_s: when it was answered, Unix seconds.
+        method: "Localize", ...
+        request: as it came.
+        response: as it went.
+        size_bytes: of both.
+        parts: of each photograph.
+        attributes: of the scene.
+        tiers: what computed the answer.
+    """
+
+    call: Call
+    scene_id: str
+    time_s: float
+    method: str
+    request: Message
+    response: Message
     size_bytes: int
-    request: Message | None = None
-    response: Message | None = None
-    parts: Sequence[tuple[Query, Result]] = ()
+    parts: tuple[Used, ...]
+    attributes: SceneAttributes
+    tiers: Sequence[Tier]
 
 
 class Recorder:
-    """Captures the calls of one server. Its methods are for the event loop, but for those that say otherwise.
+    """Captures the calls of one server. `answered` is for the event loop.
 
     Attributes:
         folder: of the calls.
@@ -94,44 +108,40 @@ class Recorder:
         folder: CaptureFolder,
         store: Store,
         observer: CaptureObserver,
-        share: float = 1.0,
+        circumstances: Callable[[Sequence[Tier]], Mapping[str, str]] = lambda _: {},
         tenants: frozenset[str] = frozenset(),
     ) -> None:
-        """Deletes at once what should be gone, and begins to watch over the rest; may take a while.
+        """Begins to watch over the folder; asks the store nothing yet.
 
         Args:
             folder: of the calls; closed at the end.
-            store: of the references.
+            store: of the references; must not be closed before.
             observer: counts.
-            share: of the calls, which are drawn by chance.
+            circumstances: what else decides the answers of these tiers, see `circumstances_of`.
             tenants: whose calls; none for those of all.
         """
         self.folder = folder
         self._observer = observer
-        self._share = share
         self._tenants = tenants
-        self._gatherer = Gatherer(store, folder)
-        self._staleness = Staleness(store)
-        self._store = store
-        self._random = random.Random()
-        self._circumstances: Callable[[], Mapping[str, str]] = dict
+        self._store = store.uncached()
+        self._gatherer = Gatherer(self._store, folder)
+        self._staleness = Staleness(self._store)
+        self._circumstances = circumstances
         self._found: Mapping[str, str] | None = None
-        self._extractors: tuple[str, ...] = ()
         self._waiting: deque[Waiting] = deque()
         self._waiting_bytes = 0
         self._paused_until_s = 0.0
         self._dropped: dict[str, int] = {}
-        self._told_s = -FAULT_PAUSE_S
+        self._told_s: dict[str, float] = {}
         self._closing_s: float | None = None
         self._news = threading.Condition()
-        self._tidy()
-        self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
-        self._thread.start()
-
-    def describe(self, settings: Settings, tiers: Sequence[Tier]) -> None:
-        """Says what computes the answers; to be said before there are any."""
-        self._extractors = tuple(tier.extractor.name for tier in tiers)
-        self._circumstances = partial(circumstances_of, settings, tiers)
+        self._closing = threading.Event()
+        self._threads = [
+            threading.Thread(target=self._run, name="capture", daemon=True),
+            threading.Thread(target=self._expire, name="capture-expiry", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def answered(
         self,
@@ -140,6 +150,7 @@ class Recorder:
         response: Response,
         call: Call,
         parts: Sequence[tuple[Query, Result]],
+        tiers: Sequence[Tier],
     ) -> None:
         """A call has been answered, and its caller is told if it is to be kept.
 
@@ -149,37 +160,27 @@ class Recorder:
             response: as it goes; neither is to be changed any more.
             call: whose they are.
             parts: its photographs, in order, and what was made of each.
+            tiers: all that the server has.
         """
-        tenant = call.principal.tenant
-        if not self._is_wanted(tenant) or self._random.random() >= self._share:
+        if self._tenants and call.principal.tenant not in self._tenants:
             return
-        captured = CapturedCall(call.request_id, time.time(), method, tenant, parse_scene_name(request.scene), 0)
-        messages: list[Message] = [request, response]
+        messages: tuple[Message, Message] = request, response
         size_bytes = sum(it.ByteSize() for it in messages)
-        if self._put(Waiting(captured, size_bytes, request, response, parts)):
+        used = tuple(used_of(*part) for part in parts)
+        attributes = parts[0][1].attempt.attributes
+        scene_id, now_s = parse_scene_name(request.scene), time.time()
+        if self._put(Waiting(call, scene_id, now_s, method, *messages, size_bytes, used, attributes, tiers)):
             call.trailing.append((CAPTURED_KEY, "1"))
-
-    def failed(self, method: str, request: Request, call: Call, failure: CapturedFailure) -> None:
-        """A call has failed: a line is kept of it, without what it asked."""
-        tenant = call.principal.tenant
-        if not self._is_wanted(tenant):
-            return
-        try:
-            scene_id = parse_scene_name(request.scene)
-        except ValueError:
-            scene_id = NO_SCENE
-        self._put(Waiting(CapturedCall(call.request_id, time.time(), method, tenant, scene_id, 0, failure=failure), 0))
 
     def close(self) -> None:
         """Writes what waits, for as long as there is time, and lets the folder go; from any thread."""
         with self._news:
             self._closing_s = time.monotonic() + CLOSING_LIMIT_S
             self._news.notify()
-        self._thread.join()
+        self._closing.set()
+        for thread in self._threads:
+            thread.join()
         self.folder.close()
-
-    def _is_wanted(self, tenant: str) -> bool:
-        return not self._tenants or tenant in self._tenants
 
     def _put(self, waiting: Waiting) -> bool:
         if time.monotonic() < self._paused_until_s:
@@ -196,9 +197,22 @@ class Recorder:
             self._drop("queue")
         return not is_full
 
+    def _expire(self) -> None:
+        """Of the expiry's thread: asks nobody but the folder."""
+        pause_s = 0.0
+        while not self._closing.wait(pause_s):
+            pause_s = EXPIRY_CHECK_S
+            try:
+                pause_s = min(max(self.folder.expire(), _MIN_PAUSE_S), EXPIRY_CHECK_S)
+            except Exception as error:  # whatever it is, the time limit holds for all others
+                self._complain("captured calls that are too old cannot be deleted", error)
+
     def _run(self) -> None:
-        due_s = self._tidy()
+        due_s = 0.0
         while True:
+            if time.monotonic() >= due_s:
+                self._check()
+                due_s = time.monotonic() + STORE_CHECK_S
             with self._news:
                 if not self._waiting and self._closing_s is None:
                     self._news.wait(max(due_s - time.monotonic(), 0.0))
@@ -209,16 +223,25 @@ class Recorder:
                 self._keep(waiting)
             elif is_closing:
                 return
-            if time.monotonic() >= due_s:
-                due_s = self._tidy()
+
+    def _check(self) -> None:
+        """Deletes what should be gone for another reason than its age."""
+        try:
+            self.folder.forget_deleted()
+            stale = self._staleness.delete_stale(self.folder)
+            if stale:
+                log.info("%d captured calls are deleted, since their scenes or references were", stale)
+        except Unavailable:
+            log.debug("the store is away; captured calls are checked later")
+        except Exception as error:  # whatever it is, what can be kept is kept, and this is tried again
+            self._complain("captured calls cannot be compared with the store", error)
 
     def _keep(self, waiting: Waiting) -> None:
         try:
-            call, blobs = self._gather(waiting)
-            if not self.folder.add(call, blobs):
-                self._drop("size")
-            elif call.failure is None:
+            if self._add(waiting):
                 self._observer.captured()
+            else:
+                self._drop("size")
         except OSError as error:
             self._paused_until_s = time.monotonic() + FAULT_PAUSE_S
             self._drop("disk")
@@ -231,65 +254,51 @@ class Recorder:
             self._drop("fault")
             log.exception("a call was not captured", extra={"request_id": waiting.call.request_id})
 
+    def _add(self, waiting: Waiting, more_tries: int = 2) -> bool:
+        try:
+            return self.folder.add(*self._gather(waiting))
+        except BlobGone:
+            if not more_tries:
+                raise
+            return self._add(waiting, more_tries - 1)
+
     def _gather(self, waiting: Waiting) -> tuple[CapturedCall, dict[str, bytes]]:
-        call, blobs = waiting.call, dict[str, bytes]()
-        if waiting.request is None or waiting.response is None:
-            return call, blobs
         if self._found is None:
-            self._found = self._circumstances()
+            self._found = self._circumstances(waiting.tiers)
+        tenant, scene_id = waiting.call.principal.tenant, waiting.scene_id
+        extractors, blobs = tuple(tier.extractor.name for tier in waiting.tiers), dict[str, bytes]()
         # First: a scene that is made anew while its references are read has others, which is then found out.
-        scene = self._store.get_scene(key_of(call.tenant, call.scene_id))
-        parts = tuple(self._gatherer.part(query, result, self._extractors, blobs) for query, result in waiting.parts)
-        call = replace(
-            call,
-            scene_created_us=time_us(scene.create_time),
-            circumstances=self._found,
-            attributes=waiting.parts[0][1].attempt.attributes,
-            parts=parts,
-            request=waiting.request.SerializeToString(),
-            response=waiting.response.SerializeToString(),
+        scene = self._store.get_scene(key_of(tenant, scene_id))
+        parts = tuple(self._gatherer.part(scene, used, extractors, blobs) for used in waiting.parts)
+        call = CapturedCall(
+            waiting.call.request_id,
+            waiting.time_s,
+            waiting.method,
+            tenant,
+            scene_id,
+            time_us(scene.create_time),
+            self._found,
+            waiting.attributes,
+            parts,
+            waiting.request.SerializeToString(),
+            waiting.response.SerializeToString(),
         )
         return call, blobs
-
-    def _tidy(self) -> float:
-        """Deletes what should be gone; when to do so again, `time.monotonic`."""
-        pause_s = STORE_CHECK_S
-        try:
-            pause_s = min(self.folder.expire(), STORE_CHECK_S)
-            stale = self._staleness.delete_stale(self.folder)
-            if stale:
-                log.info("%d captured calls are deleted, since their scenes or references were", stale)
-        except OSError as error:
-            log.error("captured calls cannot be deleted: %s", error)
-        return time.monotonic() + max(pause_s, 0.01)
 
     def _drop(self, reason: str) -> None:
         self._observer.capture_dropped(reason)
         self._dropped[reason] = self._dropped.get(reason, 0) + 1
-        now_s = time.monotonic()
-        if now_s - self._told_s >= FAULT_PAUSE_S:
-            self._told_s = now_s
+        if self._is_time_to_tell("dropped"):
             told, self._dropped = self._dropped, {}
             log.warning("calls were not captured: %s", ", ".join(f"{name} {count}" for name, count in told.items()))
 
+    def _complain(self, what: str, error: Exception) -> None:
+        if self._is_time_to_tell(what):
+            log.error("%s: %s", what, error, exc_info=None if isinstance(error, OSError) else error)
 
-@contextmanager
-def failures_of(recorder: Recorder | None, method: str, request: Request, call: Call) -> Iterator[None]:
-    """Keeps a line of a call that fails, if there is a recorder; not of those there was no room or time for."""
-    try:
-        yield
-    except (Overloaded, Unavailable, DeadlineExceeded):
-        raise
-    except Exception as error:
-        if recorder is not None:
-            recorder.failed(method, request, call, _failure_of(error))
-        raise
-
-
-def _failure_of(error: Exception) -> CapturedFailure:
-    """As the caller is told."""
-    if isinstance(error, RequestError):
-        return CapturedFailure(error.code, error.reason, str(error))
-    if isinstance(error, FieldError):
-        return CapturedFailure(InvalidArgument.code, InvalidArgument.reason, str(error))
-    return CapturedFailure(RequestError.code, type(error).__name__, "")
+    def _is_time_to_tell(self, what: str) -> bool:
+        now_s = time.monotonic()
+        is_time = now_s - self._told_s.get(what, -FAULT_PAUSE_S) >= FAULT_PAUSE_S
+        if is_time:
+            self._told_s[what] = now_s
+        return is_time

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 
-from mapless.wire import FieldError
-
 from ..assembly import engine_options, make_tiers, what_is_missing
 from ..engine import EngineOptions
-from ..errors import RequestError
 from ..settings import Settings
 from ..tiers import Tier
 from ..weights import WeightsError, WeightsMissing
@@ -21,11 +18,11 @@ from .circumstances import circumstances_of
 from .comparing import Change, changed, compare, outcome_of, stage_seconds
 from .errors import CaptureError
 from .files import calls_of, check_format
-from .recorded import Blobs
-from .replaying import recompute, response_of
+from .recompute import recompute, response_of
+from .stand_ins import Blobs
 
-IDENTICAL, CHANGED, FAILED = "identical", "changed", "failed"
-"""Verdicts on a call; one that failed then has nothing to be computed anew."""
+IDENTICAL, CHANGED = "identical", "changed"
+"""Verdicts on a call."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +41,13 @@ class Selection:
     tenant: str = ""
     scene_id: str = ""
 
-    def takes(self, call: CapturedCall) -> bool:
-        """Whether a call is one of them, whatever its age."""
-        wanted = not self.request_ids or call.request_id in self.request_ids
-        return wanted and self.tenant in ("", call.tenant) and self.scene_id in ("", call.scene_id)
+    def files(self, folder: Path) -> list[Path]:
+        """Files of the tenant and the scene, the latest first."""
+        found = [it for it in calls_of(folder) if self._takes(*it.relative_to(folder).parts)]
+        return sorted(found, key=lambda it: it.name, reverse=True)
+
+    def _takes(self, _tenants: str, tenant: str, _calls: str, scene_id: str, _name: str) -> bool:
+        return self.tenant in ("", tenant) and self.scene_id in ("", scene_id)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ class Replayed:
         stages_then, stages_now: of each stage.
         apart_cm, apart_deg: how far the poses are apart; None where there are no two, or the answers are identical.
         changes: what is different; the first of it.
-        error: why there is no answer, then (`FAILED`) or now.
+        error: why there is no answer now.
+        found_anew: references whose captured features this version cannot read, so that it found them anew.
     """
 
     request_id: str
@@ -81,6 +82,7 @@ class Replayed:
     apart_deg: float | None = None
     changes: tuple[Change, ...] = ()
     error: str = ""
+    found_anew: int = 0
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ class Report:
     @property
     def is_identical(self) -> bool:
         """Whether every answer is the same, to the last bit."""
-        return not self.unreadable and all(it.verdict != CHANGED for it in self.calls)
+        return not self.unreadable and all(it.verdict == IDENTICAL for it in self.calls)
 
 
 def replay(folder: Path, selection: Selection, settings: Settings) -> Report:
@@ -116,28 +118,47 @@ def replay(folder: Path, selection: Selection, settings: Settings) -> Report:
     """
     check_format(folder)
     unreadable: list[str] = []
-    found = [path for path, call in _read(folder, unreadable) if selection.takes(call)]
-    if selection.last is not None:
-        found = heapq.nlargest(selection.last, found, key=lambda it: it.name)
-    if not (found or unreadable):
-        raise CaptureError(f"{folder} holds no such calls")
-    tiers, options = _tiers(settings), engine_options(settings)
-    now, blobs = circumstances_of(settings, tiers), Blobs(folder)
+    found = select(folder, selection, unreadable)
     calls, circumstances = [], dict[Change, None]()
-    for path in sorted(found, key=lambda it: it.name):
-        call = _call_in(path, folder, unreadable)
-        if call is None:
-            continue
-        if call.failure is None:
+    with ExitStack() as stack:
+        tiers, options = _tiers(settings), engine_options(settings)
+        for tier in tiers:
+            stack.callback(tier.pipeline.matcher.close)
+        now, blobs = circumstances_of(settings, tiers), Blobs(folder)
+        for path in found:
+            call = _call_in(path, folder, unreadable)
+            if call is None:
+                continue
+            replayed = _replayed(call, blobs, tiers, options)
+            if replayed.error and not path.exists():  # its server deleted it, or a part of it, meanwhile
+                continue
             circumstances |= dict.fromkeys(changed(call.circumstances, now))
-        calls.append(_replayed(call, blobs, tiers, options))
-    for tier in tiers:
-        tier.pipeline.matcher.close()
+            calls.append(replayed)
     return Report(tuple(calls), tuple(circumstances), tuple(unreadable))
 
 
-def _read(folder: Path, unreadable: list[str]) -> Iterator[tuple[Path, CapturedCall]]:
-    for path in calls_of(folder):
+def select(folder: Path, selection: Selection, unreadable: list[str]) -> list[Path]:
+    """Files of the calls, the oldest first; of files that cannot be read nobody knows whether they were meant."""
+    found: list[Path] = []
+    ids: set[str] = set()
+    for path, call in _read(selection.files(folder), folder, unreadable):
+        if not selection.request_ids or call.request_id in selection.request_ids:
+            found.append(path)
+            ids.add(call.request_id)
+        if len(found) == selection.last:
+            break
+    missing = selection.request_ids - ids if selection.last is None or len(found) < selection.last else frozenset()
+    if missing or not (found or unreadable):
+        which = f"call of id {', '.join(sorted(missing))}" if missing else "such calls"
+        faults = f"; {len(unreadable)} files cannot be read" if unreadable else ""
+        raise CaptureError(f"{folder} holds no {which}{faults}")
+    if selection.request_ids:
+        unreadable.clear()  # all that were asked for are there
+    return found[::-1]
+
+
+def _read(paths: list[Path], folder: Path, unreadable: list[str]) -> Iterator[tuple[Path, CapturedCall]]:
+    for path in paths:
         call = _call_in(path, folder, unreadable)
         if call is not None:
             yield path, call
@@ -148,9 +169,11 @@ def _call_in(path: Path, folder: Path, unreadable: list[str]) -> CapturedCall | 
         return decode_call(path.read_bytes())
     except FileNotFoundError:  # its server has deleted it since
         return None
+    except OSError as error:
+        unreadable.append(f"{path.relative_to(folder)}: {error.strerror}")
     except CaptureError as error:
         unreadable.append(f"{path.relative_to(folder)}: {error}")
-        return None
+    return None
 
 
 def _tiers(settings: Settings) -> tuple[Tier, ...]:
@@ -165,19 +188,19 @@ def _tiers(settings: Settings) -> tuple[Tier, ...]:
 def _replayed(call: CapturedCall, blobs: Blobs, tiers: tuple[Tier, ...], options: EngineOptions) -> Replayed:
     time = datetime.fromtimestamp(call.time_s, timezone.utc).isoformat(timespec="milliseconds")
     about = (call.request_id, time, call.method, call.tenant, call.scene_id)
-    if call.failure is not None:
-        return Replayed(*about, FAILED, error=f"{call.failure.code} {call.failure.reason}: {call.failure.message}")
-    then = response_of(call)
-    stages_then = stage_seconds(then)
+    outcome_then, stages_then = "", dict[str, float]()
     try:
+        then = response_of(call)
+        outcome_then, stages_then = outcome_of(then), stage_seconds(then)
         now = recompute(call, blobs, tiers, options)
-    except (RequestError, FieldError, CaptureError) as error:
-        return Replayed(*about, CHANGED, outcome_of(then), stages_then=stages_then, error=f"{error}")
-    comparison, stages_now = compare(then, now), stage_seconds(now)
+        comparison, stages_now = compare(then, now), stage_seconds(now)
+    except Exception as error:  # whatever this version cannot do with one call is said of it, and the others are told
+        name = "" if isinstance(error, CaptureError) else f"{type(error).__name__}: "
+        return Replayed(*about, CHANGED, outcome_then, stages_then=stages_then, error=f"error: {name}{error}")
     return Replayed(
         *about,
         IDENTICAL if comparison.is_identical else CHANGED,
-        outcome_of(then),
+        outcome_then,
         outcome_of(now),
         sum(stages_then.values()),
         sum(stages_now.values()),
@@ -186,4 +209,5 @@ def _replayed(call: CapturedCall, blobs: Blobs, tiers: tuple[Tier, ...], options
         comparison.apart_cm,
         comparison.apart_deg,
         comparison.changes,
+        found_anew=len(blobs.found_anew & {key for _, key in call.keys}),
     )

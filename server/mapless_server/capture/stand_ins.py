@@ -23,6 +23,7 @@ from ..retrieval.chosen import Choice
 from ..retrieval.narrowing import Narrowing
 from ..retrieval.ranking import RankOptions
 from ..store import SceneAttributes, codec
+from ..store.cache import LruCache
 from ..tenancy import SceneKey, scene_id_of
 from ..turns import Turn
 from .calls import CapturedCall, CapturedPart, CapturedReference
@@ -32,34 +33,51 @@ from .files import blob_path
 RETRIEVAL = "retrieval"
 """The stage in which references are chosen."""
 
+_REMEMBERED_BYTES = 512 * 2**20
+
 
 class Blobs:
-    """Photographs and features of references in a capture folder; what was read is remembered for the next call."""
+    """Photographs and features of references in a capture folder; what was read is remembered for the next call.
+
+    Attributes:
+        found_anew: keys of the references whose features this program could not read.
+    """
 
     def __init__(self, folder: Path) -> None:
+        self.found_anew: set[str] = set()
         self._folder = folder
-        self._views: dict[tuple[str, str], View] = {}
+        self._views: LruCache[View] = LruCache(_REMEMBERED_BYTES)
 
     def view(self, tenant: str, reference: CapturedReference, extractor: FeatureExtractor) -> View:
-        """What an extractor found in a reference: as it was captured, or found anew if it has other features.
+        """What an extractor found in a reference: as it was captured, or found anew.
+
+        That is so if the extractor finds other features than those that were captured, or if another version wrote them
+        in a form that this one cannot read; the latter is noted.
 
         Raises:
             DamagedCapture: it is not there, or not what was written.
         """
         known = (reference.key, extractor.name)
-        if known not in self._views:
-            self._views[known] = self._read_view(tenant, reference, extractor)
-        return self._views[known]
+        view = self._views.get(known)
+        if view is None:
+            view = self._read_view(tenant, reference, extractor)
+            features = view.features
+            size_bytes = features.keypoints.nbytes + features.descriptors.nbytes + features.sizes_px.nbytes
+            self._views.put(known, view, size_bytes)
+        return view
 
     def pixels(self, tenant: str, reference: CapturedReference) -> NDArray[np.uint8]:
         """A reference's photograph, (H, W, 3) RGB; DamagedCapture if it is not there, or not what was written."""
         return decode_image(self._read(tenant, reference.image_sha256), STORED_IMAGES)
 
     def _read_view(self, tenant: str, reference: CapturedReference, extractor: FeatureExtractor) -> View:
-        if extractor.name not in reference.views:
-            return extractor.extract(self.pixels(tenant, reference), reference.camera)
-        data = self._read(tenant, reference.views[extractor.name])
-        return codec.decode_view("", data, codec.sha256_for("", data))
+        if extractor.name in reference.views:
+            data = self._read(tenant, reference.views[extractor.name])
+            try:
+                return codec.decode_view("", data, codec.sha256_for("", data))
+            except codec.Damaged:  # its bytes are what was written, so it is its form that is unknown
+                self.found_anew.add(reference.key)
+        return extractor.extract(self.pixels(tenant, reference), reference.camera)
 
     def _read(self, tenant: str, sha256: str) -> bytes:
         try:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 if TYPE_CHECKING:
-    from ..capture.replay import Replayed, Report
+    from ..capture.report import Replayed, Report
 
 SHOWN_CHANGES = 12
 
@@ -44,7 +44,7 @@ def replay_command(
     configure_libraries(settings)
 
     from ..capture.errors import CaptureError
-    from ..capture.replay import Selection, replay
+    from ..capture.report import Selection, replay
 
     try:
         selection = Selection(frozenset(request_id or ()), last, tenant, scene)
@@ -74,20 +74,19 @@ def _print(report: Report) -> None:
         _print_call(call)
     for fault in report.unreadable:
         print(f"unreadable: {fault}")
-    counts = {name: sum(it.verdict == name for it in report.calls) for name in ("identical", "changed", "failed")}
+    counts = {name: sum(it.verdict == name for it in report.calls) for name in ("identical", "changed")}
     counts["unreadable"] = len(report.unreadable)
     print(", ".join(f"{count} {name}" for name, count in counts.items() if count) or "nothing to compare")
 
 
 def _print_call(call: Replayed) -> None:
     head = f"{call.time} {call.request_id} {call.method} {call.tenant}/{call.scene_id}"
-    if call.verdict == "failed":
-        print(f"{head}: failed then, {call.error}; nothing to compute")
-        return
     if call.error:
         print(f"{head}: {call.outcome_then} then; now {call.error}")
         return
     print(f"{head}: {call.verdict}, {call.outcome_now}, {call.seconds_then:.2f} s then, {call.seconds_now:.2f} s now")
+    if call.found_anew:
+        print(f"    the features of {call.found_anew} references cannot be read by this version, and were found anew")
     if call.verdict == "identical":
         return
     if call.apart_cm is not None and call.apart_deg is not None:

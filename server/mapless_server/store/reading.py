@@ -162,6 +162,17 @@ class ReadingStore(BaseStore):
             return list(connection.scalars(page.order_by(column.reference_id).limit(limit)))
 
     @observed
+    def find_keys(self, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
+        """Keys by id of those of these references that exist, damaged ones too.
+
+        Raises:
+            NotFound: there is no such scene.
+        """
+        with self._database.read() as connection:
+            queries.read_generation(connection, scene_key)
+            return queries.find_keys(connection, scene_key, reference_ids)
+
+    @observed
     def load_references(
         self, scene_key: SceneKey, reference_ids: Sequence[str] | None, extractor: str
     ) -> SceneSnapshot:

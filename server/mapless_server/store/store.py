@@ -65,6 +65,13 @@ class Store(ReadingStore, ChangingStore):
         """What it is kept in."""
         return self._database
 
+    def uncached(self) -> Store:
+        """The same database for one who reads what queries do not: their memory and its counts are left alone.
+
+        It lives as long as this store, is not closed, and is only read.
+        """
+        return Store(self._database, LruCache(0))
+
     @property
     def reference_cache(self) -> LruCache[DescribedReference]:
         """The features held in memory."""
