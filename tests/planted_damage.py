@@ -6,6 +6,7 @@ from mapless_server.store import Store
 from mapless_server.tenancy import SceneKey
 
 _COLUMN = {
+    "image": "UPDATE image SET data = zeroblob(64) WHERE reference_key = ?",
     "features": "UPDATE features SET data = zeroblob(64) WHERE reference_key = ?",
     "descriptor": "UPDATE global_descriptor SET data = zeroblob(64) WHERE reference_key = ?",
     "pose": "UPDATE reference SET geometry = zeroblob(64) WHERE key = ?",
@@ -13,7 +14,7 @@ _COLUMN = {
 
 
 def damage(store: Store, scene_key: SceneKey, reference_id: str, what: str) -> None:
-    """Damages the "features", the "descriptor" or the "pose" of a reference, by the store's back door."""
+    """Damages the "image", the "features", the "descriptor" or the "pose" of a reference, by the store's back door."""
     with store.database.write() as connection:
         key = connection.exec_driver_sql(
             "SELECT key FROM reference WHERE scene_id = ? AND reference_id = ?", (scene_key, reference_id)

@@ -16,8 +16,8 @@ EXIT_INTERRUPTED = 130  # as shells have it
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; exits."""
-    parsed = make_parser().parse_args(arguments)
     try:
+        parsed = make_parser().parse_args(arguments)
         with Client(parsed.address, connect_options(parsed)) as client:
             sys.exit(parsed.run(client, parsed))
     except MaplessError as error:

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,7 +58,10 @@ class ChildServer:
 
 @contextmanager
 def child_server(
-    store: Path | SecretStr, more_flags: Mapping[str, str] | None = None, environment: Mapping[str, str] | None = None
+    store: Path | SecretStr,
+    more_flags: Mapping[str, str] | None = None,
+    environment: Mapping[str, str] | None = None,
+    log: Path | None = None,
 ) -> Iterator[ChildServer]:
     """A server on a free port of the loopback interface until the block is left, by whatever way.
 
@@ -68,6 +71,7 @@ def child_server(
         store: a data folder, or the URL of a database that servers share.
         more_flags: of the command `serve`, with their values.
         environment: variables that are added to our own.
+        log: file that its log is added to; None for our own standard error.
 
     Raises:
         ServerFailed: it ended, or did not listen within `START_TIMEOUT_S`.
@@ -85,28 +89,33 @@ def child_server(
     else:
         environment[f"{PREFIX}DATABASE_URL"] = store.get_secret_value()  # all users can read a command line
     arguments = [part for flag in flags.items() for part in flag]
-    with child_module("mapless_server", "serve", *arguments, environment=environment) as server:
+    with child_module("mapless_server", "serve", *arguments, environment=environment, log=log) as server:
         yield server
 
 
 @contextmanager
-def child_module(module: str, *arguments: str, environment: Mapping[str, str] | None = None) -> Iterator[ChildServer]:
+def child_module(
+    module: str, *arguments: str, environment: Mapping[str, str] | None = None, log: Path | None = None
+) -> Iterator[ChildServer]:
     """A module that runs as a server and announces itself as ours does; otherwise as `child_server`.
 
     Args:
         module: its name.
         arguments: of its command line.
         environment: variables that are added to our own, or replace them.
+        log: file that its standard error is added to; None for our own.
     """
-    process = subprocess.Popen(
-        [sys.executable, "-m", module, *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | (environment or {}),
-    )
+    with nullcontext() if log is None else log.open("ab") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            env=os.environ | (environment or {}),
+        )
     try:
-        yield ChildServer(_read_address(process), process.pid)
+        yield ChildServer(_read_address(process, "above" if log is None else f"in {log}"), process.pid)
     finally:
         process.terminate()
         try:
@@ -118,7 +127,7 @@ def child_module(module: str, *arguments: str, environment: Mapping[str, str] | 
             process.stdout.close()
 
 
-def _read_address(process: subprocess.Popen[str]) -> str:
+def _read_address(process: subprocess.Popen[str], where: str) -> str:
     assert process.stdout is not None
     # Reading a pipe has no deadline; a child that is gone ends it.
     deadline = threading.Timer(START_TIMEOUT_S, process.kill)
@@ -130,4 +139,4 @@ def _read_address(process: subprocess.Popen[str]) -> str:
                 return line.removeprefix(_ANNOUNCEMENT).strip()
     finally:
         deadline.cancel()
-    raise ServerFailed(f"the server did not start (exit code {process.wait()}); its own message is above")
+    raise ServerFailed(f"the server did not start (exit code {process.wait()}); its own message is {where}")

@@ -7,13 +7,14 @@ without a restart.
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ from mapless import (
     Rejected,
     Unavailable,
 )
+from mapless.__main__ import main
 from mapless.geometry import Camera
 from mapless_server import running
 from mapless_server.method.localize import Answer
@@ -142,6 +144,30 @@ class TestDisk:
                 assert {it.reference_id for it in client.list_references("s")} == stored | {"late"}
             assert faults_of(disk / "data") == ()
 
+    def test_one_that_is_full_from_the_start_serves_queries_after_a_kill_and_says_what_it_lacks_after_an_orderly_stop(
+        self, tmp_path: Path
+    ) -> None:
+        with small_disk(tmp_path / "disk", 8) as disk:
+            with served(disk / "stopped") as client:
+                fill(client, 2)
+                # What lies there while it runs is what a kill leaves behind.
+                shutil.copytree(disk / "stopped", disk / "killed")
+            with (disk / "filler").open("wb", buffering=0) as filler:
+                for size in (2**16, 1):
+                    with suppress(OSError):
+                        while True:
+                            filler.write(bytes(size))
+            with pytest.raises(StoreError, match=r"the disk is full$"), served(disk / "stopped"):
+                pass
+            with served(disk / "killed") as client:
+                wait_until(lambda: health_of(client) == (True, True, False))
+                assert is_answered(client)
+                error = error_of(lambda: client.create_scene("t"))
+                assert (error and error.code, error and error.reason) == ("RESOURCE_EXHAUSTED", "STORE_FULL")
+                (disk / "filler").unlink()
+                wait_until(lambda: health_of(client) == (True, True, True))
+                client.create_scene("t")
+
     def test_one_that_can_only_be_read_from_the_start_serves_queries(self, tmp_path: Path) -> None:
         with small_disk(tmp_path / "disk", 16) as disk:
             with served(disk / "data") as client:
@@ -154,6 +180,20 @@ class TestDisk:
             with served(disk / "data") as client:
                 client.create_scene("t")
                 assert health_of(client) == (True, True, True)
+
+    def test_the_command_tells_that_changes_alone_are_refused(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        with small_disk(tmp_path / "disk", 16) as disk:
+            with served(disk / "data") as client:
+                fill(client)
+            assert mount("-o", "remount,ro", str(disk)) == 0
+            with served(disk / "data") as client:
+                wait_until(lambda: health_of(client) == (True, True, False))
+                with pytest.raises(SystemExit) as caught:
+                    main(["--address", client.address, "health"])
+            told = "SERVING\nLocalizationService SERVING\nReferenceService NOT_SERVING\n"
+            assert (caught.value.code, capsys.readouterr().out) == (0, told)
 
     def serves_queries_alone(self, client: HealthClient) -> None:
         assert is_answered(client)

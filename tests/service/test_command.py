@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,9 +16,13 @@ import pytest
 from google.protobuf import json_format
 from servers import CAMERA, PHOTO, RunningServer, pose
 
+import mapless
 from mapless import wire
 from mapless.__main__ import main
 from mapless.cli.arguments import make_parser
+
+HEALTHY = "SERVING\nLocalizationService SERVING\nReferenceService SERVING\n"
+CLIENT = Path(mapless.__file__).parents[1]
 
 
 def run(server: RunningServer, capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, Any, str]:
@@ -44,7 +51,7 @@ def test_from_an_empty_server_to_a_pose(
     photo.write_bytes(PHOTO)
     pose_json = json_format.MessageToJson(wire.transform_to_message(pose(1.0)))
 
-    assert run(server, capsys, "health") == (0, "SERVING\n", "")
+    assert run(server, capsys, "health") == (0, HEALTHY, "")
     assert run(server, capsys, "scene", "create", "kitchen")[1]["scene_id"] == "kitchen"
     localize = ("localize", "kitchen", str(photo), "--camera", camera_json)
     code, answer, _ = run(server, capsys, *localize)
@@ -269,6 +276,34 @@ def test_what_is_wrong_is_said_before_anything_is_asked(
     assert "Traceback" not in complaint
 
 
+@pytest.mark.parametrize("command", ["localize", "retrieve"])
+def test_no_references_at_all_is_no_number_to_choose(capsys: pytest.CaptureFixture[str], command: str) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([command, "s", "photo.jpg", "--camera", "c.json", "--count", "0"])
+    assert (caught.value.code, "--count: must be at least 1, is 0" in capsys.readouterr().err) == (2, True)
+
+
+def test_an_interruption_while_the_command_is_loaded_is_quiet(tmp_path: Path) -> None:
+    """The module stands in for the client's own, and interrupts while it is being loaded."""
+    (tmp_path / "mapless").mkdir()
+    (tmp_path / "mapless" / "__init__.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
+    program = (
+        "import signal\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # whoever runs the tests may have it ignored
+        "from mapless_command import main\nmain()"
+    )
+    paths = os.pathsep.join([str(tmp_path), str(CLIENT)])
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (128 + signal.SIGINT, "", "")
+
+
 @pytest.mark.parametrize("command", [["health"], ["scene", "list"]])
 def test_how_to_connect_may_be_said_before_and_after_the_command(
     server: RunningServer, capsys: pytest.CaptureFixture[str], command: list[str]
@@ -297,4 +332,4 @@ def test_the_address_is_that_of_the_environment(
     monkeypatch.setenv("MAPLESS_ADDRESS", server.address)
     with pytest.raises(SystemExit) as caught:
         main(["health"])
-    assert (caught.value.code, capsys.readouterr().out) == (0, "SERVING\n")
+    assert (caught.value.code, capsys.readouterr().out) == (0, HEALTHY)

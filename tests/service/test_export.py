@@ -13,7 +13,8 @@ import pytest
 import typer
 from images import encode, textured
 from layouts import CAMERA, assert_same_camera, assert_same_pose, by_name, truth
-from servers import RunningServer
+from planted_damage import damage
+from servers import RunningServer, serving
 from typer.testing import CliRunner, Result
 
 from mapless import Client, Datum, NewReference, Scene
@@ -23,6 +24,8 @@ from mapless_server.formats import read_dataset
 from mapless_server.formats.colmap.writing import PosedImage
 from mapless_server.formats.writing import cameras_files
 from mapless_server.ingest.command import export_command, import_command
+from mapless_server.store import Store
+from mapless_server.tenancy import SceneKey
 
 app = typer.Typer()
 app.command("import")(import_command)
@@ -135,3 +138,34 @@ def test_scenes_that_are_not_there_or_empty_and_layouts_that_are_not_written(
     done = run(server, "export", scene, tmp_path / "c", "--format", "7scenes")
     assert (done.exit_code, "cameras or colmap" in done.stderr) == (2, True)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("what", ["image", "pose"])
+def test_damaged_references_are_named_and_the_others_are_a_whole_export(tmp_path: Path, what: str) -> None:
+    store = Store.open(tmp_path / "data")
+    with serving(tmp_path / "data", store=store) as server, Client(server.address) as client:
+        client.create_scene("s")
+        client.add_references(
+            "s", [NewReference(f"r{i}", encode(".png", textured(seed=i)), CAMERA, truth().poses[i]) for i in range(3)]
+        )
+        damage(store, SceneKey("s"), "r1", what)
+        done = run(server, "export", "s", tmp_path / "out")
+        assert done.exit_code == 1
+        assert "skipped: reference 'r1' is damaged" in done.stderr
+        assert "2 of 3 written, 1 damaged" in done.stderr
+        assert {file.name for file in (tmp_path / "out" / "images").iterdir()} == {"r0.png", "r2.png"}
+        again = run(server, "import", tmp_path / "out", "copy", "--skip-check")
+        assert again.exit_code == 0, again.output
+        assert "2 added" in again.stdout
+        assert [it.reference_id for it in client.list_references("copy")] == ["r0", "r2"]
+
+
+def test_where_all_are_damaged_nothing_is_left_that_keeps_the_next_export_out(tmp_path: Path) -> None:
+    store = Store.open(tmp_path / "data")
+    with serving(tmp_path / "data", store=store) as server, Client(server.address) as client:
+        client.create_scene("s")
+        client.add_reference("s", NewReference("r0", encode(".png", textured()), CAMERA, truth().poses[0]))
+        damage(store, SceneKey("s"), "r0", "image")
+        for _ in range(2):
+            done = run(server, "export", "s", tmp_path / "out")
+            assert (done.exit_code, "0 of 1 written, 1 damaged" in done.stderr) == (1, True)

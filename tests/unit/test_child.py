@@ -1,5 +1,6 @@
 """A server as a child process: it is told apart from one that does not start, and always ends."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -50,6 +51,19 @@ def test_a_child_s_store_is_the_one_it_is_given(monkeypatch: pytest.MonkeyPatch,
     assert "--data-dir" not in other_command
     assert "secret" not in " ".join(other_command)
     assert other_environment["MAPLESS_DATABASE_URL"] == "postgresql://u:secret@ours/db"
+
+
+def test_a_log_in_a_file_has_what_a_child_that_does_not_start_says(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "server.log"
+    with (
+        pytest.raises(child.ServerFailed, match=rf"is in {re.escape(str(log))}$"),
+        child.child_server(tmp_path / "data", {"--workers": "none"}, log=log),
+    ):
+        pass
+    assert "workers" in log.read_text()
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("module", [None, "mapless_server.load.no_op"])

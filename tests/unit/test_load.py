@@ -1,6 +1,7 @@
 """The load generator: arrivals are Poisson's, every call is accounted for once, and time counts from the intention."""
 
 import asyncio
+import itertools
 import json
 import math
 import os
@@ -29,7 +30,7 @@ from mapless_server.load.chart import SIZE_PX, draw_load
 from mapless_server.load.no_op import CAMERA, padded_photo
 from mapless_server.load.pipeline import PipelineOptions, PipelineResult, pipeline_checks, pipeline_json
 from mapless_server.load.records import CallRecord, Fate, account_of, latencies, percentile
-from mapless_server.load.report import check_lines, step_lines, update_json
+from mapless_server.load.report import Check, check_lines, machine_lines, step_lines, update_json
 from mapless_server.load.requests import photo_request, read_answer
 from mapless_server.load.scrape import Scrape, parse_metrics, reconcile
 from mapless_server.load.sender import Target, connected, send_closed_loop, send_open_loop
@@ -324,6 +325,31 @@ def test_a_closed_loop_keeps_so_many_calls_in_progress_and_goes_round_the_reques
     assert max(seen.values()) - min(seen.values()) <= 1
 
 
+def test_who_is_refused_in_a_closed_loop_comes_back_when_the_server_asks_for_it() -> None:
+    came_s: list[float] = []
+
+    async def handler(_: bytes, context: Any) -> bytes:
+        came_s.append(asyncio.get_running_loop().time())
+        status = status_pb2.Status(code=8, message="too much to do")
+        for detail in (
+            error_details_pb2.ErrorInfo(reason="QUEUE_FULL"),
+            error_details_pb2.RetryInfo(retry_delay={"nanos": 100_000_000}),
+        ):
+            status.details.add().Pack(detail)
+        context.set_trailing_metadata((("grpc-status-details-bin", status.SerializeToString()),))
+        await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, "too much to do")
+        return b""
+
+    async def run() -> list[CallRecord]:
+        async with toy_server(handler) as target:
+            return await send_closed_loop(target, [b"a"], 1, 0.55)
+
+    records = asyncio.run(run())
+    assert {(it.fate, it.retry_after_s) for it in records} == {(Fate.REFUSED, 0.1)}
+    assert 2 <= len(records) <= 6
+    assert min(later - sooner for sooner, later in itertools.pairwise(came_s)) > 0.09
+
+
 # The server's process and its own account
 
 
@@ -534,3 +560,10 @@ def test_a_step_watches_the_process_and_takes_the_servers_account_of_that_time_o
     assert measured.answers == 3
     assert len(measured.samples) >= 2
     assert [s.at_s for s in measured.samples] == sorted(s.at_s for s in measured.samples)
+
+
+def test_the_machine_is_blamed_for_a_missed_bar_where_more_wanted_to_run_than_it_has_cores_and_only_there() -> None:
+    met, missed = (Check("overdue", "", "0", it) for it in (True, False))
+    assert "6.3 threads wanted to run on 2 cores" in machine_lines([met, missed], 6.3, 2)[0]
+    assert machine_lines([met, missed], 1.9, 2) == []
+    assert machine_lines([met], 6.3, 2) == []

@@ -17,7 +17,7 @@ from mapless_server.load.arrivals import Kind, Mix, Requests, plan_calls
 from mapless_server.load.records import CallRecord, Fate
 from mapless_server.load.scrape import Series
 from mapless_server.load.slopes import MIN_SAMPLES, Slope, slope
-from mapless_server.load.soak import MIN_SETTLED_S, UNITS, SoakOptions, slopes_of
+from mapless_server.load.soak import MIN_SETTLED_S, UNITS, SoakOptions, least_minutes, slopes_of
 from mapless_server.load.soak_chart import draw_soak
 from mapless_server.load.state import ServerState, Watched, read_state
 
@@ -105,6 +105,18 @@ def test_slopes_leave_out_the_settling_and_say_nothing_of_too_short_a_time() -> 
     assert set(slopes) == set(UNITS)
     assert slopes["resident_mib"].is_flat
     assert slopes_of(climbing, 3600 - MIN_SETTLED_S) == {}
+
+
+@pytest.mark.parametrize("options", [SoakOptions(), SoakOptions(settle_share=0.0), SoakOptions(sample_every_s=60.0)])
+def test_the_least_minutes_give_slopes_and_three_fewer_give_none(options: SoakOptions) -> None:
+    def looked_at(minutes: float) -> dict[str, Slope]:
+        # The first look comes at once, the last before the end.
+        times = np.arange(0.0, 60 * minutes, options.sample_every_s).tolist()
+        return slopes_of([state(at) for at in times], options.settle_share * 60 * minutes)
+
+    least = least_minutes(options)
+    assert set(looked_at(least)) == set(UNITS)
+    assert looked_at(least - 3) == {}
 
 
 def test_a_process_is_looked_at_with_its_files_sockets_and_folder(

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 from typing import Any
 
-from google.protobuf import empty_pb2, wrappers_pb2
+from google.protobuf import wrappers_pb2
 
 from ..exchange import Call, Exchange
 
-# grpc.health.v1 in messages that every protobuf has, which spares robots a package: the request for the whole server is
-# empty, and the answer is an enum in field 1.
-_EMPTY: Any = empty_pb2  # neither module is annotated
-_WRAPPERS: Any = wrappers_pb2
+# grpc.health.v1 in messages that every protobuf has, which spares robots a package: the request is the service's name
+# in field 1, empty for the whole server, and the answer an enum in field 1.
+_WRAPPERS: Any = wrappers_pb2  # the module is not annotated
 _METHOD = "grpc.health.v1.Health/Check"
 _SERVING = 1
 
+SERVICES = ("mapless.v1.LocalizationService", "mapless.v1.ReferenceService")
+"""What can be asked for by itself: a server whose store cannot be written answers queries all the same."""
 
-def is_serving(*, timeout_s: float | None = None) -> Exchange[bool]:
-    """Whether the server takes calls; False while it starts or drains, an error if it cannot be reached."""
-    response = yield Call(_METHOD, _EMPTY.Empty(), _WRAPPERS.UInt32Value, timeout_s)
+
+def is_serving(service: str = "", *, timeout_s: float | None = None) -> Exchange[bool]:
+    """Whether the server takes calls; False while it starts or drains, an error if it cannot be reached.
+
+    Args:
+        service: one of `SERVICES`, "mapless.v1.ReferenceService", that alone is meant; empty for the whole server.
+        timeout_s: deadline of the call.
+    """
+    response = yield Call(_METHOD, _WRAPPERS.StringValue(value=service), _WRAPPERS.UInt32Value, timeout_s)
     return bool(response.value == _SERVING)

@@ -31,6 +31,8 @@ POSE is a JSON file likewise, RigidTransform:
 """
 
 
+_COUNT_DEFAULT = "(default: as many as the server thinks best)"
+
 _CONNECTION_DEFAULTS: dict[str, Any] = {
     "timeout": 30.0,
     "tls": False,
@@ -62,7 +64,14 @@ def make_parser() -> argparse.ArgumentParser:
     _add_connection(parser)
     parser.set_defaults(**_CONNECTION_DEFAULTS, address=default_address())
     groups = parser.add_subparsers(title="commands", required=True, metavar="COMMAND", parser_class=_Command)
-    groups.add_parser("health", help="whether the server takes calls").set_defaults(run=commands.health)
+    health = groups.add_parser(
+        "health",
+        help="whether the server takes calls",
+        description="The server as a whole, then each service. The ReferenceService alone is NOT_SERVING while the "
+        "store cannot be written: queries are answered, changes refused. Exit code 0 if the server as a whole serves, "
+        "else 1.",
+    )
+    health.set_defaults(run=commands.health)
     _add_scene(groups.add_parser("scene", help="create, update, get, list, delete"))
     _add_reference(groups.add_parser("reference", help="add, list, delete"))
     _add_localize(groups.add_parser("localize", help="where a photograph was taken, or a folder of them"))
@@ -169,7 +178,9 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
         "--camera", help="that took it, or all, see `mapless --help`; beside or in a cameras.json none is needed"
     )
     command.add_argument("--reference", action="append", default=[], help="compare with this one; may be repeated")
-    command.add_argument("--count", type=int, default=0, help="how many references the server chooses")
+    command.add_argument(
+        "--count", type=_count, default=0, help=f"how many references the server chooses {_COUNT_DEFAULT}"
+    )
     command.add_argument("--rerank", action="store_true", help="the server chooses among those given")
     _add_priors(command)
     command.add_argument(
@@ -201,12 +212,20 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=localize.run)
 
 
+def _count(text: str) -> int:
+    """At least 1: in a request 0 leaves the number to the server, which is what leaving out the flag says."""
+    count = int(text)
+    if count < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, is {count}")
+    return count
+
+
 def _add_questions(groups: argparse._SubParsersAction[_Command]) -> None:
     retrieve = groups.add_parser("retrieve", help="the references that resemble a photograph most")
     retrieve.add_argument("scene")
     retrieve.add_argument("photo", type=Path)
     retrieve.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
-    retrieve.add_argument("--count", type=int, default=0, help="how many")
+    retrieve.add_argument("--count", type=_count, default=0, help=f"how many {_COUNT_DEFAULT}")
     _add_priors(retrieve)
     retrieve.set_defaults(run=commands.retrieve)
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from typing import Any
 
+from ..calls.health import SERVICES
 from ..cameras import read_camera, read_pose
 from ..client import Client
+from ..errors import NotFound
 from ..geodesy import Datum
 from ..geometry import Quaternion
 from ..requests import NewReference
@@ -14,11 +17,17 @@ from .exits import EXIT_FAILED, EXIT_REJECTED
 from .localize import priors
 from .output import print_json
 
+_STATE = {True: "SERVING", False: "NOT_SERVING"}
+
 
 def health(client: Client, arguments: argparse.Namespace) -> int:
-    """Whether the server takes calls."""
+    """Whether the server takes calls, and each of its services: changes can be refused while queries are answered."""
     serving = client.is_serving()
-    print("SERVING" if serving else "NOT_SERVING")
+    print(_STATE[serving])
+    for service in SERVICES:
+        # A proxy that answers for its servers may know the whole alone.
+        with suppress(NotFound):
+            print(f"{service.rpartition('.')[2]} {_STATE[client.is_serving(service)]}")
     return 0 if serving else EXIT_FAILED
 
 

@@ -95,7 +95,10 @@ def export_command(
     token_file: TokenFile = None,
     client_id: ClientId = "",
 ) -> None:
-    """Write the references of a scene to a folder, their images bit by bit as they are stored."""
+    """Write the references of a scene to a folder, their images bit by bit as they are stored.
+
+    One that is damaged in the store is named and left out; the exit code is then 1, and the folder whole without it.
+    """
     from mapless import MaplessError
 
     from ..child import ServerFailed
@@ -103,19 +106,25 @@ def export_command(
     from ..settings import ConfigError, load_settings
     from ..signals import terminable
     from .connection import Connection, connected
-    from .exporting import Damaged, check_target, export_scene
+    from .exporting import check_target, export_scene
 
     try:
         check_target(folder, format)
         settings = load_settings({}).settings
         connection = Connection(address, tls, ca, cert, key, token_file, client_id)
         with terminable(), connected(connection, settings) as client, progress_bars() as progress:
-            count = export_scene(client, scene, folder, format, progress)
+            export = export_scene(client, scene, folder, format, progress)
     except (ValueError, ConfigError) as error:
         _fail(str(error))
-    except (MaplessError, ServerFailed, Damaged, OSError) as error:
+    except (MaplessError, ServerFailed, OSError) as error:
         _fail(str(error), code=1)
-    print(f"{count} references of scene {scene} are in {folder}")
+    for reason in export.damaged.values():
+        _say(f"skipped: {reason}")
+    where = f"references of scene {scene} are in {folder}"
+    if export.damaged:
+        count = len(export.damaged)
+        _fail(f"{export.written} of {export.total} written, {count} damaged; the {export.written} {where}", code=1)
+    print(f"{export.written} {where}")
 
 
 def _run_import(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import random
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import count, takewhile
@@ -70,6 +70,17 @@ class Outcomes:
         if code != "OK" and code not in BUSY and code not in expected:
             self.failures.setdefault(f"{worker}: {code}", text)
         return code == "OK"
+
+
+WORK: Mapping[str, str] = {
+    "references": "add references to the scene that is asked, and delete the oldest",
+    "scenes": "make scenes, ask in them, and delete them",
+    "watch queries": "watch the queries for a while",
+    "watch health": "watch the health for a while",
+    "comers": "come on a new connection each time, ask a little and go, one in three in the middle of a call",
+    "wrong": "ask for what is to be refused",
+}
+"""What the workers do, by the names that their calls are counted under."""
 
 
 @dataclass(frozen=True)

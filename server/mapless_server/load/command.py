@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +16,8 @@ if TYPE_CHECKING:
     from .report import Check
 
 load_app = typer.Typer(
-    help="Measure what the server does under load; writes load-output/load.json and load-output/load.png.",
+    help="Measure what the server does under load. Figures go to load-output/load.json, pictures beside it: load.png "
+    "of the pipeline, soak.svg of the soak; and the server's log.",
     no_args_is_help=True,
 )
 
@@ -91,50 +93,71 @@ def _overhead(quick: bool, output: Path) -> list[Check]:
 
 def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
     from ..evaluation.command import usage_errors
+    from ..settings import available_cores
     from .chart import draw_load
     from .pipeline import PipelineOptions, measure_pipeline, pipeline_checks, pipeline_json
-    from .report import step_lines
+    from .report import machine_lines, step_lines
     from .requests import place_of
 
     brief = {"unloaded_s": 4.0, "ramp_s": 4.0, "step_s": 6.0, "settle_s": 1.0} if quick else {}
     with _measuring() as progress:
         with usage_errors():
             options, place = PipelineOptions(**(given | brief)), place_of(data)
-        result = measure_pipeline(place, options, progress)
+        log = _new_log(output, "pipeline")
+        result = measure_pipeline(place, options, progress, log)
+        load = os.getloadavg()[0]
     checks = pipeline_checks(result)
-    output.mkdir(parents=True, exist_ok=True)
     (output / "load.png").write_bytes(draw_load(result))
-    _report(output, "pipeline", [f"{result.scene}:", "", *step_lines(result.all_steps)], checks, pipeline_json(result))
+    lines = [f"{result.scene}:", "", *step_lines(result.all_steps), *machine_lines(checks, load, available_cores())]
+    _report(output, "pipeline", lines, checks, pipeline_json(result), output / "load.png", log)
     return checks
 
 
 def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
     from ..evaluation.command import usage_errors
-    from .report import step_lines
+    from ..settings import available_cores
+    from .report import machine_lines, step_lines
     from .requests import place_of
-    from .soak import SoakOptions, measure_soak, soak_checks, soak_json, soak_lines
+    from .soak import SoakOptions, least_minutes, measure_soak, soak_checks, soak_json, soak_lines
     from .soak_chart import draw_soak
 
     brief = {"minutes": 0.25, "ramp_s": 4.0, "sample_every_s": 0.5, "churn": 4.0} if quick else {}
     with _measuring() as progress:
         with usage_errors():
             options, place = SoakOptions(**(given | brief)), place_of(data)
-        result = measure_soak(place, options, progress)
+        least = least_minutes(options)
+        if options.minutes < least:
+            note = f"note: {options.minutes:g} minutes are too short to tell growth from settling; {least} are enough"
+            print(note, file=sys.stderr, flush=True)
+        log = _new_log(output, "soak")
+        result = measure_soak(place, options, progress, log)
+        load = os.getloadavg()[0]
     checks = soak_checks(result)
-    lines = [f"{result.scene}:", "", *step_lines([*result.before, result.soak]), *soak_lines(result)]
-    output.mkdir(parents=True, exist_ok=True)
+    steps = step_lines([*result.before, result.soak])
+    lines = [f"{result.scene}:", "", *steps, *soak_lines(result), *machine_lines(checks, load, available_cores())]
     (output / "soak.svg").write_text(draw_soak(result.states, result.slopes), encoding="utf-8")
-    _report(output, "soak", lines, checks, soak_json(result))
+    _report(output, "soak", lines, checks, soak_json(result), output / "soak.svg", log)
     return checks
 
 
-def _report(output: Path, part: str, lines: list[str], checks: list[Check], figures: dict[str, Any]) -> None:
-    """Prints a part, and puts it into the JSON file beside the others."""
+def _new_log(output: Path, part: str) -> Path:
+    """An empty file for the log of the part's server, which would be in the way of progress and tables."""
+    output.mkdir(parents=True, exist_ok=True)
+    log = output / f"{part}-server.log"
+    log.write_bytes(b"")
+    return log
+
+
+def _report(
+    output: Path, part: str, lines: list[str], checks: list[Check], figures: dict[str, Any], *files: Path
+) -> None:
+    """Prints a part, puts it into the JSON file beside the others, and says where that and its other files are."""
     from .report import check_lines, machine, update_json
 
     print("\n".join([f"## {part}", "", machine(), "", *lines, *check_lines(checks)]), flush=True)
     output.mkdir(parents=True, exist_ok=True)
     update_json(output / "load.json", part, figures, checks)
+    print(f"Written: {', '.join(map(str, [output / 'load.json', *files]))}\n", flush=True)
 
 
 @contextmanager

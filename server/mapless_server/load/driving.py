@@ -48,11 +48,11 @@ class LoadedServer:
 
 @contextmanager
 def server_with_scene(
-    place: Place, progress: Progress, environment: Mapping[str, str] | None = None
+    place: Place, progress: Progress, environment: Mapping[str, str] | None = None, log: Path | None = None
 ) -> Iterator[LoadedServer]:
     """A server of its own with the references of a place stored, that has answered every query once.
 
-    Settings of the environment hold for it, and `environment` is added to it.
+    Settings of the environment hold for it, and `environment` is added to it. Its log is added to the file `log`.
 
     Raises:
         ServerFailed: it did not start.
@@ -61,7 +61,7 @@ def server_with_scene(
     port = free_port()
     with tempfile.TemporaryDirectory(prefix="mapless-load-") as data_dir:
         flags = {"--metrics-port": str(port), "--metrics-host": "127.0.0.1"}
-        with child_server(Path(data_dir), flags, environment) as server:
+        with child_server(Path(data_dir), flags, environment, log) as server:
             with Client(server.address, CONNECT) as client:
                 progress("storing references", 0, len(place.references))
                 store_references(client, place.references)

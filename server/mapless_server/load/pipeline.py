@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from ..demo.run import Place
@@ -86,7 +87,9 @@ class PipelineResult:
         return dict(zip(self.options.shares, self.steps, strict=True)).get(share)
 
 
-def measure_pipeline(place: Place, options: PipelineOptions, progress: Progress) -> PipelineResult:
+def measure_pipeline(
+    place: Place, options: PipelineOptions, progress: Progress, log: Path | None = None
+) -> PipelineResult:
     """Starts a server, finds what it can do at most, and offers it shares of that.
 
     Raises:
@@ -94,7 +97,7 @@ def measure_pipeline(place: Place, options: PipelineOptions, progress: Progress)
         MaplessError: a call before the measurement failed.
         RuntimeError: it answered nothing.
     """
-    with server_with_scene(place, progress) as server:
+    with server_with_scene(place, progress, log=log) as server:
         return asyncio.run(_measure(place, server, options, progress))
 
 

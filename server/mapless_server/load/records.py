@@ -50,6 +50,7 @@ class CallRecord:
         deadline_s: what it was given, seconds from sending.
         code: name of the gRPC status.
         detail: of an answer what it says, of an error its reason; empty where only our own side knows of it.
+        retry_after_s: when a refusal asks to be tried again, seconds, or None.
     """
 
     kind: Kind
@@ -60,6 +61,7 @@ class CallRecord:
     deadline_s: float
     code: str
     detail: str
+    retry_after_s: float | None = None
 
     @property
     def latency_s(self) -> float:

@@ -51,7 +51,7 @@ def step_lines(steps: Sequence[Step]) -> list[str]:
     """A table with a row a step, and below it how every call ended."""
     lines = [
         "| step | offered/s | sent | goodput/s | refused/s | answers p50 / p95 / p99 ms | refusals p50 / p99 / max ms "
-        "| overdue | server CPU s/answer | RSS MiB | threads | fds | generator's core |",
+        "| overdue | server CPU s/answer | RSS MiB, before > after | threads | fds | generator's core |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for step in steps:
@@ -90,6 +90,24 @@ def loop_lag_check(steps: Sequence[Step], bar_s: float = 0.02) -> Check:
     )
     met = None if longest is None else longest <= bar_s
     return Check("longest the event loop was held up", value, f"{1000 * bar_s:g} ms", met)
+
+
+def machine_lines(checks: Sequence[Check], load: float, cores: int) -> list[str]:
+    """A hint where bars are missed and more wanted to run than there are cores for.
+
+    Args:
+        checks: the bars.
+        load: how many threads ran or waited for a core, on average (the system's load average of a minute).
+        cores: that there are.
+    """
+    if load <= cores or all(check.met is not False for check in checks):
+        return []
+    return [
+        f"Some {load:.1f} threads wanted to run on {cores} cores, load generator and whatever else runs here among "
+        "them. Bars that depend on time (deadlines, the event loop) then say as much of the machine as of the server: "
+        "measure with more cores, nothing else running, or a lower rate.",
+        "",
+    ]
 
 
 def trend_check(figure: str, line: Trend | None, unit: str) -> Check:

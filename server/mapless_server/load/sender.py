@@ -14,12 +14,14 @@ from typing import Any
 
 import grpc
 
-from mapless.errors import from_rpc_error
+from mapless.errors import MaplessError, from_rpc_error
 
 from .arrivals import Kind, PlannedCall
-from .records import CallRecord
+from .records import CallRecord, Fate
 
 MAX_MESSAGE_BYTES = 64 * 2**20
+REFUSED_PAUSE_S = 0.1
+"""Before a caller in a closed loop comes back whom the server refuses without saying when to."""
 
 ReadAnswer = Callable[[bytes], str]
 """What an answer says, in a few words."""
@@ -98,7 +100,8 @@ async def send_closed_loop(
 ) -> list[CallRecord]:
     """Keeps so many calls in progress for a while: what a server can do at most; with one, what an unloaded one does.
 
-    Says nothing about latency under load, since the callers wait for the server.
+    Says nothing about latency under load, since the callers wait for the server. One that is refused comes back
+    when the server asks for it: refusals are cheap, and would be most of what is measured.
     """
     loop = asyncio.get_running_loop()
     begin_s = loop.time()
@@ -109,7 +112,11 @@ async def send_closed_loop(
         while (at_s := loop.time() - begin_s) < duration_s:
             number = next(numbers)
             planned = PlannedCall(at_s, number, Kind.QUERY, requests[number % len(requests)])
-            records.append(await _call(target, planned, begin_s))
+            record = await _call(target, planned, begin_s)
+            records.append(record)
+            if record.fate is Fate.REFUSED:
+                left_s = max(0.0, begin_s + duration_s - loop.time())
+                await asyncio.sleep(min(record.retry_after_s or REFUSED_PAUSE_S, left_s))
 
     await asyncio.gather(*(keep_calling() for _ in range(concurrency)))
     return records
@@ -123,13 +130,15 @@ async def _call(target: Target, planned: PlannedCall, begin_s: float) -> CallRec
     hang_up = None
     if planned.cancel_after_s is not None:
         hang_up = loop.call_later(planned.cancel_after_s, call.cancel)
+    retry_after_s = None
     try:
         answer = await call
         ended_s = loop.time()
         code, detail = "OK", target.read_answer(answer)
     except grpc.aio.AioRpcError as error:
         ended_s = loop.time()
-        code, detail = error.code().name, _reason(error)
+        known = from_rpc_error(error)
+        code, detail, retry_after_s = known.code, _reason(known), known.retry_after_s
     except asyncio.CancelledError:
         if not call.cancelled() or hang_up is None:
             raise  # this task is cancelled, not the call
@@ -147,10 +156,10 @@ async def _call(target: Target, planned: PlannedCall, begin_s: float) -> CallRec
         deadline_s,
         code,
         detail,
+        retry_after_s,
     )
 
 
-def _reason(error: grpc.aio.AioRpcError) -> str:
+def _reason(known: MaplessError) -> str:
     """The server's own; empty if it gave none, or did not speak."""
-    known = from_rpc_error(error)
     return "" if known.reason == known.code and not known.request_id else known.reason

@@ -8,15 +8,17 @@ machine with other work can bear.
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from ..demo.run import Place
 from ..progress import Progress
 from .arrivals import Mix
-from .churn import Outcomes, Workers, churning
+from .churn import WORK, Outcomes, Workers, churning
 from .driving import LoadedServer, calling, closed_step, find_saturation, open_step, server_with_scene
 from .records import Fate
 from .report import Check, loop_lag_check
@@ -114,15 +116,15 @@ class SoakResult:
     account: Reconciliation | None
 
 
-def measure_soak(place: Place, options: SoakOptions, progress: Progress) -> SoakResult:
-    """Starts a server, finds what it can do at most unless a rate is given, and keeps it busy.
+def measure_soak(place: Place, options: SoakOptions, progress: Progress, log: Path | None = None) -> SoakResult:
+    """Starts a server, finds what it can do unless a rate is given, and keeps it busy; its log is added to `log`.
 
     Raises:
         ServerFailed: it did not start.
         MaplessError: a call before the measurement failed.
         RuntimeError: it answered nothing, or ended.
     """
-    with server_with_scene(place, progress, {"MAPLESS_ALLOW_WATCHING": "true"}) as server:
+    with server_with_scene(place, progress, {"MAPLESS_ALLOW_WATCHING": "true"}, log) as server:
         return asyncio.run(_measure(place, server, options, progress))
 
 
@@ -134,14 +136,21 @@ def slopes_of(found: Sequence[ServerState], settle_s: float) -> dict[str, Slope]
     return {field: slope(column(settled, "at_s"), column(settled, field)) for field in UNITS}
 
 
+def least_minutes(options: SoakOptions) -> int:
+    """How long a soak has to be for slopes."""
+    # The first look after the settling and the last one before the end each come up to one interval off.
+    settled_s = max(MIN_SETTLED_S, (MIN_SAMPLES - 1) * options.sample_every_s) + 2 * options.sample_every_s
+    return math.ceil(settled_s / (1 - options.settle_share) / 60 - 1e-9)
+
+
 def soak_checks(result: SoakResult) -> list[Check]:
     """The bars."""
     step = result.soak
     overdue, failed = step.account.count(Fate.OVERDUE), step.account.count(Fate.FAILED)
     failures = "; ".join(f"{what} ({text})" for what, text in result.outcomes.failures.items())
     return [
-        *(_slope_check(field, result.slopes.get(field), field in BOUND) for field in UNITS),
-        _account_check(result.account),
+        *(_slope_check(field, result.slopes.get(field), field in BOUND, result.options) for field in UNITS),
+        _account_check(result),
         Check("accepted calls that ended after their deadline", str(overdue), "0", overdue == 0),
         Check("calls that failed", str(failed), "0", failed == 0),
         Check("calls beside the queries that failed", failures or "0", "0", not failures),
@@ -151,8 +160,11 @@ def soak_checks(result: SoakResult) -> list[Check]:
 
 def soak_lines(result: SoakResult) -> list[str]:
     """What went on beside the queries."""
-    told = ", ".join(f"{count} {worker} {code}" for (worker, code), count in sorted(result.outcomes.counts.items()))
-    return [f"Beside the queries: {told or 'nothing'}.", ""]
+    told: dict[str, list[str]] = {}
+    for (worker, code), count in sorted(result.outcomes.counts.items()):
+        told.setdefault(worker, []).append(f"{count} {code}")
+    lines = [f"- {worker}, who {WORK[worker]}: {', '.join(counts)}" for worker, counts in told.items()]
+    return ["Beside the queries, by how calls ended:", "", *(lines or ["- nothing"]), ""]
 
 
 def soak_json(result: SoakResult) -> dict[str, Any]:
@@ -215,10 +227,10 @@ def _mix(options: SoakOptions, p50_ms: float) -> Mix:
     )
 
 
-def _slope_check(field: str, found: Slope | None, is_bound: bool) -> Check:
+def _slope_check(field: str, found: Slope | None, is_bound: bool, options: SoakOptions) -> Check:
     figure, bar = f"slope of {field}", f"0 within {100 * CONFIDENCE:.0f} %" if is_bound else "told"
     if found is None:
-        return Check(figure, "-", bar, None)
+        return Check(figure, f"{options.minutes:g} minutes are too short, {least_minutes(options)} are not", bar, None)
     unit = f" {UNITS[field]}".rstrip()
     value = (
         f"{found.per_hour:+.3g} ({found.low:+.3g} to {found.high:+.3g}){unit}/h around {found.level:.6g}: "
@@ -227,12 +239,15 @@ def _slope_check(field: str, found: Slope | None, is_bound: bool) -> Check:
     return Check(figure, value, bar, not found.grows if is_bound else None)
 
 
-def _account_check(account: Reconciliation | None) -> Check:
-    figure, bar = "calls in the server's metrics", "every one accounted for"
+def _account_check(result: SoakResult) -> Check:
+    account = result.account
+    figure, bar = "Localize calls of the soak in the server's metrics", "every one accounted for"
     if account is None:
         return Check(figure, "-", bar, None)
     value = (
-        f"{account.sent} sent, {account.handled} counted; {account.unseen} given up before the server began with them"
+        f"{account.sent} sent ({result.soak.account.sent} queries, {account.sent - result.soak.account.sent} of those "
+        f"beside them; the steps before are not among them), {account.handled} counted; {account.unseen} given up "
+        "before the server began with them"
     )
     if account.missing or account.surplus or account.running:
         value += f"; missing {dict(account.missing)}, surplus {account.surplus}, still running {account.running}"
