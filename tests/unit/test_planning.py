@@ -17,8 +17,18 @@ from mapless_server.planning import figures
 from mapless_server.planning.__main__ import main
 from mapless_server.planning.caching import LeastRecentlyUsed, expected_hit_rate
 from mapless_server.planning.city import City, visits, zipf
-from mapless_server.planning.curves import charts, of_ranking, svg
-from mapless_server.planning.fleet import Fleet, Routing, preferences, simulate
+from mapless_server.planning.curves import (
+    DEVICES,
+    DISTRICTS,
+    SECONDS,
+    SEED,
+    SETTLED_S,
+    cached_places,
+    charts,
+    of_ranking,
+    svg,
+)
+from mapless_server.planning.fleet import Fleet, Routing, districts_of, fullest_district, preferences, simulate
 from mapless_server.planning.queueing import (
     latencies_s,
     spread_services,
@@ -181,8 +191,50 @@ def test_after_a_loss_nothing_goes_to_what_is_lost() -> None:
         assert set(run.devices[run.arrivals_s < 10.0]) & {0, 1}
 
 
+@pytest.mark.parametrize("routing", Routing)
+def test_scenes_of_a_district_are_answered_by_its_devices_alone(routing: Routing) -> None:
+    fleet = Fleet(12, 100, routing, districts=3)
+    run = simulate(TOWN, fleet, 60, seed=1, lost=6, lost_at_s=30.0)
+    parts = [run.of_district(district, 3) for district in range(3)]
+    assert sum(len(part.hits) for part in parts) == len(run.hits)
+    shares = np.bincount(districts_of(TOWN.scenes, 3), TOWN.scene_shares(), 3)
+    for district, part in enumerate(parts):
+        assert set(part.devices) == set(range(district, 12, 3))
+        # Of devices in a row each district loses as many.
+        assert set(part.devices[part.arrivals_s >= 30.0]) == {6 + district, 9 + district}
+        assert len(part.hits) / len(run.hits) == pytest.approx(shares[district], abs=0.07)
+    assert fullest_district(TOWN, 3) == (int(shares.argmax()), float(shares.max()))
+
+
+@pytest.mark.parametrize(("districts", "in_half", "in_one_of_ten"), [(4, 0.30, 0.33), (8, 0.18, 0.21)])
+def test_the_fullest_district_is_as_full_as_chance_makes_it(
+    districts: int, in_half: float, in_one_of_ten: float
+) -> None:
+    shares, generator = City().scene_shares(), np.random.default_rng(0)
+    fullest = [np.bincount(generator.integers(districts, size=len(shares)), shares).max() for _ in range(500)]
+    assert np.quantile(fullest, 0.5) == pytest.approx(in_half, abs=0.005)
+    assert np.quantile(fullest, 0.9) == pytest.approx(in_one_of_ten, abs=0.005)
+    if districts == DISTRICTS:
+        assert fullest_district(City(), districts)[1] == pytest.approx(in_one_of_ten, abs=0.005)
+        assert f"in one of ten more than {100 * in_one_of_ten:.0f} %" in " ".join(
+            (CITY / "README.md").read_text().split()
+        )
+
+
 @settings(max_examples=20)
-@given(st.sampled_from([{"devices": 0}, {"cached_places": -1}, {"balance": 1.0}, {"service_s": 0.0}, {"miss_s": -1.0}]))
+@given(
+    st.sampled_from(
+        [
+            {"devices": 0},
+            {"districts": 5},
+            {"districts": 0},
+            {"cached_places": -1},
+            {"balance": 1.0},
+            {"service_s": 0.0},
+            {"miss_s": -1.0},
+        ]
+    )
+)
 def test_a_fleet_that_cannot_be_is_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         replace(Fleet(4, 100), **wrong)  # type: ignore[arg-type]
@@ -215,7 +267,7 @@ def test_a_chart_is_a_file_of_its_own() -> None:
     assert drawn.count("<polyline") == draw(of_ranking()).count("<polyline") == 2
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_plan_shows_what_the_simulation_gives() -> None:
     """Its pictures, and the figures that its text rests on."""
     text = " ".join((CITY / "README.md").read_text().split())
@@ -229,17 +281,38 @@ def test_the_plan_shows_what_the_simulation_gives() -> None:
         (found,) = [it for it in drawn[name].curves if it.name == curve]
         return dict(found.points)[x]
 
-    by_scene, by_load = Routing.SCENE_BOUNDED.value, Routing.LOAD.value
+    by_scene, by_load, fine = Routing.SCENE_BOUNDED.value, Routing.LOAD.value, "10,000 scenes"
+    hits, p99_ms = at("memory", by_scene, 100), at("devices", by_scene, 144)
+    assert f"in the device's memory | {hits:.0f} % after half a minute" in text
+    assert f"in the fullest district alone | {p99_ms:.0f} ms |" in text
+    fleet = Fleet(DEVICES, cached_places(City()), districts=DISTRICTS)
+    long = simulate(City(), fleet, 300, SEED)
+    assert f"half a minute, {100 * long.hits[long.arrivals_s >= 270].mean():.0f} % after five" in text
+    short = simulate(City(), fleet, SECONDS, SEED)
+    assert f"it is {short.busy * DEVICES:.0f} of {DEVICES}" in text
+    fullest = short.of_district(fullest_district(City(), DISTRICTS)[0], DISTRICTS)
+    missed = 1 - fullest.hits[fullest.arrivals_s >= SETTLED_S].mean()
+    assert f"{100 * missed:.0f} % of its 330 queries/s" in text
+    assert (hits, p99_ms) == (at("balance-hits", fine, 150), at("balance-p99", fine, 150))  # one run, told thrice
     assert f"{at('memory', by_load, 100):.0f} % of the queries find their references" in text
-    assert f"it is {at('memory', by_scene, 100):.0f} %, and {at('memory', by_scene, 5):.0f} % with 5 GB" in text
-    assert f"At 1.5, as in the manifests, p99 is {at('balance-p99', '10,000 scenes', 150):.0f} ms" in text
-    assert f"at 110 (70 % busy) {at('devices', by_scene, 110):.0f} ms" in text
-    assert f"at 160 {at('devices', by_scene, 160):.0f} ms" in text
-    assert f"its p99 is {at('devices', 'one queue, sigma 0.16', 85):.0f} ms" in text
-    assert f"p99 is {at('devices', 'one queue, sigma 0.6', 160):.0f} ms even" in text
+    assert f"it is {hits:.0f} %, and {at('memory', by_scene, 5):.0f} % with 5 GB" in text
+    narrow = f"at 1.25 it is {at('balance-p99', fine, 125):.0f} ms, with {at('balance-hits', fine, 125):.0f} % instead"
+    assert f"At 1.5, as in the manifests, p99 is {p99_ms:.0f} ms; {narrow} of {hits:.0f}" in text
+    wide = f"At 3 it is {at('balance-hits', fine, 300):.0f} %, and p99 is {at('balance-p99', fine, 300) / 1000:.0f} s"
+    assert wide in text
+    few, many = at("devices", by_scene, 128), at("devices", by_scene, 176)
+    assert f"At 128 devices p99 is {few:.0f} ms, at 144 {p99_ms:.0f} ms, at 176 {many:.0f} ms" in text
+    assert f"112 would do for {at('devices', 'by scene, undivided city', 112):.0f} ms" in text
+    assert f"By load alone p99 is {at('devices', by_load, 144):.0f} ms at 144" in text
+    assert f"its p99 is {at('devices', 'one queue, sigma 0.16', 112):.0f} ms" in text
+    assert f"p99 is {at('devices', 'one queue, sigma 0.6', 176):.0f} ms even" in text
+    assert f"as 112 do: p99 {at('devices', by_scene, 112) / 1000:.1f} s" in text
     windows = dict(next(it for it in drawn["loss"].curves if it.name == "p99, by scene").points)
     before, after = (max(p99 for at_s, p99 in windows.items() if (at_s > 0) is late) for late in (False, True))
     assert f"at most {after:.0f} ms, {before:.0f} before" in text
+    assert f"at most {after:.0f} ms in any 2.5 s" in text
+    misses = dict(next(it for it in drawn["loss"].curves if it.name == "misses, by scene").points)
+    assert max(it for at_s, it in misses.items() if at_s > 0) < max(it for at_s, it in misses.items() if at_s < 0)
 
 
 def test_without_a_folder_the_command_says_what_it_wants(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,7 @@
 """How calls find devices: by their scene, by the load, or both; and how they wait there for what is before them.
 
 Each device answers one call at a time and keeps the references of so many places in memory. Those of a place that is
-not there are computed in the device.
+not there are computed in the device. A fleet may be divided into districts, which have scenes and devices of their own.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ from .caching import LeastRecentlyUsed
 from .city import City, Floats, spread, visits
 from .figures import GPU_S_PER_MISSED_REFERENCE, GPU_S_PER_QUERY
 from .queueing import spread_services
+
+DEAL = 50
+"""Seed that deals scenes to districts: the fullest of four gets 33 % of the queries; one deal in ten gives more."""
 
 
 class Routing(Enum):
@@ -37,6 +40,7 @@ class Fleet:
     Attributes:
         devices: how many.
         cached_places: whose references fit into the memory of one.
+        districts: into which scenes and devices are divided; a call finds only devices of its scene's district.
         routing: how calls find them.
         balance: what a device may have under way, as a multiple of the average; that of the manifests.
         service_s: computing for a call whose references are in memory.
@@ -51,10 +55,13 @@ class Fleet:
     service_s: float = GPU_S_PER_QUERY
     miss_s: float = GPU_S_PER_MISSED_REFERENCE
     spread: float = 0.16
+    districts: int = 1
 
     def __post_init__(self) -> None:
         if not (self.devices >= 1 and self.cached_places >= 0):
             raise ValueError("devices must be at least 1, cached_places at least 0")
+        if not 1 <= self.districts <= self.devices:
+            raise ValueError("districts must be at least 1, and no more than the devices")
         if not (self.balance > 1 and self.service_s > 0 and self.miss_s >= 0 and self.spread >= 0):
             raise ValueError("balance must be above 1, service_s above 0, miss_s and spread at least 0")
 
@@ -77,6 +84,11 @@ class Outcome:
     devices: NDArray[np.int64]
     busy: float
 
+    def of_district(self, district: int, districts: int) -> Outcome:
+        """The calls of one district; `busy` remains that of all devices."""
+        its = self.devices % districts == district
+        return Outcome(self.arrivals_s[its], self.latencies_s[its], self.hits[its], self.devices[its], self.busy)
+
     @property
     def hit_rate(self) -> float:
         """Share of the calls."""
@@ -92,6 +104,17 @@ def preferences(scenes: int, devices: int) -> NDArray[np.int64]:
     return np.argsort(np.random.default_rng(devices).random((scenes, devices)), axis=1)
 
 
+def districts_of(scenes: int, districts: int) -> NDArray[np.int64]:
+    """(scenes,) the district of each: dealt by chance, as where scenes are divided before anybody has asked."""
+    return np.random.default_rng(DEAL).integers(districts, size=scenes)
+
+
+def fullest_district(city: City, districts: int) -> tuple[int, float]:
+    """The district that most queries are for, and their share of all."""
+    shares = np.bincount(districts_of(city.scenes, districts), city.scene_shares(), districts)
+    return int(shares.argmax()), float(shares.max())
+
+
 def simulate(
     city: City, fleet: Fleet, seconds: float, seed: int, lost: int = 0, lost_at_s: float = math.inf
 ) -> Outcome:
@@ -99,7 +122,7 @@ def simulate(
 
     Args:
         city: who asks.
-        fleet: who answers.
+        fleet: who answers. Device i is of district i % districts, so that devices in a row are of all of them in turn.
         seconds: how long.
         seed: the same gives the same.
         lost: so many devices, a node's, get no more calls; what they have under way then is taken for answered.
@@ -110,10 +133,14 @@ def simulate(
     arrivals_s = np.sort(generator.random(count)) * seconds
     pace = spread_services(1.0, fleet.spread, count, generator).tolist()
     pairs = generator.integers(1 << 30, size=(count, 2)).tolist()
-    order = preferences(city.scenes, fleet.devices).tolist()
+    district_of = districts_of(city.scenes, fleet.districts).tolist()
+    order = [
+        [device for device in each if device % fleet.districts == district]
+        for each, district in zip(preferences(city.scenes, fleet.devices).tolist(), district_of, strict=True)
+    ]
     memories = _warm(city, fleet, order)
-    alive = list(range(fleet.devices))
-    under_way = [0] * fleet.devices
+    alive = [list(range(district, fleet.devices, fleet.districts)) for district in range(fleet.districts)]
+    under_way, totals = [0] * fleet.devices, [0] * fleet.districts
     free_s = [0.0] * fleet.devices
     leaving: list[tuple[float, int]] = []
     latencies_s, hits, devices = np.empty(count), np.empty(count, bool), np.empty(count, np.int64)
@@ -121,21 +148,30 @@ def simulate(
     asked = visits(city, count, generator)
     for i, (now_s, (scene, place)) in enumerate(zip(arrivals_s.tolist(), asked, strict=True)):
         while leaving and leaving[0][0] <= now_s:
-            under_way[heapq.heappop(leaving)[1]] -= 1
-        if now_s >= lost_at_s and len(alive) == fleet.devices:
-            alive = alive[lost:]
-            order = [[device for device in each if device >= lost] for each in order]
-        device = _chosen(fleet, order[scene], alive, under_way, len(leaving), pairs[i])
+            left = heapq.heappop(leaving)[1]
+            under_way[left] -= 1
+            totals[left % fleet.districts] -= 1
+        if now_s >= lost_at_s:
+            lost_at_s = math.inf
+            alive, order = _without(lost, alive), _without(lost, order)
+        district = district_of[scene]
+        device = _chosen(fleet, order[scene], alive[district], under_way, totals[district], pairs[i])
         hit = memories[device].ask((scene, place))
         missed = 0 if hit else city.references_per_place
         service_s = (fleet.service_s + fleet.miss_s * missed) * pace[i]
         end_s = max(free_s[device], now_s) + service_s
         free_s[device] = end_s
         under_way[device] += 1
+        totals[district] += 1
         heapq.heappush(leaving, (end_s, device))
         latencies_s[i], hits[i], devices[i] = end_s - now_s, hit, device
         busy_s += service_s
     return Outcome(arrivals_s, latencies_s, hits, devices, busy_s / (seconds * fleet.devices))
+
+
+def _without(lost: int, lists: list[list[int]]) -> list[list[int]]:
+    """The devices of each list but the first `lost` ones of the fleet."""
+    return [[device for device in each if device >= lost] for each in lists]
 
 
 def _chosen(fleet: Fleet, order: list[int], alive: list[int], under_way: list[int], total: int, pair: list[int]) -> int:
@@ -160,7 +196,8 @@ def _warm(city: City, fleet: Fleet, order: list[list[int]]) -> list[LeastRecentl
         return LeastRecentlyUsed(fleet.cached_places, keys)
 
     if fleet.routing is Routing.LOAD:
-        common = most_popular(np.arange(city.scenes))
-        return [LeastRecentlyUsed(fleet.cached_places, common) for _ in range(fleet.devices)]
+        all_of = districts_of(city.scenes, fleet.districts)
+        common = [most_popular(np.flatnonzero(all_of == district)) for district in range(fleet.districts)]
+        return [LeastRecentlyUsed(fleet.cached_places, common[i % fleet.districts]) for i in range(fleet.devices)]
     own = np.array([each[0] for each in order])
     return [most_popular(np.flatnonzero(own == device)) for device in range(fleet.devices)]
