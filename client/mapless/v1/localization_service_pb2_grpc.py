@@ -134,7 +134,8 @@ class LocalizationServiceServicer(object):
         Errors are Localize's, in the place of the final answer: a DEADLINE_EXCEEDED, for instance, may come after a coarse
         answer, which then is all there is. The call waits, is computed and is charged as Localize is: the coarse answer neither
         delays the final one nor is delayed by a caller that reads slowly. Whoever needs no more cancels the call, which ends the
-        computation. Without a deadline the server's default for unary calls holds, for both messages together.
+        computation. Without a deadline the server's default for unary calls holds, for both messages together; a message that was
+        made in time may be read for 10 s more, after which the call is CANCELLED.
 
         The request is the same on purpose: either method can be asked the same question.
         buf:lint:ignore RPC_REQUEST_STANDARD_NAME
