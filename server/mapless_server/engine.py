@@ -290,6 +290,10 @@ class Engine:
                 raise refusals[0]
         return work.results
 
+    def forget_scene(self, scene_key: SceneKey) -> None:
+        """Takes no more memory for a scene, which has been deleted."""
+        self._chooser.indexes.forget(scene_key)
+
     @property
     def index_bytes(self) -> int:
         """What the scenes that references are chosen from take in memory."""

@@ -88,7 +88,9 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def DeleteScene(self, request: pb.DeleteSceneRequest, call: Call) -> pb.DeleteSceneResponse:
         """Implements ReferenceService.DeleteScene."""
-        await self._stored(self._store.delete_scene, scene_key_from_name(request.name, "name", call.principal.tenant))
+        scene_key = scene_key_from_name(request.name, "name", call.principal.tenant)
+        await self._stored(self._store.delete_scene, scene_key)
+        self._engine().forget_scene(scene_key)
         return pb.DeleteSceneResponse()
 
     async def CreateReference(self, request: pb.CreateReferenceRequest, call: Call) -> pb.CreateReferenceResponse:

@@ -67,6 +67,13 @@ class SceneIndexes:
             entries = self._refresh(scene_key)
         return entries
 
+    def forget(self, scene_key: SceneKey) -> None:
+        """Takes no more memory for a scene, which has been deleted."""
+        with self._lock:
+            held = self._held.get(scene_key)
+        if held is not None:
+            self._forget(scene_key, held)
+
     def is_damaged(self, scene_key: SceneKey, reference_id: str) -> bool:
         """Whether a reference is in the scene, but not among its entries, since its pose or descriptor is damaged."""
         held = self._find(scene_key)

@@ -71,7 +71,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source, built = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    for name in ("client", "server"):
+    for name in ("client", "server", "deploy/ray"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     _pip("wheel", "--no-deps", "--wheel-dir", str(built), str(source))
     (made,) = built.glob("*.whl")
@@ -84,9 +84,10 @@ def _pip(*arguments: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_both_packages_and_nothing_beside_them(wheel: Path) -> None:
+def test_the_wheel_holds_the_packages_and_nothing_beside_them(wheel: Path) -> None:
     tops = {name.partition("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
-    assert {top for top in tops if not top.endswith(".dist-info")} == {"mapless", "mapless_server"}
+    packages = {"mapless", "mapless_command", "mapless_ray", "mapless_server"}
+    assert {top for top in tops if not top.endswith(".dist-info")} == packages
 
 
 @pytest.mark.slow

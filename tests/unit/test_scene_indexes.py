@@ -99,6 +99,16 @@ class TestMemory:
         assert set(indexes._held) == {keys[0], keys[2], keys[3]}
         assert indexes.size_bytes == sum(held.index.size_bytes for held in indexes._held.values())
 
+    def test_one_that_was_deleted_takes_none(self, store: Store) -> None:
+        store.add_references(SCENE, [new(0, is_described=True)])
+        indexes = indexes_of(store)
+        indexes.entries(SCENE, turn())
+        assert indexes.size_bytes > 0
+        for _ in range(2):  # a second time there is nothing to forget
+            indexes.forget(SCENE)
+            assert indexes.size_bytes == 0
+        assert "r0" in indexes.entries(SCENE, turn())  # as if it were asked for the first time
+
     def test_scenes_used_longest_ago_make_room_and_the_last_one_stays(self, store: Store) -> None:
         keys = [SceneKey(f"many-{i}") for i in range(4)]
         for key in keys:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 Value = TypeVar("Value")
 
@@ -44,10 +44,10 @@ class LruCache(Generic[Value]):
             self._entries.move_to_end(key)
             return entry[0]
 
-    def forget(self, is_gone: Callable[[Value], bool]) -> None:
-        """Forget values that nobody will ask for any more; not counted as evictions. Looks at each."""
+    def forget(self, is_gone: Callable[[Any, Value], bool]) -> None:
+        """Forget what nobody will ask for any more, by key and value; not counted as evictions. Looks at each."""
         with self._lock:
-            gone = [key for key, (value, _) in self._entries.items() if is_gone(value)]
+            gone = [key for key, (value, _) in self._entries.items() if is_gone(key, value)]
             for key in gone:
                 _, size_bytes = self._entries.pop(key)
                 self._used_bytes -= size_bytes

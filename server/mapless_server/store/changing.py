@@ -95,7 +95,9 @@ class ChangingStore(BaseStore):
         except DamagedPages:
             self._begin_deleting(scene_key, -1)
         # Their keys are never used again, so that they would only keep room from others until they were forgotten.
-        self._described.forget(lambda it: it.record.scene_key == scene_key)
+        self._described.forget(lambda _, it: it.record.scene_key == scene_key)
+        self._resolved.forget(lambda key, _: key[0] == scene_key)
+        self._attributes.forget(lambda key, _: key == scene_key)
         self._delete_what_is_left()
 
     def _begin_deleting(self, scene_key: SceneKey, at_once: int) -> None:
@@ -220,7 +222,7 @@ class ChangingStore(BaseStore):
             self._delete_reference(scene_key, reference_id, removing.delete_one)
         except DamagedPages:
             self._delete_reference(scene_key, reference_id, removing.set_aside)
-        self._described.forget(lambda it: it.record.scene_key == scene_key and it.record.reference_id == reference_id)
+        self._described.forget(lambda _, it: (it.record.scene_key, it.record.reference_id) == (scene_key, reference_id))
 
     def _delete_reference(
         self, scene_key: SceneKey, reference_id: str, remove: Callable[[Connection, str], None]
