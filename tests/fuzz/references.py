@@ -78,6 +78,10 @@ class WatchfulEngine:
 
     options = EngineOptions()
 
+    def forget_scene(self, key: SceneKey) -> None:
+        """Implements Engine."""
+        check_key(key)
+
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
         """Implements Engine."""
         for photo in photos:

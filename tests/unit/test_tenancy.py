@@ -74,6 +74,9 @@ class StandInEngine:
     store: Store
     options: Any = field(default_factory=lambda: SimpleNamespace(image_limits=ImageLimits()))
 
+    def forget_scene(self, _: SceneKey) -> None:
+        pass
+
     async def describe(self, photos: Sequence[Any], *_: Any, **__: Any) -> list[Description]:
         features = Features(np.zeros((1, 2), np.float32), np.ones((1, 4), np.float32), np.ones(1, np.float32))
         return [Description({"stand-in": View(photo.camera.pinhole(), features)}, {}) for photo in photos]
