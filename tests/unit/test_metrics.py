@@ -30,6 +30,8 @@ from mapless_server.scheduling.observer import Ending, Observer, Refusal
 LOCALIZE = "/mapless.v1.LocalizationService/Localize"
 
 COUNTERS = {
+    "mapless_captured_total": set(),
+    "mapless_capture_dropped_total": {"reason"},
     "grpc_server_started_total": {"grpc_service", "grpc_method"},
     "grpc_server_handled_total": {"grpc_service", "grpc_method", "grpc_code"},
     "mapless_admitted_total": set(),
@@ -50,6 +52,9 @@ COUNTERS = {
     "mapless_store_errors_total": set(),
 }
 GAUGES = {
+    "mapless_capture_bytes": set(),
+    "mapless_capture_enabled": set(),
+    "mapless_python_allocated_blocks": set(),
     "mapless_queue_depth": {"stage"},
     "mapless_queue_cost_seconds": {"stage"},
     "mapless_inflight": {"stage"},
@@ -108,7 +113,10 @@ def samples_of(metrics: Metrics) -> Samples:
 def changed(before: Samples, after: Samples) -> Samples:
     """By how much, where it did."""
     changes = {
-        key: value - before.get(key, 0.0) for key, value in after.items() if key[0].startswith(("mapless", "grpc"))
+        key: value - before.get(key, 0.0)
+        for key, value in after.items()
+        if key[0].startswith(("mapless", "grpc"))
+        and key[0] != "mapless_python_allocated_blocks"  # it changes by itself
     }
     return {key: change for key, change in changes.items() if change}
 

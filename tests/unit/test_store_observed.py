@@ -56,7 +56,7 @@ def reference(reference_id: str, features: int = 3) -> NewReference:
 def test_no_operation_is_unheard() -> None:
     methods = {name for name, _ in inspect.getmembers(Store, inspect.isfunction) if not name.startswith("_")}
     heard_of = {name for name in methods if hasattr(getattr(Store, name), "__wrapped__")}
-    assert methods - heard_of == {"open", "connect", "close"}
+    assert methods - heard_of == {"open", "connect", "close", "uncached"}
 
 
 def test_each_is_heard_of_once_and_a_callers_mistake_is_no_failure(store: Store, heard: Heard) -> None:
