@@ -128,7 +128,11 @@ def as_extra(fields: Mapping[str, object]) -> dict[str, object]:
 
 def fields_of(record: logging.LogRecord) -> dict[str, object]:
     """What a record says beyond its message, as values that JSON has."""
-    return {name: plain(value) for name, value in vars(record).items() if name not in _OWN_ATTRIBUTES}
+    return {
+        name: plain(value)
+        for name, value in vars(record).items()
+        if name not in _OWN_ATTRIBUTES and not name.startswith("_ray_")  # Ray marks every record of its processes
+    }
 
 
 def plain(value: object) -> object:
