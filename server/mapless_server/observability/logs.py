@@ -131,7 +131,7 @@ def fields_of(record: logging.LogRecord) -> dict[str, object]:
     return {
         name: plain(value)
         for name, value in vars(record).items()
-        if name not in _OWN_ATTRIBUTES and not name.startswith("_ray_")  # Ray marks every record of its processes
+        if name not in _OWN_ATTRIBUTES and not name.startswith("_")  # what other libraries mark records with
     }
 
 
