@@ -50,24 +50,30 @@ class Cluster:
     Args:
         survives_power_failure: whether it waits for the disk. Processes may be killed without: what they have written
             is the kernel's.
+        tables_on, log_on: the disks of its files and of its write-ahead log, which all must be able to reach; None for
+            the usual place.
     """
 
-    def __init__(self, survives_power_failure: bool = False) -> None:
+    def __init__(
+        self, survives_power_failure: bool = False, tables_on: Path | None = None, log_on: Path | None = None
+    ) -> None:
         folder = programs()
         assert folder is not None
         self._programs = folder
         # Root may not run it. Its files are then another user's, who must be able to reach them.
         users = [it for it in _UNPRIVILEGED if _has_user(it)] if os.geteuid() == 0 else []
         self._user = pwd.getpwnam(users[0]) if users else None
-        self._folder = Path(tempfile.mkdtemp(prefix="mapless-postgres-"))
-        if self._user is not None:
-            os.chown(self._folder, self._user.pw_uid, self._user.pw_gid)
+        self._folder = self._own_folder()
+        self._data = self._own_folder(tables_on) / "data"
+        log_folder = self._own_folder(log_on) / "log"
+        self._folders = (self._folder, self._data.parent, log_folder.parent)
         self.port = _free_port()
         self._numbers = count()
         self._settings = _SETTINGS | {"port": str(self.port), "fsync": "on" if survives_power_failure else "off"}
         self._server: subprocess.Popen[bytes] | None = None
         try:
-            self._run("initdb", "--auth=trust", f"--username={USER}", "--encoding=UTF8", "--locale=C", "--no-sync")
+            who = ("--auth=trust", f"--username={USER}")
+            self._run("initdb", *who, "--encoding=UTF8", "--locale=C", "--no-sync", f"--waldir={log_folder}")
             self.start()
         except BaseException:
             self.remove()
@@ -118,11 +124,8 @@ class Cluster:
     def remove(self) -> None:
         """End it and delete its files."""
         self.stop()
-        shutil.rmtree(self._folder, ignore_errors=True)
-
-    @property
-    def _data(self) -> Path:
-        return self._folder / "data"
+        for folder in self._folders:
+            shutil.rmtree(folder, ignore_errors=True)
 
     def lets_in(self) -> bool:
         """Whether it is there and has recovered."""
@@ -131,6 +134,12 @@ class Cluster:
         except psycopg.OperationalError:
             return False
         return True
+
+    def _own_folder(self, place: Path | None = None) -> Path:
+        folder = Path(tempfile.mkdtemp(prefix="mapless-postgres-", dir=place))
+        if self._user is not None:
+            os.chown(folder, self._user.pw_uid, self._user.pw_gid)
+        return folder
 
     def _run(self, program: str, *arguments: str) -> None:
         command = [str(self._programs / program), "-D", str(self._data), *arguments]

@@ -229,9 +229,10 @@ def serving(
 ) -> Iterator[RunningServer]:
     """A server with the given settings until the block is left, or `stop` is called, which begins to drain it.
 
-    It has a tier for each of the `features`, and closes its store, which lies in the folder unless one is given.
+    It has a tier for each of the `features`, and closes its store, which lies in the folder unless one is given. Its
+    queue is so long that a slow machine makes nobody be turned away, which is the matter of other tests.
     """
-    defaults = {"port": 0, "workers": 2, "metrics": False, "warm_up": False}
+    defaults = {"port": 0, "workers": 2, "metrics": False, "warm_up": False, "max_queued_s": 60.0}
     settings = Settings(host="127.0.0.1", data_dir=data_dir, **(defaults | options))
     store = store or Store.open(data_dir)
     method, extractors = StandInMethod(), [StandInExtractor(name) for name in features]

@@ -68,6 +68,7 @@ class Diagnostics:
         queue_s, total_s: seconds that the call waited and took, inside the server.
         processed_width_px, processed_height_px: size of the image as it was processed.
         retrieval: what the references were chosen by; empty if they were used as they were given.
+        captured: whether the server is to keep the call for a time, photograph and all.
     """
 
     request_id: str
@@ -85,6 +86,7 @@ class Diagnostics:
     processed_height_px: int
     server_version: str
     retrieval: str = ""
+    captured: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,6 +381,7 @@ def diagnostics_from_message(message: localization_pb.Diagnostics) -> Diagnostic
         processed_height_px=message.processed_height_px,
         server_version=message.server_version,
         retrieval=message.retrieval,
+        captured=message.captured,
     )
 
 

@@ -39,7 +39,6 @@ class Call:
         principal: who calls.
         client: what tells callers apart: the id that they give, else the address of their connection.
         trail: what was told of it so far.
-        trailing: metadata that are to follow the answer.
     """
 
     request_id: str
@@ -48,7 +47,6 @@ class Call:
     principal: Principal = field(default_factory=Principal)
     client: str = ""
     trail: Trail = field(default_factory=Trail, repr=False, compare=False)
-    trailing: list[tuple[str, str]] = field(default_factory=list, repr=False, compare=False)
 
     @property
     def caller(self) -> Caller:

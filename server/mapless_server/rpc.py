@@ -119,7 +119,7 @@ class CallGuard:
                     self._who_calls(method, context)
                     self._check_door(method)
                     response = await reply(handler, method, call, context)
-                    context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id), *call.trailing))
+                    context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id),))
                     account.code = "OK"
                     return response
                 except RequestError as error:

@@ -1,26 +1,41 @@
-"""A PostgreSQL that is killed under load, or that has no connection left: callers are told to come back, and do."""
+"""A PostgreSQL that is killed under load, has no connection or no room left: callers are told, and nothing is lost."""
 
 from __future__ import annotations
 
 import signal
+import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import psycopg
 import pytest
+from disks import mount, small_disk
+from images import encode
 from postgres import Cluster, require
 from programs import wait_until
 from servers import CAMERA, PHOTO, pose, serving
 
-from mapless import AlreadyExists, Client, ConnectOptions, LocalizationResult, NewReference, Unavailable
+from mapless import (
+    AlreadyExists,
+    Client,
+    ConnectOptions,
+    LocalizationResult,
+    MaplessError,
+    NewReference,
+    Unavailable,
+)
+from mapless.geometry import Camera
 from mapless_server.store import Store
 
 pytestmark = pytest.mark.slow
 
 ONCE = ConnectOptions(max_attempts=1, timeout_s=30)
+SMALL_MIB = 72
 PATIENT = ConnectOptions(max_attempts=8, initial_backoff_s=0.2, max_backoff_s=1.0)
 
 
@@ -105,6 +120,85 @@ def test_without_a_connection_left_callers_are_told_to_come_back(tmp_path: Path,
             connection.close()
         with Client(server.address, PATIENT) as patient:
             assert patient.get_scene("s", timeout_s=60).reference_count == 0
+
+
+def test_without_room_for_its_tables_changes_alone_are_refused(tmp_path: Path) -> None:
+    """With room again all goes on, without a restart of anybody."""
+    with _filled(tmp_path, lambda disk: Cluster(tables_on=disk)) as (client, database, stored, refusal):
+        assert (refusal.code, refusal.reason, refusal.retry_after_s) == ("RESOURCE_EXHAUSTED", "STORE_FULL", None)
+        assert isinstance(client.localize(PHOTO, CAMERA, "s", ["r0"]), LocalizationResult)
+        assert client.get_reference("s", "r0", include_image=True).image == _large(0).image
+        assert client.is_serving()
+        database.make_room()
+        stored.add(client.add_reference("s", _large(len(stored))).reference_id)
+        assert {it.reference_id for it in client.list_references("s")} == stored
+
+
+def test_without_room_for_its_write_ahead_log_it_ends_and_comes_back_with_all_that_was_acknowledged(
+    tmp_path: Path,
+) -> None:
+    with _filled(tmp_path, lambda disk: Cluster(log_on=disk)) as (client, database, stored, refusal):
+        assert refusal.reason in {"STORE_FULL", "STORE_UNAVAILABLE"}
+        with pytest.raises(Unavailable) as caught:
+            client.localize(PHOTO, CAMERA, "s", ["r0"])
+        assert caught.value.reason == "STORE_UNAVAILABLE"
+        assert caught.value.retry_after_s is not None
+        assert client.is_serving()
+        database.make_room()
+        database.cluster.stop()
+        database.cluster.start()
+        with Client(database.address, PATIENT) as patient:
+            stored.add(patient.add_reference("s", _large(len(stored)), timeout_s=60).reference_id)
+            assert {it.reference_id for it in patient.list_references("s")} == stored
+
+
+@dataclass(frozen=True)
+class _Cramped:
+    """A PostgreSQL on a small disk, and the address of the server that uses it."""
+
+    cluster: Cluster
+    disk: Path
+    address: str
+
+    def make_room(self) -> None:
+        assert mount("-o", f"remount,size={3 * SMALL_MIB}m", str(self.disk)) == 0
+
+
+@contextmanager
+def _filled(data_dir: Path, on: Callable[[Path], Cluster]) -> Iterator[tuple[Client, _Cramped, set[str], MaplessError]]:
+    """A server whose database has no room left: what was stored until then, and how the next one was refused."""
+    require()
+    with _disk(SMALL_MIB) as disk, ExitStack() as stack:
+        cluster = on(disk)
+        stack.callback(cluster.remove)
+        store = Store.connect(cluster.fresh_url())
+        server = stack.enter_context(serving(data_dir, store=store))
+        client = stack.enter_context(Client(server.address, ONCE))
+        client.create_scene("s")
+        stored = {client.add_reference("s", _large(0)).reference_id}
+        with pytest.raises(MaplessError) as caught:
+            _add_many(client, stored)
+        yield client, _Cramped(cluster, disk, server.address), stored, caught.value
+
+
+def _add_many(client: Client, stored: set[str]) -> None:
+    while len(stored) < 1000:
+        stored.add(client.add_reference("s", _large(len(stored))).reference_id)
+
+
+@contextmanager
+def _disk(size_mib: int) -> Iterator[Path]:
+    """One that PostgreSQL's user can reach, which the folders of tests are not."""
+    with tempfile.TemporaryDirectory(prefix="mapless-disk-") as folder:
+        Path(folder).chmod(0o755)
+        with small_disk(Path(folder) / "disk", size_mib) as disk:
+            yield disk
+
+
+def _large(i: int) -> NewReference:
+    """Some 230 kB."""
+    photo = encode(".png", np.random.default_rng(i).integers(0, 256, (240, 320, 3)).astype(np.uint8))
+    return NewReference(f"r{i}", photo, Camera(320, 240, 300.0, 300.0, 159.5, 119.5), pose(i))
 
 
 def _ours_left(connection: psycopg.Connection[tuple[object, ...]]) -> bool:

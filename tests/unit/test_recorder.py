@@ -30,7 +30,7 @@ from mapless_server.capture import recorder as recorder_module
 from mapless_server.capture.calls import CapturedCall, CapturedPart, CapturedReference, decode_call
 from mapless_server.capture.files import calls_of
 from mapless_server.capture.folder import CaptureFolder, Retention
-from mapless_server.capture.recorder import CAPTURED_KEY, Recorder
+from mapless_server.capture.recorder import Recorder
 from mapless_server.capture.staleness import Staleness
 from mapless_server.errors import Unavailable
 from mapless_server.method.views import Features, PosedView, View
@@ -80,8 +80,8 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cl
 
 def test_callers_are_told(served: tuple[Client, LocalizationServiceStub, Path]) -> None:
     _, stub, folder = served
-    answer, call = stub.Localize.with_call(localize_request("s"), timeout=30)
-    assert (CAPTURED_KEY, "1") in [tuple(it) for it in call.trailing_metadata()]
+    answer = stub.Localize(localize_request("s"), timeout=30)
+    assert answer.diagnostics.captured
     wait_until(lambda: captured_in(folder))
     kept = decode_call(captured_in(folder)[0].read_bytes())
     assert kept.response == answer.SerializeToString()
@@ -93,9 +93,8 @@ def test_callers_who_ask_for_the_coarse_pose_first_are_told_too(
     served: tuple[Client, LocalizationServiceStub, Path],
 ) -> None:
     _, stub, folder = served
-    call = stub.LocalizeProgressively(localize_request("s"), timeout=30)
-    final = list(call)[-1].answer
-    assert (CAPTURED_KEY, "1") in [tuple(it) for it in call.trailing_metadata()]
+    final = list(stub.LocalizeProgressively(localize_request("s"), timeout=30))[-1].answer
+    assert final.diagnostics.captured
     wait_until(lambda: captured_in(folder))
     assert decode_call(captured_in(folder)[0].read_bytes()).response == final.SerializeToString()
 
@@ -140,14 +139,15 @@ def recording(folder: Path, store: Store, counts: Counts, **options: Any) -> Ite
         recorder.close()
 
 
-def answer(recorder: Recorder, tenant: str = "default") -> Call:
-    """A call that was answered without any reference."""
+def answer(recorder: Recorder, tenant: str = "default") -> pb.LocalizeResponse:
+    """Of a call that was answered without any reference."""
     call = Call("id", time.monotonic(), math.inf, Principal(tenant=tenant))
     query = SimpleNamespace(photo=SimpleNamespace(field="image"))
     attempt = SimpleNamespace(choice=None, references=(), generation=1, attributes=SceneAttributes())
     part = cast(Any, (query, SimpleNamespace(attempt=attempt)))
-    recorder.answered("Localize", localize_request("s"), pb.LocalizeResponse(), call, [part], ())
-    return call
+    response = pb.LocalizeResponse()
+    recorder.answered("Localize", localize_request("s"), response, call, [part], ())
+    return response
 
 
 def test_a_slow_disk_holds_up_nobody(tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,7 +180,7 @@ def test_a_full_disk_pauses_and_fails_no_call(
 
 def test_only_the_tenants_that_are_named_are_captured(tmp_path: Path, store: Store) -> None:
     with recording(tmp_path, store, Counts(), tenants=frozenset({"acme"})) as recorder:
-        told = [bool(answer(recorder, tenant).trailing) for tenant in ("default", "acme", "other")]
+        told = [answer(recorder, tenant).diagnostics.captured for tenant in ("default", "acme", "other")]
     assert told == [False, True, False]
     assert [decode_call(it.read_bytes()).tenant for it in captured_in(tmp_path / "captured")] == ["acme"]
 

@@ -98,8 +98,7 @@ class LocalizationServiceServicer(object):
 
     def Localize(self, request, context):
         """Localizes one photograph. Safe to retry. Stores nothing, unless the server's operator has it capture calls of this and
-        the next three methods: then the answer has the trailing metadata `x-mapless-captured: 1`, and its photographs are to be
-        kept for a time.
+        the next three methods: then the answer says so (`Diagnostics.captured`), and its photographs are to be kept for a time.
 
         "I could not localize this" is an answer (Rejection), not an error. Errors:
 

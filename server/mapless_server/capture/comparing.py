@@ -1,6 +1,7 @@
 """What is different between an answer and the same answer computed anew.
 
-Durations, the call's id and the server's version are no part of an answer; what it was computed with is compared apart.
+Durations, the call's id, the server's version and whether it was captured are no part of an answer; what it was
+computed with is compared apart.
 """
 
 from __future__ import annotations
@@ -19,8 +20,7 @@ from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
 
 from ..query import UNFINISHED
-from .recompute import diagnostics_of
-from .recorder import Response
+from .messages import Response, diagnostics_of
 
 DESCRIBE = "describe"
 """The stage in which a server finds features once and for all: a replay has them."""
@@ -97,7 +97,7 @@ def _essence(response: Any) -> Any:
     copy = type(response)()
     copy.CopyFrom(response)
     for diagnostics in diagnostics_of(copy):
-        for name in ("request_id", "queue_duration", "total_duration", "server_version"):
+        for name in ("request_id", "queue_duration", "total_duration", "server_version", "captured"):
             diagnostics.ClearField(name)
         kept = [it.stage for it in diagnostics.stages if it.stage != DESCRIBE and not it.stage.endswith(UNFINISHED)]
         del diagnostics.stages[:]

@@ -33,7 +33,7 @@ from ..tiers import Tier
 from ..watching import Watchers
 from .calls import CapturedCall
 from .errors import CaptureError
-from .recorder import Response
+from .messages import Response, diagnostics_of
 from .stand_ins import RETRIEVAL, Blobs, RecordedChooser, RecordedSource
 
 Joined = TypeVar("Joined")
@@ -72,13 +72,6 @@ def recompute(call: CapturedCall, blobs: Blobs, tiers: Sequence[Tier], options: 
     service = LocalizationService(lambda: engine, Metrics(), cast(Store, _Attributes(call)), Watchers(False))
     now = Call(call.request_id, time.monotonic(), math.inf, Principal(tenant=call.tenant))
     return cast(Response, asyncio.run(getattr(service, call.method)(request, now)))
-
-
-def diagnostics_of(response: Response) -> list[pb.Diagnostics]:
-    """Of each photograph, in order."""
-    if isinstance(response, pb.LocalizeResponse):
-        return [response.diagnostics]
-    return [image.diagnostics for image in response.images]
 
 
 class _Attributes:

@@ -19,7 +19,6 @@ from typing import Protocol
 from google.protobuf.message import Message
 
 from mapless.names import parse_scene_name
-from mapless.v1 import localization_service_pb2 as pb
 
 from ..call import Call
 from ..errors import DataLoss, NotFound, Unavailable
@@ -32,12 +31,10 @@ from .calls import CapturedCall
 from .errors import BlobGone
 from .folder import CaptureFolder
 from .gathering import Gatherer, Gone, Used, used_of
+from .messages import Request, Response, diagnostics_of
 from .staleness import Staleness
 
 log = logging.getLogger(__name__)
-
-CAPTURED_KEY = "x-mapless-captured"
-"""Trailing metadata of an answer whose call is to be kept."""
 
 MAX_WAITING = 32
 """Calls that wait for the disk."""
@@ -52,9 +49,6 @@ FAULT_PAUSE_S = 60.0
 CLOSING_LIMIT_S = 5.0
 """For what waits to be written when the server stops."""
 _MIN_PAUSE_S = 0.01
-
-Request = pb.LocalizeRequest | pb.LocalizeRigRequest | pb.LocalizeSequenceRequest
-Response = pb.LocalizeResponse | pb.LocalizeRigResponse | pb.LocalizeSequenceResponse
 
 
 class CaptureObserver(Protocol):
@@ -152,12 +146,12 @@ class Recorder:
         parts: Sequence[tuple[Query, Result]],
         tiers: Sequence[Tier],
     ) -> None:
-        """A call has been answered, and its caller is told if it is to be kept.
+        """A call has been answered; the answer says so if it is to be kept.
 
         Args:
             method: "Localize", ...
             request: as it came.
-            response: as it goes; neither is to be changed any more.
+            response: as it goes; neither is to be changed afterwards.
             call: whose they are.
             parts: its photographs, in order, and what was made of each.
             tiers: all that the server has.
@@ -169,8 +163,10 @@ class Recorder:
         used = tuple(used_of(*part) for part in parts)
         attributes = parts[0][1].attempt.attributes
         scene_id, now_s = parse_scene_name(request.scene), time.time()
-        if self._put(Waiting(call, scene_id, now_s, method, *messages, size_bytes, used, attributes, tiers)):
-            call.trailing.append((CAPTURED_KEY, "1"))
+        if self._has_room(size_bytes):
+            for diagnostics in diagnostics_of(response):
+                diagnostics.captured = True
+            self._put(Waiting(call, scene_id, now_s, method, *messages, size_bytes, used, attributes, tiers))
 
     def close(self) -> None:
         """Writes what waits, for as long as there is time, and lets the folder go; from any thread."""
@@ -182,20 +178,23 @@ class Recorder:
             thread.join()
         self.folder.close()
 
-    def _put(self, waiting: Waiting) -> bool:
+    def _has_room(self, size_bytes: int) -> bool:
+        """Whether another call may wait; only the event loop adds any."""
         if time.monotonic() < self._paused_until_s:
             self._drop("disk")
             return False
         with self._news:
-            fits = not self._waiting or self._waiting_bytes + waiting.size_bytes <= MAX_WAITING_BYTES
-            is_full = len(self._waiting) >= MAX_WAITING or not fits
-            if not is_full:
-                self._waiting.append(waiting)
-                self._waiting_bytes += waiting.size_bytes
-                self._news.notify()
-        if is_full:
+            fits = not self._waiting or self._waiting_bytes + size_bytes <= MAX_WAITING_BYTES
+            has_room = fits and len(self._waiting) < MAX_WAITING
+        if not has_room:
             self._drop("queue")
-        return not is_full
+        return has_room
+
+    def _put(self, waiting: Waiting) -> None:
+        with self._news:
+            self._waiting.append(waiting)
+            self._waiting_bytes += waiting.size_bytes
+            self._news.notify()
 
     def _expire(self) -> None:
         """Of the expiry's thread: asks nobody but the folder."""
