@@ -8,6 +8,8 @@ transparency are not applied, so that nothing is lost.
 from __future__ import annotations
 
 import struct
+import zlib
+from collections.abc import Iterable
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _ESSENTIAL = frozenset({b"IHDR", b"PLTE", b"IDAT"})
@@ -16,6 +18,9 @@ _MAX_CHUNKS = 100_000  # of 160 bytes each in the largest file; encoders make ch
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """By the header's colour type."""
 _DATA_SLACK_BYTES = 2**16
+_TRUSTED_DATA_BYTES = 2**18
+"""So much data inflates to 270 MB at most, in less than a second, whatever it holds."""
+_PIECE_BYTES = 2**20
 
 
 class BadChunks(Exception):
@@ -39,7 +44,8 @@ def essential_png(data: bytes) -> bytes:
     """
     view = memoryview(data)
     kept: list[memoryview | bytes] = [_SIGNATURE]
-    position, data_bytes = len(_SIGNATURE), 0
+    pixel_data: list[memoryview] = []
+    position = len(_SIGNATURE)
     for _ in range(_MAX_CHUNKS):
         if position + 12 > len(data):
             raise BadChunks("the image cannot be decoded: the PNG is cut off", False)
@@ -51,13 +57,31 @@ def essential_png(data: bytes) -> bytes:
             break
         if kind in _ESSENTIAL:
             kept.append(view[position:end])
-            data_bytes += length if kind == b"IDAT" else 0
+        if kind == b"IDAT":
+            pixel_data.append(view[position + 8 : position + 8 + length])
         position = end
     else:
         raise BadChunks("the PNG has too many chunks", True)
-    if data_bytes > _most_data_bytes(data):
+    data_bytes, most_bytes = sum(map(len, pixel_data)), _most_data_bytes(data)
+    if data_bytes > most_bytes or (data_bytes > _TRUSTED_DATA_BYTES and _inflates_beyond(most_bytes, pixel_data)):
         raise BadChunks("the PNG has more data than pixels", True)
     return b"".join([*kept, _END])
+
+
+def _inflates_beyond(most_bytes: int, compressed: Iterable[memoryview]) -> bool:
+    """Whether there is more in a stream; no more than that is inflated, and nothing is held.
+
+    The decoder inflates the stream to its end, wherever the pixels end: a megabyte of zeros a thousandfold.
+    """
+    inflater, inflated_bytes = zlib.decompressobj(), 0
+    try:
+        for rest in compressed:
+            while rest and inflated_bytes <= most_bytes:
+                inflated_bytes += len(inflater.decompress(rest, _PIECE_BYTES))
+                rest = memoryview(inflater.unconsumed_tail)
+    except zlib.error:  # it is the decoder's to refuse, where it ends
+        return False
+    return inflated_bytes > most_bytes
 
 
 def _most_data_bytes(data: bytes) -> int:

@@ -16,6 +16,7 @@ from fuzz.importing import Layout
 from images import encode, textured
 
 from mapless.geometry import Camera, RigidTransform
+from mapless_server import png_chunks
 from mapless_server.dataset import Refusal, printable
 from mapless_server.decode import ImageLimits, decode_image
 from mapless_server.errors import InvalidArgument
@@ -71,6 +72,47 @@ def test_a_png_with_more_data_than_pixels_is_refused() -> None:
     with pytest.raises(InvalidArgument, match="more data than pixels") as caught:
         decode_image(data, LIMITS)
     assert caught.value.reason == "IMAGE_TOO_COMPLEX"
+
+
+def test_a_png_whose_data_goes_on_beyond_its_pixels_is_not_inflated_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sixteen megabytes of it, as many as a file may have, inflate to seventeen gigabytes."""
+    flushed = zlib.compressobj(9)
+    megabyte = flushed.compress(bytes(2**20)) + flushed.flush(zlib.Z_FULL_FLUSH)
+    start, again = megabyte, megabyte[2:]  # the first has the stream's header
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 5000, 1000, 8, 2, 0, 0, 0))
+    pieces = [chunk(b"IDAT", start), *[chunk(b"IDAT", again)] * 2000, chunk(b"IEND", b"")]
+    inflated, inflater = [0], zlib.decompressobj
+
+    class Counted:
+        def __init__(self) -> None:
+            self._inflater = inflater()
+
+        def decompress(self, data: bytes, most: int) -> bytes:
+            out = self._inflater.decompress(data, most)
+            inflated[0] += len(out)
+            return out
+
+        @property
+        def unconsumed_tail(self) -> bytes:
+            return self._inflater.unconsumed_tail
+
+    monkeypatch.setattr("zlib.decompressobj", Counted)
+    with pytest.raises(InvalidArgument, match="more data than pixels") as caught:
+        decode_image(b"\x89PNG\r\n\x1a\n" + header + b"".join(pieces), LIMITS)
+    assert caught.value.reason == "IMAGE_TOO_COMPLEX"
+    assert 5000 * 1000 * 3 < inflated[0] < 20 * 2**20
+
+
+@pytest.mark.parametrize("in_chunks_of", [100, 10**9])
+@pytest.mark.parametrize("level", [0, 6])
+def test_a_large_png_is_decoded_however_badly_it_is_compressed(level: int, in_chunks_of: int) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (400, 400, 3)).astype(np.uint8)
+    data = zlib.compress(b"".join(b"\0" + row.tobytes() for row in rgb), level)
+    assert len(data) > png_chunks._TRUSTED_DATA_BYTES
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 400, 400, 8, 2, 0, 0, 0))
+    parts = [chunk(b"IDAT", data[i : i + in_chunks_of]) for i in range(0, len(data), in_chunks_of)]
+    whole = b"\x89PNG\r\n\x1a\n" + header + b"".join(parts) + chunk(b"IEND", b"")
+    np.testing.assert_array_equal(decode_image(whole, LIMITS), rgb)
 
 
 def test_a_png_of_nothing_but_chunks_is_refused() -> None:
