@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, TypeVar
 
 import grpc
@@ -9,6 +10,18 @@ from google.protobuf.message import DecodeError, Message
 from google.rpc import error_details_pb2, status_pb2
 
 _DETAILS_KEY = "grpc-status-details-bin"
+_NO_TIME = "Deadline Exceeded"
+_NOT_CONNECTED = "connections to all backends failing"
+_NOT_CONNECTED_BECAUSE = {
+    "Socket closed": "the server hangs up at once; does it speak TLS? Then say so, --tls or --ca FILE (Python: tls, "
+    "root_certificates), and --cert if it asks for a certificate",
+    "WRONG_VERSION_NUMBER": "the server does not speak TLS",
+    "unable to get local issuer certificate": "the server's certificate is not signed by a known one; --ca FILE "
+    "(Python: root_certificates) names another",
+    "Failed to create security handshaker": "what was given as certificates is unusable; is it PEM?",
+    "Connection refused": "nobody listens there (connection refused)",
+}
+_ADDRESS = re.compile(r"ipv[46]:(\S+): ")
 Detail = TypeVar("Detail", bound=Message)
 
 
@@ -117,12 +130,24 @@ def from_rpc_error(error: Any) -> MaplessError:
     code: grpc.StatusCode = error.code()
     return _BY_CODE.get(code.name, MaplessError)(
         code.name,
-        error.details() or "",
+        _in_words(error.details() or ""),
         reason=info.reason if info else "",
         field=(info.metadata.get("field") if info else None),
         retry_after_s=retry.retry_delay.ToNanoseconds() / 1e9 if retry else None,
         request_id=metadata.get("x-request-id", ""),
     )
+
+
+def _in_words(details: str) -> str:
+    """What kept a connection from being made, in other words than gRPC's where it is known; else as it is said."""
+    if details == _NO_TIME:
+        return "no answer in time"
+    if not details.startswith(_NOT_CONNECTED):
+        return details
+    reason = details.rpartition("last error: ")[2]
+    known = next((words for sign, words in _NOT_CONNECTED_BECAUSE.items() if sign in reason), "")
+    address = _ADDRESS.search(reason)
+    return f"cannot connect{f' to {address[1]}' if address else ''}: {known or reason}"
 
 
 def _detail(status: status_pb2.Status, empty: Detail) -> Detail | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
@@ -289,6 +289,11 @@ class Engine:
             if len(refusals) == jobs:  # else those that were admitted have done it all
                 raise refusals[0]
         return work.results
+
+    def forget_references(self, keys: Collection[str]) -> None:
+        """Takes no more memory for what was found out of references, which have been deleted."""
+        for tier in self.tiers:
+            tier.pipeline.matcher.forget(keys)
 
     def forget_scene(self, scene_key: SceneKey) -> None:
         """Takes no more memory for a scene, which has been deleted."""

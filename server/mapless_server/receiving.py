@@ -62,8 +62,7 @@ class Receiver:
 
     def _forget(self, reading: asyncio.Future[Any]) -> None:
         self._reading.discard(reading)
-        if not reading.cancelled():
-            reading.exception()  # of a call that has ended: nobody waits for it
+        retrieve(reading)
 
 
 class OpenMethods:
@@ -94,7 +93,7 @@ class OpenMethods:
         async def answer(_: object, context: Context) -> None:
             await self._enter(context)
             try:
-                await handler.unary_stream(await self._request(handler, context), context)
+                await handler.unary_stream(await self._request(handler, context), _Latest(context))
             finally:
                 self._streams -= 1
 
@@ -130,3 +129,34 @@ class OpenMethods:
             await context.abort(getattr(grpc.StatusCode, error.code), str(error))
         finally:
             self._waiting.pop(gives_way, None)
+
+
+class _Latest:
+    """What a health watch writes to. It waits for no reader: of what the caller does not read, the latest is kept.
+
+    The servicer writes while it holds a lock that whoever changes the health needs, as the server does that stops.
+    """
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._message: Any = None
+        self._writing: asyncio.Future[None] | None = None
+
+    async def write(self, message: Any) -> None:
+        """Returns at once."""
+        self._message = message
+        if self._writing is None or self._writing.done():
+            self._writing = asyncio.ensure_future(self._write())
+            self._writing.add_done_callback(retrieve)
+
+    async def _write(self) -> None:
+        """Never cancelled, as reading is not."""
+        while self._message is not None:
+            message, self._message = self._message, None
+            await self._context.write(message)
+
+
+def retrieve(task: asyncio.Future[Any]) -> None:
+    """Looks at how a task ended, lest asyncio complains that nobody did."""
+    if not task.cancelled():
+        task.exception()  # of a call that has ended: nobody waits for it

@@ -89,9 +89,15 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def DeleteScene(self, request: pb.DeleteSceneRequest, call: Call) -> pb.DeleteSceneResponse:
         """Implements ReferenceService.DeleteScene."""
         scene_key = scene_key_from_name(request.name, "name", call.principal.tenant)
-        await self._stored(self._store.delete_scene, scene_key)
-        self._engine().forget_scene(scene_key)
+        await self._stored(self._delete_scene, self._engine(), scene_key)
         return pb.DeleteSceneResponse()
+
+    def _delete_scene(self, engine: Engine, scene_key: SceneKey) -> None:
+        # Gone it may be even where this fails late, or where nobody waits for it any more.
+        try:
+            engine.forget_references(self._store.delete_scene(scene_key))
+        finally:
+            engine.forget_scene(scene_key)
 
     async def CreateReference(self, request: pb.CreateReferenceRequest, call: Call) -> pb.CreateReferenceResponse:
         """Implements ReferenceService.CreateReference."""
@@ -143,10 +149,12 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def DeleteReference(self, request: pb.DeleteReferenceRequest, call: Call) -> pb.DeleteReferenceResponse:
         """Implements ReferenceService.DeleteReference."""
-        await self._stored(
-            self._store.delete_reference, *reference_key_from_name(request.name, "name", call.principal.tenant)
-        )
+        named = reference_key_from_name(request.name, "name", call.principal.tenant)
+        await self._stored(self._delete_reference, self._engine(), *named)
         return pb.DeleteReferenceResponse()
+
+    def _delete_reference(self, engine: Engine, scene_key: SceneKey, reference_id: str) -> None:
+        engine.forget_references({self._store.delete_reference(scene_key, reference_id)})
 
     async def RetrieveReferences(
         self, request: pb.RetrieveReferencesRequest, call: Call

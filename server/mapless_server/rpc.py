@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import logging
 import time
 from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Iterator, Mapping
@@ -12,7 +13,6 @@ from typing import Any, Protocol, TypeVar
 
 import grpc
 from google.protobuf.message import DecodeError
-from grpc_status import rpc_status
 
 from mapless.wire import FieldError
 
@@ -23,7 +23,7 @@ from .observability.tracing import CallSpan, Metadata, NoTracer, Tracer
 from .principal import Principal
 from .receiving import Context, OpenMethods, Receiver
 from .security.access import ENDLESS_METHODS, OPEN_METHODS
-from .status import to_status
+from .sending import ENDLESS_SEND_LIMIT_S, SEND_LIMIT_S, Sender
 
 log = logging.getLogger(__name__)
 
@@ -35,10 +35,6 @@ Authenticate = Callable[[Metadata, str, Mapping[str, Iterable[bytes]]], Principa
 Raises Unauthenticated or PermissionDenied; called on the event loop.
 """
 
-
-SEND_LIMIT_S = 10.0
-"""For the caller of a stream that comes to an end to read a message that was made in time. Answers of unary calls wait
-in grpc, and cost nothing but themselves; a stream that nobody reads is a call that goes on."""
 
 Making = Coroutine[Any, Any, AsyncGenerator[Any, None]]
 """A servicer's method of a stream: gives an iterator of messages."""
@@ -103,6 +99,7 @@ class CallGuard:
         self._idle.set()
         self._abandoned: set[asyncio.Task[Any]] = set()  # the loop itself would forget them
         self._receiver = Receiver()
+        self._sender = Sender()
         self._open = OpenMethods(self._receiver)
 
     def guarded(self, method: str, handler: Any) -> Any:
@@ -125,8 +122,8 @@ class CallGuard:
                 except RequestError as error:
                     account.code = error.code
                     call.note(reason=error.reason, error=str(error))
-                    await _abort(context, call, error)
-                    raise  # not reached: abort raises
+                    await self._sender.error(context, call, error)
+                    raise  # not reached: sending it raises
                 except asyncio.CancelledError:
                     # Where the caller's deadline passes, it may be grpc that notices first.
                     account.code = "CANCELLED" if time.monotonic() < call.deadline_s else "DEADLINE_EXCEEDED"
@@ -136,7 +133,7 @@ class CallGuard:
                     call.note(reason=type(error).__name__)
                     ids = {"request_id": call.request_id, "trace_id": account.span.trace_id}
                     log.exception("%s failed", method, extra=ids)
-                    await _abort(context, call, RequestError(f"internal error, id={call.request_id}"))
+                    await self._sender.error(context, call, RequestError(f"internal error, id={call.request_id}"))
                     raise
 
         # Not as a unary method, whose message grpc receives first: what is refused shall cost nothing, and who sends no
@@ -194,42 +191,34 @@ class CallGuard:
         request, call = await self._request(handler, method, call, context)
         making = handler.unary_stream(request, call)
         del request  # a photograph, which shall not wait for who reads slowly
+        limit_s, sent_bytes = ENDLESS_SEND_LIMIT_S if is_endless else SEND_LIMIT_S, 0
         messages = (
-            self._endless(making, method, handler, context) if is_endless else self._finite(making, handler, call)
+            self._endless(making, method, handler, context)
+            if is_endless
+            else self._finite(making, handler, call, context)
         )
-        sent_bytes = 0
         try:
             async with aclosing(messages) as coming:
                 async for data in coming:
-                    await self._send(data, context, None if is_endless else SEND_LIMIT_S)
+                    await self._sender.message(context, data, limit_s)
                     sent_bytes += len(data)
         except FieldError as error:
             raise InvalidArgument(str(error), field=error.field) from None
         finally:
             call.note(bytes_out=sent_bytes)
 
-    async def _send(self, data: bytes, context: Context, limit_s: float | None) -> None:
-        """Returns when there is room for it on the way; who does not read in time, or has left, has ended the call."""
-        writing = asyncio.ensure_future(context.write(data))
-        writing.add_done_callback(_retrieve)
-        # Never cancelled: grpc still reads from where it was told to. It ends with the call at the latest.
-        await asyncio.wait({writing}, timeout=limit_s)
-        if not writing.done() or isinstance(writing.exception(), grpc.aio.BaseError):
-            raise asyncio.CancelledError("nobody reads any more")
-        writing.result()
-
     async def _endless(
         self, making: Making, method: str, handler: Any, context: Context
     ) -> AsyncGenerator[bytes, None]:
         """A servicer's messages, each when the one before is sent; the caller learns when they can come."""
         async with aclosing(await making) as responses:
-            await context.send_initial_metadata(())
+            await self._sender.headers(context)
             async for response in responses:
                 # The token may have been revoked, or have expired, since.
                 self._who_calls(method, context)
                 yield bytes(handler.response_serializer(response))
 
-    async def _finite(self, making: Making, handler: Any, call: Call) -> AsyncGenerator[bytes, None]:
+    async def _finite(self, making: Making, handler: Any, call: Call, context: Context) -> AsyncGenerator[bytes, None]:
         """A servicer's messages, a few, made in time and as fast as it can, however slowly the caller reads."""
         made: asyncio.Queue[bytes | None] = asyncio.Queue()
 
@@ -241,12 +230,18 @@ class CallGuard:
         task = asyncio.ensure_future(self._in_time(make, call.deadline_s))
         task.add_done_callback(lambda _: made.put_nowait(None))
         try:
-            while (data := await made.get()) is not None:
+            data = await made.get()
+            if data is not None:
+                await self._sender.headers(context)
+            while data is not None:
                 yield data
+                data = await made.get()
             await task
         finally:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
+            if inspect.getcoroutinestate(making) == inspect.CORO_CREATED:  # the time was over before it began
+                making.close()
 
     async def _request(self, handler: Any, method: str, call: Call, context: Context) -> tuple[Any, Call]:
         """The call's message, and the call with who makes it."""
@@ -314,15 +309,5 @@ class CallGuard:
         log.info("%s %s", method.rpartition("/")[2], code, extra=as_extra(fields))
 
 
-def _retrieve(task: asyncio.Task[None]) -> None:
-    if not task.cancelled():
-        task.exception()  # of a call that has ended: nobody waits for it
-
-
 def _ms(seconds: float) -> float:
     return round(1000 * seconds, 1)
-
-
-async def _abort(context: Context, call: Call, error: RequestError) -> None:
-    status = rpc_status.to_status(to_status(error))
-    await context.abort(status.code, status.details, (*status.trailing_metadata, (REQUEST_ID_KEY, call.request_id)))

@@ -97,7 +97,8 @@ async def running_server(
     Args:
         settings: port 0 takes any free one.
         make: makes the engine, in a thread of its own: networks take long to load. Closed at the end.
-        store: what the engine reads; opened from the settings if None. Closed at the end either way.
+        store: what the engine reads; opened from the settings if None. Closed at the end either way, but not if the
+            settings' protection is refused.
         listen: makes what brings the calls.
 
     Raises:
@@ -106,10 +107,10 @@ async def running_server(
     """
     metrics = Metrics()
     async with AsyncExitStack() as stack:
+        protection = _make_protection(settings)  # before there is a store: a refused start leaves none
         store = store or open_store(settings)
         store.observer = metrics
         stack.push_async_callback(asyncio.to_thread, store.close)
-        protection = _make_protection(settings)
         tracer = _make_tracer(settings)
         stack.push_async_callback(asyncio.to_thread, tracer.close, _TRACES_FLUSH_S)
         metrics_address = _serve_metrics(settings, metrics, store, protection, stack)

@@ -58,26 +58,27 @@ class SceneIndexes:
             NotFound: there is no such scene (field "scene").
             Over: the turn is over.
         """
-        entries = self._refresh(scene_key)
-        while undescribed := self._find(scene_key).describable(entries):
+        # Whatever becomes of the scene meanwhile, this call goes on with what it has begun with.
+        held = self._hold(scene_key)
+        entries = self._refresh(scene_key, held)
+        while undescribed := held.describable(entries):
             log.info("describing %d references of scene %s for retrieval", len(undescribed), scene_key)
             with turn.stage("describe"):
                 for reference_id, key in undescribed:
-                    self._describe(scene_key, reference_id, key, turn)
-            entries = self._refresh(scene_key)
+                    self._describe(scene_key, held, reference_id, key, turn)
+            entries = self._refresh(scene_key, held)
         return entries
 
     def forget(self, scene_key: SceneKey) -> None:
         """Takes no more memory for a scene, which has been deleted."""
-        with self._lock:
-            held = self._held.get(scene_key)
+        held = self._find(scene_key)
         if held is not None:
             self._forget(scene_key, held)
 
     def is_damaged(self, scene_key: SceneKey, reference_id: str) -> bool:
         """Whether a reference is in the scene, but not among its entries, since its pose or descriptor is damaged."""
         held = self._find(scene_key)
-        if reference_id not in held.damaged_ids:
+        if held is None or reference_id not in held.damaged_ids:
             return False
         try:
             self._store.get_reference(scene_key, reference_id)
@@ -90,12 +91,13 @@ class SceneIndexes:
 
     def tell_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
         """Logs, once while the scene is held, that a reference is not used because it is damaged."""
-        told = self._find(scene_key).told
-        if reference_id not in told:
-            told.add(reference_id)
+        held = self._find(scene_key)
+        if held is None or reference_id not in held.told:
+            if held is not None:
+                held.told.add(reference_id)
             log.error("reference %s of scene %s is not used: %s", reference_id, scene_key, error)
 
-    def _describe(self, scene_key: SceneKey, reference_id: str, key: str, turn: Turn) -> None:
+    def _describe(self, scene_key: SceneKey, held: _Held, reference_id: str, key: str, turn: Turn) -> None:
         """Finds and keeps a reference's descriptor; nothing if it was deleted since."""
         turn.check()
         claims = self._library.claims
@@ -112,13 +114,12 @@ class SceneIndexes:
             except NotFound:
                 return
             except DataLoss as error:
-                self._find(scene_key).undescribable.add(key)
+                held.undescribable.add(key)
                 self.tell_damaged(scene_key, reference_id, error)
                 return
-        self._find(scene_key).describe({key: vector})
+        held.describe({key: vector})
 
-    def _refresh(self, scene_key: SceneKey) -> Entries:
-        held = self._find(scene_key)
+    def _refresh(self, scene_key: SceneKey, held: _Held) -> Entries:
         try:
             entries = held.refresh(self._store, scene_key, self._descriptor.name)
         except Exception:
@@ -134,7 +135,12 @@ class SceneIndexes:
         with self._lock:
             return self._size_bytes
 
-    def _find(self, scene_key: SceneKey) -> _Held:
+    def _find(self, scene_key: SceneKey) -> _Held | None:
+        with self._lock:
+            return self._held.get(scene_key)
+
+    def _hold(self, scene_key: SceneKey) -> _Held:
+        """What is held of a scene that is asked for, from now on at the latest."""
         with self._lock:
             held = self._held.get(scene_key)
             if held is None:

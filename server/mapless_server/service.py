@@ -110,11 +110,11 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         debug, support = None, result.attempt.answer.support
         if support is not None and (request.options.include_debug or self._watchers.is_watched(query.scene_key)):
             debug = await asyncio.to_thread(debug_to_message, support)
-        self._watchers.publish(query.scene_key, request, response, debug)
         if request.options.include_debug and debug is not None:
             response.debug.CopyFrom(debug)
         if self._recorder is not None:
             self._recorder.answered("Localize", request, response, call, [(query, result)], self._engine().tiers)
+        self._watchers.publish(query.scene_key, request, response, debug)
         return response
 
     def _coarse(self, asked: _Asked, call: Call, result: Result) -> pb.LocalizeResponse:

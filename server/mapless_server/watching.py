@@ -2,7 +2,8 @@
 
 Everything runs on the event loop. Photographs are held in memory until they are sent, a few for each watcher, and
 stored nowhere: at most MAX_WATCHERS times QUEUE_LENGTH, so 24 images of `max_image_mib` (384 MiB by default), and the
-message that each watcher is being sent. Without watchers it costs a look into a dictionary.
+message that each watcher is being sent. One that reads nothing for a minute is sent away (see `sending`); what it was
+being sent is held until it reads it or its connection ends. Without watchers it costs a look into a dictionary.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ can be written down, and reads back as it was; a page begins after a legal id.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import datetime, timezone
 from functools import cache
@@ -81,6 +81,9 @@ class WatchfulEngine:
     def forget_scene(self, key: SceneKey) -> None:
         """Implements Engine."""
         check_key(key)
+
+    def forget_references(self, keys: Collection[str]) -> None:
+        """Implements Engine."""
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
         """Implements Engine."""

@@ -144,6 +144,40 @@ class TestDisk:
                 assert {it.reference_id for it in client.list_references("s")} == stored | {"late"}
             assert faults_of(disk / "data") == ()
 
+    def test_a_scene_is_deleted_where_there_is_room_for_one_of_its_references_and_else_the_rest_of_it_later(
+        self, tmp_path: Path
+    ) -> None:
+        def leave(room_bytes: int) -> None:
+            free = os.statvfs(disk)
+            (disk / "filler").write_bytes(bytes(free.f_bavail * free.f_frsize - room_bytes))
+
+        def count_left() -> int:
+            with closing(SqliteDatabase.look_at(disk / "data" / DATABASE_FILE)) as database, database.read() as left:
+                return int(left.exec_driver_sql("SELECT count(*) FROM reference").scalar_one())
+
+        with small_disk(tmp_path / "disk", 32) as disk:
+            with served(disk / "data") as client:
+                for scene in ("s", "t"):
+                    client.create_scene(scene)
+                    client.add_references(scene, [large(i) for i in range(20)])
+            with served(disk / "data") as client:
+                leave(600_000)
+                client.delete_scene("s")
+                assert count_left() == 20
+                (disk / "filler").unlink()
+            with served(disk / "data") as client:
+                leave(150_000)
+                error = error_of(lambda: client.delete_scene("t"))
+                assert (error and error.code, error and error.reason) == ("RESOURCE_EXHAUSTED", "STORE_FULL")
+                with pytest.raises(NotFound):
+                    client.get_scene("t")
+                assert count_left() > 0
+                (disk / "filler").unlink()
+                with pytest.raises(NotFound):
+                    client.delete_scene("t")
+                assert count_left() == 0
+            assert large_photo(7)[1000:1016] not in (disk / "data" / DATABASE_FILE).read_bytes()
+
     def test_one_that_is_full_from_the_start_serves_queries_after_a_kill_and_says_what_it_lacks_after_an_orderly_stop(
         self, tmp_path: Path
     ) -> None:

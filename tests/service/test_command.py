@@ -126,7 +126,11 @@ def test_a_call_that_fails_does_not_end_the_others(
     code, printed, told = run(
         server, capsys, "localize", scene, str(folder / "images"), "--camera", camera, "--output", str(written)
     )
-    assert (code, printed, told) == (1, "", f"2 of 3 localized, 1 failed\nanswers are in {written}\n")
+    assert (code, printed, told) == (
+        1,
+        "",
+        f"2 of 3 localized, 1 failed (1 IMAGE_UNKNOWN_FORMAT)\nanswers are in {written}\n",
+    )
     first, second, third = lines_of(written.read_text())
     assert (second["photo"], second["error"]["code"], second["error"]["field"]) == (
         "1.png",
@@ -143,7 +147,7 @@ def test_photographs_of_a_folder_that_are_not_localized_end_with_3(
 ) -> None:
     assert run(server, capsys, "scene", "create", "bare")[0] == 0
     code, printed, told = run(server, capsys, "localize", "bare", str(folder))
-    assert (code, told) == (3, "0 of 2 localized, 2 not localized\n")
+    assert (code, told) == (3, "0 of 2 localized, 2 not localized (2 NO_USABLE_REFERENCES)\n")
     assert {answer["reason"] for answer in lines_of(printed)} == {"NO_USABLE_REFERENCES"}
 
 

@@ -8,6 +8,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+import grpc
 import numpy as np
 import pytest
 from compare import assert_pose_close
@@ -31,6 +32,7 @@ from mapless import (
 from mapless.axes import Axes, pose_to
 from mapless.geometry import rotation_from_vector
 from mapless.v1 import localization_service_pb2 as pb
+from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.child import child_server
 from mapless_server.demo.raycast import Quad, Surface
 from mapless_server.demo.room import Photo, Station, look_at, take
@@ -274,6 +276,18 @@ def test_photographs_of_all_that_together_are_more_than_may_be_held_are_refused(
             client.localize_rig([image] * 2, "hall")
         assert (refused.value.code, refused.value.reason) == ("RESOURCE_EXHAUSTED", "TOO_LARGE")
         assert isinstance(client.localize_rig([image], "hall"), GroupRejected)
+
+
+def test_callers_are_told_of_each_photograph_that_is_captured(tmp_path: Path) -> None:
+    captured = tmp_path / "captured"
+    with serving(tmp_path / "data", capture_dir=captured) as server, Client(server.address) as client:
+        client.create_scene("hall")
+        with grpc.insecure_channel(server.address) as channel:
+            stub = LocalizationServiceStub(channel)
+            rig = stub.LocalizeRig(rig_request("hall"), timeout=30)
+            sequence = stub.LocalizeSequence(sequence_request("hall"), timeout=30)
+    for answer in (rig, sequence):
+        assert [report.diagnostics.captured for report in answer.images] == [True] * 3
 
 
 def test_an_unknown_scene_is_not_found(stubs: Stubs) -> None:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -22,9 +22,12 @@ from wall import wall
 
 from mapless import Client
 from mapless.geometry import Camera
+from mapless_server.child import ServerFailed
 from mapless_server.formats.colmap.writing import PosedImage
 from mapless_server.formats.writing import LAYOUTS
 from mapless_server.ingest.command import export_command, import_command
+from mapless_server.ingest.connection import Connection
+from mapless_server.settings import Settings
 
 PROGRAM = (
     "import typer; from mapless_server.ingest.command import import_command, export_command; app = typer.Typer();"
@@ -259,3 +262,23 @@ def test_terminated_in_the_middle_the_next_run_goes_on(tmp_path: Path) -> None:
     # A message whose answer was cut off may be stored, so more can be there than the first run counts.
     assert added <= len(content["skipped"]) < count
     assert len(content["skipped"]) + len(content["added"]) == count
+
+
+@pytest.mark.parametrize("command", ["import", "export"])
+def test_the_store_may_be_named_by_its_folder(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> None:
+    asked: list[Path] = []
+
+    def connected(connection: Connection, settings: Settings) -> NoReturn:
+        asked.append(settings.data_dir)
+        raise ServerFailed("as asked")
+
+    monkeypatch.setattr("mapless_server.ingest.connection.connected", connected)
+    monkeypatch.delenv("MAPLESS_DATABASE_URL", raising=False)
+    arguments = ["scene", str(tmp_path / "out")] if command == "export" else [str(folder), "scene", "--skip-check"]
+    arguments = [command, *arguments, "--data-dir", str(tmp_path / "data")]
+    assert "as asked" in run(*arguments).output
+    assert asked == [tmp_path / "data"]
+    both = run(*arguments, "--address", "127.0.0.1:1")
+    assert (both.exit_code, "say one of them" in both.output, len(asked)) == (2, True, 1)

@@ -132,10 +132,22 @@ def asked(place: Place) -> list[bytes]:
 
 
 def answered(address: str, request: bytes) -> bytes:
-    """All of an answer that is not time or the call's own name."""
     with grpc.insecure_channel(address, [("grpc.max_send_message_length", -1)]) as channel:
         data = channel.unary_unary("/mapless.v1.LocalizationService/Localize")(request, timeout=LIMIT_S)
-    answer = pb.LocalizeResponse.FromString(data)
+    return essence(pb.LocalizeResponse.FromString(data))
+
+
+def answered_twice(address: str, request: bytes) -> tuple[bool, bytes]:
+    """Whether there was a coarse answer before the final one, and the final one."""
+    with grpc.insecure_channel(address, [("grpc.max_send_message_length", -1)]) as channel:
+        stream = channel.unary_stream("/mapless.v1.LocalizationService/LocalizeProgressively")
+        *coarse, final = map(pb.LocalizeProgressivelyResponse.FromString, stream(request, timeout=LIMIT_S))
+    assert [it.is_final for it in (*coarse, final)] == [*[False] * len(coarse), True]
+    return bool(coarse), essence(final.answer)
+
+
+def essence(answer: pb.LocalizeResponse) -> bytes:
+    """All of it that is not time or the call's own name."""
     assert answer.diagnostics.request_id
     for own in ("request_id", "stages", "queue_duration", "total_duration"):
         answer.diagnostics.ClearField(own)
@@ -158,7 +170,9 @@ def test_answers_are_those_of_the_plain_server_bit_for_bit(
         for request in asked(place):
             expected = answered(plain.address, request)
             assert [answered(way, request) for way in ways] == [expected] * 3
-            outcomes.add(pb.LocalizeResponse.FromString(expected).WhichOneof("outcome"))
+            outcome = pb.LocalizeResponse.FromString(expected).WhichOneof("outcome")
+            assert answered_twice(real.address, request) == (outcome == "localization", expected)
+            outcomes.add(outcome)
     assert outcomes == {"localization", "rejection"}
     with Client(real.address) as client:
         client.delete_scene("load")

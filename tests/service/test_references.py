@@ -11,13 +11,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from images import encode, textured
+from programs import wait_until
 from servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, pose, serving
 
-from mapless import AlreadyExists, Client, ConnectOptions, InvalidArgument, NewReference, NotFound, wire
+from mapless import (
+    AlreadyExists,
+    Client,
+    ConnectOptions,
+    DeadlineExceeded,
+    InvalidArgument,
+    NewReference,
+    NotFound,
+    ResourceExhausted,
+    wire,
+)
 from mapless.v1 import reference_service_pb2 as pb
 from mapless_server import reference_service
+from mapless_server.errors import Overloaded
 from mapless_server.messages import references
-from mapless_server.store import ReferenceRecord
+from mapless_server.store import ReferenceRecord, Store
 
 
 def create_request(reference_id: str) -> pb.CreateReferenceRequest:
@@ -43,6 +55,44 @@ def test_the_life_of_a_scene(client: Client) -> None:
     for operation in (client.get_scene, client.delete_scene):
         with pytest.raises(NotFound):
             operation("life")
+
+
+def test_a_deleted_scene_takes_no_memory(client: Client, server: RunningServer) -> None:
+    before = server.engine.index_bytes
+    client.create_scene("chosen")
+    client.add_references("chosen", [NewReference("r0", PHOTO, CAMERA, pose(0.0))])
+    client.localize(PHOTO, CAMERA, "chosen")
+    assert server.engine.index_bytes > before
+    client.delete_scene("chosen")
+    assert server.engine.index_bytes == before
+
+
+@pytest.mark.parametrize("ends", ["late", "full"])
+def test_nor_does_one_whose_deletion_takes_too_long_or_fails_late(tmp_path: Path, ends: str) -> None:
+    """The scene is gone by then."""
+    store, is_over = Store.open(tmp_path), threading.Event()
+
+    def delete_what_is_left() -> None:
+        assert is_over.wait(30)
+        raise Overloaded("the store's disk is full", reason="STORE_FULL")
+
+    with serving(tmp_path, store=store) as server, Client(server.address, ConnectOptions(max_attempts=1)) as client:
+        client.create_scene("s")
+        client.add_references("s", [NewReference("r0", PHOTO, CAMERA, pose(0.0))])
+        client.localize(PHOTO, CAMERA, "s")
+        assert server.engine.index_bytes > 0
+        store._leftovers.delete = delete_what_is_left  # type: ignore[method-assign]
+        if ends == "late":
+            with pytest.raises(DeadlineExceeded):
+                client.delete_scene("s", timeout_s=0.5)
+            is_over.set()
+        else:
+            is_over.set()
+            with pytest.raises(ResourceExhausted, match="full"):
+                client.delete_scene("s")
+        wait_until(lambda: server.engine.index_bytes == 0)
+        with pytest.raises(NotFound):
+            client.get_scene("s")
 
 
 def test_the_life_of_a_reference(client: Client, scene: str, tmp_path: Path) -> None:

@@ -250,8 +250,8 @@ def test_a_call_that_cannot_be_computed_is_a_row_and_the_others_are_told(capture
     code, report = replay(tmp_path / "copy")
     told = {it["request_id"]: (it["verdict"], it["error"]) for it in report["calls"]}
     assert code == 1
-    assert told["unknown"] == ("changed", "error: this program knows no method LocalizeTwice")
-    assert told["garbage"][0] == "changed"
+    assert told["unknown"] == ("not computed", "error: this program knows no method LocalizeTwice")
+    assert told["garbage"][0] == "not computed"
     assert told["garbage"][1].startswith("error: DecodeError: ")
     assert told[call.request_id] == ("identical", "")
 

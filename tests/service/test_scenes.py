@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
+from pathlib import Path
 
 import numpy as np
 import pytest
-from servers import Stubs, failure_of
+from servers import CAMERA, PHOTO, Stubs, failure_of, pose, serving
 
-from mapless import UNCHANGED, Calibration, Client, Datum, InvalidArgument, NotFound, Quaternion
+from mapless import UNCHANGED, Calibration, Client, Datum, InvalidArgument, NewReference, NotFound, Quaternion
 from mapless.geodesy import enu_from_y_up
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1.geometry_pb2 import Vector3
+from mapless_server.engine import Engine
+from mapless_server.store import Store
+from mapless_server.tenancy import key_of
 
 DATUM = Datum(47.5, 8.25, 400.0, enu_from_y_up(0))
 CALIBRATION = Calibration(1.5, 1.25, 2.0, 1.75, 40, "sift-2048", "geometric", "BEST", "0.1.0")
@@ -154,3 +158,22 @@ def test_a_quaternion_is_answered_normalized(client: Client, scene: str) -> None
     q = found.enu_from_world
     assert np.linalg.norm([q.x, q.y, q.z, q.w]) == pytest.approx(1, abs=1e-12)
     assert (q.z, q.w) == pytest.approx((0.6, 0.8), abs=1e-3)
+
+
+def test_what_is_deleted_leaves_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The engine hears of it: of one reference, then of the others with their scene."""
+    heard: list[object] = []
+    monkeypatch.setattr(Engine, "forget_references", lambda _, keys: heard.append(set(keys)))
+    monkeypatch.setattr(Engine, "forget_scene", lambda _, scene_key: heard.append(scene_key))
+    store = Store.open(tmp_path)
+    with serving(tmp_path, store=store) as server, Client(server.address) as client:
+        client.create_scene("s")
+        client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
+        client.localize(PHOTO, CAMERA, "s")
+        scene_key = key_of("default", "s")
+        keys = store.find_keys(scene_key, ["r0", "r1", "r2"])
+        client.delete_reference("s", "r1")
+        client.delete_scene("s")
+        with pytest.raises(NotFound):
+            client.delete_scene("s")
+    assert heard == [{keys["r1"]}, {keys["r0"], keys["r2"]}, scene_key, scene_key]

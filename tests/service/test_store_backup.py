@@ -259,6 +259,8 @@ def test_commands_do_it_beside_a_server(tmp_path: Path, backup: Path, monkeypatc
         assert "reference: 9" in ended.stdout
         assert run("migrate", "--data-dir", str(data_dir))[0] == "1"
     assert run("verify", str(backup)).startswith("0")
+    assert "there is no database" in run("restore", str(tmp_path / "nothing"), "--data-dir", str(other))
+    assert not other.exists()
     assert run("restore", str(backup), "--data-dir", str(other)).startswith("0")
     assert run("verify", "--data-dir", str(other)).startswith("0")
     with Store.open(other) as store:

@@ -21,12 +21,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import postgres
 import pytest
+from programs import wait_until
 from stores import DATABASES, Folder, Place, Shared
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server import errors
 from mapless_server.method.views import Features, View
-from mapless_server.store import NewReference, Store, StoreError
+from mapless_server.principal import DEFAULT_TENANT
+from mapless_server.store import NewReference, Store, StoreError, removing
 from mapless_server.store.postgresql import PostgresqlDatabase
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 from mapless_server.store.verify import verify
@@ -41,6 +43,9 @@ COUNTS = (
 WAIT_S = 30.0
 DATABASE_IS_KILLED_EVERY = 8
 """Rounds; in between it is the server."""
+DELETES = "deletes"
+"""What the names of those begin with that delete scenes."""
+REFERENCES_OF_A_SCENE = 6
 DIES_YOUNG_EVERY = 5
 """Rounds: before it has opened the store."""
 
@@ -95,6 +100,19 @@ def change_until_killed(address: str, prefix: str) -> None:
                 say(f"done {change}")
 
 
+def delete_until_killed(address: str, prefix: str) -> None:
+    """Makes scenes of several references, and deletes them one reference at a time."""
+    removing.PORTION_BYTES = 0
+    with open_when_there(address) as store:
+        for index in range(100_000):
+            scene = SceneKey(f"{prefix}-{index}")
+            store.create_scene(scene)
+            store.add_references(scene, [make_reference(f"r{it}") for it in range(REFERENCES_OF_A_SCENE)])
+            say(f"try {scene}")
+            store.delete_scene(scene)
+            say(f"done {scene}")
+
+
 def say(line: str) -> None:
     """At once, and as a whole."""
     os.write(1, f"{line}\n".encode())
@@ -109,7 +127,8 @@ def nurse(address: str) -> None:
     for line in sys.stdin:
         victim = os.fork()
         if victim == 0:
-            change_until_killed(address, line.strip())
+            live = delete_until_killed if line.startswith(DELETES) else change_until_killed
+            live(address, line.strip())
         say(f"born {victim}")
         _, status = os.waitpid(victim, 0)
         say(f"ended {os.waitstatus_to_exitcode(status)}")
@@ -290,6 +309,39 @@ def kill_and_check(database: str, folder: Path, rounds: int) -> None:
 @pytest.mark.parametrize("database", DATABASES)
 def test_killed_at_random_moments(database: str, tmp_path: Path) -> None:
     kill_and_check(database, tmp_path, 10)
+
+
+def check_scenes(place: Place) -> None:
+    """Each is there with all it had, or gone; and what is left of those is gone soon after the store is opened."""
+    with place.open() as store:
+        scenes = store.list_scenes(DEFAULT_TENANT, 100)
+        assert all(it.reference_count in (0, REFERENCES_OF_A_SCENE) for it in scenes)
+        whole = sum(it.reference_count for it in scenes)
+        wait_until(lambda: place.fetch("SELECT count(*) FROM reference") == [(whole,)])
+        assert place.fetch(COUNTS) == [(whole,) * 3]
+        for scene in scenes:
+            assert len(store.list_references(SceneKey(scene.scene_id), 100)) == scene.reference_count
+        with store.database.read() as connection:
+            assert verify(connection).faults == ()
+
+
+@pytest.mark.parametrize("database", DATABASES)
+def test_killed_while_scenes_are_deleted(database: str, tmp_path: Path) -> None:
+    moments = random.Random(21)
+    with place_of_its_own(database, tmp_path) as (place, cluster):
+        place.open().close()
+        nursery = Nursery(place.url if isinstance(place, Shared) else str(tmp_path))
+        try:
+            for number in range(3):
+                victim = nursery.bear(f"{DELETES}{number}")
+                nursery.wait_for_work()
+                time.sleep(moments.uniform(0.0, 0.1))
+                nursery.bury(victim)
+                if cluster is not None:
+                    wait_for_the_dead(cluster)
+                check_scenes(place)
+        finally:
+            nursery.end()
 
 
 @pytest.mark.thorough

@@ -73,6 +73,24 @@ def test_answers_are_seen_as_they_come_and_those_of_other_scenes_are_not(
     seen.cancel()
 
 
+def test_what_is_seen_is_what_the_caller_gets(tmp_path: Path) -> None:
+    """Whether the call is captured, too."""
+    with (
+        serving(tmp_path / "data", allow_watching=True, capture_dir=tmp_path / "captured") as server,
+        Client(server.address) as client,
+        grpc.insecure_channel(server.address) as channel,
+    ):
+        fill(client, "hall")
+        stub = LocalizationServiceStub(channel)
+        seen = watching(stub)
+        request = localize_request("hall")
+        request.options.include_debug = True
+        own = stub.Localize(request, timeout=LIMIT_S)
+        assert own.diagnostics.captured
+        assert next(seen).answer == own
+        seen.cancel()
+
+
 def test_it_needs_to_be_allowed(tmp_path: Path) -> None:
     with serving(tmp_path) as closed, grpc.insecure_channel(closed.address) as channel:
         failure = ending(LocalizationServiceStub(channel).WatchQueries(REQUEST, timeout=LIMIT_S))

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
+from pathlib import Path
 
 import pytest
 
+from mapless_server.assembly import StartupError
+from mapless_server.running import running_server
 from mapless_server.security.binding import Advice, Verdict, advise, is_loopback, resolve_host
+from mapless_server.settings import Settings
 
 HOSTS = {
     "loopback": ["127.0.0.1", "127.8.8.8", "::1", "localhost", "::ffff:127.0.0.1", "127.1"],
@@ -72,3 +77,15 @@ def test_what_is_said(host: str, flags: str, verdict: Verdict, words: str) -> No
     assert advice.verdict is verdict
 
     assert re.search(words, advice.sentence)
+
+
+def test_a_refused_start_leaves_no_store_behind(tmp_path: Path) -> None:
+    settings = Settings(host="0.0.0.0", data_dir=tmp_path / "data")
+
+    async def start() -> None:
+        async with running_server(settings):
+            pass
+
+    with pytest.raises(StartupError, match="insecure"):
+        asyncio.run(start())
+    assert not (tmp_path / "data").exists()

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
+import shutil
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from mapless.geodesy import Datum
 from mapless.geometry import Camera, RadialTangential, RigidTransform, rotation_from_vector
+from mapless_server.capture import blobs as blobs_module
+from mapless_server.capture import files as files_module
 from mapless_server.capture import folder as folder_module
+from mapless_server.capture import held as held_module
 from mapless_server.capture.calls import (
     CapturedCall,
     CapturedPart,
@@ -27,6 +35,7 @@ from mapless_server.capture.errors import BlobGone, CaptureError, DamagedCapture
 from mapless_server.capture.files import write_whole
 from mapless_server.capture.folder import CaptureFolder, Retention
 from mapless_server.capture.opening import open_recorder
+from mapless_server.capture.report import Selection
 from mapless_server.observability.metrics import Metrics
 from mapless_server.retrieval.chosen import Choice
 from mapless_server.retrieval.ranking import RankedReference
@@ -103,7 +112,7 @@ def test_references_are_kept_once_and_go_with_the_last_call_that_needs_them(tmp_
         assert folder.add(call, missing)
     assert len(files(tmp_path / "c")) == 3 + 3
     for count, left in ((5, 2), (3, 1), (0, 0)):
-        folder.remove(folder.held()[0])
+        folder.remove_all(folder.held()[:1])
         assert (len(files(tmp_path / "c")), len(folder)) == ((2 + 2, 1 + 2, 0)[2 - left], left), count
     assert folder.space_bytes == 0
     folder.close()
@@ -127,7 +136,8 @@ def test_the_limit_of_size_holds_at_every_moment(tmp_path: Path, monkeypatch: py
         write_whole(path, data)
         most.append(sum(-(-it.stat().st_size // 4096) * 4096 for it in files(tmp_path / "c")))
 
-    monkeypatch.setattr(folder_module, "write_whole", watched)
+    for module in (folder_module, blobs_module):
+        monkeypatch.setattr(module, "write_whole", watched)
     folder = opened(tmp_path / "c", Retention(3600.0, limit))
     random = np.random.default_rng(1)
     for number in range(60):
@@ -166,6 +176,29 @@ def test_what_is_too_old_goes_while_nothing_comes_and_at_the_start(tmp_path: Pat
     now_s[0] -= 10_000  # the clock is set back: nobody knows how old it is
     folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
     assert files(tmp_path / "c") == []
+    folder.close()
+
+
+def test_what_is_too_old_goes_though_the_clock_is_set_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Back: what has passed counts. Ahead: the clock does. And a call that was ahead of the clock stays no longer."""
+    now_s, passed_s = [NOW_S], [0.0]
+    for module in (folder_module, held_module):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: passed_s[0]))
+    folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
+    folder.add(a_call(0, ()), {})
+    folder.add(a_call(1, (), NOW_S + 50), {})
+    now_s[0] -= 10_000
+    passed_s[0] = 99.0
+    assert (folder.expire(), len(folder)) == (1.0, 2)
+    passed_s[0] = 100.0
+    assert (folder.expire(), len(folder), files(tmp_path / "c")) == (100.0, 0, [])
+    folder.add(a_call(2, (), now_s[0]), {})
+    now_s[0] += 60
+    assert (folder.expire(), len(folder)) == (40.0, 1)
+    now_s[0] += 40
+    assert (folder.expire(), len(folder)) == (100.0, 0)
     folder.close()
 
 
@@ -288,11 +321,229 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.M
             raise OSError(28, "No space left on device")
         write_whole(path, data)
 
-    monkeypatch.setattr(folder_module, "write_whole", full)
+    for module in (folder_module, blobs_module):
+        monkeypatch.setattr(module, "write_whole", full)
     with pytest.raises(OSError, match="No space"):
         folder.add(a_call(), blobs_of(a_call()))
     assert (files(tmp_path / "c"), folder.space_bytes, len(folder)) == ([], 0, 0)
     folder.close()
+
+
+def test_what_cannot_be_deleted_never_makes_it_more_than_the_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others go in place of a call that cannot be deleted; where that is not enough nothing is written."""
+    limit, random = 100_000, np.random.default_rng(3)
+    folder = opened(tmp_path / "c", Retention(3600.0, limit))
+    stuck = set[Path]()
+    unlink = Path.unlink
+
+    def refused(path: Path, missing_ok: bool = False) -> None:
+        if path in stuck:
+            raise PermissionError(1, "Operation not permitted")
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", refused)
+    for number in range(3):
+        folder.add(a_call(number, (number,), size=1000), blobs_of(a_call(number, (number,))))
+    first = folder.held()[0]
+    stuck.add(first.path)
+    assert folder.add(a_call(3, (3,), size=20_000), blobs_of(a_call(3, (3,))))
+    assert folder.held()[0].path == first.path
+    stuck.update(files(tmp_path / "c"))
+    for number in range(4, 8):
+        call = a_call(number, (number,), size=int(random.integers(30_000, 60_000)))
+        with pytest.raises(OSError, match="leaves no room"):
+            folder.add(call, blobs_of(call))
+        assert sum(-(-it.stat().st_size // 4096) * 4096 for it in files(tmp_path / "c")) == folder.space_bytes <= limit
+    folder.close()
+
+
+@pytest.mark.parametrize("left", ["lock", "marker, half", "marker, empty", "calls", "nothing"])
+def test_a_folder_that_a_killed_server_or_a_deletion_by_hand_left_is_opened(tmp_path: Path, left: str) -> None:
+    """And its limits hold again."""
+    path = tmp_path / "c"
+    folder = opened(path)
+    folder.add(a_call(), blobs_of(a_call()))
+    folder.close()
+    (path / "mapless-capture.json").unlink()
+    if left == "nothing":
+        (path / "lock").unlink()
+    if left != "calls":
+        shutil.rmtree(path / "tenants")
+    if left == "marker, half":
+        (path / "mapless-capture.json.tmp").write_text('{"for')
+    if left == "marker, empty":
+        (path / "mapless-capture.json").touch()
+    folder = opened(path, clock=lambda: NOW_S + 10_000)
+    assert sorted(it.name for it in path.rglob("*") if it.is_file()) == ["lock", "mapless-capture.json"]
+    folder.close()
+
+
+def test_a_folder_for_which_the_disk_was_full_is_opened_when_it_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files_module, "write_whole", full)
+    with pytest.raises(CaptureError, match="No space left"):
+        opened(tmp_path / "c")
+    monkeypatch.undo()
+    opened(tmp_path / "c").close()
+
+
+def test_a_folder_that_is_deleted_by_hand_is_made_anew_by_its_server_alone(tmp_path: Path) -> None:
+    path = tmp_path / "c"
+    folder = opened(path)
+    folder.add(a_call(), blobs_of(a_call()))
+    shutil.rmtree(path)
+    with pytest.raises(BlobGone):
+        folder.add(a_call(1), {})
+    assert folder.add(a_call(1), blobs_of(a_call(1)))
+    assert len(folder) == 1
+    assert stat.S_IMODE(path.stat().st_mode) == 0o700
+    with pytest.raises(CaptureError, match="in use by another server"):
+        opened(path)
+    shutil.rmtree(path)
+    other = opened(path)
+    with pytest.raises(CaptureError, match="in use by another server"):
+        folder.add(a_call(2), blobs_of(a_call(2)))
+    assert files(path) == []
+    other.close()
+    folder.close()
+    opened(path).close()
+
+
+def with_header(data: bytes, change: Callable[[dict[str, Any]], object]) -> bytes:
+    """The file of a call with another header, and the digest of that."""
+    header, _, messages = data[32:].partition(b"\n")
+    content = json.loads(header)
+    change(content)
+    body = json.dumps(content).encode() + b"\n" + messages
+    return hashlib.sha256(body).digest() + body
+
+
+ODD_VALUES: tuple[Any, ...] = (
+    *(math.nan, math.inf, -math.inf, 1e300, -1e300, 10**400, -1, 0, True, None, NOW_S + 61, NOW_S + 59),
+    *("", "..", "/", "\ud800", "\0", "acme/../other", [], [[]], {}, {"a": {}}, ["acme"], [float("nan")], "x" * 300),
+)
+
+
+def places_in(content: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Of each of the values in a header, the inner ones too."""
+    inner = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    for name, it in inner:
+        yield (*path, name)
+        yield from places_in(it, (*path, name))
+
+
+def set_at(place: tuple[Any, ...], value: Any, content: Any) -> None:
+    for name in place[:-1]:
+        content = content[name]
+    content[place[-1]] = value
+
+
+def test_nothing_that_a_header_says_keeps_a_call_beyond_its_time(tmp_path: Path) -> None:
+    """Any value of it, changed to anything, by somebody who can make digests: the call goes at once, or on time."""
+    now_s, kept = [NOW_S], 0
+    path = tmp_path / "c"
+    folder = opened(path)
+    call = replace(
+        a_call(size=10), parts=(CapturedPart("image", 7, (replace(reference(0), views={"a": f"{1:064x}"}),)),)
+    )
+    folder.add(call, blobs_of(call))
+    (held,) = folder.held()
+    folder.close()
+    data = held.path.read_bytes()
+    places = list(places_in(json.loads(data[32:].partition(b"\n")[0])))
+    random = np.random.default_rng(0)
+    for place in places:
+        is_vital = place in (("tenant",), ("scene_id",), ("time_s",))
+        for index in range(len(ODD_VALUES)) if is_vital else random.choice(len(ODD_VALUES), 1).tolist():
+            now_s[0] = NOW_S
+            changed = with_header(data, partial(set_at, place, ODD_VALUES[index]))
+            write_whole(held.path, changed)
+            for blob in held.blobs:
+                write_whole(blob, IMAGES[blob.name])
+            try:
+                folder = opened(path, clock=lambda: now_s[0])
+            except CaptureError as error:  # of a format to come
+                assert "its format" in str(error)  # noqa: PT017
+                continue
+            kept += len(folder)
+            now_s[0] += ROOM.keep_s + 60
+            assert 0 < folder.expire() <= ROOM.keep_s
+            assert (files(path), len(folder), folder.space_bytes) == ([], 0, 0)
+            folder.close()
+    assert kept > 10
+
+
+def test_a_call_of_another_scene_than_its_place_says_is_deleted(tmp_path: Path) -> None:
+    """Who deletes that scene would not know of it."""
+    folder = opened(tmp_path / "c")
+    folder.add(a_call(), blobs_of(a_call()))
+    (held,) = folder.held()
+    folder.close()
+    write_whole(held.path, with_header(held.path.read_bytes(), lambda header: header.update(scene_id="other")))
+    folder = opened(tmp_path / "c")
+    assert files(tmp_path / "c") == []
+    folder.close()
+
+
+def test_calls_of_the_same_moment_do_not_take_one_anothers_place(tmp_path: Path) -> None:
+    """As of two servers, one after the other, with the same process id, when the clock is set back between."""
+    for count in (1, 2, 3):
+        folder = opened(tmp_path / "c")
+        folder.add(a_call(count, ()), {})
+        assert len(folder) == len(files(tmp_path / "c")) == count
+        folder.close()
+
+
+def test_what_is_larger_than_all_may_be_is_deleted_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may be larger than the memory."""
+    folder = opened(tmp_path / "c")
+    folder.add(a_call(), blobs_of(a_call()))
+    (held,) = folder.held()
+    folder.close()
+    with held.path.open("r+b") as file:
+        file.truncate(ROOM.max_bytes + 1)
+    monkeypatch.setattr(held_module, "decode_call", lambda _: pytest.fail("read"))
+    folder = opened(tmp_path / "c")
+    assert files(tmp_path / "c") == []
+    folder.close()
+
+
+@pytest.mark.parametrize("place", ["tenants", "tenants/acme", "tenants/acme/blobs", "tenants/acme/calls/hall"])
+@pytest.mark.parametrize("fault", ["link", "locked"])
+def test_what_cannot_be_looked_into_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, fault: str
+) -> None:
+    """Nobody would see to it that what is in there goes; and what lies elsewhere is not deleted."""
+    path = tmp_path / "c"
+    folder = opened(path)
+    folder.add(a_call(), blobs_of(a_call()))
+    folder.close()
+    before = len(files(path))
+    if fault == "link":
+        (path / place).rename(tmp_path / "elsewhere")
+        (path / place).symlink_to(tmp_path / "elsewhere")
+    else:
+        scandir = os.scandir
+
+        def locked(at: Any) -> Any:
+            if Path(at) == path / place:
+                raise PermissionError(13, "Permission denied", str(at))
+            return scandir(at)
+
+        monkeypatch.setattr(os, "scandir", locked)
+    with pytest.raises(CaptureError, match=rf"cannot be used: .*{place}: (a symbolic link|Permission denied)"):
+        opened(path)
+    with pytest.raises(CaptureError, match=rf"{place} cannot be read: (a symbolic link|Permission denied)"):
+        Selection().files(path)
+    monkeypatch.undo()
+    elsewhere = files(tmp_path / "elsewhere")
+    assert len(files(path)) + len(elsewhere) == before
 
 
 def test_folders_that_cannot_be_used_are_refused(tmp_path: Path) -> None:

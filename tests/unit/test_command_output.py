@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted_answers import localized, rejected
+from planted_answers import diagnostics, localized, rejected
 
 from mapless.answers import PriorCheck
 from mapless.axes import Axes
@@ -57,6 +57,15 @@ def test_a_rejection_names_the_reference_that_shares_most() -> None:
     hint = rejected().hint
     assert hint is not None
     assert lines(rejected(hint=replace(hint, best_reference="")))[-1] == "  Point the camera there."
+
+
+def test_what_the_server_is_to_keep_is_said_and_of_nothing_else() -> None:
+    captured = replace(diagnostics(), captured=True)
+    assert "  support   180 of 200 matches, 2 references, 0.30 s, captured by the server" in lines(
+        localized(diagnostics=captured)
+    )
+    assert lines(rejected(diagnostics=captured))[-1] == "  captured by the server"
+    assert "captured" not in "\n".join([*lines(localized()), *lines(rejected())])
 
 
 def test_progress_counts_each_kind_by_its_name() -> None:

@@ -280,6 +280,21 @@ def test_the_memory_is_bounded_and_forgets_the_longest_unused(
     assert len(matched_pairs) == 4
 
 
+def test_pairs_of_a_deleted_reference_are_forgotten(matched_pairs: list[tuple[Features, Features]]) -> None:
+    scene = make_scene(random_for("deleted"), SceneOptions(reference_count=3, point_count=50))
+    a, b, c = scene.references
+    matcher = Matcher()
+    for first, second in ((a, b), (b, c), (a, c)):
+        matcher.match_references(first, second)
+    matcher.forget({b.key, "another"})
+    assert len(matched_pairs) == 3
+    matcher.match_references(a, c)
+    assert len(matched_pairs) == 3
+    matcher.match_references(a, b)
+    matcher.match_references(b, c)
+    assert len(matched_pairs) == 5
+
+
 # The seam
 
 

@@ -131,6 +131,13 @@ def test_rejections_are_shown_and_drawn(folder: Path, tmp_path: Path, monkeypatc
     assert "0 of 2 localized" in said
 
 
+def test_half_of_a_folder_is_too_little(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FakeClient, "rejected", ("p1",))
+    console = Console(record=True, width=140)
+    assert not run.run_demo(folder, tmp_path / "out", console)
+    assert "expected: more than half localized" in console.export_text()
+
+
 @pytest.mark.parametrize(("offset_m", "good"), [(0.029, True), (0.031, False), (math.inf, False)])
 def test_the_rendered_room_must_reach_its_limits(photos: list[Photo], offset_m: float, good: bool) -> None:
     queries = [run.Photograph(p.name, b"", p.camera, p.world_from_camera) for p in photos]

@@ -111,10 +111,16 @@ def test_a_server_that_says_when_to_come_back_is_asked_until_the_deadline() -> N
     assert Played(asking(timeout_s=30.0), [starting], ConnectOptions(max_attempts=1)).pauses == []
 
 
-def test_other_errors_are_final() -> None:
-    wrong = InvalidArgument("INVALID_ARGUMENT", "wrong")
-    played = Played(asking(), [wrong], ConnectOptions())
-    assert (played.result, len(played.tries)) == (wrong, 1)
+@pytest.mark.parametrize(
+    "error",
+    [
+        InvalidArgument("INVALID_ARGUMENT", "wrong"),
+        DeadlineExceeded("DEADLINE_EXCEEDED", "read too late", reason="READ_LATE"),
+    ],
+)
+def test_other_errors_are_final(error: MaplessError) -> None:
+    played = Played(asking(), [error], ConnectOptions())
+    assert (played.result, len(played.tries)) == (error, 1)
 
 
 def test_every_upload_has_the_time_of_uploads() -> None:

@@ -170,6 +170,15 @@ def written(path: Path, of: Layout, old: bytes, new: bytes) -> Path:
     return path
 
 
+def test_a_cambridge_lens_beyond_all_numbers_refuses_its_image(tmp_path: Path) -> None:
+    """It was an OverflowError."""
+    of = layout(benchmarks.LAYOUTS, "ShopFacade")
+    folder = written(tmp_path, of, b" -0.05 0", b" 1e200 0")
+    dataset = read_dataset(folder, of.format, of.options(folder))
+    assert len(dataset.frames) == 2
+    assert len(dataset.refused) == 1
+
+
 def test_a_name_longer_than_any_files_in_a_colmap_model_refuses_its_image(tmp_path: Path) -> None:
     """It was an OSError."""
     of = layout(colmap.LAYOUTS, "text")

@@ -84,7 +84,7 @@ def test_the_numbers_are_told() -> None:
     assert "120 local features" in hint_of(RejectionReason.LOW_TEXTURE, features=120).message
 
 
-def test_the_best_reference_is_the_one_with_most_inliers_or_else_matches() -> None:
+def test_the_best_reference_is_the_one_whose_matches_the_sentence_counts() -> None:
     assert hint_of(RejectionReason.LOW_OVERLAP).best_reference == NAMES[1]
     assert hint_of(RejectionReason.LOW_OVERLAP, (0,) * 6).best_reference is None
     rejection = Rejection(RejectionReason.GATE, "planted")
@@ -92,7 +92,19 @@ def test_the_best_reference_is_the_one_with_most_inliers_or_else_matches() -> No
     outcome = hinted(answer, view_of(900), SCENE.references).outcome
     assert isinstance(outcome, Rejection)
     assert outcome.hint is not None
-    assert outcome.hint.best_reference == NAMES[3]
+    assert outcome.hint.best_reference == NAMES[1]
+    assert "shares 60 of" in outcome.hint.message
+
+
+def test_what_one_reference_alone_shows_wants_another_and_no_other_calibration() -> None:
+    """Its very photograph shares all features with it, and hardly any has a point."""
+    alone, others = Rejection(RejectionReason.LOW_OVERLAP, "planted", tried=27), (0, 1267, 8, 0, 2, 0)
+    outcome = hinted(Answer(alone, reference_match_counts=others), view_of(1267), SCENE.references).outcome
+    assert isinstance(outcome, Rejection)
+    assert outcome.hint is not None
+    assert outcome.hint.advice is Advice.ADD_REFERENCES
+    assert outcome.hint.best_reference == NAMES[1]
+    assert NAMES[1] in outcome.hint.message
 
 
 def test_where_a_prior_leaves_no_reference_it_is_to_be_checked() -> None:

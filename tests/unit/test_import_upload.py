@@ -10,6 +10,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from layouts import CAMERA, truth, write_image
 
@@ -26,7 +27,7 @@ from mapless import (
     ResourceExhausted,
     Unavailable,
 )
-from mapless.geometry import RigidTransform
+from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.dataset import Dataset, Frame
 from mapless_server.ingest.existing import KnownReferences
 from mapless_server.ingest.items import BATCH_BYTES, BATCH_COUNT
@@ -155,6 +156,33 @@ def test_what_differs_from_what_is_there_is_refused_with_the_difference(tmp_path
     assert "0.05 m" in why["r001"]
     assert "focal_x_px is 80.0, not 90.0" in why["r002"]
     assert [item.frame for item in report.skipped] == ["r003"]
+
+
+@pytest.mark.parametrize(
+    ("moved_m", "turned_deg", "is_same"),
+    [(9e-4, 0.0, True), (0.0, 9e-3, True), (1.1e-3, 0.0, False), (0, 0.011, False)],
+)
+def test_the_same_photograph_with_almost_the_same_pose_is_skipped(
+    tmp_path: Path, moved_m: float, turned_deg: float, is_same: bool
+) -> None:
+    (frame,) = frames_in(tmp_path, 1)
+    far = replace(frame, world_from_camera=frame.world_from_camera.shifted([4e5, 5e6, 0]))
+    server = Server()
+    upload(server, [far])
+    moved = far.world_from_camera.shifted([moved_m, 0, 0])
+    turned = RigidTransform(moved.rotation @ rotation_from_vector([np.radians(turned_deg), 0, 0]), moved.translation)
+    report = upload(server, [replace(far, world_from_camera=turned)])
+    assert (len(report.skipped), len(report.refused)) == ((1, 0) if is_same else (0, 1))
+
+
+def test_what_is_refused_is_not_counted_as_stored(tmp_path: Path) -> None:
+    frames = frames_in(tmp_path, 4)
+    frames[1].image_path.write_bytes(b"")
+    told: list[tuple[int, int]] = []
+    report = ImportReport("s", Dataset("d", tuple(frames), True, ""), frames)
+    uploader = Uploader(Server(), KnownReferences([]), report, QUICK, lambda step, *counts: told.append(counts))  # type: ignore[arg-type]
+    uploader.run()
+    assert told == [(0, 4), (3, 3)]
 
 
 def test_the_same_image_under_another_id_is_the_same_reference(tmp_path: Path) -> None:

@@ -142,6 +142,13 @@ def test_fields_cannot_pass_for_what_every_line_has() -> None:
     assert (line["level_"], line["name_"], line["message_"], line["exception_"]) == ("fake", "scene", "x", "z")
 
 
+@pytest.mark.parametrize("formatter", [JsonFormatter(), TextFormatter()])
+def test_what_a_library_marks_records_with_is_no_field(formatter: logging.Formatter) -> None:
+    line = formatter.format(record_of("m", scene="hall", _ray_timestamp_ns=1))
+    assert "hall" in line
+    assert "_ray_timestamp_ns" not in line
+
+
 def test_arguments_that_do_not_fit_are_shown_as_they_are() -> None:
     assert written("%d of %d", "one")["message"] == "%d of %d ['one']"
     assert written("%s", Unshowable())["message"] == "%s ['<Unshowable that raises RuntimeError>']"

@@ -230,6 +230,13 @@ def test_what_is_not_calibrated_says_so_where_it_is_read_first() -> None:
     assert "uncalibrated" not in report_html(calibrated, PHOTO, CAMERA)
 
 
+def test_what_the_server_is_to_keep_is_said() -> None:
+    captured = replace(diagnostics(), captured=True)
+    for answer in (localized(diagnostics=captured), rejected(diagnostics=captured)):
+        assert "The server is to keep this call" in report_html(answer, PHOTO, CAMERA)
+    assert "The server is to keep this call" not in report_html(localized(), PHOTO, CAMERA)
+
+
 def embedded(html: str) -> bytes:
     return base64.b64decode(re.findall(r"data:image/\w+;base64,([\w+/=]+)", html)[0])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from mapless_server.store.records import IndexedReference, SceneChanges
 DIMENSION = 16
 QUERY = np.eye(DIMENSION, dtype=np.float32)[0]
 AHEAD = np.array([0.0, 0.0, 1.0])
-UNTHINNED = RankOptions(nearby_weight=1.0)
+UNTHINNED = RankOptions(nearby_weight=1.0, same_place_m=0.0)
 
 
 def with_similarity(similarity: float) -> NDArray[np.float32]:
@@ -93,7 +94,7 @@ class TestOrder:
         entries = planted(similarity.tolist(), x_m=[0.0] * 3000)
         exact = entries.similarities(QUERY, entries.rows())
         expected = np.argsort(-exact, kind="stable")[:7].tolist()
-        options = RankOptions(nearby_weight=1.0, pool=1, smallest_pool=1)
+        options = replace(UNTHINNED, pool=1, smallest_pool=1)
         assert [int(it.reference_id) for it in rank_references(entries, QUERY, 7, options=options)] == expected
 
 
@@ -146,6 +147,14 @@ class TestThinning:
         assert ids(rank_references(entries, QUERY, 2)) == "0 2"
         assert ids(rank_references(entries, QUERY, 2, options=UNTHINNED)) == "0 1"
 
+    def test_of_a_camera_that_stood_still_few_are_chosen_before_others(self) -> None:
+        """Three hundred alike, more than are looked at first; then those that are less so, the better first."""
+        similarities: list[float | None] = [*[0.99] * 300, 0.5, 0.7, 0.6, *[0.1] * 400]
+        places = [0.0001 * i for i in range(300)] + [1.0, 2.0, 3.0] + [10.0 + i for i in range(400)]
+        ranked = rank_references(planted(similarities, places), QUERY, 6)
+        assert ids(ranked) == "0 1 2 301 302 300"
+        assert ids(rank_references(planted([0.9, 0.8, 0.7], [0.0, 0.01, 0.02]), QUERY, 2)) == "0 1"
+
     @settings(deadline=None)
     @given(
         st.lists(
@@ -154,15 +163,23 @@ class TestThinning:
         st.integers(0, 9),
         st.sampled_from([0.0, 0.5, 1.0]),
         st.sampled_from([-0.5, 0.2]),
+        st.sampled_from([0.0, 0.15]),
+        st.integers(1, 3),
     )
     def test_the_choice_is_that_of_loops(
-        self, candidates: list[tuple[int, int, int]], count: int, weight: float, typical: float
+        self,
+        candidates: list[tuple[int, int, int]],
+        count: int,
+        weight: float,
+        typical: float,
+        same_m: float,
+        most: int,
     ) -> None:
         scores = [0.1 * score for score, _, _ in candidates]
         centres = np.array([[0.1 * place, 0.0, 0.0] for _, place, _ in candidates])
         angles = np.radians([turn for _, _, turn in candidates])
         axes = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
-        options = RankOptions(apart_m=0.25, apart_deg=30.0, nearby_weight=weight)
+        options = RankOptions(0.25, 30.0, weight, same_m, most)
         expected = slow_spread(scores, centres, axes, count, typical, options)
         assert spread(scores, centres, axes, count, typical, options) == expected
 
@@ -180,12 +197,24 @@ def slow_spread(
             for c in chosen
         )
 
+    def is_passed_over(i: int) -> bool:
+        there = [
+            c
+            for c in chosen
+            if np.linalg.norm(centres[i] - centres[c]) < options.same_place_m
+            and math.degrees(math.acos(min(1.0, axes[i] @ axes[c]))) <= options.apart_deg
+        ]
+        return len(there) >= max(1, min(options.per_place, count // 2))
+
     def worth(i: int) -> float:
         lead = max(scores[i] - typical, 0.0)
         return scores[i] - (1 - options.nearby_weight) * lead if sees_what_is_seen(i) else scores[i]
 
-    while len(chosen) < min(count, len(scores)):
-        chosen.append(max((i for i in range(len(scores)) if i not in chosen), key=lambda i: (worth(i), -i)))
+    while len(chosen) < count:
+        left = [i for i in range(len(scores)) if i not in chosen and not is_passed_over(i)]
+        if not left:
+            break
+        chosen.append(max(left, key=lambda i: (worth(i), -i)))
     return chosen
 
 
@@ -214,6 +243,8 @@ def test_a_removed_reference_is_never_ranked() -> None:
         lambda: RankOptions(apart_deg=181.0),
         lambda: RankOptions(nearby_weight=1.5),
         lambda: RankOptions(nearby_weight=math.nan),
+        lambda: RankOptions(same_place_m=-1.0),
+        lambda: RankOptions(per_place=0),
         lambda: RankOptions(pool=0),
         lambda: RankOptions(smallest_pool=0),
     ],

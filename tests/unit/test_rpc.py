@@ -23,6 +23,7 @@ from mapless_server.call import ANSWER_MARGIN_SHARE, Call
 from mapless_server.errors import NotFound, Overloaded, PermissionDenied, Unauthenticated
 from mapless_server.observability.trail import MAX_STEPS, Step
 from mapless_server.principal import Principal, Role
+from mapless_server.receiving import OpenMethods, Receiver
 from mapless_server.rpc import CallGuard
 
 CHECK, WATCH = "/grpc.health.v1.Health/Check", "/grpc.health.v1.Health/Watch"
@@ -418,6 +419,45 @@ def test_streams_that_anybody_may_open_are_few_and_keep_no_probe_out(
                 await asyncio.sleep(0.01)
             assert not await is_let_in()
             assert codes == {"RESOURCE_EXHAUSTED"}
+
+    asyncio.run(run())
+
+
+class Unread:
+    """A call whose caller does not read before it is let."""
+
+    def __init__(self) -> None:
+        self.may_read = asyncio.Event()
+        self.begun, self.seen = 0, list[int]()
+
+    async def read(self) -> bytes:
+        return b""
+
+    async def write(self, message: health_pb2.HealthCheckResponse) -> None:
+        self.begun += 1
+        await self.may_read.wait()
+        self.seen.append(message.status)
+
+
+def test_who_does_not_read_how_the_server_is_keeps_nobody_from_changing_it() -> None:
+    """Health's servicer holds a lock while it writes; a server that stops says so first."""
+    status = health_pb2.HealthCheckResponse
+
+    async def run() -> None:
+        healthy = health.aio.HealthServicer()  # type: ignore[attr-defined]
+        method = grpc.unary_stream_rpc_method_handler(
+            healthy.Watch, health_pb2.HealthCheckRequest.FromString, status.SerializeToString
+        )
+        call = Unread()
+        watching = asyncio.ensure_future(OpenMethods(Receiver()).guarded(method).stream_stream(None, call))
+        for now in (status.SERVING, status.NOT_SERVING, status.UNKNOWN, status.NOT_SERVING):
+            await asyncio.wait_for(healthy.set("", now), LIMIT_S)
+            await until(lambda: call.begun == 1)
+            await asyncio.sleep(0)
+        call.may_read.set()
+        await until(lambda: call.seen[-1:] == [status.NOT_SERVING])
+        assert len(call.seen) == 2  # the first, and how it is now
+        watching.cancel()
 
     asyncio.run(run())
 

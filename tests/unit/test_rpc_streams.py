@@ -6,8 +6,11 @@ Those that could last for ever are waited for by nobody; those that come to an e
 from __future__ import annotations
 
 import asyncio
+import gc
 import time
-from collections.abc import AsyncIterator, Callable
+import warnings
+import weakref
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,7 +21,7 @@ import pytest
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
-from mapless_server import rpc
+from mapless_server import rpc, sending
 from mapless_server.call import Call
 from mapless_server.errors import FailedPrecondition, Unauthenticated
 from mapless_server.principal import Principal
@@ -70,9 +73,12 @@ class Numbers:
 
 @asynccontextmanager
 async def serving(
-    numbers: Numbers | Exception, counted: Counted, **options: Any
+    numbers: Numbers | Exception,
+    counted: Counted,
+    understand: Callable[[bytes], pb.WatchQueriesRequest] = pb.WatchQueriesRequest.FromString,
+    **options: Any,
 ) -> AsyncIterator[tuple[Any, CallGuard]]:
-    """A channel to a server whose streams are answered so."""
+    """A channel to a server whose streams are answered so; of a message that nobody reads it takes 64 KiB."""
 
     async def watch(request: pb.WatchQueriesRequest, call: Call) -> Numbers:
         if isinstance(numbers, Exception):
@@ -82,15 +88,14 @@ async def serving(
 
     guard = CallGuard(observer=counted, **options)
     server = grpc.aio.server()
-    method = grpc.unary_stream_rpc_method_handler(
-        watch, pb.WatchQueriesRequest.FromString, pb.WatchQueriesResponse.SerializeToString
-    )
+    method = grpc.unary_stream_rpc_method_handler(watch, understand, pb.WatchQueriesResponse.SerializeToString)
     service = {name.rpartition("/")[2]: guard.guarded(name, method) for name in (METHOD, FINITE)}
     server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("mapless.v1.LocalizationService", service)])
     port = server.add_insecure_port("127.0.0.1:0")
     await server.start()
     try:
-        async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
+        as_by_default = [("grpc.http2.bdp_probe", 0)]  # or the window would grow with what was read before
+        async with grpc.aio.insecure_channel(f"127.0.0.1:{port}", as_by_default) as channel:
             yield channel, guard
     finally:
         await server.stop(5)
@@ -287,6 +292,12 @@ class Large(Numbers):
         return message
 
 
+class Asked:
+    """What a message is understood as."""
+
+    scene = "scenes/hall"
+
+
 class TestStreamsThatComeToAnEnd:
     def test_all_that_is_sent_comes_and_they_are_counted(self) -> None:
         async def run() -> None:
@@ -300,7 +311,7 @@ class TestStreamsThatComeToAnEnd:
         asyncio.run(run())
 
     @pytest.mark.parametrize("options", [{"default_deadline_s": 0.3}, {"max_deadline_s": 0.3}])
-    def test_their_deadline_is_that_of_unary_calls(self, options: dict[str, float]) -> None:
+    def test_their_deadline_is_that_of_unary_calls(self, options: dict[str, Any]) -> None:
         async def run() -> None:
             counted, numbers, seen = Counted(), Numbers(1, "wait"), list[int]()
             async with serving(numbers, counted, **options) as (channel, _):
@@ -357,24 +368,43 @@ class TestStreamsThatComeToAnEnd:
             asyncio.run(run())
         assert not caplog.records
 
-    def test_who_never_reads_has_no_call_for_long(
-        self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        """No deadline ends it: its messages were made in time, and the caller gave none."""
-        monkeypatch.setattr(rpc, "SEND_LIMIT_S", 0.2)
+    def test_the_request_does_not_wait_for_who_reads_slowly(self) -> None:
+        """It is a photograph."""
+        requests: list[weakref.ref[Asked]] = []
+
+        def understand(data: bytes) -> Any:
+            asked = Asked()
+            requests.append(weakref.ref(asked))
+            return asked
 
         async def run() -> None:
             counted, numbers = Counted(), Large(8)
-            async with serving(numbers, counted) as (channel, guard):
-                call = watching(channel, None, FINITE)
-                await call.initial_metadata()
-                await until(lambda: len(counted.handled) == 1)
-                await guard.wait_until_idle(LIMIT_S)
-            assert (counted.handled, numbers.is_closed) == (["CANCELLED"], True)
+            async with serving(numbers, counted, understand) as (channel, _):
+                call = watching(channel, method=FINITE)
+                await until(lambda: numbers.is_closed)
+                assert [it() for it in requests] == [None]
+                assert not counted.handled
+                assert await read(call) == [*range(1, 9)]
 
-        with caplog.at_level("WARNING"):
+        asyncio.run(run())
+
+    def test_one_whose_time_is_over_before_it_begins_leaves_nothing_behind(self) -> None:
+        def authenticate(*_: Any) -> Principal:
+            time.sleep(0.15)  # at the door, and with the message
+            return Principal()
+
+        async def run() -> None:
+            late = serving(Numbers(1), Counted(), default_deadline_s=0.2, authenticate=authenticate)
+            async with late as (channel, _):
+                with pytest.raises(grpc.RpcError) as caught:
+                    await read(watching(channel, None, FINITE))
+            assert from_rpc_error(caught.value).reason == "DEADLINE_EXCEEDED"
+
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
             asyncio.run(run())
-        assert not caplog.records
+            gc.collect()
+        assert not told
 
     def test_who_was_let_in_is_answered(self) -> None:
         asked = []
@@ -387,5 +417,58 @@ class TestStreamsThatComeToAnEnd:
             async with serving(Numbers(2), Counted(), authenticate=authenticate) as (channel, _):
                 assert await read(watching(channel, method=FINITE)) == [1, 2]
             assert len(asked) == 2  # at the door, and with the message
+
+        asyncio.run(run())
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> Iterator[None]:
+    """A server that waits for no reader, and has nothing to complain of."""
+    for limit in ("SEND_LIMIT_S", "ENDLESS_SEND_LIMIT_S"):
+        monkeypatch.setattr(rpc, limit, 0.1)
+    monkeypatch.setattr(sending, "_STATUS_LIMIT_S", 0.1)
+    with caplog.at_level("WARNING"):
+        yield
+    assert not caplog.records
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("method", [METHOD, FINITE])
+class TestWhoReadsTooSlowly:
+    """No deadline ends it: its messages were made in time, and the caller gave none."""
+
+    @pytest.mark.parametrize("read_before", [0, 1])
+    def test_is_told_so_when_it_reads_again_and_has_no_call_meanwhile(self, method: str, read_before: int) -> None:
+        async def run() -> None:
+            counted, numbers = Counted(), Large(8)
+            async with serving(numbers, counted) as (channel, guard):
+                before = len(asyncio.all_tasks())
+                call, seen = watching(channel, None, method), list[int]()
+                for _ in range(read_before):
+                    await anext(aiter(call))
+                await until(lambda: len(counted.handled) == 1)
+                await guard.wait_until_idle(LIMIT_S)
+                assert numbers.is_closed
+                with pytest.raises(grpc.RpcError) as caught:
+                    await asyncio.wait_for(read(call, seen), LIMIT_S)
+                failure = from_rpc_error(caught.value)
+                await until(lambda: len(asyncio.all_tasks()) == before + 1)  # the one that asks
+            assert (failure.code, failure.reason) == ("DEADLINE_EXCEEDED", "READ_LATE")
+            assert failure.request_id
+            assert seen == [read_before + 1]
+            assert counted.handled == ["DEADLINE_EXCEEDED"]
+
+        asyncio.run(run())
+
+    def test_leaves_nothing_behind_when_it_never_reads_and_goes(self, method: str) -> None:
+        async def run() -> None:
+            counted = Counted()
+            async with serving(Large(8), counted) as (channel, _):
+                before = len(asyncio.all_tasks())
+                call = watching(channel, None, method)
+                await until(lambda: len(counted.handled) == 1)
+                call.cancel()
+                await until(lambda: len(asyncio.all_tasks()) == before + 1)  # the one that asks
+            assert counted.handled == ["DEADLINE_EXCEEDED"]
 
         asyncio.run(run())

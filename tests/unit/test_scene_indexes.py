@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +13,10 @@ from images import encode, textured
 from planted_damage import damage
 from servers import CAMERA, StandInDescriptor, StandInExtractor, pose
 
-from mapless_server.errors import NotFound
+from mapless_server.errors import DataLoss, NotFound
 from mapless_server.library import ReferenceLibrary
 from mapless_server.scene_indexes import SceneIndexes
-from mapless_server.store import NewReference, Store
+from mapless_server.store import NewReference, SceneChanges, Store
 from mapless_server.tenancy import SceneKey
 from mapless_server.turns import Turn
 
@@ -108,6 +109,31 @@ class TestMemory:
             indexes.forget(SCENE)
             assert indexes.size_bytes == 0
         assert "r0" in indexes.entries(SCENE, turn())  # as if it were asked for the first time
+
+    @pytest.mark.parametrize("is_described", [True, False])
+    def test_one_that_is_deleted_while_it_is_asked_takes_none(
+        self, store: Store, is_described: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Neither what has been read of it by then, nor what was found out after."""
+        store.add_references(SCENE, [new(i, is_described) for i in range(3)])
+        indexes = indexes_of(store)
+        real = store.list_changes
+
+        def read_then_delete(*arguments: Any) -> SceneChanges:
+            changes = real(*arguments)
+            store.delete_scene(SCENE)
+            indexes.forget(SCENE)
+            return changes
+
+        monkeypatch.setattr(store, "list_changes", read_then_delete)
+        if is_described:
+            assert len(indexes.entries(SCENE, turn())) == 3
+        else:
+            with pytest.raises(NotFound):
+                indexes.entries(SCENE, turn())
+        assert not indexes.is_damaged(SCENE, "r0")
+        indexes.tell_damaged(SCENE, "r0", DataLoss("lost"))
+        assert (indexes.size_bytes, dict(indexes._held)) == (0, {})
 
     def test_scenes_used_longest_ago_make_room_and_the_last_one_stays(self, store: Store) -> None:
         keys = [SceneKey(f"many-{i}") for i in range(4)]

@@ -179,6 +179,7 @@ class TestAdmission:
         late = toy.refusal(deadline_s=1.0)
         assert late.reason is Refusal.DEADLINE_INFEASIBLE
         assert late.retry_after_s is not None
+        assert "after the deadline, by about 0.8 s" in str(late)
         hopeless = toy.refusal(deadline_s=0.5)  # 0.6 s of computing alone
         assert (hopeless.reason, hopeless.retry_after_s) == (Refusal.DEADLINE_INFEASIBLE, None)
         toy.admit(deadline_s=2.5)

@@ -21,7 +21,7 @@ from mapless.geometry import Quaternion, rotation_from_vector
 from mapless.scenes import Calibration, unit_vector
 from mapless_server import errors
 from mapless_server.principal import DEFAULT_TENANT
-from mapless_server.store import ContradictingDown, SceneAttributes, Store, changing, codec, queries
+from mapless_server.store import ContradictingDown, SceneAttributes, Store, codec, leftovers, queries
 from mapless_server.tenancy import SceneKey
 
 OFFICE, HALL, NOWHERE = map(SceneKey, ("office", "hall", "nowhere"))
@@ -112,8 +112,8 @@ def test_other_changes_leave_it_alone(store: Store) -> None:
 def test_a_scene_that_is_deleted_and_created_again_has_forgotten(
     store: Store, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
-    """Whether it was deleted at once, or in portions."""
-    monkeypatch.setattr(changing, "REFERENCES_DELETED_AT_A_TIME", 2)
+    """Whether it is deleted in one portion, or in several."""
+    monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", 2)
     store.create_scene(OFFICE, SceneAttributes(DATUM, DOWN))
     if count:
         store.add_references(OFFICE, [make_reference(f"r{i}") for i in range(count)])
@@ -234,6 +234,21 @@ def test_a_store_that_nobody_else_changes_is_asked_once(place: Place, monkeypatc
         for _ in range(5):
             assert store.get_attributes(OFFICE).datum == DATUM
         assert len(asked) == (5 if isinstance(place, Shared) else 1)
+
+
+def test_a_store_that_remembers_nothing_hears_of_every_change(place: Place) -> None:
+    with place.open() as store:
+        store.create_scene(OFFICE, SceneAttributes(DATUM))
+        store.add_references(OFFICE, [make_reference("a")])
+        other = store.uncached()
+        assert other.get_attributes(OFFICE).down_in_world is None
+        assert other.load_references(OFFICE, ["a"], EXTRACTOR).generation == 2
+        store.update_scene(OFFICE, down_in_world=DOWN)
+        assert other.get_attributes(OFFICE).down_in_world == DOWN
+        store.delete_scene(OFFICE)
+        with pytest.raises(errors.NotFound):
+            other.get_attributes(OFFICE)
+        assert [it.used_bytes for it in (other._described, other._resolved, other._attributes)] == [0, 0, 0]
 
 
 finite = st.floats(allow_nan=False, allow_infinity=False)

@@ -12,7 +12,7 @@ import pytest
 from stores import EXTRACTOR, make_reference, view_of
 
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
-from mapless_server.store import Store, changing
+from mapless_server.store import Store, leftovers
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 from mapless_server.store.verify import verify
 from mapless_server.tenancy import SceneKey
@@ -108,7 +108,7 @@ def test_whatever_is_lost_the_store_says_so_and_the_reference_can_be_stored_anew
 def test_a_scene_with_lost_pages_is_deleted_and_so_is_what_else_is_deleted_later(
     folder: Path, at_a_time: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(changing, "REFERENCES_DELETED_AT_A_TIME", at_a_time)
+    monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", at_a_time)
     lose(folder, "features", "b")
     lose(folder, "features", "c")
     with Store.open(folder) as store:

@@ -90,12 +90,14 @@ class TestOpening:
 
     def settings_in_use(self, store: Store) -> dict[str, object]:
         names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "trusted_schema", "cell_size_check")
+        more = ("mmap_size", "journal_size_limit")
         with store._database.read() as connection:
-            return {name: connection.exec_driver_sql(f"PRAGMA {name}").scalar() for name in (*names, "mmap_size")}
+            return {name: connection.exec_driver_sql(f"PRAGMA {name}").scalar() for name in (*names, *more)}
 
     def test_settings_of_every_connection(self, store: Store) -> None:
         expected = {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1, "busy_timeout": 5000}
         expected |= {"trusted_schema": 0, "cell_size_check": 1, "mmap_size": 0}
+        expected["journal_size_limit"] = sqlite.JOURNAL_KEPT_BYTES
         with ThreadPoolExecutor(3) as pool:
             barrier = threading.Barrier(3, timeout=10)
 

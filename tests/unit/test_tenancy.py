@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -75,6 +75,9 @@ class StandInEngine:
     options: Any = field(default_factory=lambda: SimpleNamespace(image_limits=ImageLimits()))
 
     def forget_scene(self, _: SceneKey) -> None:
+        pass
+
+    def forget_references(self, _: Collection[str]) -> None:
         pass
 
     async def describe(self, photos: Sequence[Any], *_: Any, **__: Any) -> list[Description]:

@@ -7,7 +7,7 @@ import contextlib
 import itertools
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,20 +18,21 @@ import numpy as np
 from ..answers import LocalizationResult, Rejected
 from ..cameras import FOLDER_FILE, read_camera, read_cameras
 from ..client import Client
-from ..errors import MaplessError, NotFound
+from ..errors import InvalidArgument, MaplessError, NotFound
 from ..geometry import Camera
 from ..priors import GravityPrior, HeadingPrior, PositionPrior, Priors
 from ..report import write_report
+from ..requests import ImageSource
 from ..results import Reference
 from . import output
-from .exits import EXIT_FAILED, EXIT_REJECTED
+from .exits import EXIT_REJECTED
+from .pace import Pace, PacedClient
 from .progress import Progress
+from .tally import LOCALIZED, Outcome, Tally
 
 ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 _FIELDS_OF_PHOTOS = ("image", "intrinsics")
 _DRAWN_REFERENCES, _SHOWN_REFERENCES = 16, 4
-Outcome = LocalizationResult | Rejected | MaplessError
-_WITHOUT = {LocalizationResult: "", Rejected: "not localized"}
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ def run(client: Client, arguments: argparse.Namespace) -> int:
 
 def _one(client: Client, arguments: argparse.Namespace) -> int:
     photo = Photo(arguments.photo, arguments.photo.name, _camera_of(arguments.photo, arguments.camera))
-    answers = _answers(client, photo, arguments)
+    answers = _answers(client, photo, photo.path, arguments)
     first = next(answers)  # before there is a file that nothing is written to
     indent = None if arguments.progressive else 2  # of several answers each is a line
     with _opened(arguments.output) as file:
@@ -79,20 +80,25 @@ def _folder(client: Client, arguments: argparse.Namespace) -> int:
     names = [photo.name for photo in photos]
     width = max(map(len, names))
     as_json = bool(arguments.json or arguments.output or not sys.stdout.isatty())
-    counts = {LocalizationResult: 0, Rejected: 0, MaplessError: 0}
-    with _opened(arguments.output) as file, Progress(len(photos)) as progress:
-        if not as_json:
-            print(output.heading(width), file=file)
-        for name, outcome in zip(names, _all(client, photos, arguments), strict=True):
-            progress.clear()
-            print(_row(name, width, outcome, as_json, arguments), file=file, flush=True)
-            progress.step(_WITHOUT.get(type(outcome), "failed"))
-            counts[MaplessError if isinstance(outcome, MaplessError) else type(outcome)] += 1
-    print(f"{counts[LocalizationResult]} of {len(photos)} localized{progress.without()}", file=sys.stderr)
-    _tell_where(arguments)
-    if counts[MaplessError]:
-        return EXIT_FAILED
-    return EXIT_REJECTED if counts[Rejected] else 0
+    tally = Tally(len(photos))
+    try:
+        with (
+            _opened(arguments.output) as file,
+            Progress(len(photos)) as progress,
+            contextlib.closing(_all(client, photos, arguments)) as outcomes,
+        ):
+            if not as_json:
+                print(output.heading(width), file=file)
+            for name, outcome in zip(names, outcomes, strict=True):
+                progress.clear()
+                print(_row(name, width, outcome, as_json, arguments), file=file, flush=True)
+                kind = tally.count(outcome)
+                progress.step("" if kind == LOCALIZED else kind)
+    finally:
+        if tally.done:  # also of a run that ends early: by Ctrl-C, or because the server is gone
+            print(tally.text(), file=sys.stderr)
+            _tell_where(arguments)
+    return tally.exit_code
 
 
 def _tell_where(arguments: argparse.Namespace) -> None:
@@ -141,22 +147,28 @@ def _camera_beside(path: Path) -> Camera:
     raise ValueError(f"say --camera: which camera took the photograph; there is no {FOLDER_FILE} beside it")
 
 
-def _all(client: Client, photos: list[Photo], arguments: argparse.Namespace) -> Iterator[Outcome]:
-    """An outcome for each photograph, in their order, `parallel` calls at a time."""
+def _all(client: Client, photos: list[Photo], arguments: argparse.Namespace) -> Generator[Outcome, None, None]:
+    """An outcome for each photograph, in their order; `parallel` calls at a time, or as many as there is room for."""
+    pace = Pace(arguments.parallel)
 
     def outcome(photo: Photo) -> Outcome:
         try:
-            return _ask(client, photo, arguments)
+            with pace.turn():
+                return _ask(paced, photo, arguments)
         except MaplessError as error:
             if _is_everybodys(error):
                 raise
             return error
 
-    with ThreadPoolExecutor(arguments.parallel, "localize") as threads:
+    with (
+        PacedClient(arguments.address, client.options, pace) as paced,
+        ThreadPoolExecutor(arguments.parallel, "localize") as threads,
+    ):
         try:
             yield from threads.map(outcome, photos)
         except BaseException:
             threads.shutdown(wait=False, cancel_futures=True)
+            paced.close()  # ends the calls in flight
             raise
 
 
@@ -168,12 +180,19 @@ def _is_everybodys(error: MaplessError) -> bool:
 
 
 def _ask(client: Client, photo: Photo, arguments: argparse.Namespace) -> LocalizationResult | Rejected:
-    """The answer alone."""
-    (answer,) = _answers(client, photo, arguments)
+    """The answer alone; a file that cannot be read is its own call's fault."""
+    try:
+        image = photo.path.read_bytes()
+    except OSError as error:
+        message = f"{photo.path} cannot be read: {error.strerror}"
+        raise InvalidArgument("INVALID_ARGUMENT", message, reason="UNREADABLE_FILE", field="image") from error
+    (answer,) = _answers(client, photo, image, arguments)
     return answer
 
 
-def _answers(client: Client, photo: Photo, arguments: argparse.Namespace) -> Iterator[LocalizationResult | Rejected]:
+def _answers(
+    client: Client, photo: Photo, image: ImageSource, arguments: argparse.Namespace
+) -> Iterator[LocalizationResult | Rejected]:
     """The answer; with --progressive, what is known before it comes first."""
     asked: dict[str, Any] = {
         "priors": priors(arguments),
@@ -186,7 +205,7 @@ def _answers(client: Client, photo: Photo, arguments: argparse.Namespace) -> Ite
         "axes": arguments.axes,
         "include_debug": arguments.debug or arguments.draw is not None,
     }
-    about = photo.path, photo.camera, arguments.scene, arguments.reference
+    about = image, photo.camera, arguments.scene, arguments.reference
     if arguments.progressive:
         for answer in client.localize_progressively(*about, **asked):
             yield answer
@@ -196,7 +215,7 @@ def _answers(client: Client, photo: Photo, arguments: argparse.Namespace) -> Ite
     if arguments.draw is not None:
         page = arguments.draw / f"{photo.name.replace('/', '_')}.html"
         shown = _references(client, arguments.scene, answer)
-        write_report(answer, photo.path, photo.camera, page, references=shown, title=photo.name)
+        write_report(answer, image, photo.camera, page, references=shown, title=photo.name)
 
 
 def _references(client: Client, scene: str, answer: LocalizationResult | Rejected) -> list[Reference]:

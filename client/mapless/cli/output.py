@@ -20,6 +20,8 @@ from ..geometry import Camera, RigidTransform
 DOUBTFUL_TRUST = 0.05
 """Below, an answer looks worse than 19 of 20 right ones: usually what was said of the camera is wrong."""
 
+_CAPTURED = "captured by the server"
+
 
 def print_json(value: object) -> int:
     """Prints a value, and says that all went well."""
@@ -60,7 +62,7 @@ def lines(answer: LocalizationResult | Rejected) -> list[str]:
             told.append(f"  {answer.hint.message}")
         if answer.hint is not None and answer.hint.best_reference:
             told.append(f"  shares most with reference {answer.hint.best_reference.rpartition('/')[2]}")
-        return told
+        return [*told, f"  {_CAPTURED}"] if answer.diagnostics.captured else told
     pose = answer.world_from_camera if answer.in_axes is None else answer.in_axes.world_from_camera
     frame = "" if answer.in_axes is None else f"   in {answer.in_axes.axes} axes"
     x, y, z = pose.translation
@@ -74,7 +76,8 @@ def lines(answer: LocalizationResult | Rejected) -> list[str]:
         geo = answer.geo_pose
         told.append(f"  on earth  {geo.lat:.7f}, {geo.lon:.7f}, {geo.h:.2f} m")
     told += [f"  prior     {_checked(check)}" for check in answer.prior_checks]
-    told.append(f"  support   {_support(answer)}, {answer.diagnostics.total_s:.2f} s")
+    captured = f", {_CAPTURED}" if answer.diagnostics.captured else ""
+    told.append(f"  support   {_support(answer)}, {answer.diagnostics.total_s:.2f} s{captured}")
     if answer.trust is not None and answer.trust < DOUBTFUL_TRUST:
         told.append(
             f"  warning   fewer than {100 * DOUBTFUL_TRUST:g} % of right answers look as doubtful: check the intrinsics"

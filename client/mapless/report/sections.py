@@ -39,8 +39,10 @@ def cards(answer: LocalizationResult | Rejected) -> str:
 
 
 def notices(answer: LocalizationResult | Rejected) -> str:
-    """What would help, and what contradicts the answer."""
+    """What would help, what contradicts the answer, and that it is kept."""
     parts = []
+    if answer.diagnostics.captured:
+        parts.append('<p class="hint">The server is to keep this call for a time, photograph and all.</p>')
     if isinstance(answer, Rejected) and answer.hint is not None:
         hint = answer.hint
         best = f" It shares most with <b>{text(reference_id(hint.best_reference))}</b>." if hint.best_reference else ""

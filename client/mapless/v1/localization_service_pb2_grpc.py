@@ -134,7 +134,7 @@ class LocalizationServiceServicer(object):
         answer, which then is all there is. The call waits, is computed and is charged as Localize is: the coarse answer neither
         delays the final one nor is delayed by a caller that reads slowly. Whoever needs no more cancels the call, which ends the
         computation. Without a deadline the server's default for unary calls holds, for both messages together; a message that was
-        made in time may be read for 10 s more, after which the call is CANCELLED.
+        made in time may be read for 10 s more, after which the call ends with DEADLINE_EXCEEDED, reason READ_LATE.
 
         The request is the same on purpose: either method can be asked the same question.
         buf:lint:ignore RPC_REQUEST_STANDARD_NAME
@@ -165,7 +165,8 @@ class LocalizationServiceServicer(object):
         """Shows a scene's calls of Localize, and of LocalizeProgressively by their final answers, as they are answered, with their
         photographs, until the caller has seen enough: for whoever watches over a scene. Nothing is stored; a watcher that reads
         too slowly misses answers. Takes the role write. FAILED_PRECONDITION unless the server is configured to allow it;
-        RESOURCE_EXHAUSTED when too many watch.
+        RESOURCE_EXHAUSTED when too many watch; DEADLINE_EXCEEDED, reason READ_LATE, for a watcher that takes longer than a minute
+        to read a message.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -52,7 +52,7 @@ _LAST_BYTES_S = 5.0
 
 
 class Ingress:
-    """What brings a replica its calls; there is one a process. Implements `mapless_server.serve.Listener`.
+    """What brings a replica its calls; there is one a process. Implements `mapless_server.running.Listener`.
 
     Attributes:
         address: unknown; Serve opens the port, which it chooses, once the replica is ready.

@@ -14,15 +14,18 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
 
 from mapless.geometry import Camera, RigidTransform
+from mapless.names import check_id
 
 from ..retrieval.chosen import Choice
 from ..retrieval.ranking import RankedReference
 from ..store import SceneAttributes, codec
+from ..tenancy import check_tenant
 from .errors import CaptureError, DamagedCapture
 
 FORMAT_VERSION = 1
@@ -131,6 +134,8 @@ def encode_call(call: CapturedCall) -> bytes:
 def decode_call(data: bytes) -> CapturedCall:
     """The call of a file.
 
+    Whoever can write the file can make its digest, too: names, times and blobs are what they should be, whoever did.
+
     Raises:
         DamagedCapture: it is cut or changed.
         CaptureError: its format is newer than this program.
@@ -143,6 +148,9 @@ def decode_call(data: bytes) -> CapturedCall:
         header = json.loads(text)
         if header["format"] != FORMAT_VERSION:
             raise CaptureError(f"its format {header['format']} is another than this program's, {FORMAT_VERSION}")
+        datetime.fromtimestamp(header["time_s"], timezone.utc)  # or it is no time: NaN would be kept for ever
+        check_id(header["scene_id"])
+        check_tenant(header["tenant"])
         names = ("request_id", "time_s", "method", "tenant", "scene_id", "scene_created_us", "circumstances")
         return CapturedCall(
             **{name: header[name] for name in names},
@@ -151,7 +159,7 @@ def decode_call(data: bytes) -> CapturedCall:
             request=messages[: header["request_bytes"]],
             response=messages[header["request_bytes"] :],
         )
-    except (ValueError, KeyError, TypeError, codec.Damaged) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError, codec.Damaged) as error:
         raise DamagedCapture(f"its header is not one of ours: {error}") from error
 
 
@@ -204,9 +212,15 @@ def _reference_to_dict(reference: CapturedReference) -> dict[str, Any]:
 def _reference_of(content: Mapping[str, Any]) -> CapturedReference:
     geometry = json.dumps({name: content[name] for name in ("camera", "world_from_camera")}).encode()
     camera, world_from_camera = codec.decode_geometry("", geometry, codec.sha256_for("", geometry))
-    return CapturedReference(
-        content["reference_id"], content["key"], camera, world_from_camera, content["image"], content["views"]
-    )
+    views = {_text(name): _text(blob) for name, blob in content["views"].items()}
+    reference_id, key, image = check_id(content["reference_id"]), _text(content["key"]), _text(content["image"])
+    return CapturedReference(reference_id, key, camera, world_from_camera, image, views)
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{type(value).__name__} in place of text")
+    return value
 
 
 def _pose_to_dict(ranked: RankedReference) -> dict[str, Any]:

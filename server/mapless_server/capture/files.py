@@ -10,11 +10,12 @@ A tenant's calls are a folder of their own and share nothing with another's, so 
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from .errors import CaptureError
@@ -44,17 +45,23 @@ def open_folder(folder: Path) -> int:
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if not (folder / MARKER_FILE).exists() and any(folder.iterdir()):
+        # Files of ours without the marker are what a server left that was killed, or whose folder was deleted by hand.
+        if not _is_marked(folder) and any(foreign_in(folder)):
             raise CaptureError(f"capture folder {folder} holds something else; name an empty or a new one")
         if stat.S_IMODE(folder.stat().st_mode) & 0o077:
             folder.chmod(0o700)
-        lock = _lock(folder)
-        if not (folder / MARKER_FILE).exists():
-            write_whole(folder / MARKER_FILE, json.dumps({"format": FOLDER_FORMAT}).encode())
-        check_format(folder)
-        return lock
+        return _lock(folder)
     except OSError as error:
-        raise CaptureError(f"capture folder {folder} cannot be used: {error.strerror}") from error
+        what = f"{error.filename or folder}: {error.strerror or error}"
+        raise CaptureError(f"capture folder {folder} cannot be used: {what}") from error
+
+
+def is_locked_by(folder: Path, lock: int) -> bool:
+    """Whether a descriptor is that of the folder's lock, and not of one that somebody deleted with the folder."""
+    try:
+        return os.path.samestat(os.fstat(lock), os.lstat(folder / LOCK_FILE))
+    except FileNotFoundError:
+        return False
 
 
 def check_format(folder: Path) -> None:
@@ -67,7 +74,7 @@ def check_format(folder: Path) -> None:
         found = json.loads((folder / MARKER_FILE).read_bytes())["format"]
     except FileNotFoundError:
         raise CaptureError(f"{folder} is no capture folder: it has no {MARKER_FILE}") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise CaptureError(f"{folder / MARKER_FILE} cannot be read: {error}") from error
     if found != FOLDER_FORMAT:
         raise CaptureError(f"capture folder {folder} has format {found}, this program knows {FOLDER_FORMAT}")
@@ -75,23 +82,23 @@ def check_format(folder: Path) -> None:
 
 def calls_of(folder: Path) -> Iterator[Path]:
     """Files of calls, whatever is in them."""
-    yield from _files(folder.glob(f"{TENANTS}/*/{CALLS}/*/*{CALL_SUFFIX}"))
+    return (it for it in _files(folder) if _is_call(*_parts(folder, it)))
 
 
 def blobs_of(folder: Path) -> Iterator[Path]:
     """Files of blobs."""
-    yield from (it for it in _files(folder.glob(f"{TENANTS}/*/{BLOBS}/*")) if _is_digest(it.name))
+    return (it for it in _files(folder) if _is_blob(*_parts(folder, it)))
 
 
 def unfinished_in(folder: Path) -> Iterator[Path]:
     """What a server that was killed had begun to write."""
-    yield from _files(folder.glob(f"{TENANTS}/*/*/**/*{UNFINISHED_SUFFIX}"))
+    return (it for it in _files(folder) if _is_unfinished(*_parts(folder, it)))
 
 
-def foreign_in(folder: Path) -> list[Path]:
+def foreign_in(folder: Path) -> Iterator[Path]:
     """Files that are none of ours; nobody but their owner deletes them."""
-    ours = {*calls_of(folder), *blobs_of(folder), *unfinished_in(folder), folder / MARKER_FILE, folder / LOCK_FILE}
-    return sorted(it for it in folder.rglob("*") if not it.is_dir() and it not in ours)
+    kinds = (_is_call, _is_blob, _is_unfinished, _is_about_the_folder)
+    return (it for it in _all(folder) if not (_is_regular(it) and any(kind(*_parts(folder, it)) for kind in kinds)))
 
 
 def call_path(folder: Path, tenant: str, scene_id: str, name: str) -> Path:
@@ -121,18 +128,81 @@ def write_whole(path: Path, data: bytes) -> None:
         raise
 
 
-def _files(paths: Iterator[Path]) -> Iterator[Path]:
-    return (it for it in paths if it.is_file() and not it.is_symlink())
+def do_each(actions: Iterable[Callable[[], object]]) -> None:
+    """Does all of it; then OSError, if some of it failed: one file that cannot be deleted keeps no other."""
+    faults = [fault for it in actions if (fault := _fault_of(it)) is not None]
+    if faults:
+        raise faults[0]
 
 
-def _is_digest(name: str) -> bool:
-    return len(name) == 64 and not set(name) - set("0123456789abcdef")
+def _fault_of(action: Callable[[], object]) -> OSError | None:
+    try:
+        action()
+    except OSError as error:
+        return error
+    return None
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return filter(_is_regular, _all(folder))
+
+
+def _is_regular(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink()
+
+
+def _all(folder: Path) -> Iterator[Path]:
+    """All that is in the folder but folders, in order; OSError if one cannot be looked into, or lies elsewhere."""
+    for place, folders, files in os.walk(folder, onerror=_unless_gone):
+        folders.sort()
+        for name in folders:
+            path = Path(place, name)
+            if path.is_symlink() and _parts(folder, path)[0] == TENANTS:
+                raise OSError(errno.ELOOP, "a symbolic link stands in place of a folder", str(path))
+        yield from (Path(place, name) for name in sorted(files))
+
+
+def _unless_gone(error: OSError) -> None:
+    if not isinstance(error, FileNotFoundError):
+        raise error
+
+
+def _parts(folder: Path, path: Path) -> tuple[str, ...]:
+    return path.relative_to(folder).parts
+
+
+def _is_call(*parts: str) -> bool:
+    return len(parts) == 5 and (parts[0], parts[2]) == (TENANTS, CALLS) and parts[4].endswith(CALL_SUFFIX)
+
+
+def _is_blob(*parts: str) -> bool:
+    is_digest = len(parts[-1]) == 64 and not set(parts[-1]) - set("0123456789abcdef")
+    return len(parts) == 4 and (parts[0], parts[2]) == (TENANTS, BLOBS) and is_digest
+
+
+def _is_unfinished(*parts: str) -> bool:
+    whole = (*parts[:-1], parts[-1].removesuffix(UNFINISHED_SUFFIX))
+    return whole != parts and (_is_call(*whole) or _is_blob(*whole))
+
+
+def _is_about_the_folder(*parts: str) -> bool:
+    return parts in ((LOCK_FILE,), (MARKER_FILE,), (MARKER_FILE + UNFINISHED_SUFFIX,))
+
+
+def _is_marked(folder: Path) -> bool:
+    """Whether it is said to be one of ours; a power failure may leave the marker empty."""
+    marker = folder / MARKER_FILE
+    return marker.exists() and marker.stat().st_size > 0
 
 
 def _lock(folder: Path) -> int:
+    """Locks it, and sees that it is one of ours: nobody else makes it so meanwhile."""
     lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not _is_marked(folder):
+            write_whole(folder / MARKER_FILE, json.dumps({"format": FOLDER_FORMAT}).encode())
+        check_format(folder)
     except BlockingIOError:
         os.close(lock)
         raise CaptureError(f"capture folder {folder} is in use by another server; each needs one of its own") from None

@@ -1,42 +1,43 @@
 """Captured calls under a limit of time and one of size, both kept at every moment that the server runs.
 
-What is to be written is made room for first: the oldest calls go. A blob goes with the last call that needs it; one
-that cannot be deleted stays counted, and is tried again. Its methods may be called from any thread.
+The limit of time is that of `held`, and `expire` keeps it; `_make_room` keeps that of size: what is to be written is
+made room for first, and the oldest calls go. What cannot be deleted stays counted, and is tried again. When a folder is
+opened anything may be in it: a call that is not as it was written, or not within the limits, is deleted. Methods may be
+called from any thread.
 """
 
 from __future__ import annotations
 
-import hashlib
+import errno
 import logging
 import os
 import threading
 import time
-from collections import Counter, OrderedDict
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from ..tenancy import SceneKey, key_of
-from .calls import CapturedCall, decode_call, encode_call
+from .blobs import BlobLedger
+from .calls import CapturedCall, encode_call
 from .errors import BlobGone, CaptureError, DamagedCapture
 from .files import (
     blob_path,
-    blobs_of,
     call_path,
     calls_of,
+    do_each,
     foreign_in,
+    is_locked_by,
     open_folder,
     space_of,
     unfinished_in,
     write_whole,
 )
+from .held import Held, held_of, read_held
 
 log = logging.getLogger(__name__)
-
-_FUTURE_S = 60.0
-"""A call that is further ahead of the clock than this was captured while the clock was wrong."""
 
 
 @dataclass(frozen=True)
@@ -56,37 +57,11 @@ class Retention:
             raise ValueError(f"senseless limits: {self}")
 
 
-@dataclass(frozen=True, eq=False)
-class Held:
-    """A call in the folder.
-
-    Attributes:
-        path: its file.
-        scene_key: of its scene.
-        scene_created_us: which of the scenes that had this name.
-        references: id and key of each.
-        blobs: files that it needs.
-        space_bytes: of its own file.
-        expiry_s: when it goes, Unix seconds.
-        expiry_monotonic_s: the same by a clock that nobody sets.
-    """
-
-    path: Path
-    scene_key: SceneKey
-    scene_created_us: int
-    references: frozenset[tuple[str, str]]
-    blobs: frozenset[Path]
-    space_bytes: int
-    expiry_s: float
-    expiry_monotonic_s: float
-
-
 class CaptureFolder:
     """The calls of one server. Opening deletes what is too old, cut, or too much.
 
     Attributes:
         path: of the folder.
-        space_bytes: what its calls and blobs take.
     """
 
     def __init__(self, path: Path, retention: Retention, clock: Callable[[], float] = time.time) -> None:
@@ -96,16 +71,13 @@ class CaptureFolder:
             CaptureError: see `files.open_folder`; or something in it cannot be read or deleted.
         """
         self.path = path
-        self.space_bytes = 0
         self._retention = retention
         self._clock = clock
         self._guard = threading.RLock()
         self._lock = open_folder(path)
         self._calls: OrderedDict[Path, Held] = OrderedDict()  # the oldest first
-        self._blob_space: dict[Path, int] = {}
-        self._unverified: set[Path] = set()  # blobs of before: a power failure may have cut them
-        self._uses: Counter[Path] = Counter()
-        self._unused: set[Path] = set()  # blobs to be deleted
+        self._calls_bytes = 0
+        self._blobs = BlobLedger()
         self._number = 0
         try:
             self._take_stock()
@@ -119,6 +91,11 @@ class CaptureFolder:
 
     def __len__(self) -> int:
         return len(self._calls)
+
+    @property
+    def space_bytes(self) -> int:
+        """What its calls and blobs take on the disk."""
+        return self._calls_bytes + self._blobs.space_bytes
 
     def close(self) -> None:
         """Lets other servers in."""
@@ -135,9 +112,10 @@ class CaptureFolder:
         """Whether a blob need not be given again; one that is not what was written goes, and what needs it."""
         path = blob_path(self.path, tenant, sha256)
         with self._guard:
-            if path in self._unverified:
-                self._verify(path)
-            return path in self._blob_space
+            if not self._blobs.is_intact(path):
+                log.warning("captured blob %s is damaged, and is deleted with the calls that need it", path.name)
+                self.remove_all([it for it in self._calls.values() if path in it.blobs])
+            return path in self._blobs
 
     def add(self, call: CapturedCall, blobs: Mapping[str, bytes]) -> bool:
         """Keeps a call, and deletes the oldest ones for it where there is no room.
@@ -152,34 +130,31 @@ class CaptureFolder:
         Raises:
             OSError: the disk is full, or the like; what was written of it is gone.
             BlobGone: one that the folder had went meanwhile; gather the call again.
+            CaptureError: somebody deleted the folder by hand, and another server has it now.
         """
         data = encode_call(call)
         with self._guard:
+            self._see_that_it_is_ours()
             needed = {blob_path(self.path, call.tenant, name): name for name in call.blobs}
-            missing = [path for path in needed if path not in self._blob_space]
+            missing = [path for path in needed if path not in self._blobs]
             if any(needed[path] not in blobs for path in missing):
                 raise BlobGone
-            space = {path: space_of(len(blobs[needed[path]])) for path in missing}
-            whole = {path: self._blob_space.get(path, space.get(path, 0)) for path in needed}
-            if space_of(len(data)) + sum(whole.values()) > self._retention.max_bytes:
+            new_bytes = space_of(len(data)) + sum(space_of(len(blobs[needed[path]])) for path in missing)
+            if new_bytes + sum(map(self._blobs.space_of, needed)) > self._retention.max_bytes:
                 return False
-            self._use(needed)  # before room is made, so that none of them goes
+            self._blobs.use(needed)  # before room is made, so that none of them goes
             try:
-                self._make_room(space_of(len(data)) + sum(space.values()))
+                self._make_room(new_bytes)
                 for path in missing:
-                    write_whole(path, blobs[needed[path]])
-                    self._blob_space[path] = space[path]
-                    self.space_bytes += space[path]
-                self._number += 1
-                name = f"{round(1e3 * call.time_s):014d}-{os.getpid()}-{self._number}"
-                path = call_path(self.path, call.tenant, call.scene_id, name)
+                    self._blobs.write(path, blobs[needed[path]])
+                path = self._new_path(call)
                 write_whole(path, data)
             except BaseException:
-                self._release(needed)
+                self._blobs.release(needed)
                 with suppress(OSError):  # what stays is tried again
-                    self._sweep()
+                    self._blobs.sweep()
                 raise
-            self._enter(self._held(path, call, len(data)))
+            self._enter(held_of(self.path, path, call, len(data), self._retention.keep_s, self._clock()))
             return True
 
     def expire(self) -> float:
@@ -193,136 +168,89 @@ class CaptureFolder:
         """
         with self._guard:
             now_s, monotonic_s = self._clock(), time.monotonic()
-            held = self._calls.values()
-            self._remove_all([it for it in held if it.expiry_s <= now_s or it.expiry_monotonic_s <= monotonic_s])
-            rest = [min(it.expiry_s - now_s, it.expiry_monotonic_s - monotonic_s) for it in self._calls.values()]
+            self.remove_all([it for it in self._calls.values() if it.left_s(now_s, monotonic_s) <= 0])
+            rest = (it.left_s(now_s, monotonic_s) for it in self._calls.values())
             return min(rest, default=self._retention.keep_s)
 
     def forget_deleted(self) -> None:
-        """Forgets what somebody deleted by hand, and deletes what is of no use without it; OSError as `expire`."""
+        """Forgets what somebody deleted by hand, and deletes what is of no use without it; OSError as `remove_all`."""
         with self._guard:
-            gone = {path for path in self._blob_space if not os.path.lexists(path)}
+            gone = self._blobs.deleted_by_hand()
             held = self._calls.values()
-            self._remove_all([it for it in held if it.blobs & gone or not os.path.lexists(it.path)])
+            self.remove_all([it for it in held if it.blobs & gone or not os.path.lexists(it.path)])
 
-    def remove(self, held: Held) -> None:
-        """Deletes a call, and what no other call needs."""
+    def remove_all(self, gone: Collection[Held]) -> None:
+        """Deletes calls, and what no other call needs, each that can be; OSError if there are some that cannot be."""
         with self._guard:
-            if held.path in self._calls:
-                self._remove(held)
+            do_each([*(partial(self._remove, it) for it in gone), self._blobs.sweep])
 
     def _take_stock(self) -> None:
-        foreign = foreign_in(self.path)
+        foreign = sum(1 for _ in foreign_in(self.path))
         if foreign:
-            log.warning("capture folder %s: %d files are not ours, and left alone", self.path, len(foreign))
-        for path in unfinished_in(self.path):
+            log.warning("capture folder %s: %d files are not ours, and left alone", self.path, foreign)
+        for path in list(unfinished_in(self.path)):
             path.unlink()
-        for path in blobs_of(self.path):
-            self._blob_space[path] = space_of(path.stat().st_size)
-        self._unverified.update(self._blob_space)
-        self.space_bytes = sum(self._blob_space.values())
-        found = [it for path in calls_of(self.path) if (it := self._read(path)) is not None]
+        self._blobs.take_stock(self.path)
+        found = [it for path in list(calls_of(self.path)) if (it := self._read(path)) is not None]
         for held in sorted(found, key=lambda it: (it.expiry_s, it.path.name)):
-            self._use(held.blobs)
+            self._blobs.use(held.blobs)
             self._enter(held)
-        self._unused = self._blob_space.keys() - self._uses.keys()
-        self._sweep()
+        self._blobs.sweep()
         self.expire()
         self._make_room(0)
 
     def _read(self, path: Path) -> Held | None:
-        """The call of a file; one that cannot be read, or is of the future, is deleted: nothing limits its time."""
+        """The call of a file; None if it had to be deleted, see `read_held`."""
         try:
-            data = path.read_bytes()
-            call = decode_call(data)
-            if not path.is_relative_to(call_path(self.path, call.tenant, call.scene_id, "").parent):
-                raise DamagedCapture("it is another tenant's or scene's")
-            held = self._held(path, call, len(data))
-            if not held.blobs <= self._blob_space.keys():
+            held = read_held(self.path, path, self._retention.keep_s, self._retention.max_bytes, self._clock())
+            if not all(it in self._blobs for it in held.blobs):
                 raise DamagedCapture("a part of it is gone")
-            if call.time_s > self._clock() + _FUTURE_S:
-                raise DamagedCapture("it was captured later than now")
             return held
         except DamagedCapture as error:
             log.warning("captured call %s is deleted: %s", path.name, error)
             path.unlink()
             return None
+        except CaptureError as error:
+            raise CaptureError(f"captured call {path} cannot be used: {error}") from error
 
-    def _verify(self, path: Path) -> None:
-        with suppress(OSError):  # what cannot be read is of no use to a replay either
-            if hashlib.sha256(path.read_bytes()).hexdigest() == path.name:
-                self._unverified.discard(path)
-                return
-        log.warning("captured blob %s is not what was written, and is deleted with the calls that need it", path.name)
-        self._remove_all([it for it in self._calls.values() if path in it.blobs])
+    def _see_that_it_is_ours(self) -> None:
+        """Makes and locks the folder anew if somebody deleted it by hand."""
+        if not is_locked_by(self.path, self._lock):
+            lock = open_folder(self.path)
+            os.close(self._lock)
+            self._lock = lock
+            self.forget_deleted()
 
-    def _held(self, path: Path, call: CapturedCall, size_bytes: int) -> Held:
-        now_s, expiry_s = self._clock(), call.time_s + self._retention.keep_s
-        return Held(
-            path,
-            key_of(call.tenant, call.scene_id),
-            call.scene_created_us,
-            call.keys,
-            frozenset(blob_path(self.path, call.tenant, name) for name in call.blobs),
-            space_of(size_bytes),
-            expiry_s,
-            time.monotonic() + min(expiry_s - now_s, self._retention.keep_s),
-        )
+    def _new_path(self, call: CapturedCall) -> Path:
+        """Where a call is to lie; a server before this one, with the clock set back since, may have had the name."""
+        while True:
+            self._number += 1
+            name = f"{round(1e3 * call.time_s):014d}-{os.getpid()}-{self._number}"
+            path = call_path(self.path, call.tenant, call.scene_id, name)
+            if path not in self._calls and not os.path.lexists(path):
+                return path
 
     def _enter(self, held: Held) -> None:
         self._calls[held.path] = held
-        self.space_bytes += held.space_bytes
+        self._calls_bytes += held.space_bytes
 
     def _make_room(self, wanted_bytes: int) -> None:
-        while self._calls and self.space_bytes + wanted_bytes > self._retention.max_bytes:
-            self._remove(next(iter(self._calls.values())))
+        """Deletes the oldest calls until so much more fits; OSError if it does not, since some cannot be deleted."""
+        for held in self.held():
+            if self._fits(wanted_bytes):
+                return
+            with suppress(OSError):  # others may do
+                self.remove_all([held])
+        if not self._fits(wanted_bytes):
+            raise OSError(errno.ENOSPC, "what cannot be deleted leaves no room within the limit", str(self.path))
 
-    def _remove_all(self, gone: Collection[Held]) -> None:
-        """Deletes calls, each that can be, and what was left of others; OSError if there are some that cannot be."""
-        _do_each([*(partial(self._remove, it) for it in gone), self._sweep])
+    def _fits(self, wanted_bytes: int) -> bool:
+        return self.space_bytes + wanted_bytes <= self._retention.max_bytes
 
     def _remove(self, held: Held) -> None:
         held.path.unlink(missing_ok=True)
-        del self._calls[held.path]
-        self.space_bytes -= held.space_bytes
-        self._release(held.blobs)
+        if self._calls.pop(held.path, None) is not None:
+            self._calls_bytes -= held.space_bytes
+            self._blobs.release(held.blobs)
         with suppress(OSError):  # other calls are in it, or somebody was faster
             held.path.parent.rmdir()
-        self._sweep()
-
-    def _use(self, blobs: Collection[Path]) -> None:
-        self._uses.update(list(blobs))
-        self._unused.difference_update(blobs)
-
-    def _release(self, blobs: Collection[Path]) -> None:
-        for path in blobs:
-            self._uses[path] -= 1
-            if self._uses[path] <= 0:
-                del self._uses[path]
-                if path in self._blob_space:
-                    self._unused.add(path)
-
-    def _sweep(self) -> None:
-        """Deletes the blobs that no call needs, each that can be; OSError if there are some that cannot be."""
-        _do_each([partial(self._delete_blob, it) for it in self._unused])
-
-    def _delete_blob(self, path: Path) -> None:
-        path.unlink(missing_ok=True)
-        self._unused.discard(path)
-        self._unverified.discard(path)
-        self.space_bytes -= self._blob_space.pop(path)
-
-
-def _do_each(actions: Iterable[Callable[[], None]]) -> None:
-    """Does all of it; then OSError, if some of it failed."""
-    faults = [fault for it in actions if (fault := _fault_of(it)) is not None]
-    if faults:
-        raise faults[0]
-
-
-def _fault_of(action: Callable[[], None]) -> OSError | None:
-    try:
-        action()
-    except OSError as error:
-        return error
-    return None

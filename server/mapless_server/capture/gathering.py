@@ -20,7 +20,7 @@ _REMEMBERED = 100_000
 
 
 class Gone(Exception):
-    """A reference that was used has been deleted since, so what was made of it is not to be kept either."""
+    """What was used has been deleted since, so what was made of it is not to be kept either."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,10 +73,13 @@ class Gatherer:
             blobs: gets those that the folder lacks.
 
         Raises:
-            Gone: a reference that was used was deleted meanwhile, or is another one by now.
+            Gone: a reference that was used was deleted meanwhile, or is another one by now; or none was used, so that
+                nothing says whether a scene that has changed is still the one that was asked.
             DataLoss: it is damaged.
             Unavailable: the store is not there.
         """
+        if not used.used and used.generation != scene.generation:
+            raise Gone
         wanted = dict(used.wanted)
         read_at = {used.generation, used.generation if used.choice is None else used.choice.generation}
         if read_at != {scene.generation}:

@@ -1,14 +1,11 @@
 """Takes calls from the services, and keeps them, in a thread of its own: it never delays a call and never fails one.
 
-What it cannot keep it counts. Calls wait for the disk in a queue that is bounded in number and bytes. What is too old
-goes on time, whether calls come or not and whether the store answers or not: a second thread sees to that alone. What
-was made of a scene or of references that have been deleted since, by whatever server, goes within `STORE_CHECK_S`.
-Neither thread ends before the recorder is closed.
+What it cannot keep it counts. Calls wait for the disk in a queue that is bounded in number and bytes. `deletion` sees
+to it that what is kept goes when it is to go.
 """
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import deque
@@ -28,27 +25,21 @@ from ..store.rows import time_us
 from ..tenancy import key_of
 from ..tiers import Tier
 from .calls import CapturedCall
+from .deletion import Deletion
 from .errors import BlobGone
 from .folder import CaptureFolder
 from .gathering import Gatherer, Gone, Used, used_of
 from .messages import Request, Response, diagnostics_of
-from .staleness import Staleness
-
-log = logging.getLogger(__name__)
+from .telling import Telling
 
 MAX_WAITING = 32
 """Calls that wait for the disk."""
 MAX_WAITING_BYTES = 64 * 2**20
 """Of their messages."""
-STORE_CHECK_S = 30.0
-"""How long after a scene or a reference was deleted what was made of it is there at most."""
-EXPIRY_CHECK_S = 1.0
-"""How late a call may go, where the clock has been set; else it goes on time."""
 FAULT_PAUSE_S = 60.0
-"""After the disk has failed nothing is captured for so long; and of what fails the log tells no more often."""
+"""After the disk has failed nothing is captured for so long, not what waits already either."""
 CLOSING_LIMIT_S = 5.0
 """For what waits to be written when the server stops."""
-_MIN_PAUSE_S = 0.01
 
 
 class CaptureObserver(Protocol):
@@ -58,7 +49,10 @@ class CaptureObserver(Protocol):
         """A call is kept."""
 
     def capture_dropped(self, reason: str) -> None:
-        """A call that was to be captured is not: "queue", "size", "disk", "deleted", "store" or "fault"."""
+        """A call that was to be captured is not: "queue", "size", "disk", "deleted", "store" or "fault".
+
+        "queue" if too many waited, or if it still did when the server stopped.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,23 +113,17 @@ class Recorder:
         self._tenants = tenants
         self._store = store.uncached()
         self._gatherer = Gatherer(self._store, folder)
-        self._staleness = Staleness(self._store)
         self._circumstances = circumstances
         self._found: Mapping[str, str] | None = None
         self._waiting: deque[Waiting] = deque()
         self._waiting_bytes = 0
         self._paused_until_s = 0.0
-        self._dropped: dict[str, int] = {}
-        self._told_s: dict[str, float] = {}
         self._closing_s: float | None = None
         self._news = threading.Condition()
-        self._closing = threading.Event()
-        self._threads = [
-            threading.Thread(target=self._run, name="capture", daemon=True),
-            threading.Thread(target=self._expire, name="capture-expiry", daemon=True),
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._telling = Telling()
+        self._deletion = Deletion(folder, self._store, self._telling)
+        self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
+        self._thread.start()
 
     def answered(
         self,
@@ -168,19 +156,24 @@ class Recorder:
                 diagnostics.captured = True
             self._put(Waiting(call, scene_id, now_s, method, *messages, size_bytes, used, attributes, tiers))
 
+    @property
+    def is_closing(self) -> bool:
+        """Whether no more than what waits is written."""
+        return self._closing_s is not None
+
     def close(self) -> None:
         """Writes what waits, for as long as there is time, and lets the folder go; from any thread."""
         with self._news:
             self._closing_s = time.monotonic() + CLOSING_LIMIT_S
             self._news.notify()
-        self._closing.set()
-        for thread in self._threads:
-            thread.join()
+        self._thread.join()
+        self._telling.tell_dropped()
+        self._deletion.close()
         self.folder.close()
 
     def _has_room(self, size_bytes: int) -> bool:
         """Whether another call may wait; only the event loop adds any."""
-        if time.monotonic() < self._paused_until_s:
+        if self._is_paused():
             self._drop("disk")
             return False
         with self._news:
@@ -196,46 +189,27 @@ class Recorder:
             self._waiting_bytes += waiting.size_bytes
             self._news.notify()
 
-    def _expire(self) -> None:
-        """Of the expiry's thread: asks nobody but the folder."""
-        pause_s = 0.0
-        while not self._closing.wait(pause_s):
-            pause_s = EXPIRY_CHECK_S
-            try:
-                pause_s = min(max(self.folder.expire(), _MIN_PAUSE_S), EXPIRY_CHECK_S)
-            except Exception as error:  # whatever it is, the time limit holds for all others
-                self._complain("captured calls that are too old cannot be deleted", error)
-
     def _run(self) -> None:
-        due_s = 0.0
         while True:
-            if time.monotonic() >= due_s:
-                self._check()
-                due_s = time.monotonic() + STORE_CHECK_S
             with self._news:
-                if not self._waiting and self._closing_s is None:
-                    self._news.wait(max(due_s - time.monotonic(), 0.0))
-                is_closing = self._closing_s is not None
-                waiting = self._waiting.popleft() if self._waiting else None
-                self._waiting_bytes -= waiting.size_bytes if waiting else 0
-            if waiting is not None and not (is_closing and time.monotonic() > (self._closing_s or 0.0)):
+                self._news.wait_for(lambda: self._waiting or self.is_closing)
+                if not self._waiting:
+                    return
+                waiting = self._waiting.popleft()
+                self._waiting_bytes -= waiting.size_bytes
+                is_late = self._closing_s is not None and time.monotonic() >= self._closing_s
+            if is_late:
+                self._drop("queue")
+            else:
                 self._keep(waiting)
-            elif is_closing:
-                return
 
-    def _check(self) -> None:
-        """Deletes what should be gone for another reason than its age."""
-        try:
-            self.folder.forget_deleted()
-            stale = self._staleness.delete_stale(self.folder)
-            if stale:
-                log.info("%d captured calls are deleted, since their scenes or references were", stale)
-        except Unavailable:
-            log.debug("the store is away; captured calls are checked later")
-        except Exception as error:  # whatever it is, what can be kept is kept, and this is tried again
-            self._complain("captured calls cannot be compared with the store", error)
+    def _is_paused(self) -> bool:
+        return time.monotonic() < self._paused_until_s
 
     def _keep(self, waiting: Waiting) -> None:
+        if self._is_paused():
+            self._drop("disk")
+            return
         try:
             if self._add(waiting):
                 self._observer.captured()
@@ -244,14 +218,14 @@ class Recorder:
         except OSError as error:
             self._paused_until_s = time.monotonic() + FAULT_PAUSE_S
             self._drop("disk")
-            log.error("nothing is captured for %g s: %s", FAULT_PAUSE_S, error)
+            self._telling.complain(f"nothing is captured for {FAULT_PAUSE_S:g} s", error)
         except (Gone, NotFound):
             self._drop("deleted")
         except (DataLoss, Unavailable):
             self._drop("store")
-        except Exception:
+        except Exception as error:
             self._drop("fault")
-            log.exception("a call was not captured", extra={"request_id": waiting.call.request_id})
+            self._telling.complain("a call was not captured", error, waiting.call.request_id)
 
     def _add(self, waiting: Waiting, more_tries: int = 2) -> bool:
         try:
@@ -286,18 +260,4 @@ class Recorder:
 
     def _drop(self, reason: str) -> None:
         self._observer.capture_dropped(reason)
-        self._dropped[reason] = self._dropped.get(reason, 0) + 1
-        if self._is_time_to_tell("dropped"):
-            told, self._dropped = self._dropped, {}
-            log.warning("calls were not captured: %s", ", ".join(f"{name} {count}" for name, count in told.items()))
-
-    def _complain(self, what: str, error: Exception) -> None:
-        if self._is_time_to_tell(what):
-            log.error("%s: %s", what, error, exc_info=None if isinstance(error, OSError) else error)
-
-    def _is_time_to_tell(self, what: str) -> bool:
-        now_s = time.monotonic()
-        is_time = now_s - self._told_s.get(what, -FAULT_PAUSE_S) >= FAULT_PAUSE_S
-        if is_time:
-            self._told_s[what] = now_s
-        return is_time
+        self._telling.dropped(reason)

@@ -21,8 +21,8 @@ from .files import calls_of, check_format
 from .recompute import recompute, response_of
 from .stand_ins import Blobs
 
-IDENTICAL, CHANGED = "identical", "changed"
-"""Verdicts on a call."""
+IDENTICAL, CHANGED, NOT_COMPUTED = "identical", "changed", "not computed"
+"""Verdicts on a call; the last says nothing of its answer: a part of what was captured is damaged, or unknown here."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,11 @@ class Selection:
     scene_id: str = ""
 
     def files(self, folder: Path) -> list[Path]:
-        """Files of the tenant and the scene, the latest first."""
-        found = [it for it in calls_of(folder) if self._takes(*it.relative_to(folder).parts)]
+        """Files of the tenant and the scene, the latest first; CaptureError if a folder cannot be read."""
+        try:
+            found = [it for it in calls_of(folder) if self._takes(*it.relative_to(folder).parts)]
+        except OSError as error:
+            raise CaptureError(f"{error.filename} cannot be read: {error.strerror}") from error
         return sorted(found, key=lambda it: it.name, reverse=True)
 
     def _takes(self, _tenants: str, tenant: str, _calls: str, scene_id: str, _name: str) -> bool:
@@ -196,7 +199,7 @@ def _replayed(call: CapturedCall, blobs: Blobs, tiers: tuple[Tier, ...], options
         comparison, stages_now = compare(then, now), stage_seconds(now)
     except Exception as error:  # whatever this version cannot do with one call is said of it, and the others are told
         name = "" if isinstance(error, CaptureError) else f"{type(error).__name__}: "
-        return Replayed(*about, CHANGED, outcome_then, stages_then=stages_then, error=f"error: {name}{error}")
+        return Replayed(*about, NOT_COMPUTED, outcome_then, stages_then=stages_then, error=f"error: {name}{error}")
     return Replayed(
         *about,
         IDENTICAL if comparison.is_identical else CHANGED,

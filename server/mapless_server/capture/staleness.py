@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from itertools import groupby
 
-from ..errors import DataLoss, NotFound
+from ..errors import DataLoss, NotFound, Unavailable
 from ..store import SceneRecord, Store
 from ..store.rows import time_us
 from ..tenancy import SceneKey
-from .folder import CaptureFolder, Held
+from .folder import CaptureFolder
+from .held import Held
 
 References = frozenset[tuple[str, str]]
 """Ids and keys."""
@@ -24,22 +25,38 @@ class Staleness:
     def delete_stale(self, folder: CaptureFolder) -> int:
         """Deletes the calls of scenes that were deleted, and those that a deleted reference took part in.
 
+        Whatever is wrong with one scene or one file keeps nothing of another.
+
         Returns:
             How many calls went.
 
         Raises:
             Unavailable: the store is away and says nothing; what is to go then goes when it is back, or for its age.
             OSError: a file cannot be deleted.
+            Exception: a scene cannot be asked for.
         """
         held = sorted(folder.held(), key=lambda it: it.scene_key)
         of_scene = {key: list(calls) for key, calls in groupby(held, lambda it: it.scene_key)}
         self._known = {key: known for key, known in self._known.items() if key in of_scene}
-        gone = 0
-        for scene_key, calls in of_scene.items():
-            for it in self._stale(scene_key, calls):
-                folder.remove(it)
-                gone += 1
-        return gone
+        stale: list[Held] = []
+        faults: list[Exception] = []
+        try:
+            for scene_key, calls in of_scene.items():
+                stale += self._stale_unless_faulty(scene_key, calls, faults)
+        finally:
+            folder.remove_all(stale)
+        if faults:
+            raise faults[0]
+        return len(stale)
+
+    def _stale_unless_faulty(self, scene_key: SceneKey, calls: list[Held], faults: list[Exception]) -> list[Held]:
+        try:
+            return self._stale(scene_key, calls)
+        except Unavailable:  # and is so for the others
+            raise
+        except Exception as error:
+            faults.append(error)
+            return []
 
     def _stale(self, scene_key: SceneKey, calls: list[Held]) -> list[Held]:
         try:

@@ -74,7 +74,7 @@ def _print(report: Report) -> None:
         _print_call(call)
     for fault in report.unreadable:
         print(f"unreadable: {fault}")
-    counts = {name: sum(it.verdict == name for it in report.calls) for name in ("identical", "changed")}
+    counts = {name: sum(it.verdict == name for it in report.calls) for name in ("identical", "changed", "not computed")}
     counts["unreadable"] = len(report.unreadable)
     print(", ".join(f"{count} {name}" for name, count in counts.items() if count) or "nothing to compare")
 
@@ -82,7 +82,7 @@ def _print(report: Report) -> None:
 def _print_call(call: Replayed) -> None:
     head = f"{call.time} {call.request_id} {call.method} {call.tenant}/{call.scene_id}"
     if call.error:
-        print(f"{head}: {call.outcome_then} then; now {call.error}")
+        print(f"{head}: {call.verdict}, {call.outcome_then} then; now {call.error}")
         return
     print(f"{head}: {call.verdict}, {call.outcome_now}, {call.seconds_then:.2f} s then, {call.seconds_now:.2f} s now")
     if call.found_anew:
@@ -92,7 +92,7 @@ def _print_call(call: Replayed) -> None:
     if call.apart_cm is not None and call.apart_deg is not None:
         print(f"    the poses are {call.apart_cm:.4f} cm and {call.apart_deg:.5f} degrees apart")
     for change in call.changes[:SHOWN_CHANGES]:
-        print(f"    {change.field}: {change.then} > {change.now}")
+        print(f"    {change.field}: {change.then} → {change.now}")
     if len(call.changes) > SHOWN_CHANGES:
         print(f"    and {len(call.changes) - SHOWN_CHANGES} more, see --json")
 

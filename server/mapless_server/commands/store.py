@@ -73,9 +73,12 @@ def restore_command(
 ) -> None:
     """Check a backup and copy it into the store, which must be empty: all of it or nothing."""
     from ..store.backup import restore
+    from ..store.sqlite import SqliteDatabase
 
-    with _faults_said(), _progress() as on_progress, closing(_open(config, data_dir)) as database:
-        found = restore(file, database, on_progress)
+    with _faults_said(), _progress() as on_progress:
+        SqliteDatabase.look_at(file).close()  # before a store is made for it
+        with closing(_open(config, data_dir)) as database:
+            found = restore(file, database, on_progress)
     _report(found, "restored, read again and found whole")
 
 

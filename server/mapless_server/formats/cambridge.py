@@ -72,7 +72,7 @@ class Lens:
         That is the inverse of VisualSFM's: u = d + k d^3 solved for d = u - k u^3 + 3 k^2 u^5 - 12 k^3 u^7 + ...
         """
         k = self.k
-        distortion = RadialTangential(k1=-k, k2=3 * k**2, k3=-12 * k**3) if k else None
+        distortion = RadialTangential(k1=-k, k2=3 * k * k, k3=-12 * k * k * k) if k else None
         return from_corner(Camera(*size, self.focal_px, self.focal_px, size[0] / 2, size[1] / 2, distortion))
 
 

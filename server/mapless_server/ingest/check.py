@@ -72,9 +72,9 @@ class _Comparison:
         new = [pair for pair in pairs if pair not in self.pairs]
         missing = sorted({i for pair in new for i in pair} - self.views.keys())
         with ThreadPoolExecutor(available_cores()) as threads:
-            for done, (i, view) in enumerate(zip(missing, threads.map(self._view, missing), strict=True)):
-                self.progress("checking poses", done, len(missing))
+            for done, (i, view) in enumerate(zip(missing, threads.map(self._view, missing), strict=True), 1):
                 self.views[i] = view
+                self.progress("checking poses", done, len(missing))
             found = list(threads.map(self._match, new))
         self.pairs += new
         self.matched += [item for item in found if item is not None and len(item.matches)]
@@ -82,7 +82,8 @@ class _Comparison:
     def verdict(self) -> Verdict:
         """On all pairs so far."""
         views = {i: view for i, view in self.views.items() if view is not None}
-        return judge(views, self.matched, len(self.pairs) - len(self.matched))
+        readable = sum(views.keys() >= set(pair) for pair in self.pairs)
+        return judge(views, self.matched, readable - len(self.matched))
 
     def _view(self, index: int) -> PosedView | None:
         frame = self.frames[index]

@@ -23,6 +23,9 @@ Scene = Annotated[str, typer.Argument(help="Id of the scene.")]
 Address = Annotated[
     str, typer.Option(help="host:port of the server; default: one is started on the store of the settings.")
 ]
+DataDir = Annotated[
+    Path | None, typer.Option(help="Folder of the store, where no --address is given; default: that of the settings.")
+]
 Tls = Annotated[bool, typer.Option("--tls", help="Encrypt; --ca and --cert imply it.")]
 Ca = Annotated[Path | None, typer.Option(help="Certificate that signed the server's, PEM.")]
 Cert = Annotated[Path | None, typer.Option(help="Our own certificate, PEM, if the server asks.")]
@@ -50,6 +53,7 @@ def import_command(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Read and check the poses, store nothing.")] = False,
     skip_check: Annotated[bool, typer.Option("--skip-check", help="Do not compare photographs with poses.")] = False,
     report: Annotated[Path | None, typer.Option(help="JSON file for the whole report.")] = None,
+    data_dir: DataDir = None,
     address: Address = "",
     tls: Tls = False,
     ca: Ca = None,
@@ -60,7 +64,7 @@ def import_command(
 ) -> None:
     """Store the posed photographs of a folder as references of a scene; run it again to go on where it was cut off."""
     from ..formats import ReadOptions
-    from ..settings import ConfigError, load_settings
+    from ..settings import ConfigError
     from .connection import Connection
     from .importing import ImportOptions
     from .waiting import UploadOptions
@@ -76,7 +80,7 @@ def import_command(
             check=not skip_check,
             upload=UploadOptions(parallel=parallel),
         )
-        settings = load_settings({}).settings
+        settings = _settings(data_dir, address)
         connection = Connection(address, tls, ca, cert, key, token_file, client_id)
     except (ValueError, ConfigError) as error:
         _fail(str(error))
@@ -87,6 +91,7 @@ def export_command(
     scene: Scene,
     folder: Annotated[Path, typer.Argument(help="Folder to write to; must be empty or not be there.")],
     format: Annotated[str, typer.Option(help="Layout: cameras or colmap.")] = "cameras",
+    data_dir: DataDir = None,
     address: Address = "",
     tls: Tls = False,
     ca: Ca = None,
@@ -103,14 +108,14 @@ def export_command(
 
     from ..child import ServerFailed
     from ..progress import progress_bars
-    from ..settings import ConfigError, load_settings
+    from ..settings import ConfigError
     from ..signals import terminable
     from .connection import Connection, connected
     from .exporting import check_target, export_scene
 
     try:
         check_target(folder, format)
-        settings = load_settings({}).settings
+        settings = _settings(data_dir, address)
         connection = Connection(address, tls, ca, cert, key, token_file, client_id)
         with terminable(), connected(connection, settings) as client, progress_bars() as progress:
             export = export_scene(client, scene, folder, format, progress)
@@ -209,6 +214,14 @@ def _reported(report: ImportReport, file: Path | None) -> Iterator[None]:
         print_report(report, Console(soft_wrap=True))
         if file is not None:
             write_json(file, to_json(report))
+
+
+def _settings(data_dir: Path | None, address: str) -> Settings:
+    from ..settings import load_settings
+
+    if data_dir is not None and address:
+        raise ValueError("--data-dir is a store, --address a server: say one of them")
+    return load_settings({"data_dir": data_dir}).settings
 
 
 def _intrinsics(text: str) -> Intrinsics | None:

@@ -59,7 +59,6 @@ class Uploader:
         self._progress = progress
         self._stop = threading.Event()
         self._lock = threading.Lock()
-        self._done = 0
 
     def run(self) -> None:
         """Stores the report's chosen frames. An interruption stops it soon, and goes through."""
@@ -90,8 +89,10 @@ class Uploader:
                 items = [item for frame in batch if (item := self._load(frame)) is not None]
                 self._send(items)
                 with self._lock:
-                    self._done += len(batch)
-                    self._progress("storing references", self._done, len(self._report.chosen))
+                    report = self._report
+                    refused = len(report.refused) - len(report.dataset.refused)
+                    done = len(report.added) + len(report.skipped)
+                    self._progress("storing references", done, len(report.chosen) - refused)
         except _Stopped:
             pass
         except BaseException:

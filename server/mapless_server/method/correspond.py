@@ -13,7 +13,7 @@ serves queries that are lost otherwise.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -190,6 +190,12 @@ class Matcher:
             while len(self._remembered) > self.options.remembered_pairs:
                 self._remembered.popitem(last=False)
         return matches
+
+    def forget(self, keys: Collection[str]) -> None:
+        """Forgets the pairs of references that nobody will ask for any more. Looks at each."""
+        with self._lock:
+            for pair in [it for it in self._remembered if it[0] in keys or it[1] in keys]:
+                del self._remembered[pair]
 
     def _match_strictly(self, first: PosedView, second: PosedView) -> Matches:
         matches = mutual_matches(first.view.features, second.view.features, self.options.reference_ratio)

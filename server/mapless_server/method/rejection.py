@@ -87,6 +87,7 @@ class Rejection:
         reason: for programs.
         message: one sentence for a person, with the numbers that decided.
         hint: what to do about it; None where nobody has asked (see `hints`).
+        tried: matches with points of the references that it was judged by; None where none were made.
         hypotheses: the places between which nothing decides, the better supported first; empty unless AMBIGUOUS.
     """
 
@@ -94,3 +95,4 @@ class Rejection:
     message: str
     hint: Hint | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
+    tried: int | None = None

@@ -2,7 +2,8 @@
 
 Two references at one place that look the same way see the same and triangulate nothing, so after the first of them the
 second counts for less. It is not left out: in a dense sequence the strictly spread ones see so little of the query that
-they cost a third of the accuracy.
+they cost a third of the accuracy. But where a camera stood still, on a tripod or at a robot's dock, hundreds are more
+alike than any other: of those a few are chosen, and then others before the rest.
 """
 
 from __future__ import annotations
@@ -32,20 +33,26 @@ class RankOptions:
             already. 1 does not thin, 0 spreads at any price. In the kitchen of 7-Scenes (100 references, 60 queries)
             the median errors with 1, 0.75 and 0.5 are 0.13, 0.15 and 0.15 cm, and 90 % lie below 0.27, 0.29 and 0.32;
             with 0 the chosen share half as many matches with the query.
+        same_place_m: of references that stand closer together than this and look the same way a photograph of the same
+            place resembles all about equally, and ten of them tell no depth. A video at walking speed has two or three.
+        per_place: so many of them are chosen, but no more than half of what is wanted, before all others.
         pool: so many times the references that are wanted are looked at, the most similar ones. Those behind them are
-            never chosen instead of one that is nearby.
+            never chosen instead of one that is nearby, unless too few of them stand at places of their own.
         smallest_pool: but at least so many.
     """
 
     apart_m: float = 0.3
     apart_deg: float = 30.0
     nearby_weight: float = 0.75
+    same_place_m: float = 0.05
+    per_place: int = 3
     pool: int = 10
     smallest_pool: int = 200
 
     def __post_init__(self) -> None:
-        is_sensible = self.apart_m >= 0 and 0 <= self.apart_deg <= 180 and 0 <= self.nearby_weight <= 1
-        if not (is_sensible and self.pool >= 1 and self.smallest_pool >= 1):
+        is_sensible = min(self.apart_m, self.same_place_m) >= 0 and 0 <= self.apart_deg <= 180
+        counts = (self.per_place, self.pool, self.smallest_pool)
+        if not (is_sensible and 0 <= self.nearby_weight <= 1 and min(counts) >= 1):
             raise ValueError(f"senseless options: {self}")
 
 
@@ -97,16 +104,25 @@ def rank_references(
     score = _scores(similarity, entries, rows, narrowing)
     known = similarity[~np.isnan(similarity)]
     typical = float(np.median(known)) if len(known) else math.inf
-    pool = _best(score, max(options.pool * count, options.smallest_pool))
-    rows, similarity, score = rows[pool], similarity[pool], score[pool]
-    order = spread(score, entries.centres(rows), entries.axes(rows), count, typical, options)
-    return [_ranked(entries, int(rows[i]), float(similarity[i])) for i in order]
+    wanted, size = min(count, len(rows)), max(options.pool * count, options.smallest_pool)
+    while True:
+        pool = _best(score, size)
+        at = rows[pool]
+        order = spread(score[pool], entries.centres(at), entries.axes(at), wanted, typical, options)
+        if len(order) == wanted or len(pool) == len(rows):
+            break
+        size *= 10
+    rest = np.setdiff1d(np.arange(len(pool)), order)  # in the order of their scores
+    chosen = pool[[*order, *rest[: wanted - len(order)]]]
+    return [_ranked(entries, int(rows[i]), float(similarity[i])) for i in chosen]
 
 
 def spread(
     scores: ArrayLike, centres: ArrayLike, axes: ArrayLike, count: int, typical: float, options: RankOptions
 ) -> list[int]:
     """Takes the best score again and again, where one near a chosen one has less of a lead; ties go to the first.
+
+    Where enough have been taken from one place, the others there are passed over.
 
     Args:
         scores: (N,) finite, or -inf.
@@ -117,7 +133,7 @@ def spread(
         options: see there.
 
     Returns:
-        Indices in the order of choice, as many as there are, but not more than `count`.
+        Indices in the order of choice, not more than `count`; fewer if the rest are passed over.
     """
     score, centre, axis = np.asarray(scores, float), np.asarray(centres, float), np.asarray(axes, float)
     lead = np.maximum(score - typical, 0.0)
@@ -126,13 +142,18 @@ def spread(
     left = np.ones(len(score), bool)
     current = score.copy()
     chosen: list[int] = []
-    for _ in range(min(count, len(score))):
+    taken_there = np.zeros(len(score), int)
+    most_there = max(1, min(options.per_place, count // 2))
+    while len(chosen) < count and left.any():
         candidates = np.flatnonzero(left)
         best = int(candidates[np.argmax(current[candidates])])
         chosen.append(best)
+        away_m = np.linalg.norm(centre - centre[best], axis=1)
+        alike = axis @ axis[best] >= same_way
+        current = np.where((away_m < options.apart_m) & alike, lowered, current)
+        taken_there += (away_m < options.same_place_m) & alike
+        left &= taken_there < most_there
         left[best] = False
-        nearby = np.linalg.norm(centre - centre[best], axis=1) < options.apart_m
-        current = np.where(nearby & (axis @ axis[best] >= same_way), lowered, current)
     return chosen
 
 

@@ -76,7 +76,8 @@ class Admission:
         late_s = now_s + options.caution * (max(waits_s) + own_s) - job.deadline_s
         if late_s > 0:
             retry_s = None if now_s + own_s > job.deadline_s else max(MIN_RETRY_S, late_s)
-            raise Refused(Refusal.DEADLINE_INFEASIBLE, "the answer would come after the deadline", retry_s)
+            message = f"the answer would come after the deadline, by about {late_s:.1g} s"
+            raise Refused(Refusal.DEADLINE_INFEASIBLE, message, retry_s)
 
     def check_queue(self, flow: Flow, cost_s: Counter[str]) -> None:
         """Raises Refused if a caller cannot be let in with any job of this cost, whatever its deadline and size.

@@ -11,6 +11,7 @@ from sqlalchemy import Connection
 from mapless_server.errors import RequestError
 from mapless_server.store.cache import LruCache
 from mapless_server.store.database import Database
+from mapless_server.store.leftovers import Leftovers
 from mapless_server.store.observed import StoreObserver, Unobserved
 from mapless_server.store.records import DescribedReference, SceneAttributes
 
@@ -49,16 +50,20 @@ class BaseStore:
         write_fault: why the last change could not be written, one of `UNWRITABLE`; empty if it could.
     """
 
-    def __init__(self, database: Database, described: LruCache[DescribedReference]) -> None:
+    def __init__(
+        self, database: Database, described: LruCache[DescribedReference], name_cache_bytes: int = NAME_CACHE_BYTES
+    ) -> None:
         self._database = database
+        self._leftovers = Leftovers(database)
         self.observer: StoreObserver = Unobserved()
         # By (key, extractor): references never change and keys are never reused, so no entry is ever stale.
         self._described = described
         # What names meant, by scene and names. Where this process alone writes, it holds as long as nothing was written
         # since, and the database is not asked at all; where others write, as long as the generation is the same.
-        self._resolved: LruCache[Resolved] = LruCache(NAME_CACHE_BYTES)
-        self._attributes: LruCache[Attributes] = LruCache(NAME_CACHE_BYTES)
+        self._resolved: LruCache[Resolved] = LruCache(name_cache_bytes)
+        self._attributes: LruCache[Attributes] = LruCache(name_cache_bytes)
         self._state = object()
+        self._deletion = object()
         self.write_fault = ""
 
     @contextmanager

@@ -44,13 +44,18 @@ class LruCache(Generic[Value]):
             self._entries.move_to_end(key)
             return entry[0]
 
-    def forget(self, is_gone: Callable[[Any, Value], bool]) -> None:
-        """Forget what nobody will ask for any more, by key and value; not counted as evictions. Looks at each."""
+    def forget(self, is_gone: Callable[[Any, Value], bool]) -> list[Any]:
+        """Forget what nobody will ask for any more, by key and value; not counted as evictions. Looks at each.
+
+        Returns:
+            The keys of what was forgotten.
+        """
         with self._lock:
             gone = [key for key, (value, _) in self._entries.items() if is_gone(key, value)]
             for key in gone:
                 _, size_bytes = self._entries.pop(key)
                 self._used_bytes -= size_bytes
+        return gone
 
     def put(self, key: Hashable, value: Value, size_bytes: int) -> None:
         """Hold a value, unless it is larger than the whole cache."""

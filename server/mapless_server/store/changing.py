@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, delete, insert, select, update
+from sqlalchemy import Connection, insert, select, update
 
 from mapless.geodesy import Datum
 from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
-from mapless_server.errors import AlreadyExists
+from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.method.views import View
 from mapless_server.store import queries, removing, rows, tables
 from mapless_server.store.base import BaseStore
@@ -21,9 +21,6 @@ from mapless_server.store.damage import DamagedPages
 from mapless_server.store.observed import observed
 from mapless_server.store.records import NewReference, ReferenceRecord, SceneAttributes, SceneRecord
 from mapless_server.tenancy import SceneKey, scene_id_of
-
-REFERENCES_DELETED_AT_A_TIME = 100
-"""Less than a second even on slow disks: so long others wait who want to write to SQLite."""
 
 GENERATIONS_REMEMBERED = 100_000
 """How far back `list_changes` knows what was deleted: some 10 MB a scene; who asks less often may read it all."""
@@ -81,54 +78,38 @@ class ChangingStore(BaseStore):
             return rows.scene_record(queries.find_scene(connection, scene_key))
 
     @observed
-    def delete_scene(self, scene_key: SceneKey) -> None:
+    def delete_scene(self, scene_key: SceneKey) -> frozenset[str]:
         """Delete a scene and all its references.
 
-        A large one is first gone, in one transaction, and then deleted, a portion at a time, so that nobody has to wait
-        for it. What is left when we are cut off in between is deleted together with the next scene.
+        It is first gone, in one transaction, and then deleted, a portion at a time, so that nobody has to wait for it.
+        What is left when we are cut off in between is deleted when the store is opened again, or by the next call of
+        this method, for whichever scene.
+
+        Returns:
+            Keys of those of its references that were in memory.
 
         Raises:
-            NotFound: there is no such scene.
+            NotFound: there is no such scene, and nothing left of a deleted one.
+            Overloaded: the disk is full. If the scene is gone all the same, something of it is left.
         """
         try:
-            self._begin_deleting(scene_key, REFERENCES_DELETED_AT_A_TIME)
-        except DamagedPages:
-            self._begin_deleting(scene_key, -1)
+            self._set_apart(scene_key)
+        except NotFound:
+            self._leftovers.delete()
+            raise
+        self._deletion = object()
         # Their keys are never used again, so that they would only keep room from others until they were forgotten.
-        self._described.forget(lambda _, it: it.record.scene_key == scene_key)
+        gone = self._described.forget(lambda _, it: it.record.scene_key == scene_key)
         self._resolved.forget(lambda key, _: key[0] == scene_key)
         self._attributes.forget(lambda key, _: key == scene_key)
-        self._delete_what_is_left()
+        self._leftovers.delete()
+        return frozenset(key for key, _ in gone)
 
-    def _begin_deleting(self, scene_key: SceneKey, at_once: int) -> None:
-        """The scene is gone; with all its references if they are so few."""
-        column = tables.scene.c
+    def _set_apart(self, scene_key: SceneKey) -> None:
         with self._changing() as connection:
             queries.begin_change(connection, scene_key)
             self._database.take_your_time(connection)
-            count = connection.execute(select(column.reference_count).where(column.scene_id == scene_key)).scalar_one()
-            if count > at_once:
-                removing.set_apart(connection, scene_key)
-            else:
-                connection.execute(delete(tables.scene).where(column.scene_id == scene_key))
-
-    def _delete_what_is_left(self) -> None:
-        """Of deleted scenes; references on pages that cannot be freed are put aside."""
-        is_more, count = True, REFERENCES_DELETED_AT_A_TIME
-        while is_more:
-            is_more, is_damaged = self._delete_portion(count)
-            if is_damaged and count == 1:
-                with self._database.write() as connection:
-                    removing.set_next_aside(connection)
-            count = 1 if is_damaged and count > 1 else REFERENCES_DELETED_AT_A_TIME
-
-    def _delete_portion(self, count: int) -> tuple[bool, bool]:
-        """Whether there may be more, and whether damaged pages kept it from being deleted."""
-        try:
-            with self._database.write() as connection:  # changes nothing that anybody sees
-                return removing.delete_portion(connection, count), False
-        except DamagedPages:
-            return True, True
+            removing.set_apart(connection, scene_key)
 
     @observed
     def add_references(self, scene_key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
@@ -212,21 +193,26 @@ class ChangingStore(BaseStore):
                 connection.execute(update(reference).where(reference.c.key == key).values(generation=generation))
 
     @observed
-    def delete_reference(self, scene_key: SceneKey, reference_id: str) -> None:
+    def delete_reference(self, scene_key: SceneKey, reference_id: str) -> str:
         """Delete a reference with its image and features; works on a damaged one, too, whose pages then stay lost.
+
+        Returns:
+            Its key.
 
         Raises:
             NotFound: there is no such scene or reference.
         """
         try:
-            self._delete_reference(scene_key, reference_id, removing.delete_one)
+            key = self._delete_reference(scene_key, reference_id, removing.remove)
         except DamagedPages:
-            self._delete_reference(scene_key, reference_id, removing.set_aside)
-        self._described.forget(lambda _, it: (it.record.scene_key, it.record.reference_id) == (scene_key, reference_id))
+            key = self._delete_reference(scene_key, reference_id, removing.set_aside)
+        self._deletion = object()
+        self._described.forget(lambda _, it: it.record.key == key)
+        return key
 
     def _delete_reference(
         self, scene_key: SceneKey, reference_id: str, remove: Callable[[Connection, str], None]
-    ) -> None:
+    ) -> str:
         with self._changing() as connection:
             generation = queries.begin_change(connection, scene_key, -1)
             key = queries.find_key(connection, scene_key, reference_id)
@@ -234,6 +220,7 @@ class ChangingStore(BaseStore):
             tombstone = {"scene_id": scene_key, "generation": generation, "reference_key": key}
             connection.execute(insert(tables.removed_reference).values(tombstone))
             queries.forget_removals(connection, scene_key, generation - GENERATIONS_REMEMBERED)
+        return key
 
     @observed
     def try_writing(self) -> None:

@@ -17,11 +17,17 @@ class Database(Protocol):
 
     Attributes:
         is_shared: whether other processes may change it. If so, nothing remembered is believed without its generation.
+        only_reads: whether every change is refused.
         name: for messages.
     """
 
     @property
     def is_shared(self) -> bool:
+        """See the class."""
+        ...
+
+    @property
+    def only_reads(self) -> bool:
         """See the class."""
         ...
 
@@ -44,6 +50,13 @@ class Database(Protocol):
 
     def take_your_time(self, connection: Connection) -> None:
         """Lift the limits of a transaction, which is no call that somebody waits for."""
+        ...
+
+    def make_room(self) -> None:
+        """Free what the database takes of the disk beside its data, as far as that can be done soon.
+
+        The caller has no transaction.
+        """
         ...
 
     def close(self) -> None:

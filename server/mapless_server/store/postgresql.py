@@ -65,6 +65,7 @@ class PostgresqlDatabase:
     """One database of a PostgreSQL, shared with other servers; safe for many threads."""
 
     is_shared = True
+    only_reads = False
 
     def __init__(self, engine: Engine, name: str) -> None:
         self.name = name
@@ -123,6 +124,9 @@ class PostgresqlDatabase:
         """Implements Database."""
         for setting in _UNLIMITED:
             connection.exec_driver_sql(f"SET LOCAL {setting} = 0")
+
+    def make_room(self) -> None:
+        """Implements Database."""
 
     def close(self) -> None:
         """Implements Database."""

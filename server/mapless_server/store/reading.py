@@ -189,7 +189,7 @@ class ReadingStore(BaseStore):
             NotFound: there is no such scene (field "scene") or reference (field "references[i]").
             DataLoss: features, camera or pose of one of them are damaged.
         """
-        state = self._state
+        state, deletion = self._state, self._deletion
         names = None if reference_ids is None else tuple(reference_ids)
         resolved = None if names is None else self._resolved.get((scene_key, names))
         remembered: dict[str, DescribedReference | None] = {}  # each is asked for once: hits and misses are counted
@@ -225,6 +225,9 @@ class ReadingStore(BaseStore):
         for key, row in found.items():
             described[key] = rows.described_reference(row)
             self._described.put((key, extractor), described[key], len(row.data) + RECORD_BYTES)
+        if self._deletion is not deletion:  # perhaps of these, and who deleted them has had them forgotten already
+            self._described.forget(lambda key, _: key[0] in found)
+            self._resolved.forget(lambda key, _: key == (scene_key, names))
         return SceneSnapshot(
             generation,
             tuple(described[key] for key in wanted if key in described),

@@ -6,12 +6,22 @@ Each statement runs in the caller's transaction.
 from __future__ import annotations
 
 import uuid
+from bisect import bisect_right
 from collections.abc import Sequence
+from itertools import accumulate
 
-from sqlalchemy import ColumnElement, Connection, delete, insert, select, update
+from sqlalchemy import ColumnElement, Connection, ScalarSelect, Table, delete, func, insert, select, update
 
-from mapless_server.store.tables import reference, scene
+from mapless_server.store.tables import features, global_descriptor, image, reference, scene
 from mapless_server.tenancy import SceneKey
+
+PORTION_BYTES = 4 * 2**20
+"""Of photographs, features and descriptors that are deleted in one transaction, unless one reference alone has more.
+
+SQLite overwrites what it deletes, so that it writes as much to its journal, which needs the room on the disk until the
+transaction is over. That is as much as it collects there before it puts it in place anyway: the journal stays as small
+as it always is, and others wait for a fraction of a second.
+"""
 
 _REMOVED = "-/"
 """What keys of deleted scenes begin with: no tenant's name is a hyphen."""
@@ -24,7 +34,7 @@ _DAMAGED = f"{_REMOVED}damaged"
 def set_apart(connection: Connection, scene_key: SceneKey) -> str:
     """Delete a scene but keep its references' rows, under a key at which nobody finds them; the caller has its lock.
 
-    That is one short row a reference, where deleting means megabytes: `delete_portion` does that afterwards.
+    That is one short row a reference, where deleting means megabytes: `Leftovers` does that afterwards.
 
     Returns:
         The key.
@@ -45,36 +55,42 @@ def set_aside(connection: Connection, key: str) -> None:
     connection.execute(update(reference).where(column.key == key).values(scene_id=_DAMAGED, reference_id=key))
 
 
-def delete_portion(connection: Connection, count: int) -> bool:
-    """Delete some of what was set apart, by whomever; whether there may be more.
+def is_left(connection: Connection) -> bool:
+    """Whether anything that was set apart is still to be deleted."""
+    column = scene.c.scene_id
+    return connection.scalar(select(column).where(is_set_apart(column), column != _DAMAGED).limit(1)) is not None
+
+
+def next_portion(connection: Connection, at_most: int) -> Sequence[str]:
+    """Keys of what to delete next of what was set apart: so many, or so few that they are not too large together.
 
     What another server is deleting at this moment is left to it.
     """
     column = reference.c
-    keys = _portion(connection, count)
-    if keys:
-        connection.execute(delete(reference).where(column.key.in_(keys)))
-        return True
-    is_empty = ~select(column.key).where(column.scene_id == scene.c.scene_id).exists()
+    left = select(column.key).where(is_set_apart(column.scene_id), column.scene_id != _DAMAGED).order_by(column.key)
+    keys = connection.scalars(left.limit(at_most).with_for_update(skip_locked=True)).all()
+    if len(keys) <= 1:  # where pages are damaged even the size may not be readable
+        return keys
+    size_bytes = _size_bytes(image) + _size_bytes(features) + _size_bytes(global_descriptor)
+    sizes = connection.scalars(select(size_bytes).where(column.key.in_(keys)).order_by(column.key))
+    return keys[: max(1, bisect_right(list(accumulate(sizes)), PORTION_BYTES))]
+
+
+def _size_bytes(table: Table) -> ScalarSelect[int]:
+    """What a reference has in a table; the bytes themselves are not read for it."""
+    total = select(func.coalesce(func.sum(func.length(table.c.data)), 0))
+    return total.where(table.c.reference_key == reference.c.key).scalar_subquery()
+
+
+def remove(connection: Connection, *keys: str) -> None:
+    """Delete references with everything that belongs to them."""
+    connection.execute(delete(reference).where(reference.c.key.in_(keys)))
+
+
+def forget_empty(connection: Connection) -> None:
+    """Delete what scenes were set apart under, where nothing is left of them."""
+    is_empty = ~select(reference.c.key).where(reference.c.scene_id == scene.c.scene_id).exists()
     connection.execute(delete(scene).where(is_set_apart(scene.c.scene_id), is_empty))
-    return False
-
-
-def set_next_aside(connection: Connection) -> None:
-    """Put aside what `delete_portion` would delete next if it were to delete one."""
-    for key in _portion(connection, 1):
-        set_aside(connection, key)
-
-
-def delete_one(connection: Connection, key: str) -> None:
-    """Delete one reference with everything that belongs to it."""
-    connection.execute(delete(reference).where(reference.c.key == key))
-
-
-def _portion(connection: Connection, count: int) -> Sequence[str]:
-    column = reference.c
-    portion = select(column.key).where(is_set_apart(column.scene_id), column.scene_id != _DAMAGED)
-    return connection.scalars(portion.order_by(column.key).limit(count).with_for_update(skip_locked=True)).all()
 
 
 def forget_removed(connection: Connection) -> None:

@@ -34,6 +34,10 @@ logger = logging.getLogger(__name__)
 DATABASE_FILE = "mapless.sqlite3"
 BUSY_TIMEOUT_MS = 5000
 """How long a connection waits for another's lock. Our writers queue before SQLite does; this is for tools beside us."""
+MAKE_ROOM_TIMEOUT_MS = 100
+"""For those who read what is not in the file yet; a backup reads for longer, and is not waited for."""
+JOURNAL_KEPT_BYTES = 8 * 2**20
+"""A journal that a large change has made longer is cut when it is begun anew. Deleting needs less."""
 ROOM_TO_OPEN_BYTES = 64 * 1024
 """What SQLite needs beside the file to open it."""
 
@@ -64,7 +68,7 @@ class SqliteDatabase:
         # SQLite lets writers poll for its lock, in no order; here they queue.
         self._write_lock = threading.Lock()
         self._folder_lock = folder_lock
-        self._only_reads = only_reads
+        self.only_reads = only_reads
 
     @staticmethod
     def open(folder: Path) -> SqliteDatabase:
@@ -183,13 +187,24 @@ class SqliteDatabase:
     @contextmanager
     def write(self) -> Iterator[Connection]:
         """Implements Database."""
-        if self._only_reads:
+        if self.only_reads:
             raise FailedPrecondition("the store can only be read", reason="STORE_READ_ONLY")
         with faults_translated(), self._write_lock, self._writing_engine.begin() as connection:
             yield connection
 
     def take_your_time(self, connection: Connection) -> None:
         """Implements Database."""
+
+    def make_room(self) -> None:
+        """Implements Database."""
+        suppressed = suppress(self._engine.dialect.loaded_dbapi.Error)  # what cannot be put in place stays where it is
+        with faults_translated(), self._write_lock, self._engine.connect() as connection, suppressed:
+            # Who writes waits while this waits for who reads.
+            _execute(connection, f"PRAGMA busy_timeout={MAKE_ROOM_TIMEOUT_MS}")
+            try:
+                _execute(connection, "PRAGMA wal_checkpoint(RESTART)")
+            finally:
+                _execute(connection, f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
 
     def close(self) -> None:
         """Close all connections and let other servers in; nothing may be reading or writing."""
@@ -269,6 +284,7 @@ def create_sqlite_engine(
             "trusted_schema=OFF",
             "cell_size_check=ON",
             "mmap_size=0",
+            f"journal_size_limit={JOURNAL_KEPT_BYTES}",
             "secure_delete=ON",  # else deleted photographs lie in the file until something else is written there
         ):
             cursor.execute(f"PRAGMA {setting}")

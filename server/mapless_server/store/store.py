@@ -43,7 +43,7 @@ class Store(ReadingStore, ChangingStore):
             ValueError: cache_bytes is negative.
         """
         described: LruCache[DescribedReference] = LruCache(cache_bytes)
-        return Store(SqliteDatabase.open(data_dir), described)
+        return Store._resumed(SqliteDatabase.open(data_dir), described)
 
     @staticmethod
     def connect(database_url: str, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
@@ -58,7 +58,14 @@ class Store(ReadingStore, ChangingStore):
             ValueError: cache_bytes is negative.
         """
         described: LruCache[DescribedReference] = LruCache(cache_bytes)
-        return Store(PostgresqlDatabase.open(database_url), described)
+        return Store._resumed(PostgresqlDatabase.open(database_url), described)
+
+    @staticmethod
+    def _resumed(database: Database, described: LruCache[DescribedReference]) -> Store:
+        """A store that goes on with what the one before it has left."""
+        store = Store(database, described)
+        store._leftovers.resume()
+        return store
 
     @property
     def database(self) -> Database:
@@ -70,7 +77,7 @@ class Store(ReadingStore, ChangingStore):
 
         It lives as long as this store, is not closed, and is only read.
         """
-        return Store(self._database, LruCache(0))
+        return Store(self._database, LruCache(0), name_cache_bytes=0)
 
     @property
     def reference_cache(self) -> LruCache[DescribedReference]:
@@ -79,6 +86,7 @@ class Store(ReadingStore, ChangingStore):
 
     def close(self) -> None:
         """Release the data folder; no call may be in progress or follow."""
+        self._leftovers.close()
         self._database.close()
 
     def __enter__(self) -> Store:

@@ -123,7 +123,7 @@ class GeometricReconstructor:
         inlier_px = self.options.pnp.inlier_px
         if pose is None:
             message = f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references"
-            return Rejection(RejectionReason.LOW_OVERLAP, message), np.zeros(len(matches), bool)
+            return _no_overlap(message, matches), np.zeros(len(matches), bool)
         x_in_world, pixels = structure.x_in_world[matches.point], query.features.keypoints[matches.keypoint]
         inliers = reprojection_errors_px(query.camera, pose, x_in_world, pixels.astype(np.float64)) < inlier_px
         expected = log10_false_alarms(query.camera, matches, inliers, inlier_px) + priors.log10_chance(pose)
@@ -133,7 +133,7 @@ class GeometricReconstructor:
             f"{inliers.sum()} of {len(matches)} matches with the references' points agree on a pose, which chance"
             f" could do ({told_false_alarms(expected)})"
         )
-        return Rejection(RejectionReason.LOW_OVERLAP, message), inliers
+        return _no_overlap(message, matches), inliers
 
     def _check(self, references: Sequence[PosedView]) -> Rejection | None:
         if len(references) < 2:
@@ -199,3 +199,7 @@ class GeometricReconstructor:
 def _unit_frame(world_from_camera: RigidTransform, x_in_world: Array) -> Similarity:
     distance_m = float(np.median(np.linalg.norm(x_in_world - world_from_camera.translation, axis=1)))
     return Similarity(distance_m, world_from_camera.rotation, world_from_camera.translation).inverse()
+
+
+def _no_overlap(message: str, matches: PointMatches) -> Rejection:
+    return Rejection(RejectionReason.LOW_OVERLAP, message, tried=len(matches))

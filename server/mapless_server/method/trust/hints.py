@@ -57,8 +57,8 @@ class _Case:
         features: of the photograph.
         matches: of the best reference with it.
         inliers: of all its matches with points, those that agree on a pose.
-        tried: matches with points.
-        best: the best reference's name; None if none shares anything.
+        tried: matches with points; None where none were made.
+        best: name of the reference with most matches; None if none has any.
         reference_count: how many were used.
         has_prior: whether the caller said where the camera is.
     """
@@ -67,7 +67,7 @@ class _Case:
     features: int
     matches: int
     inliers: int
-    tried: int
+    tried: int | None
     best: str | None
     reference_count: int
     has_prior: bool
@@ -93,14 +93,14 @@ def hinted(
     if not isinstance(rejection, Rejection) or rejection.hint is not None:
         return answer
     estimate = answer.support.estimate if answer.support else None
-    counts = [answer.reference_inlier_counts, answer.reference_match_counts]
-    best = next((int(np.argmax(c)) for c in counts if any(c) and len(c) == len(references)), None)
+    matches = answer.reference_match_counts
+    best = int(np.argmax(matches)) if any(matches) else None
     case = _Case(
         rejection,
         len(query.features),
-        max(answer.reference_match_counts, default=0),
+        max(matches, default=0),
         0 if estimate is None else int(estimate.inliers.sum()),
-        0 if answer.support is None else len(answer.support.matches),
+        rejection.tried if answer.support is None else len(answer.support.matches),
         None if best is None else references[best].name,
         len(references),
         has_prior,
@@ -157,6 +157,12 @@ def _of_overlap(case: _Case, options: HintOptions) -> tuple[Advice, str]:
         return (
             Advice.CHOOSE_OTHER_REFERENCES,
             f"Use references that show what the photograph shows: {shared}, as chance does for another place.",
+        )
+    if case.matches >= options.many_matches and case.tried is not None and case.tried < case.matches / 4:
+        return (
+            Advice.ADD_REFERENCES,
+            f"Add references that show the same as {case.best} from a step aside: {shared}, but of the photograph's "
+            f"matches {case.tried} have a point that a second reference shows as well, which depth takes.",
         )
     if case.matches >= options.many_matches and case.inliers < case.matches / 4:
         agreeing = f"{case.inliers} of {case.tried} matches with points agree on a pose" if case.tried else "few agree"

@@ -137,9 +137,9 @@ def _distrusted(evidence: Evidence, trust: float, coverage: float) -> Rejection:
 
 def _miscalibrated(support: Support, focal: Focal) -> Rejection:
     message = (
-        f"the photograph says a focal length of {focal.told_px:.0f} px (standard deviation "
-        f"{focal.sigma * focal.told_px:.2g}), its intrinsics say {focal.given_px:.0f}: {focal.agreeing} of the matches "
-        f"looked at agree with the former, {focal.agreeing_before} with the latter"
+        f"the photograph says {focal.told_px / focal.given_px:.3f} times the focal length that its intrinsics say "
+        f"(standard deviation {focal.sigma:.2g}): {focal.agreeing} of the matches looked at agree with the former, "
+        f"{focal.agreeing_before} with the latter"
     )
     advice = (
         "Check the photograph's focal length: intrinsics belong to one image size, change with it when a photograph is "

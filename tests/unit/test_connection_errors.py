@@ -1,0 +1,61 @@
+"""Connections that cannot be made, and what a person is told of them."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import grpc
+import pytest
+from certificates import authority, signed
+
+from mapless import Client, ConnectOptions, MaplessError
+
+OURS, ANOTHER = authority(), authority("another")
+CERTIFICATE = signed(OURS, "server")
+
+
+@pytest.fixture(scope="module")
+def addresses() -> Iterator[dict[str, str]]:
+    """Servers that answer nothing, one with TLS, one without; and a port at which nobody listens."""
+    plain, tls = (grpc.server(ThreadPoolExecutor(1)) for _ in range(2))
+    credentials = grpc.ssl_server_credentials([(CERTIFICATE.key_pem, CERTIFICATE.certificate_pem)])
+    ports = {
+        "plain": plain.add_insecure_port("127.0.0.1:0"),
+        "tls": tls.add_secure_port("127.0.0.1:0", credentials),
+    }
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        ports["nobody"] = taken.getsockname()[1]
+        for server in (plain, tls):
+            server.start()
+        yield {kind: f"127.0.0.1:{port}" for kind, port in ports.items()}
+        for server in (plain, tls):
+            server.stop(None).wait()
+
+
+@pytest.mark.parametrize(
+    ("kind", "certificates", "told"),
+    [
+        ("tls", None, "does it speak TLS?"),
+        ("tls", ANOTHER.certificate_pem, "is not signed by a known one"),
+        ("tls", b"no certificate", "is it PEM?"),
+        ("plain", OURS.certificate_pem, "does not speak TLS"),
+        ("nobody", None, "nobody listens there"),
+    ],
+)
+def test_a_connection_that_cannot_be_made_is_told_in_words(
+    addresses: dict[str, str], kind: str, certificates: bytes | None, told: str
+) -> None:
+    options = ConnectOptions(tls=certificates is not None, root_certificates=certificates, max_attempts=1)
+    with Client(addresses[kind], options) as client, pytest.raises(MaplessError) as caught:
+        client.is_serving()
+    assert caught.value.code == "UNAVAILABLE"
+    assert caught.value.message.startswith(f"cannot connect to {addresses[kind]}: ")
+    assert told in caught.value.message
+
+
+def test_what_the_server_itself_says_stays(addresses: dict[str, str]) -> None:
+    with Client(addresses["plain"]) as client, pytest.raises(MaplessError, match="UNIMPLEMENTED: Method not found!"):
+        client.is_serving()
