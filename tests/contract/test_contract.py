@@ -59,6 +59,7 @@ ABOVE = {
         "grpc_server",
         "status",
         "receiving",
+        "sending",
     ),
     *("commands", "messages", "security", "observability", "demo", "ingest", "evaluation", "bench", "load"),
     *("calibration", "capture", "view"),

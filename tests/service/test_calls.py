@@ -44,10 +44,15 @@ def pool() -> Iterator[futures.ThreadPoolExecutor]:
         yield threads
 
 
-def test_a_full_queue_refuses_and_says_when_to_come_back(
-    server: RunningServer, client: Client, scene: str, pool: futures.ThreadPoolExecutor
-) -> None:
-    with server.method.held(), Client(server.address, ConnectOptions(max_attempts=1)) as impatient:
+def test_a_full_queue_refuses_and_says_when_to_come_back(tmp_path: Path, pool: futures.ThreadPoolExecutor) -> None:
+    with (
+        serving(tmp_path, max_queued_s=2.0) as server,
+        Client(server.address) as client,
+        Client(server.address, ConnectOptions(max_attempts=1)) as impatient,
+        server.method.held(),
+    ):
+        scene = client.create_scene("s").scene_id
+        client.add_references(scene, [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
         admitted = [pool.submit(client.localize, PHOTO, CAMERA, scene) for _ in range(2)]
         for _ in range(2):
             assert server.method.started.acquire(timeout=20)

@@ -203,7 +203,11 @@ def test_errors_pass_with_all_their_details(fleet: Fleet, what: str) -> None:
 
 def test_a_refusal_says_when_to_come_back(url: str, fleet: Fleet, tmp_path: Path) -> None:
     """No retry of the gateway's hides it, and no server is left out for it."""
-    with fleet_of(tmp_path, url) as full, ExitStack() as stack, futures.ThreadPoolExecutor(200) as pool:
+    with (
+        fleet_of(tmp_path, url, max_queued_s=2.0) as full,
+        ExitStack() as stack,
+        futures.ThreadPoolExecutor(200) as pool,
+    ):
         for server in full.servers:
             stack.enter_context(server.method.held())
         client = stack.enter_context(Client(full.gateway.address, replace(full.gateway.options, max_attempts=1)))
