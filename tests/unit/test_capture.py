@@ -73,6 +73,18 @@ def opened(path: Path, retention: Retention = ROOM, clock: Callable[[], float] =
     return CaptureFolder(path, retention, clock)
 
 
+def refuse_to_delete(stuck: set[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """From now on files that are in the set cannot be deleted."""
+    unlink = Path.unlink
+
+    def refused(path: Path, missing_ok: bool = False) -> None:
+        if path in stuck:
+            raise PermissionError(1, "Operation not permitted")
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", refused)
+
+
 def test_a_call_is_read_as_it_was_written() -> None:
     """To the last bit, NaN among the similarities too."""
     ranked = tuple(RankedReference(f"r{i}", f"key-{i}", value, POSE) for i, value in enumerate((1 / 3, float("nan"))))
@@ -243,14 +255,7 @@ def test_one_file_that_cannot_be_deleted_keeps_no_other(tmp_path: Path, monkeypa
         folder.add(call, blobs_of(call))
     held = folder.held()
     stuck = {held[0].path, next(iter(held[2].blobs))}
-    unlink = Path.unlink
-
-    def refused(path: Path, missing_ok: bool = False) -> None:
-        if path in stuck:
-            raise PermissionError(1, "Operation not permitted")
-        unlink(path, missing_ok)
-
-    monkeypatch.setattr(Path, "unlink", refused)
+    refuse_to_delete(stuck, monkeypatch)
     now_s[0] += 101
     for _ in range(2):
         with pytest.raises(PermissionError):
@@ -336,14 +341,7 @@ def test_what_cannot_be_deleted_never_makes_it_more_than_the_limit(
     limit, random = 100_000, np.random.default_rng(3)
     folder = opened(tmp_path / "c", Retention(3600.0, limit))
     stuck = set[Path]()
-    unlink = Path.unlink
-
-    def refused(path: Path, missing_ok: bool = False) -> None:
-        if path in stuck:
-            raise PermissionError(1, "Operation not permitted")
-        unlink(path, missing_ok)
-
-    monkeypatch.setattr(Path, "unlink", refused)
+    refuse_to_delete(stuck, monkeypatch)
     for number in range(3):
         folder.add(a_call(number, (number,), size=1000), blobs_of(a_call(number, (number,))))
     first = folder.held()[0]
