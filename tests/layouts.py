@@ -13,7 +13,7 @@ import numpy as np
 from images import encode, textured
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
-from mapless_server.dataset import Dataset, Frame
+from mapless_tools.dataset import Dataset, Frame
 
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.25, 30.75)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import Store
-from mapless_server.tenancy import SceneKey
 
 _COLUMN = {
     "image": "UPDATE image SET data = zeroblob(64) WHERE reference_key = ?",

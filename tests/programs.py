@@ -22,16 +22,16 @@ from typing import Any, cast
 
 from servers import StandInExtractor, StandInMethod, StandInReconstructor, whole
 
-from mapless_server.assembly import engine_options
-from mapless_server.engine import Engine
+from mapless_server.engine.engine import Engine
+from mapless_server.engine.tiers import Tier
 from mapless_server.method.localize import Answer, Pipeline
 from mapless_server.observability.logs import configure_logging
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.rate import RateLimiter
-from mapless_server.serve import serve
+from mapless_server.serve.assembly import engine_options
+from mapless_server.serve.run import serve
 from mapless_server.settings import Settings, load_settings
 from mapless_server.store import Store
-from mapless_server.tiers import Tier
 
 LIMIT_S = 60.0
 _ANNOUNCEMENT = "mapless-server listening on "
@@ -125,7 +125,7 @@ def real(folder: Path, **settings: Any) -> Iterator[Program]:
     """`mapless-server serve`, at once."""
     given = {"port": 0, "metrics_port": 0, "data_dir": folder / "data", "workers": 2} | settings
     flags = [part for name, value in given.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-    with program(folder, ["-m", "mapless_server", "serve", *flags], MAPLESS_WARM_UP="false") as running:
+    with program(folder, ["-m", "mapless_tools", "serve", *flags], MAPLESS_WARM_UP="false") as running:
         yield running
 
 

@@ -18,16 +18,16 @@ from servers import COVARIANCE, StandInDescriptor, StandInExtractor, StandInReco
 from mapless.geometry import Similarity
 from mapless_ray.app import deployed
 from mapless_ray.replica import MaplessReplica
-from mapless_server.assembly import engine_options
-from mapless_server.engine import Engine
+from mapless_server.engine.engine import Engine
+from mapless_server.engine.tiers import Tier
 from mapless_server.method.localize import Answer, Localization, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.scale import MetricScale, ScaleStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.rate import RateLimiter
+from mapless_server.serve.assembly import engine_options
 from mapless_server.settings import Settings
 from mapless_server.store import Store
-from mapless_server.tiers import Tier
 
 FAILS, HANGS, ENDS = -1.0, -2.0, -3.0
 """With an exception; never; and the process with it."""

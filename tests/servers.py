@@ -24,19 +24,19 @@ from mapless.geometry import Camera, RigidTransform, Similarity, rotation_from_v
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
-from mapless_server.assembly import MakeEngine, engine_options
-from mapless_server.engine import Engine
+from mapless_server.engine.engine import Engine
+from mapless_server.engine.stages import Method
+from mapless_server.engine.tiers import Tier
 from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.scale import MetricScale, ScaleStage
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.observability.metrics import Metrics
-from mapless_server.query_stages import Method
-from mapless_server.running import Running, running_server
 from mapless_server.security.rate import RateLimiter
+from mapless_server.serve.assembly import MakeEngine, engine_options
+from mapless_server.serve.running import Running, running_server
 from mapless_server.settings import Settings
 from mapless_server.store import Store
-from mapless_server.tiers import Tier
 
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
 PHOTO = encode(".png", textured())

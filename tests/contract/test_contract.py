@@ -26,8 +26,8 @@ from mapless_server.method.pnp import PoseStage
 from mapless_server.method.priors.known import PriorKind
 from mapless_server.method.rejection import Advice, RejectionReason
 from mapless_server.method.scale import ScaleStage, ScaleStrategy
-from mapless_server.reference_service import ReferenceService
-from mapless_server.service import LocalizationService
+from mapless_server.services.localization import LocalizationService
+from mapless_server.services.references import ReferenceService
 
 ROOT = Path(__file__).parents[2]
 SERVICES = [

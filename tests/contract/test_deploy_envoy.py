@@ -15,7 +15,7 @@ import yaml  # type: ignore[import-untyped]
 
 from mapless.routing import SCENE_KEY
 from mapless.v1 import localization_service_pb2
-from mapless_server.services import SERVICE_NAMES
+from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.settings import Settings
 
 FOLDER = Path(__file__).parents[2] / "deploy" / "envoy"

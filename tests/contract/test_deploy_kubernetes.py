@@ -22,13 +22,13 @@ import kubernetes_validate  # type: ignore[import-untyped]
 import pytest
 import yaml  # type: ignore[import-untyped]
 
+from mapless_server.networks.weights.catalogue import CATALOGUE
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.binding import Verdict, advise
-from mapless_server.serve import CLOSING_LIMIT_S, LAST_WORDS_S
-from mapless_server.services import SERVICE_NAMES
+from mapless_server.serve.run import CLOSING_LIMIT_S, LAST_WORDS_S
+from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.settings import PREFIX, Settings, load_settings
-from mapless_server.weights.catalogue import CATALOGUE
 
 if sys.version_info >= (3, 11):
     import tomllib

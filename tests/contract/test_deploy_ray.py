@@ -25,7 +25,7 @@ from ray.serve.schema import ServeDeploySchema
 from mapless.routing import SCENE_KEY
 from mapless_ray.app import build
 from mapless_ray.environment import variables
-from mapless_server.services import SERVICE_NAMES
+from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.settings import PREFIX, Settings, load_settings
 
 ROOT = Path(__file__).parents[2]

@@ -9,10 +9,10 @@ from pathlib import Path
 import typer.main
 
 from mapless.cli.arguments import make_parser
-from mapless_server.cli import app
 from mapless_server.errors import Unavailable
 from mapless_server.settings import Settings, load_settings
 from mapless_server.store.postgresql import CONNECTION_WAIT_S, CONNECTIONS_AT_MOST, CONNECTIONS_KEPT, RETRY_AFTER_S
+from mapless_tools.cli.app import app
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 README = (DEPLOY / "README.md").read_text()

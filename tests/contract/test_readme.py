@@ -20,12 +20,12 @@ from mapless import Client, NewReference, RigidTransform
 from mapless import errors as client_errors
 from mapless.cli.arguments import make_parser
 from mapless_server import errors
-from mapless_server.cli import app
 from mapless_server.method.localize import Variant
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling.observer import Refusal
 from mapless_server.settings import Settings
+from mapless_tools.cli.app import app
 
 SERVER = Path(errors.__file__).parent
 README = (Path(__file__).parents[2] / "README.md").read_text()

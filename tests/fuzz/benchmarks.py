@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from mapless.geometry import RigidTransform
-from mapless_server.formats import ReadOptions
-from mapless_server.formats.colmap.writing import PosedImage, model_texts
+from mapless_tools.ingest.formats import ReadOptions
+from mapless_tools.ingest.formats.colmap.writing import PosedImage, model_texts
 
 from .importing import CAMERA, TRUTH, Layout, numbers, target
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from layouts import opengl
 
-from mapless_server.formats import Intrinsics, ReadOptions
-from mapless_server.formats.colmap.writing import PosedImage
-from mapless_server.formats.writing import cameras_files
+from mapless_tools.ingest.formats import Intrinsics, ReadOptions
+from mapless_tools.ingest.formats.colmap.writing import PosedImage
+from mapless_tools.ingest.formats.writing import cameras_files
 
 from .importing import CAMERA, TRUTH, Layout, image_of, numbers, target
 

@@ -6,9 +6,9 @@ import struct
 from pathlib import Path
 
 from mapless.geometry import RigidTransform
-from mapless_server.formats import ReadOptions
-from mapless_server.formats.colmap.camera_models import MODEL_NAMES
-from mapless_server.formats.colmap.writing import PosedImage, model_texts
+from mapless_tools.ingest.formats import ReadOptions
+from mapless_tools.ingest.formats.colmap.camera_models import MODEL_NAMES
+from mapless_tools.ingest.formats.colmap.writing import PosedImage, model_texts
 
 from .importing import CAMERA, TRUTH, Layout, target
 

@@ -20,12 +20,12 @@ from layouts import truth
 
 from mapless.geometry import Camera
 from mapless.names import check_id
-from mapless_server.dataset import SPLITS, Dataset, read_frame
-from mapless_server.formats import ReadOptions, read_dataset, recognize
-from mapless_server.formats.collecting import check_camera
-from mapless_server.formats.colmap.camera_models import from_camera
-from mapless_server.formats.colmap.writing import PosedImage
-from mapless_server.formats.writing import cameras_files
+from mapless_tools.dataset import SPLITS, Dataset, read_frame
+from mapless_tools.ingest.formats import ReadOptions, read_dataset, recognize
+from mapless_tools.ingest.formats.collecting import check_camera
+from mapless_tools.ingest.formats.colmap.camera_models import from_camera
+from mapless_tools.ingest.formats.colmap.writing import PosedImage
+from mapless_tools.ingest.formats.writing import cameras_files
 
 from . import folders
 from .images import seeds as image_seeds

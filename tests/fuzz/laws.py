@@ -13,8 +13,8 @@ from mapless import wire
 from mapless.geometry import MAX_COORDINATE_M, Camera, RigidTransform
 from mapless.wire import FieldError
 from mapless_server.errors import InvalidArgument, RequestError
-from mapless_server.formats.collecting import check_camera
-from mapless_server.status import to_status
+from mapless_server.rpc.status import to_status
+from mapless_tools.ingest.formats.collecting import check_camera
 
 _TRAILER_BYTES = 8192
 """What gRPC gives all of a call's trailers; base64 makes four bytes of three."""

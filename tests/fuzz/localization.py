@@ -19,23 +19,23 @@ from mapless.geometry import MAX_COORDINATE_M, Camera, Quaternion, RigidTransfor
 from mapless.names import check_id
 from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.decode import image_size
-from mapless_server.engine import EngineOptions
-from mapless_server.group_localization import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES
-from mapless_server.messages.answers import addressee_of
-from mapless_server.messages.frames import MAX_SESSION_COORDINATE_M, framed_to_message, geo_pose_to_message
-from mapless_server.messages.groups import (
+from mapless_server.engine.engine import EngineOptions
+from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES
+from mapless_server.engine.query import Query
+from mapless_server.images.decode import image_size
+from mapless_server.method.priors.known import DirectionPrior, PosePrior, PositionPrior, Prior
+from mapless_server.security.tenancy import scene_id_of, tenant_of
+from mapless_server.services.messages.answers import addressee_of
+from mapless_server.services.messages.frames import MAX_SESSION_COORDINATE_M, framed_to_message, geo_pose_to_message
+from mapless_server.services.messages.groups import (
     poses_from_message,
     queries_from_message,
     session_from_rig_from_message,
     session_poses_from_message,
 )
-from mapless_server.messages.priors import needs_attributes
-from mapless_server.messages.queries import MAX_CANDIDATES, MAX_REFERENCES, query_from_message
-from mapless_server.method.priors.known import DirectionPrior, PosePrior, PositionPrior, Prior
-from mapless_server.query import Query
+from mapless_server.services.messages.priors import needs_attributes
+from mapless_server.services.messages.queries import MAX_CANDIDATES, MAX_REFERENCES, query_from_message
 from mapless_server.store import SceneAttributes
-from mapless_server.tenancy import scene_id_of, tenant_of
 
 from . import messages
 from .images import seeds as image_seeds

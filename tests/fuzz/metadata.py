@@ -18,9 +18,9 @@ from typing import Any
 import grpc
 
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.call import CLIENT_ID_KEY, REQUEST_ID_KEY, Call
 from mapless_server.observability.logs import JsonFormatter, TextFormatter
-from mapless_server.rpc import CallGuard
+from mapless_server.rpc.call import CLIENT_ID_KEY, REQUEST_ID_KEY, Call
+from mapless_server.rpc.guard import CallGuard
 from mapless_server.security.access import METHOD_ROLES, Authenticator
 from mapless_server.security.errors import SecurityError
 from mapless_server.security.tokens import Token, Tokens, read_tokens, sha256_of
@@ -113,7 +113,7 @@ def _serving() -> tuple[Any, asyncio.AbstractEventLoop, Lines, folders.Folder]:
     )
     handler = loop.run_until_complete(guard()).guarded("/mapless.v1.LocalizationService/Localize", method)
     lines = Lines()
-    log = logging.getLogger("mapless_server.rpc")
+    log = logging.getLogger("mapless_server.rpc.guard")
     log.addHandler(lines)
     log.setLevel(logging.INFO)
     log.propagate = False

@@ -24,27 +24,20 @@ from mapless.scenes import UNCHANGED
 from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
-from mapless_server import reference_service
-from mapless_server.audit.coverage import Coverage, CoverageVerdict
-from mapless_server.auditing import Viewpoint
-from mapless_server.call import Call
-from mapless_server.describing import Description
-from mapless_server.engine import EngineOptions
-from mapless_server.messages.pages import MAX_PAGE_SIZE
+from mapless_server.engine.describing import Description
+from mapless_server.engine.engine import EngineOptions
+from mapless_server.engine.query import Caller, Photo
 from mapless_server.method.views import Features, View
-from mapless_server.principal import Principal
-from mapless_server.query import Caller, Photo
-from mapless_server.retrieval.chosen import Choice
-from mapless_server.retrieval.narrowing import Narrowing
-from mapless_server.store import (
-    NewReference,
-    ReferenceRecord,
-    SceneAttributes,
-    SceneRecord,
-    codec,
-    rows,
-)
-from mapless_server.tenancy import SceneKey, key_of, scene_id_of, tenant_of
+from mapless_server.rpc.call import Call
+from mapless_server.scenes.audit.coverage import Coverage, CoverageVerdict
+from mapless_server.scenes.auditing import Viewpoint
+from mapless_server.scenes.retrieval.chosen import Choice
+from mapless_server.scenes.retrieval.narrowing import Narrowing
+from mapless_server.security.principal import Principal
+from mapless_server.security.tenancy import SceneKey, key_of, scene_id_of, tenant_of
+from mapless_server.services import references as reference_service
+from mapless_server.services.messages.pages import MAX_PAGE_SIZE
+from mapless_server.store import NewReference, ReferenceRecord, SceneAttributes, SceneRecord, codec, rows
 
 from . import messages
 from .laws import answered, check_pose, check_received_camera

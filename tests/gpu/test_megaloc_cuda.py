@@ -17,7 +17,7 @@ from small_megaloc import SMALL_MEGALOC, ruled_megaloc
 from small_networks import photograph, view_of
 
 from mapless_server.networks import blocks
-from mapless_server.retrieval.megaloc import MegaLocDescriptor, MegaLocOptions
+from mapless_server.scenes.retrieval.megaloc import MegaLocDescriptor, MegaLocOptions
 
 pytestmark = [
     pytest.mark.gpu,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mapless_server.dataset import Dataset, read_folder
+from mapless_tools.dataset import Dataset, read_folder
 
 DATA = Path(os.environ.get("TEST_DATA") or Path(__file__).parents[3] / "shared" / "data")
 

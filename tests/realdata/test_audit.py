@@ -14,7 +14,10 @@ import numpy as np
 import pytest
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.audit import (
+from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.method.features import make_extractor
+from mapless_server.method.views import PosedView
+from mapless_server.scenes.audit import (
     CoverageVerdict,
     PairMatches,
     Verdict,
@@ -22,12 +25,9 @@ from mapless_server.audit import (
     check_coverage,
     surroundings_of,
 )
-from mapless_server.audit.resection import with_focal
-from mapless_server.audit.verdict import ReferenceAudit
-from mapless_server.dataset import Dataset, read_folder
-from mapless_server.decode import ImageLimits, decode_image
-from mapless_server.method.features import make_extractor
-from mapless_server.method.views import PosedView
+from mapless_server.scenes.audit.resection import with_focal
+from mapless_server.scenes.audit.verdict import ReferenceAudit
+from mapless_tools.dataset import Dataset, read_folder
 
 pytestmark = [pytest.mark.realdata, pytest.mark.timeout(300)]
 

@@ -19,9 +19,9 @@ from mapless import (
     SequenceLocalization,
 )
 from mapless.geometry import Array
-from mapless_server.child import child_server
-from mapless_server.dataset import Dataset, Frame
-from mapless_server.evaluation.run import CONNECT
+from mapless_tools.child import child_server
+from mapless_tools.dataset import Dataset, Frame
+from mapless_tools.evaluate.run import CONNECT
 
 pytestmark = [pytest.mark.realdata, pytest.mark.thorough]
 

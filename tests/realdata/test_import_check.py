@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from mapless.geometry import RigidTransform
-from mapless_server.dataset import Dataset, Frame
-from mapless_server.ingest.check import check_frames
-from mapless_server.ingest.verdict import Verdict
+from mapless_tools.dataset import Dataset, Frame
+from mapless_tools.ingest.check import check_frames
+from mapless_tools.ingest.verdict import Verdict
 
 pytestmark = pytest.mark.realdata
 

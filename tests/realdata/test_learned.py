@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapless_server.assembly import make_tiers
-from mapless_server.dataset import Dataset
-from mapless_server.decode import ImageLimits, decode_image
+from mapless_server.engine.tiers import EscalationOptions, Tier, is_doubtful
+from mapless_server.images.decode import ImageLimits, decode_image
 from mapless_server.method.localize import Answer, Localization, LocalizeOptions, localize
 from mapless_server.method.views import PosedView, View
+from mapless_server.serve.assembly import make_tiers
 from mapless_server.settings import Settings, default_weights_dir
-from mapless_server.tiers import EscalationOptions, Tier, is_doubtful
+from mapless_tools.dataset import Dataset
 
 pytestmark = [pytest.mark.realdata, pytest.mark.timeout(300)]
 

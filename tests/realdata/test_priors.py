@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from mapless_server.bench.priors import SENSORS, Place, Setting
-from mapless_server.dataset import Dataset
+from mapless_tools.bench.priors import SENSORS, Place, Setting
+from mapless_tools.dataset import Dataset
 
 pytestmark = pytest.mark.realdata
 

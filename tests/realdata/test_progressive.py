@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mapless import Client, LocalizationResult, NewReference
-from mapless_server.child import child_server
-from mapless_server.dataset import Dataset
+from mapless_tools.child import child_server
+from mapless_tools.dataset import Dataset
 
 
 @pytest.mark.slow

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from mapless import Client, LocalizationResult
-from mapless_server.child import child_server
-from mapless_server.dataset import Dataset, Frame
-from mapless_server.evaluation.metrics import Summary, summarize
-from mapless_server.evaluation.plan import EvaluationOptions, Plan
-from mapless_server.evaluation.run import CONNECT, SCENE, evaluate, localize_queries, plan_for, upload
 from mapless_server.settings import Settings
+from mapless_tools.child import child_server
+from mapless_tools.dataset import Dataset, Frame
+from mapless_tools.evaluate.metrics import Summary, summarize
+from mapless_tools.evaluate.plan import EvaluationOptions, Plan
+from mapless_tools.evaluate.run import CONNECT, SCENE, evaluate, localize_queries, plan_for, upload
 
 pytestmark = pytest.mark.realdata
 

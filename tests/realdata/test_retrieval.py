@@ -8,16 +8,16 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from mapless_server.dataset import Dataset, Frame
-from mapless_server.decode import ImageLimits, decode_image
-from mapless_server.evaluation.metrics import pose_error
-from mapless_server.evaluation.plan import EvaluationOptions, split_frames
+from mapless_server.images.decode import ImageLimits, decode_image
 from mapless_server.method.features import SiftExtractor
-from mapless_server.retrieval.descriptor import Vector
-from mapless_server.retrieval.index import SceneIndex
-from mapless_server.retrieval.ranking import RankedReference, RankOptions, rank_references
-from mapless_server.retrieval.vlad import VladDescriptor
+from mapless_server.scenes.retrieval.descriptor import Vector
+from mapless_server.scenes.retrieval.index import SceneIndex
+from mapless_server.scenes.retrieval.ranking import RankedReference, RankOptions, rank_references
+from mapless_server.scenes.retrieval.vlad import VladDescriptor
 from mapless_server.store.records import IndexedReference, SceneChanges
+from mapless_tools.dataset import Dataset, Frame
+from mapless_tools.evaluate.metrics import pose_error
+from mapless_tools.evaluate.plan import EvaluationOptions, split_frames
 
 pytestmark = pytest.mark.realdata
 

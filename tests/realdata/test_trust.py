@@ -10,7 +10,10 @@ from itertools import chain
 import numpy as np
 import pytest
 
-from mapless_server.calibration.pairs import (
+from mapless_server.method.localize import Localization, LocalizeOptions
+from mapless_server.method.rejection import Advice, Rejection, RejectionReason
+from mapless_server.method.trust.focal import FocalOptions, wrong_focal
+from mapless_tools.calibrate.pairs import (
     METRIC,
     OTHERS,
     Measured,
@@ -20,10 +23,7 @@ from mapless_server.calibration.pairs import (
     read_places,
     right_pairs,
 )
-from mapless_server.dataset import Dataset
-from mapless_server.method.localize import Localization, LocalizeOptions
-from mapless_server.method.rejection import Advice, Rejection, RejectionReason
-from mapless_server.method.trust.focal import FocalOptions, wrong_focal
+from mapless_tools.dataset import Dataset
 
 from .conftest import DATA
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.special import bdtrik
 
-from mapless_server.calibration.pairs import answered, read_places, right_pairs
-from mapless_server.dataset import Dataset
 from mapless_server.method.localize import Localization, LocalizeOptions
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
+from mapless_tools.calibrate.pairs import answered, read_places, right_pairs
+from mapless_tools.dataset import Dataset
 
 pytestmark = pytest.mark.realdata
 

@@ -13,10 +13,10 @@ from servers import listening
 from wall import wall
 
 from mapless import Camera, Client, InvalidArgument, NewReference, NotFound, RigidTransform
-from mapless_server.assembly import make_engine
+from mapless_server.security.tenancy import SceneKey
+from mapless_server.serve.assembly import make_engine
 from mapless_server.settings import Settings
 from mapless_server.store import Store
-from mapless_server.tenancy import SceneKey
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
 SHOTS = wall(CAMERA, 7)

@@ -21,11 +21,11 @@ from wall import wall
 
 from mapless import Camera, Client, LocalizationResult, NewReference, RigidTransform
 from mapless.geometry import rotation_from_vector
-from mapless_server.calibration.claims import Claim
-from mapless_server.calibration.fit import Sample, fit_factors
-from mapless_server.cli import app
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_server.store import Store
+from mapless_tools.calibrate.claims import Claim
+from mapless_tools.calibrate.fit import Sample, fit_factors
+from mapless_tools.cli.app import app
 
 COUNT = 12
 OFF_M = np.linspace(0.05, 0.75, COUNT)

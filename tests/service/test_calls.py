@@ -157,7 +157,7 @@ def test_a_strange_request_id_is_not(stubs: Stubs, scene: str, given: str) -> No
 
 
 def test_every_call_is_one_line_in_the_log(stubs: Stubs, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "mapless_server.rpc")
+    caplog.set_level(logging.INFO, "mapless_server.rpc.guard")
     request = pb.LocalizeRequest(scene="scenes/a\nrequest_id=forged")
     failure_of(stubs.localization.Localize, request, metadata=[("x-request-id", "logged")])
 

@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 from wall import Shot, wall
 
 from mapless.geometry import Camera
-from mapless_server.evaluation.cli import evaluate_command
+from mapless_tools.evaluate.cli import evaluate_command
 
 app = typer.Typer()
 app.command()(evaluate_command)
@@ -96,7 +96,7 @@ def chess(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def _same_code_and_no_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who edits the code while its tests run measures anew; the first call's time is nobody's matter here."""
-    monkeypatch.setattr("mapless_server.evaluation.provenance.commit_of", lambda _: "abc1234")
+    monkeypatch.setattr("mapless_tools.evaluate.provenance.commit_of", lambda _: "abc1234")
     monkeypatch.setenv("MAPLESS_WARM_UP", "false")
 
 

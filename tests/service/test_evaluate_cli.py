@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from wall import wall
 
 from mapless.geometry import Camera
-from mapless_server.cli import app
+from mapless_tools.cli.app import app
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
 
@@ -45,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "mapless_server", *map(str, arguments)]
+    return [sys.executable, "-m", "mapless_tools", *map(str, arguments)]
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:

@@ -20,12 +20,12 @@ from typer.testing import CliRunner, Result
 from mapless import Client, Datum, NewReference, Scene
 from mapless.geodesy import enu_from_y_up
 from mapless.geometry import Fisheye, RadialTangential
-from mapless_server.formats import read_dataset
-from mapless_server.formats.colmap.writing import PosedImage
-from mapless_server.formats.writing import cameras_files
-from mapless_server.ingest.command import export_command, import_command
+from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import Store
-from mapless_server.tenancy import SceneKey
+from mapless_tools.ingest.command import export_command, import_command
+from mapless_tools.ingest.formats import read_dataset
+from mapless_tools.ingest.formats.colmap.writing import PosedImage
+from mapless_tools.ingest.formats.writing import cameras_files
 
 app = typer.Typer()
 app.command("import")(import_command)

@@ -57,16 +57,17 @@ from mapless import (
 )
 from mapless.geometry import Camera
 from mapless.v1 import reference_service_pb2 as reference_pb
-from mapless_server import grpc_server, receiving
-from mapless_server.assembly import engine_options
-from mapless_server.engine import Engine
-from mapless_server.load.scrape import Scrape, read_metrics
+from mapless_server.engine.engine import Engine
+from mapless_server.engine.tiers import Tier
 from mapless_server.method.localize import Answer, Localization, Pipeline
 from mapless_server.observability.metrics import Metrics
+from mapless_server.rpc import receiving
 from mapless_server.security.rate import RateLimiter
+from mapless_server.serve import listening as grpc_server
+from mapless_server.serve.assembly import engine_options
 from mapless_server.settings import Settings
 from mapless_server.store import Store
-from mapless_server.tiers import Tier
+from mapless_tools.load.scrape import Scrape, read_metrics
 
 ONCE = ConnectOptions(max_attempts=1)
 PATIENT = ConnectOptions(max_attempts=5, initial_backoff_s=1.0, max_backoff_s=5.0)

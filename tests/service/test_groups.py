@@ -33,10 +33,10 @@ from mapless.axes import Axes, pose_to
 from mapless.geometry import rotation_from_vector
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.child import child_server
-from mapless_server.demo.raycast import Quad, Surface
-from mapless_server.demo.room import Photo, Station, look_at, take
-from mapless_server.demo.textures import painting
+from mapless_tools.child import child_server
+from mapless_tools.demo.raycast import Quad, Surface
+from mapless_tools.demo.room import Photo, Station, look_at, take
+from mapless_tools.demo.textures import painting
 
 CORNER = Camera(320, 240, 280.0, 280.0, 160.3, 118.9)
 WALK = [look_at([0.25 + 0.12 * i, 0.15, 1.02 + 0.01 * i], [1.5, 1.6, 1]) for i in range(4)]

@@ -22,15 +22,15 @@ from wall import wall
 
 from mapless import Client
 from mapless.geometry import Camera
-from mapless_server.child import ServerFailed
-from mapless_server.formats.colmap.writing import PosedImage
-from mapless_server.formats.writing import LAYOUTS
-from mapless_server.ingest.command import export_command, import_command
-from mapless_server.ingest.connection import Connection
 from mapless_server.settings import Settings
+from mapless_tools.child import ServerFailed
+from mapless_tools.ingest.command import export_command, import_command
+from mapless_tools.ingest.connection import Connection
+from mapless_tools.ingest.formats.colmap.writing import PosedImage
+from mapless_tools.ingest.formats.writing import LAYOUTS
 
 PROGRAM = (
-    "import typer; from mapless_server.ingest.command import import_command, export_command; app = typer.Typer();"
+    "import typer; from mapless_tools.ingest.command import import_command, export_command; app = typer.Typer();"
     "app.command('import')(import_command); app.command('export')(export_command); app()"
 )
 app = typer.Typer()
@@ -274,7 +274,7 @@ def test_the_store_may_be_named_by_its_folder(
         asked.append(settings.data_dir)
         raise ServerFailed("as asked")
 
-    monkeypatch.setattr("mapless_server.ingest.connection.connected", connected)
+    monkeypatch.setattr("mapless_tools.ingest.connection.connected", connected)
     monkeypatch.delenv("MAPLESS_DATABASE_URL", raising=False)
     arguments = ["scene", str(tmp_path / "out")] if command == "export" else [str(folder), "scene", "--skip-check"]
     arguments = [command, *arguments, "--data-dir", str(tmp_path / "data")]

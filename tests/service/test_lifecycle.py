@@ -107,7 +107,7 @@ def command(data_dir: Path, *arguments: str, **environment: str) -> Iterator[Com
     flags = ["--port", "0", "--metrics-port", "0", "--data-dir", str(data_dir), *arguments]
     with log.open("w") as stderr:
         process = subprocess.Popen(
-            [sys.executable, "-m", "mapless_server", "serve", *flags],
+            [sys.executable, "-m", "mapless_tools", "serve", *flags],
             stdout=subprocess.PIPE,
             stderr=stderr,
             text=True,
@@ -177,7 +177,7 @@ def test_a_server_that_cannot_start_says_why_in_one_line(tmp_path: Path, argumen
     given |= dict(zip(arguments[::2], arguments[1::2], strict=True))
     flat = [part for pair in given.items() for part in pair]
     done = subprocess.run(
-        [sys.executable, "-m", "mapless_server", "serve", *flat],
+        [sys.executable, "-m", "mapless_tools", "serve", *flat],
         capture_output=True,
         text=True,
         timeout=60,
@@ -193,7 +193,7 @@ def test_a_server_that_cannot_start_says_why_in_one_line(tmp_path: Path, argumen
 def test_a_taken_port_is_not_shared(server: RunningServer, tmp_path: Path) -> None:
     port = server.address.rpartition(":")[2]
     done = subprocess.run(
-        [sys.executable, "-m", "mapless_server", "serve", "--port", port, "--data-dir", str(tmp_path)],
+        [sys.executable, "-m", "mapless_tools", "serve", "--port", port, "--data-dir", str(tmp_path)],
         capture_output=True,
         text=True,
         timeout=60,

@@ -20,8 +20,8 @@ from small_networks import GRIDS, small_network
 
 from mapless import Client, LocalizationResult, NewReference, Rejected
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.assembly import engine_options
-from mapless_server.engine import Engine
+from mapless_server.engine.engine import Engine
+from mapless_server.engine.tiers import Tier
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.features import SiftExtractor
 from mapless_server.method.localize import Pipeline
@@ -29,9 +29,9 @@ from mapless_server.networks.network import Network
 from mapless_server.networks.runner import NetworkRunner
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.rate import RateLimiter
+from mapless_server.serve.assembly import engine_options
 from mapless_server.settings import Settings
 from mapless_server.store import Store
-from mapless_server.tiers import Tier
 
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 DISTANCE_M = 3.0

@@ -45,16 +45,16 @@ from mapless import (
 from mapless.errors import from_rpc_error
 from mapless.geometry import Camera, RigidTransform
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.assembly import engine_options
-from mapless_server.engine import Engine
+from mapless_server.engine.engine import Engine
+from mapless_server.engine.stages import Method
+from mapless_server.engine.tiers import Tier
 from mapless_server.method.localize import Answer, Localization, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.observability.metrics import Metrics
-from mapless_server.query_stages import Method
 from mapless_server.security.rate import RateLimiter
+from mapless_server.serve.assembly import engine_options
 from mapless_server.settings import Settings
 from mapless_server.store import Store
-from mapless_server.tiers import Tier
 
 COST_S = 0.04
 WORKERS = 2

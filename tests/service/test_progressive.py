@@ -35,19 +35,19 @@ from mapless import Client, ConnectOptions, MaplessError, NewReference, RigidTra
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.assembly import engine_options, make_engine
-from mapless_server.engine import Engine
+from mapless_server.engine.engine import Engine
+from mapless_server.engine.stages import Method
+from mapless_server.engine.tiers import Tier
 from mapless_server.method.localize import Answer, Localization, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.observability.metrics import Metrics
-from mapless_server.query_stages import Method
 from mapless_server.scheduling.jobs import Over
 from mapless_server.security.rate import RateLimiter
 from mapless_server.security.tokens import create_token
+from mapless_server.serve.assembly import engine_options, make_engine
 from mapless_server.settings import Settings
 from mapless_server.store import Store
-from mapless_server.tiers import Tier
 
 LIMIT_S = 30.0
 COARSE_X_M = 7.0
@@ -453,7 +453,7 @@ def test_of_two_kinds_of_features_the_first_gives_the_coarse_pose_and_the_better
 
 def test_the_log_says_when_the_coarse_answer_was_there(server: Serving, caplog: pytest.LogCaptureFixture) -> None:
     counted = sample(server, "mapless_coarse_answer_seconds_count")
-    with caplog.at_level("INFO", "mapless_server.rpc"):
+    with caplog.at_level("INFO", "mapless_server.rpc.guard"):
         call = asking(server, metadata=(("x-request-id", "logged"),))
         next(call)
         server.method.gate.set()

@@ -43,13 +43,13 @@ from mapless import (
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.child import child_server
-from mapless_server.demo import room
-from mapless_server.demo.run import Photograph, Place, real_place
-from mapless_server.load.requests import photo_request
 from mapless_server.security.tokens import create_token
-from mapless_server.services import SERVICE_NAMES
+from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.store import Store
+from mapless_tools.child import child_server
+from mapless_tools.demo import room
+from mapless_tools.demo.run import Photograph, Place, real_place
+from mapless_tools.load.requests import photo_request
 
 pytest.importorskip("ray.serve", reason="needs Ray Serve: the extra `ray`")
 

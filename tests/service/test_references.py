@@ -26,9 +26,9 @@ from mapless import (
     wire,
 )
 from mapless.v1 import reference_service_pb2 as pb
-from mapless_server import reference_service
 from mapless_server.errors import Overloaded
-from mapless_server.messages import references
+from mapless_server.services import references as reference_service
+from mapless_server.services.messages import references
 from mapless_server.store import ReferenceRecord, Store
 
 

@@ -37,14 +37,14 @@ from mapless import (
     SequenceFrame,
 )
 from mapless.geometry import RigidTransform as Pose
-from mapless_server.capture import report as report_module
-from mapless_server.capture.calls import CapturedCall, decode_call, encode_call
-from mapless_server.capture.errors import CaptureError
-from mapless_server.capture.files import blob_path, calls_of
-from mapless_server.capture.recompute import recompute
-from mapless_server.capture.report import Report, Selection, select
-from mapless_server.child import child_server
+from mapless_server.services.capture.calls import CapturedCall, decode_call, encode_call
+from mapless_server.services.capture.errors import CaptureError
+from mapless_server.services.capture.files import blob_path, calls_of
 from mapless_server.settings import load_settings
+from mapless_tools.child import child_server
+from mapless_tools.replay import report as report_module
+from mapless_tools.replay.recompute import recompute
+from mapless_tools.replay.report import Report, Selection, select
 
 pytestmark = pytest.mark.slow
 
@@ -124,7 +124,7 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def replay(folder: Path, *arguments: str, **environment: str) -> tuple[int, dict[str, Any]]:
     """Exit code and report of the command, which runs on its own, far from the store."""
-    command = [sys.executable, "-m", "mapless_server", "replay", str(folder), "--json", *arguments]
+    command = [sys.executable, "-m", "mapless_tools", "replay", str(folder), "--json", *arguments]
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=100, cwd=folder.parent, env={**os.environ, **environment}
     )
@@ -196,7 +196,7 @@ def test_what_is_computed_with_is_compared_too(captured: Path, tmp_path: Path) -
 def test_a_person_reads_what_has_changed(captured: Path, tmp_path: Path) -> None:
     path, call = only(captured, tmp_path / "copy", is_named)
     path.write_bytes(encode_call(replace(call, circumstances={**call.circumstances, "mapless": "0.0.1"})))
-    command = [sys.executable, "-m", "mapless_server", "replay", str(tmp_path / "copy"), "--last", "1"]
+    command = [sys.executable, "-m", "mapless_tools", "replay", str(tmp_path / "copy"), "--last", "1"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
     assert "mapless: then 0.0.1, now " in done.stdout
     assert f"{call.request_id} Localize default/corner: identical, localized" in done.stdout
@@ -301,7 +301,7 @@ def test_what_its_server_deletes_meanwhile_is_left_out(
     ],
 )
 def test_what_cannot_be_done_is_said(captured: Path, arguments: list[str], message: str) -> None:
-    command = [sys.executable, "-m", "mapless_server", "replay", str(captured), *arguments]
+    command = [sys.executable, "-m", "mapless_tools", "replay", str(captured), *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert done.returncode == 2
     assert message in done.stderr
@@ -310,11 +310,11 @@ def test_what_cannot_be_done_is_said(captured: Path, arguments: list[str], messa
 
 def test_a_folder_that_is_none_is_refused(tmp_path: Path) -> None:
     for folder, message in ((tmp_path / "absent", "no capture folder"), (tmp_path, "no capture folder")):
-        command = [sys.executable, "-m", "mapless_server", "replay", str(folder)]
+        command = [sys.executable, "-m", "mapless_tools", "replay", str(folder)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=100)
         assert (done.returncode, message in done.stderr) == (2, True)
     (tmp_path / "mapless-capture.json").write_text('{"format": 99}')
     done = subprocess.run(
-        [sys.executable, "-m", "mapless_server", "replay", str(tmp_path)], capture_output=True, text=True, timeout=100
+        [sys.executable, "-m", "mapless_tools", "replay", str(tmp_path)], capture_output=True, text=True, timeout=100
     )
     assert (done.returncode, "has format 99" in done.stderr) == (2, True)

@@ -47,9 +47,9 @@ from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.capture.files import blobs_of, calls_of
-from mapless_server.decode import ImageLimits, decode_image
+from mapless_server.images.decode import ImageLimits, decode_image
 from mapless_server.method.features import make_extractor
+from mapless_server.services.capture.files import blobs_of, calls_of
 
 SERVICE = "mapless.v1.LocalizationService"
 RUN_BYTES = 16
@@ -163,7 +163,7 @@ def served(
     }
     with (folder / "log").open("w") as log:
         process = subprocess.Popen(
-            [*prefix, sys.executable, "-m", "mapless_server", "serve", *flags],
+            [*prefix, sys.executable, "-m", "mapless_tools", "serve", *flags],
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,

@@ -24,8 +24,8 @@ from mapless import (
     Priors,
     Rejected,
 )
+from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import Store
-from mapless_server.tenancy import SceneKey
 
 COUNT = 12
 PHOTOS = [encode(".png", textured(seed=i)) for i in range(COUNT)]

@@ -16,9 +16,9 @@ from mapless.geodesy import enu_from_y_up
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1.geometry_pb2 import Vector3
-from mapless_server.engine import Engine
+from mapless_server.engine.engine import Engine
+from mapless_server.security.tenancy import key_of
 from mapless_server.store import Store
-from mapless_server.tenancy import key_of
 
 DATUM = Datum(47.5, 8.25, 400.0, enu_from_y_up(0))
 CALIBRATION = Calibration(1.5, 1.25, 2.0, 1.75, 40, "sift-2048", "geometric", "BEST", "0.1.0")

@@ -16,14 +16,14 @@ from stores import DATABASES, EXTRACTOR, Folder, Place, Shared, assert_same_view
 from typer.testing import CliRunner
 
 from mapless.geodesy import Datum
-from mapless_server.commands.store import store_app
-from mapless_server.principal import DEFAULT_TENANT
+from mapless_server.security.principal import DEFAULT_TENANT
+from mapless_server.security.tenancy import SceneKey, key_of
 from mapless_server.store import SceneAttributes, Store, StoreError, codec, tables
 from mapless_server.store.backup import GENERATIONS_SKIPPED, back_up, restore
 from mapless_server.store.postgresql import PostgresqlDatabase
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase, choose_library
 from mapless_server.store.verify import verify
-from mapless_server.tenancy import SceneKey, key_of
+from mapless_tools.cli.store import store_app
 
 OFFICE = SceneKey("office")
 THEIRS = key_of("acme", "hall")
@@ -253,7 +253,7 @@ def test_commands_do_it_beside_a_server(tmp_path: Path, backup: Path, monkeypatc
     assert "there is no database" in run("backup", str(backup), "--data-dir", str(data_dir))
     with Store.open(data_dir) as store:
         fill(store)
-        code = [sys.executable, "-m", "mapless_server", "store", "backup", str(backup), "--data-dir", str(data_dir)]
+        code = [sys.executable, "-m", "mapless_tools", "store", "backup", str(backup), "--data-dir", str(data_dir)]
         ended = subprocess.run(code, capture_output=True, text=True, timeout=60)
         assert ended.returncode == 0, ended.stderr
         assert "reference: 9" in ended.stdout

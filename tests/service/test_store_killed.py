@@ -27,12 +27,12 @@ from stores import DATABASES, Folder, Place, Shared
 from mapless.geometry import Camera, RigidTransform
 from mapless_server import errors
 from mapless_server.method.views import Features, View
-from mapless_server.principal import DEFAULT_TENANT
+from mapless_server.security.principal import DEFAULT_TENANT
+from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import NewReference, Store, StoreError, removing
 from mapless_server.store.postgresql import PostgresqlDatabase
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 from mapless_server.store.verify import verify
-from mapless_server.tenancy import SceneKey
 
 SCENE = SceneKey("office")
 EXTRACTOR, DESCRIPTOR = "sift", "vlad"

@@ -18,7 +18,7 @@ from corner import CAMERA, photograph, pose
 from numpy.typing import NDArray
 
 from mapless import Client, ConnectOptions, LocalizationResult, NewReference
-from mapless_server.child import child_server
+from mapless_tools.child import child_server
 
 pytest.importorskip("viser", reason="needs the extra view")
 
@@ -33,7 +33,7 @@ def view(address: str, scene: str) -> Iterator[str]:
     """The address of a viewer of its own."""
     arguments = ["view", scene, "--address", address, "--no-open", "--port", "0", "--seeds", "2"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "mapless_server", *arguments], stdout=subprocess.PIPE, text=True, env=dict(os.environ)
+        [sys.executable, "-m", "mapless_tools", *arguments], stdout=subprocess.PIPE, text=True, env=dict(os.environ)
     )
     assert process.stdout is not None
     try:

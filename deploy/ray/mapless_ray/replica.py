@@ -11,10 +11,10 @@ from typing import Any
 
 import ray
 
-from mapless_server.assembly import MakeEngine, make_engine
 from mapless_server.observability.logs import configure_logging
-from mapless_server.running import running_server
-from mapless_server.serve import SWITCH_INTERVAL_S, end_broken
+from mapless_server.serve.assembly import MakeEngine, make_engine
+from mapless_server.serve.run import SWITCH_INTERVAL_S, end_broken
+from mapless_server.serve.running import running_server
 from mapless_server.settings import Settings, load_settings
 
 from .environment import check_environment

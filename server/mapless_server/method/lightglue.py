@@ -29,8 +29,8 @@ from torch import Tensor, nn
 from torch.nn.functional import log_softmax, logsigmoid, scaled_dot_product_attention
 
 from mapless.geometry import Camera
+from mapless_server.networks.checkpoint import load_strictly
 
-from ..networks.checkpoint import load_strictly
 from .correspond import Matches
 from .views import Features, PosedView, View
 

@@ -25,7 +25,6 @@ import numpy as np
 
 from mapless.geometry import Array
 
-from ..stopwatch import timed
 from .adjust import adjust_pose
 from .answer import Answer, Localization, LocalizeOptions, Variant, is_better, shifted
 from .coarse import Bucket, Outcome, Reconstruction, Reconstructor, Request, reconstruct_one
@@ -36,6 +35,7 @@ from .pnp import PoseStage, solve_pose
 from .priors.known import NO_PRIORS, Priors
 from .rejection import Rejection, RejectionReason
 from .scale import MetricScale, ScaleOptions, estimate_scale
+from .stopwatch import timed
 from .structure import Structure, build_structure
 from .support import Support
 from .trust.gate import doubts

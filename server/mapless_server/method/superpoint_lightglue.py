@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from transformers import LightGlueConfig, LightGlueForKeypointMatching
 
-from ..networks.checkpoint import load_strictly
+from mapless_server.networks.checkpoint import load_strictly
+
 from .lightglue import LightGlue
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import torch
 
-from ..weights.errors import CheckpointError
-from ..weights.safetensors_header import Entry, check_fit, opened, read_header
+from .weights.errors import CheckpointError
+from .weights.safetensors_header import Entry, check_fit, opened, read_header
 
 IMAGE_NORMALIZATION: Mapping[str, Sequence[float]] = {
     "image_mean": (0.485, 0.456, 0.406),

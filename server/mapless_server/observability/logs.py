@@ -20,7 +20,7 @@ from itertools import islice
 from numbers import Integral, Real
 from typing import TextIO, TypeVar
 
-from ..settings import Settings
+from mapless_server.settings import Settings
 
 T = TypeVar("T")
 

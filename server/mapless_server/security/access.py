@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime, timezone
 
-from ..errors import PermissionDenied, Unauthenticated
-from ..principal import Principal, Role
+from mapless_server.errors import PermissionDenied, Unauthenticated
+
+from .principal import Principal, Role
 from .tokens import Tokens
 
 METHOD_ROLES: Mapping[str, Role] = {

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 
-from ..settings import Settings
+from mapless_server.settings import Settings
+
 from .access import Authenticator
 from .binding import Verdict, advise
 from .errors import SecurityError

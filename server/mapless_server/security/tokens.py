@@ -26,8 +26,8 @@ from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 
 from mapless.names import check_id
 
-from ..principal import DEFAULT_TENANT, Role
 from .errors import SecurityError
+from .principal import DEFAULT_TENANT, Role
 from .reloading import read_file
 
 PREFIX = "mapless_"

@@ -1,7 +1,7 @@
 """Keeps scenes and their references: rows, image bytes and features in one transactional database."""
 
-from mapless_server.store.database import StoreError
-from mapless_server.store.records import (
+from .database import StoreError
+from .records import (
     ContradictingDown,
     DescribedReference,
     IndexedReference,
@@ -12,7 +12,7 @@ from mapless_server.store.records import (
     SceneRecord,
     SceneSnapshot,
 )
-from mapless_server.store.store import Store
+from .store import Store
 
 __all__ = [
     "ContradictingDown",

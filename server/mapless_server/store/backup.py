@@ -18,25 +18,13 @@ from sqlalchemy import Connection, MetaData, Table, delete, func, insert, select
 from sqlalchemy.exc import DBAPIError
 
 from mapless_server.errors import RequestError
-from mapless_server.store import queries, removing
-from mapless_server.store.database import Database, StoreError
-from mapless_server.store.migrations import read_version
-from mapless_server.store.sqlite import SqliteDatabase, choose_library
-from mapless_server.store.tables import (
-    SCHEMA_VERSION,
-    alembic_version,
-    removed_reference,
-    scene,
-    scene_generation,
-    store_version,
-)
-from mapless_server.store.verify import (
-    BLOBS_AT_A_TIME,
-    Progress,
-    Verification,
-    ignore_progress,
-    verify,
-)
+
+from . import queries, removing
+from .database import Database, StoreError
+from .migrations import read_version
+from .sqlite import SqliteDatabase, choose_library
+from .tables import SCHEMA_VERSION, alembic_version, removed_reference, scene, scene_generation, store_version
+from .verify import BLOBS_AT_A_TIME, Progress, Verification, ignore_progress, verify
 
 GENERATIONS_SKIPPED = 1_000_000
 """A restored scene counts on past what it may have come to after the backup, so that no generation means two things."""

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from sqlalchemy import Connection
 
 from mapless_server.errors import RequestError
-from mapless_server.store.cache import LruCache
-from mapless_server.store.database import Database
-from mapless_server.store.leftovers import Leftovers
-from mapless_server.store.observed import StoreObserver, Unobserved
-from mapless_server.store.records import DescribedReference, SceneAttributes
+
+from .cache import LruCache
+from .database import Database
+from .leftovers import Leftovers
+from .observed import StoreObserver, Unobserved
+from .records import DescribedReference, SceneAttributes
 
 NAME_CACHE_BYTES = 16 * 2**20
 UNWRITABLE = frozenset({"STORE_READ_ONLY", "STORE_FULL", "STORE_UNAVAILABLE"})

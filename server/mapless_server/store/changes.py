@@ -8,11 +8,12 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, Select, and_, select
 
-from mapless_server.store import queries, rows
-from mapless_server.store.damage import unless_damaged
-from mapless_server.store.records import IndexedReference, SceneChanges
-from mapless_server.store.tables import global_descriptor, reference, removed_reference
-from mapless_server.tenancy import SceneKey
+from mapless_server.security.tenancy import SceneKey
+
+from . import queries, rows
+from .damage import unless_damaged
+from .records import IndexedReference, SceneChanges
+from .tables import global_descriptor, reference, removed_reference
 
 _ROWS_AT_A_TIME = 2000
 """A few megabytes, so that a scene that is read whole is not in memory twice."""

@@ -15,12 +15,13 @@ from mapless.geodesy import Datum
 from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
 from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.method.views import View
-from mapless_server.store import queries, removing, rows, tables
-from mapless_server.store.base import BaseStore
-from mapless_server.store.damage import DamagedPages
-from mapless_server.store.observed import observed
-from mapless_server.store.records import NewReference, ReferenceRecord, SceneAttributes, SceneRecord
-from mapless_server.tenancy import SceneKey, scene_id_of
+from mapless_server.security.tenancy import SceneKey, scene_id_of
+
+from . import queries, removing, rows, tables
+from .base import BaseStore
+from .damage import DamagedPages
+from .observed import observed
+from .records import NewReference, ReferenceRecord, SceneAttributes, SceneRecord
 
 GENERATIONS_REMEMBERED = 100_000
 """How far back `list_changes` knows what was deleted: some 10 MB a scene; who asks less often may read it all."""

@@ -31,7 +31,8 @@ from mapless.geodesy import Datum
 from mapless.geometry import Camera, Distortion, Fisheye, Quaternion, RadialTangential, RigidTransform
 from mapless.scenes import Calibration
 from mapless_server.method.views import Features, View
-from mapless_server.store.records import SceneAttributes
+
+from .records import SceneAttributes
 
 VIEW_FORMAT_VERSION = 1
 _PREFIX = struct.Struct("<B3xI")

@@ -12,7 +12,7 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 
-from mapless_server.store.database import StoreError
+from .database import StoreError
 
 LOCK_FILE = "mapless.lock"
 

@@ -6,9 +6,10 @@ import logging
 import threading
 
 from mapless_server.errors import Overloaded
-from mapless_server.store import removing
-from mapless_server.store.damage import DamagedPages
-from mapless_server.store.database import Database
+
+from . import removing
+from .damage import DamagedPages
+from .database import Database
 
 logger = logging.getLogger(__name__)
 

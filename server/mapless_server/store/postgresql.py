@@ -20,10 +20,11 @@ from sqlalchemy.exc import ArgumentError, DBAPIError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from mapless_server.errors import Overloaded, RequestError, Unavailable
-from mapless_server.store.damage import DamagedPages, is_damage
-from mapless_server.store.database import StoreError
-from mapless_server.store.migrations import migrate, read_version
-from mapless_server.store.tables import SCHEMA_VERSION
+
+from .damage import DamagedPages, is_damage
+from .database import StoreError
+from .migrations import migrate, read_version
+from .tables import SCHEMA_VERSION
 
 DRIVER = "postgresql+psycopg"
 CONNECTIONS_KEPT = 4

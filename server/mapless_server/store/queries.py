@@ -9,18 +9,11 @@ from sqlalchemy import ColumnElement, Connection, Row, Select, Table, delete, se
 from sqlalchemy.dialects import postgresql, sqlite
 
 from mapless_server.errors import AlreadyExists, NotFound
-from mapless_server.principal import DEFAULT_TENANT
-from mapless_server.store.removing import is_set_apart
-from mapless_server.store.tables import (
-    features,
-    global_descriptor,
-    image,
-    reference,
-    removed_reference,
-    scene,
-    scene_generation,
-)
-from mapless_server.tenancy import KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
+from mapless_server.security.principal import DEFAULT_TENANT
+from mapless_server.security.tenancy import KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
+
+from .removing import is_set_apart
+from .tables import features, global_descriptor, image, reference, removed_reference, scene, scene_generation
 
 _IDS_PER_STATEMENT = 500
 """Databases bound the number of parameters of a statement."""

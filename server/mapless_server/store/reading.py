@@ -8,20 +8,14 @@ from typing import Any, NoReturn
 
 from sqlalchemy import Connection, Row, select
 
-from mapless_server.store import queries, rows, tables
-from mapless_server.store.base import Attributes, BaseStore, Resolved
-from mapless_server.store.changes import read_changes
-from mapless_server.store.damage import DamagedPages, unless_damaged
-from mapless_server.store.observed import observed
-from mapless_server.store.records import (
-    DescribedReference,
-    ReferenceRecord,
-    SceneAttributes,
-    SceneChanges,
-    SceneRecord,
-    SceneSnapshot,
-)
-from mapless_server.tenancy import SceneKey
+from mapless_server.security.tenancy import SceneKey
+
+from . import queries, rows, tables
+from .base import Attributes, BaseStore, Resolved
+from .changes import read_changes
+from .damage import DamagedPages, unless_damaged
+from .observed import observed
+from .records import DescribedReference, ReferenceRecord, SceneAttributes, SceneChanges, SceneRecord, SceneSnapshot
 
 NAME_BYTES = 300
 """About the size of a reference's id and key in memory."""

@@ -12,8 +12,9 @@ from itertools import accumulate
 
 from sqlalchemy import ColumnElement, Connection, ScalarSelect, Table, delete, func, insert, select, update
 
-from mapless_server.store.tables import features, global_descriptor, image, reference, scene
-from mapless_server.tenancy import SceneKey
+from mapless_server.security.tenancy import SceneKey
+
+from .tables import features, global_descriptor, image, reference, scene
 
 PORTION_BYTES = 4 * 2**20
 """Of photographs, features and descriptors that are deleted in one transaction, unless one reference alone has more.

@@ -14,16 +14,10 @@ from sqlalchemy import Row
 
 from mapless_server.errors import DataLoss
 from mapless_server.method.views import View
-from mapless_server.store import codec
-from mapless_server.store.records import (
-    DescribedReference,
-    IndexedReference,
-    NewReference,
-    ReferenceRecord,
-    SceneAttributes,
-    SceneRecord,
-)
-from mapless_server.tenancy import SceneKey, scene_id_of
+from mapless_server.security.tenancy import SceneKey, scene_id_of
+
+from . import codec
+from .records import DescribedReference, IndexedReference, NewReference, ReferenceRecord, SceneAttributes, SceneRecord
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _MICROSECOND = timedelta(microseconds=1)

@@ -22,12 +22,13 @@ from sqlalchemy import URL, Connection, Engine, create_engine, event
 from sqlalchemy.exc import DBAPIError
 
 from mapless_server.errors import FailedPrecondition, RequestError
-from mapless_server.store.damage import is_damage
-from mapless_server.store.database import StoreError
-from mapless_server.store.folder_lock import FolderLock
-from mapless_server.store.migrations import migrate, read_version
-from mapless_server.store.sqlite_faults import faults_translated
-from mapless_server.store.tables import SCHEMA_VERSION
+
+from .damage import is_damage
+from .database import StoreError
+from .folder_lock import FolderLock
+from .migrations import migrate, read_version
+from .sqlite_faults import faults_translated
+from .tables import SCHEMA_VERSION
 
 logger = logging.getLogger(__name__)
 

@@ -11,7 +11,8 @@ from contextlib import contextmanager
 from sqlalchemy.exc import DBAPIError
 
 from mapless_server.errors import FailedPrecondition, Overloaded, RequestError, Unavailable
-from mapless_server.store.damage import DamagedPages, is_damage
+
+from .damage import DamagedPages, is_damage
 
 RETRY_AFTER_S = 1.0
 _BROKEN = ("disk I/O error", "unable to open database file")

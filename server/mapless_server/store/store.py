@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from types import TracebackType
 
-from mapless_server.store.cache import LruCache
-from mapless_server.store.changing import ChangingStore
-from mapless_server.store.database import Database
-from mapless_server.store.postgresql import PostgresqlDatabase
-from mapless_server.store.reading import ReadingStore
-from mapless_server.store.records import DescribedReference
-from mapless_server.store.sqlite import SqliteDatabase
+from .cache import LruCache
+from .changing import ChangingStore
+from .database import Database
+from .postgresql import PostgresqlDatabase
+from .reading import ReadingStore
+from .records import DescribedReference
+from .sqlite import SqliteDatabase
 
 DEFAULT_CACHE_BYTES = 512 * 2**20
 """About 500 references with 2048 SIFT features each; 0 reads the database every time."""

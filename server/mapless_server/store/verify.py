@@ -12,11 +12,12 @@ from sqlalchemy import Connection, Row, Select, Table, func, select
 from sqlalchemy.exc import DBAPIError
 
 from mapless_server.errors import DataLoss
-from mapless_server.store import codec, queries, removing, rows
-from mapless_server.store.damage import is_damage, unless_damaged
-from mapless_server.store.migrations import read_version
-from mapless_server.store.tables import features, global_descriptor, image, reference, scene
-from mapless_server.tenancy import SceneKey, scene_id_of, tenant_of
+from mapless_server.security.tenancy import SceneKey, scene_id_of, tenant_of
+
+from . import codec, queries, removing, rows
+from .damage import is_damage, unless_damaged
+from .migrations import read_version
+from .tables import features, global_descriptor, image, reference, scene
 
 BLOBS_AT_A_TIME = 16
 """Images are megabytes each."""

@@ -9,10 +9,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mapless_server.load.report import Check, check_lines, machine, update_json
-from mapless_server.load.requests import place_of
-from mapless_server.progress import Progress, progress_bars
-from mapless_server.signals import terminable
+from mapless_server.serve.signals import terminable
+from mapless_tools.load.report import Check, check_lines, machine, update_json
+from mapless_tools.load.requests import place_of
+from mapless_tools.progress import Progress, progress_bars
 
 from .cluster import ClusterFailed
 from .database import NoDatabase

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 from mapless import Client, ConnectOptions, MaplessError, NewReference, RigidTransform
 from mapless.geometry import Camera
-from mapless_server.load.no_op import CAMERA, padded_photo
+from mapless_tools.load.no_op import CAMERA, padded_photo
 
 END_LIMIT_S = 60.0
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from ray.serve import Application
 
-from mapless_server.load.no_op import make_no_op_engine
+from mapless_tools.load.no_op import make_no_op_engine
 
 from ..app import deployed
 from ..replica import MaplessReplica

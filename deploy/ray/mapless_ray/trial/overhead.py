@@ -10,13 +10,13 @@ from statistics import median
 from typing import Any
 
 from mapless import Client
-from mapless_server.child import child_module
-from mapless_server.load import no_op
-from mapless_server.load.report import Check
-from mapless_server.load.requests import METHOD, SCENE, photo_request, read_answer
-from mapless_server.load.sender import Target, connected, send_closed_loop
-from mapless_server.load.step import ServerUnderLoad, Step, run_step
-from mapless_server.progress import Progress
+from mapless_tools.child import child_module
+from mapless_tools.load import no_op
+from mapless_tools.load.report import Check
+from mapless_tools.load.requests import METHOD, SCENE, photo_request, read_answer
+from mapless_tools.load.sender import Target, connected, send_closed_loop
+from mapless_tools.load.step import ServerUnderLoad, Step, run_step
+from mapless_tools.progress import Progress
 
 from .callers import Scenes
 from .cluster import application, running_cluster

@@ -6,10 +6,10 @@ import asyncio
 import sys
 import tempfile
 
-from mapless_server.load.no_op import make_no_op_engine
 from mapless_server.observability.logs import configure_logging
-from mapless_server.serve import serve
+from mapless_server.serve.run import serve
 from mapless_server.settings import load_settings
+from mapless_tools.load.no_op import make_no_op_engine
 
 if __name__ == "__main__":
     settings = load_settings({"port": 0, "metrics_port": 0, "warm_up": False, "workers": int(sys.argv[1])}).settings

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from mapless import Client
-from mapless_server.load.report import Check
-from mapless_server.progress import Progress
+from mapless_tools.load.report import Check
+from mapless_tools.progress import Progress
 
 from .callers import Calls, Scenes, calling
 from .cluster import Cluster, Replica, application, running_cluster

@@ -12,14 +12,14 @@ from statistics import median
 from typing import Any
 
 from mapless import Client
-from mapless_server.demo.run import Place
-from mapless_server.load.records import Fate
-from mapless_server.load.report import Check
-from mapless_server.load.requests import METHOD, read_answer, requests_for, store_references
-from mapless_server.load.sender import Target, connected, send_closed_loop
-from mapless_server.load.step import ServerUnderLoad, Step, run_step
-from mapless_server.load.watch import read_process
-from mapless_server.progress import Progress
+from mapless_tools.demo.run import Place
+from mapless_tools.load.records import Fate
+from mapless_tools.load.report import Check
+from mapless_tools.load.requests import METHOD, read_answer, requests_for, store_references
+from mapless_tools.load.sender import Target, connected, send_closed_loop
+from mapless_tools.load.step import ServerUnderLoad, Step, run_step
+from mapless_tools.load.watch import read_process
+from mapless_tools.progress import Progress
 
 from .cluster import Cluster, application, running_cluster
 from .database import VARIABLE, database_url

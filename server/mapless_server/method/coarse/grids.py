@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mapless.geometry import Array, Camera
+from mapless_server.networks.encoder import PATCH_PX
 
-from ...networks.encoder import PATCH_PX
 from ..features import undistort_pixels
 
 PIXEL_LIMIT = 37 * 28 * PATCH_PX**2

@@ -6,7 +6,8 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ...weights import WeightsMissing, find_weights
+from mapless_server.networks.weights import WeightsMissing, find_weights
+
 from . import Reconstructor
 from .geometric import GeometricReconstructor
 
@@ -92,10 +93,11 @@ def _load(
 ) -> Reconstructor:
     import torch
 
-    from ...networks.checkpoint import TRAINING_ONLY, load_strictly
-    from ...networks.pi3 import Pi3
-    from ...networks.pi3x import Pi3X
-    from ...networks.runner import Bucket, NetworkRunner, RunnerOptions
+    from mapless_server.networks.checkpoint import TRAINING_ONLY, load_strictly
+    from mapless_server.networks.pi3 import Pi3
+    from mapless_server.networks.pi3x import Pi3X
+    from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions
+
     from .grids import GridOptions, fitted_grid
     from .network import NetworkReconstructor
 

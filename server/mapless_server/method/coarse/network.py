@@ -21,9 +21,9 @@ import torch
 from torch import Tensor
 
 from mapless.geometry import Array, RigidTransform
+from mapless_server.networks.network import NetworkOutput
+from mapless_server.networks.runner import NetworkRunner
 
-from ...networks.network import NetworkOutput
-from ...networks.runner import NetworkRunner
 from ..rejection import Rejection, RejectionReason
 from ..views import Photograph, PosedView, View
 from . import Bucket, Outcome, Request

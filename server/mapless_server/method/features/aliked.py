@@ -10,8 +10,8 @@ from kornia.feature import ALIKED
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera
+from mapless_server.networks.checkpoint import load_strictly
 
-from ...networks.checkpoint import load_strictly
 from ..views import View
 from .image import reduce_image, view_of
 from .network import LearnedOptions, array_of, image_tensor

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch.nn.functional import log_softmax, max_pool2d, normalize, pixel_shuffle
 
 from mapless.geometry import Camera
+from mapless_server.networks.checkpoint import load_strictly
 
-from ...networks.checkpoint import load_strictly
 from ..views import View
 from .image import reduce_image, view_of
 from .network import LearnedOptions, array_of, image_tensor

@@ -27,7 +27,7 @@ quarter (the tests). What is drawn towards i^2 H^-1 claims more than that where 
 on photographs: their errors are larger in directions that are told badly than the references' disagreement shows.
 
 What remains are two factors on standard deviations, one for positions and one for angles, and one for the tail: errors
-have heavier ones than the normal distribution. `mapless_server.calibration.generic` measures all three on scenes with
+have heavier ones than the normal distribution. `mapless_tools.calibrate.generic` measures all three on scenes with
 known poses, each tested on a scene that it was not measured on.
 """
 

@@ -21,7 +21,7 @@ import logging
 
 from sqlalchemy import Connection, insert, inspect, select
 
-from mapless_server.store.tables import SCHEMA_VERSION, alembic_version, metadata, store_version
+from ..tables import SCHEMA_VERSION, alembic_version, metadata, store_version
 
 log = logging.getLogger(__name__)
 

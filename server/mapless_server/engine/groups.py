@@ -1,0 +1,186 @@
+"""Several photographs in one call: each goes through the queue like any other, and then they are posed together."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from mapless.geometry import RigidTransform
+from mapless_server.errors import Overloaded, RequestError
+from mapless_server.method.groups.checks import metric_as_said, mounted_as_said
+from mapless_server.method.groups.hints import hinted_group
+from mapless_server.method.groups.rig import RigEstimate, RigOptions, solve_rig
+from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOptions, solve_sequence
+from mapless_server.method.groups.sightings import GroupImage
+from mapless_server.method.localize import LocalizeOptions
+from mapless_server.method.rejection import Rejection
+from mapless_server.scheduling.jobs import Visit
+
+from .engine import Engine
+from .query import Caller, Query, Result
+
+Joint = TypeVar("Joint", RigEstimate, SequenceEstimate)
+
+MAX_RIG_IMAGES = 8
+MIN_FRAMES, MAX_FRAMES = 2, 16
+"""Of a sequence."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroupResult:
+    """What is known of each photograph alone.
+
+    Attributes:
+        results: in the order of the queries.
+        visits: of each, the stages that it went through.
+        seconds: from when each began until it was done.
+    """
+
+    results: tuple[Result, ...]
+    visits: tuple[tuple[Visit, ...], ...]
+    seconds: tuple[float, ...]
+
+    def images(self) -> list[GroupImage]:
+        """For posing them together."""
+        return [_image(result) for result in self.results]
+
+    def hinted(self, outcome: Joint | Rejection) -> Joint | Rejection:
+        """What was computed of them together, with a hint if it is a rejection."""
+        if not isinstance(outcome, Rejection):
+            return outcome
+        return hinted_group(outcome, [(result.attempt.answer, result.attempt.references) for result in self.results])
+
+
+async def localize_rig(
+    engine: Engine, group: GroupResult, rig_from_camera: Sequence[RigidTransform], caller: Caller
+) -> RigEstimate | Rejection:
+    """The pose of the rig that took the photographs.
+
+    Raises:
+        RequestError: a passed deadline.
+    """
+    images = group.images()
+    found = await engine.join(lambda: solve_rig(images, rig_from_camera, RigOptions()), caller)
+    if not isinstance(found, Rejection):
+        found = mounted_as_said(found, [result.attempt.answer for result in group.results])
+    return group.hinted(found)
+
+
+async def localize_sequence(
+    engine: Engine,
+    group: GroupResult,
+    session_from_camera: Sequence[RigidTransform],
+    estimate_scale: bool,
+    caller: Caller,
+) -> SequenceEstimate | Rejection:
+    """The poses of the frames of a sequence, OpenCV's axes.
+
+    Raises:
+        RequestError: a passed deadline.
+    """
+    images, options = group.images(), SequenceOptions()
+    found = await engine.join(lambda: solve_sequence(images, session_from_camera, estimate_scale, options), caller)
+    if not isinstance(found, Rejection) and not estimate_scale:
+        found = metric_as_said(found, session_from_camera)
+    return group.hinted(found)
+
+
+async def localize_each(
+    engine: Engine,
+    queries: Sequence[Query],
+    caller: Caller,
+    list_name: str,
+    visits: Sequence[list[Visit]] | None = None,
+) -> GroupResult:
+    """Localizes photographs, as many at a time as the engine computes.
+
+    All of them at once would be more than a caller may have waiting. A photograph that there is no room for waits until
+    another one of the same call is done; only the first one is refused.
+
+    Args:
+        engine: which computes.
+        queries: the photographs.
+        caller: whose they are.
+        list_name: the field of the request that holds them, for what is wrong with one.
+        visits: of each, gets the stages that it goes through, for who wants to know how far they came if one fails.
+
+    Raises:
+        RequestError: as of `Engine.localize`, its field within the list.
+    """
+    group = _Group(engine, queries, caller, list_name, visits or [[] for _ in queries])
+    workers = [asyncio.ensure_future(group.work()) for _ in range(min(len(queries), engine.parallel_queries))]
+    try:
+        await asyncio.gather(*workers)
+    finally:
+        for worker in workers:
+            worker.cancel()
+        await asyncio.gather(*workers, return_exceptions=True)
+    return group.result()
+
+
+@dataclass(eq=False)
+class _Group:
+    """Photographs on their way; several workers take one after the other."""
+
+    engine: Engine
+    queries: Sequence[Query]
+    caller: Caller
+    list_name: str
+    visits: Sequence[list[Visit]]
+    done: dict[int, tuple[Result, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._waiting = deque(range(len(self.queries)))
+        self._underway = 0
+
+    async def work(self) -> None:
+        """Localizes what waits, until nothing does or there is no room for as many at a time."""
+        while self._waiting:
+            index = self._waiting.popleft()
+            self._underway += 1
+            try:
+                await self._localize(index)
+            except Overloaded as refused:
+                self._waiting.appendleft(index)
+                if self._underway > 1:
+                    return  # the others go on, and come to it
+                await self._wait(refused)
+            finally:
+                self._underway -= 1
+
+    async def _localize(self, index: int) -> None:
+        start_s = time.monotonic()
+        try:
+            result, _ = await self.engine.localize(self.queries[index], self.caller, visits=self.visits[index])
+        except RequestError as error:
+            if error.field is not None and error.field.startswith("references"):
+                error.field = f"{self.list_name}[{index}].{error.field}"
+            raise
+        self.done[index] = result, time.monotonic() - start_s
+
+    async def _wait(self, refused: Overloaded) -> None:
+        """Until there may be room; raises what there was no room by, if nothing was computed or there is no time."""
+        pause_s = refused.retry_after_s
+        if not self.done or pause_s is None or time.monotonic() + pause_s > self.caller.deadline_s:
+            raise refused
+        await asyncio.sleep(pause_s)
+
+    def result(self) -> GroupResult:
+        """Of all."""
+        results, seconds = zip(*(self.done[i] for i in range(len(self.queries))), strict=True)
+        return GroupResult(results, tuple(map(tuple, self.visits)), seconds)
+
+
+def queued_s(visits: Sequence[Visit]) -> float:
+    """How long a photograph waited before anything was computed for it."""
+    return visits[0].start_s - visits[0].queued_s if visits else 0.0
+
+
+def _image(result: Result) -> GroupImage:
+    attempt = result.attempt
+    similarity = attempt.tier.pipeline.matcher.options.guided_similarity
+    return GroupImage(attempt.answer, LocalizeOptions().match(similarity))

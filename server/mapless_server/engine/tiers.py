@@ -1,0 +1,142 @@
+"""When a query deserves stronger features, and which of two answers to it is the better one.
+
+Cheap features answer nearly every query. Where they find little, stronger ones often find enough, at many times the
+price; so a tier is tried only when the answer of the one before is a rejection that better matches could mend, or a
+pose that is claimed with little support.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mapless.geometry import Camera, rotation_angle_deg
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.uncertainty.accuracy import Accuracy, accuracy_from_covariance
+from mapless_server.method.views import PosedView
+from mapless_server.scenes.retrieval.chosen import Choice
+from mapless_server.store import SceneAttributes
+
+UNMENDABLE = frozenset({RejectionReason.NO_USABLE_REFERENCES, RejectionReason.DEGENERATE_REFERENCES})
+"""Rejections for what the references are, whatever is seen in them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tier:
+    """Features, and what works on them.
+
+    Attributes:
+        extractor: finds them.
+        pipeline: its matcher remembers matches of these features, so no other tier may have the same one. Tiers may
+            share a reconstructor.
+    """
+
+    extractor: FeatureExtractor
+    pipeline: Pipeline
+
+
+@dataclass(frozen=True)
+class EscalationOptions:
+    """Options of trying stronger features.
+
+    Attributes:
+        doubtful_trust: a pose that is trusted less is doubtful. Of 967 photographs, many with few references, SIFT had
+            13 over 10 cm off; trying again below this trust tries 110, all of these among them, where fewer than 50
+            inliers or a large radius tried 105, with 10 of them.
+        doubtful_radius_m: a pose whose claimed 68 % radius is larger is doubtful: what a robot needs to pass a door.
+        same_position_m, same_rotation_deg: two poses closer than this never contradict each other, however small the
+            claimed radii, which leave out the errors of the references' poses.
+        clearly_more: so many times the inliers of a contradicting pose make the stronger features' pose believed.
+        time_share: of the time left, what a stronger tier may take. After that the answer at hand is given: better a
+            doubtful one than none, and the rest is enough to send it.
+    """
+
+    doubtful_trust: float = 0.1
+    doubtful_radius_m: float = 0.2
+    same_position_m: float = 0.1
+    same_rotation_deg: float = 2.0
+    clearly_more: float = 1.5
+    time_share: float = 0.8
+
+    def __post_init__(self) -> None:
+        bounds = (self.doubtful_trust, self.doubtful_radius_m, self.same_position_m, self.same_rotation_deg)
+        if not (all(bound >= 0 for bound in bounds) and self.clearly_more >= 1 and 0 < self.time_share <= 1):
+            raise ValueError(f"senseless options: {self}")
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """What one tier made of a query.
+
+    Attributes:
+        tier: which.
+        answer: its answer.
+        references: those it used, in order.
+        generation: of the scene when they were read.
+        processed: the camera of the reduced image that features were found in.
+        choice: how the references were chosen; None if they were used as they were named.
+        attributes: of the scene.
+    """
+
+    tier: Tier
+    answer: Answer
+    references: tuple[PosedView, ...]
+    generation: int
+    processed: Camera
+    choice: Choice | None = None
+    attributes: SceneAttributes = field(default_factory=SceneAttributes)
+
+
+def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:
+    """Whether stronger features could mend the answer.
+
+    A pose that nothing has checked (`Variant.COARSE`) has no trust and claims nothing, so there is nothing to doubt.
+    """
+    outcome = answer.outcome
+    if isinstance(outcome, Rejection):
+        return outcome.reason not in UNMENDABLE
+    if outcome.covariance is None or outcome.trust is None:
+        return False
+    radius_m = accuracy_from_covariance(outcome.covariance).position_68_m
+    return outcome.trust < options.doubtful_trust or not radius_m <= options.doubtful_radius_m
+
+
+def better_of(cheaper: Attempt, stronger: Attempt, options: EscalationOptions) -> Attempt:
+    """The better of a doubtful attempt and one with stronger features.
+
+    A localization is better than a rejection, and of two rejections the stronger features' says more. Of two poses that
+    agree, within the sum of their 95 % radii or what the options let pass, the one with the smaller claimed radius is
+    better. Of two that contradict each other at least one is wrong, and the cheaper features' was doubtful: that of the
+    stronger ones is answered if it has clearly more inliers, and neither otherwise.
+    """
+    first, second = cheaper.answer.outcome, stronger.answer.outcome
+    if isinstance(first, Rejection):
+        return stronger
+    if isinstance(second, Rejection):
+        return cheaper
+    poses = first.world_from_camera, second.world_from_camera
+    apart_m = float(np.linalg.norm(poses[1].translation - poses[0].translation))
+    apart_deg = rotation_angle_deg(poses[0].rotation.T @ poses[1].rotation)
+    claims = _claim(first), _claim(second)
+    reach_m = max(options.same_position_m, sum(claim.position_95_m for claim in claims))
+    reach_deg = max(options.same_rotation_deg, sum(claim.rotation_95_deg for claim in claims))
+    if apart_m <= reach_m and apart_deg <= reach_deg:
+        return cheaper if claims[0].position_68_m < claims[1].position_68_m else stronger
+    if second.inlier_count >= options.clearly_more * first.inlier_count:
+        return stronger
+    message = (
+        f"the features disagree: the pose of {cheaper.tier.extractor.name} ({first.inlier_count} inliers) and that of "
+        f"{stronger.tier.extractor.name} ({second.inlier_count}) are {apart_m:.2f} m and {apart_deg:.1f} degrees apart"
+    )
+    return replace(stronger, answer=replace(stronger.answer, outcome=Rejection(RejectionReason.GATE, message)))
+
+
+def _claim(localization: Localization) -> Accuracy:
+    """The claimed radii; infinite where nothing is claimed."""
+    if localization.covariance is None:
+        return Accuracy(math.inf, math.inf, math.inf, math.inf)
+    return accuracy_from_covariance(localization.covariance)

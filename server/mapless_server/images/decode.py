@@ -1,0 +1,212 @@
+"""Bytes of an image file to pixels, and whatever is wrong with them.
+
+The header is read first, by the parsers below: decoders allocate for whatever size a header claims, and a file of 1 MB
+can claim 900 megapixels. Only JPEG, PNG and WebP are let through, by their first bytes: a decoder library reads many
+more formats than anybody has hardened.
+
+The raster is the one stored in the file. EXIF orientation is a note to viewers; intrinsics and poses belong to the
+sensor.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless_server.errors import InvalidArgument
+
+from .png_chunks import BadChunks, essential_png
+
+# IMREAD_UNCHANGED would also ignore the orientation, but keeps alpha and 16 bits. Asked for 8-bit colour, the decoder
+# keeps the high byte of 16, drops alpha, repeats grey and converts CMYK.
+_DECODE_FLAGS = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+_PNG = b"\x89PNG\r\n\x1a\n"
+_MAX_JPEG_SEGMENTS = 2000  # 64 KiB each; bounds the walk through a file of nothing but empty ones
+_JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd9-\xfe]", re.DOTALL)
+_MAX_JPEG_SCANS = 100  # a progressive file has about ten; thousands make a small file decode for minutes
+
+# Start-of-frame markers: C0 to CF without DHT (C4), JPG (C8) and DAC (CC).
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_WITHOUT_LENGTH = frozenset(range(0xD0, 0xD8)) | {0x01}
+
+
+@dataclass(frozen=True)
+class ImageLimits:
+    """What is accepted.
+
+    Attributes:
+        max_bytes: of the encoded file.
+        max_pixels: width times height.
+        min_side_px, max_side_px: bounds of width and height, inclusive.
+    """
+
+    max_bytes: int = 16 * 2**20
+    max_pixels: int = 50_000_000
+    min_side_px: int = 32
+    max_side_px: int = 16384
+
+
+def image_size(data: bytes, limits: ImageLimits, field: str = "image") -> tuple[int, int]:
+    """Width and height of an image in pixels, from the header alone.
+
+    Raises:
+        InvalidArgument: empty, too many bytes, not a JPEG, PNG or WebP, cut within its header, or of a size that is not
+            accepted; names `field`.
+    """
+    if not data:
+        raise InvalidArgument("the image is empty", reason="IMAGE_EMPTY", field=field)
+    if len(data) > limits.max_bytes:
+        raise InvalidArgument(
+            f"the image has {len(data)} bytes, at most {limits.max_bytes} are accepted",
+            reason="IMAGE_TOO_LARGE",
+            field=field,
+        )
+    try:
+        width, height = _read_header(data)
+    except IndexError:
+        raise InvalidArgument("the image ends within its header", reason="IMAGE_TRUNCATED", field=field) from None
+    except _Malformed as error:
+        raise InvalidArgument(str(error), reason=error.reason, field=field) from None
+    if min(width, height) < limits.min_side_px:
+        raise InvalidArgument(
+            f"the image is {width}x{height} pixels, its sides must be at least {limits.min_side_px}",
+            reason="IMAGE_TOO_SMALL",
+            field=field,
+        )
+    if max(width, height) > limits.max_side_px or width * height > limits.max_pixels:
+        raise InvalidArgument(
+            f"the image is {width}x{height} pixels; at most {limits.max_pixels} in all and {limits.max_side_px} a side "
+            "are accepted",
+            reason="IMAGE_TOO_LARGE",
+            field=field,
+        )
+    return width, height
+
+
+def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDArray[np.uint8]:
+    """Pixels of an image, (H, W, 3) RGB, as the file stores them: EXIF orientation is not applied.
+
+    Raises:
+        InvalidArgument: what `image_size` refuses, or the decoder cannot read the file to its end; names `field`.
+    """
+    width, height = image_size(data, limits, field)
+    if data.startswith(b"\xff\xd8") and _has_many_scans(data):
+        raise InvalidArgument("the JPEG has too many scans", reason="IMAGE_TOO_COMPLEX", field=field)
+    if data.startswith(_PNG):
+        try:
+            data = essential_png(data)
+        except BadChunks as error:
+            reason = "IMAGE_TOO_COMPLEX" if error.is_too_much else "IMAGE_UNDECODABLE"
+            raise InvalidArgument(str(error), reason=reason, field=field) from None
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), _DECODE_FLAGS)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise InvalidArgument(
+            "the image cannot be decoded: truncated or damaged", reason="IMAGE_UNDECODABLE", field=field
+        )
+    if pixels.shape != (height, width, 3) or pixels.dtype != np.uint8:
+        raise InvalidArgument(
+            f"the image decodes to {pixels.shape[1]}x{pixels.shape[0]} pixels, its header says {width}x{height}",
+            reason="IMAGE_UNDECODABLE",
+            field=field,
+        )
+    return np.asarray(pixels, np.uint8)
+
+
+def _has_many_scans(data: bytes) -> bool:
+    """Whether a JPEG has more than _MAX_JPEG_SCANS, read from marker to marker up to the end of its image."""
+    position, scans = 2, 0
+    while scans <= _MAX_JPEG_SCANS:
+        # Within a scan's data FF is always followed by 00 or a restart marker.
+        marker = _JPEG_MARKER.search(data, position)
+        if marker is None or marker[0][-1] == 0xD9:
+            return False
+        scans += marker[0][-1] == 0xDA
+        position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
+    return True
+
+
+class _Malformed(Exception):
+    def __init__(self, message: str, reason: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+def _read_header(data: bytes) -> tuple[int, int]:
+    """Width and height; IndexError where the bytes end too early."""
+    if data.startswith(b"\xff\xd8\xff"):
+        return _read_jpeg_header(data)
+    if data.startswith(_PNG):
+        return _read_png_header(data)
+    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+        return _read_webp_header(data)
+    raise _Malformed("the image is not a JPEG, PNG or WebP file", "IMAGE_UNKNOWN_FORMAT")
+
+
+def _read_jpeg_header(data: bytes) -> tuple[int, int]:
+    """Walks the segments to the frame header, which stands before the first scan."""
+    position = 2
+    for _ in range(_MAX_JPEG_SEGMENTS):
+        marker = _big_endian(data, position, 2)
+        if marker >> 8 != 0xFF:
+            raise _Malformed("the JPEG is damaged: no marker where one must stand", "IMAGE_UNDECODABLE")
+        marker &= 0xFF
+        if marker == 0xFF:  # padding
+            position += 1
+        elif marker in _JPEG_WITHOUT_LENGTH:
+            position += 2
+        elif marker in _JPEG_FRAMES:
+            return _big_endian(data, position + 7, 2), _big_endian(data, position + 5, 2)
+        elif marker in (0xDA, 0xD9):
+            raise _Malformed("the JPEG has no frame header", "IMAGE_UNDECODABLE")
+        else:
+            position += 2 + _big_endian(data, position + 2, 2)
+    raise _Malformed("the JPEG has too many segments before its frame header", "IMAGE_TOO_COMPLEX")
+
+
+def _read_png_header(data: bytes) -> tuple[int, int]:
+    """IHDR is the first chunk, always."""
+    width, height = _big_endian(data, 16, 4), _big_endian(data, 20, 4)
+    if data[12:16] != b"IHDR":
+        raise _Malformed("the PNG does not begin with its header", "IMAGE_UNDECODABLE")
+    return width, height
+
+
+def _read_webp_header(data: bytes) -> tuple[int, int]:
+    """The first chunk is the frame itself (lossy or lossless) or the extended header."""
+    kind = data[12:16]
+    if kind == b"VP8 ":
+        width, height = _little_endian(data, 26, 2) & 0x3FFF, _little_endian(data, 28, 2) & 0x3FFF
+        if data[23:26] != b"\x9d\x01\x2a":
+            raise _Malformed("the WebP does not begin with a key frame", "IMAGE_UNDECODABLE")
+        return width, height
+    if kind == b"VP8L":
+        bits = _little_endian(data, 21, 4)
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if kind == b"VP8X":
+        if data[20] & 0x02:
+            raise _Malformed("the WebP is an animation", "IMAGE_UNKNOWN_FORMAT")
+        return _little_endian(data, 24, 3) + 1, _little_endian(data, 27, 3) + 1
+    if len(data) < 16:
+        raise IndexError
+    raise _Malformed("the WebP holds no image", "IMAGE_UNDECODABLE")
+
+
+def _big_endian(data: bytes, position: int, length: int) -> int:
+    return int.from_bytes(_take(data, position, length), "big")
+
+
+def _little_endian(data: bytes, position: int, length: int) -> int:
+    return int.from_bytes(_take(data, position, length), "little")
+
+
+def _take(data: bytes, position: int, length: int) -> bytes:
+    if position + length > len(data):
+        raise IndexError
+    return data[position : position + length]

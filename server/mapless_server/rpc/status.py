@@ -1,0 +1,32 @@
+"""Errors as callers get them: google.rpc.Status with details for programs."""
+
+from __future__ import annotations
+
+import grpc
+from google.protobuf.message import Message
+from google.rpc import error_details_pb2, status_pb2
+
+from mapless_server.errors import AlreadyExists, NotFound, RequestError
+
+_DOMAIN = "mapless"
+_MAX_MESSAGE_CHARACTERS = 1000  # trailers hold about 8 KB, and the text stands in them twice
+
+
+def to_status(error: RequestError) -> status_pb2.Status:
+    """The error as google.rpc.Status: one ErrorInfo, and what belongs to its kind."""
+    message = str(error)[:_MAX_MESSAGE_CHARACTERS]
+    field = {} if error.field is None else {"field": error.field}
+    details: list[Message] = [error_details_pb2.ErrorInfo(reason=error.reason, domain=_DOMAIN, metadata=field)]
+    if isinstance(error, NotFound | AlreadyExists):
+        details.append(error_details_pb2.ResourceInfo(description=message))
+    elif error.field is not None:
+        violation = error_details_pb2.BadRequest.FieldViolation(field=error.field, description=message)
+        details.append(error_details_pb2.BadRequest(field_violations=[violation]))
+    if error.retry_after_s is not None:
+        retry = error_details_pb2.RetryInfo()
+        retry.retry_delay.FromMilliseconds(round(1000 * error.retry_after_s))
+        details.append(retry)
+    status = status_pb2.Status(code=grpc.StatusCode[error.code].value[0], message=message)
+    for detail in details:
+        status.details.add().Pack(detail)
+    return status

@@ -1,0 +1,50 @@
+"""Whether two references are the same photograph, or add nothing to one another."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+
+from mapless_server.method.correspond import Matches
+from mapless_server.method.views import PosedView
+
+from .options import AuditOptions
+
+
+class Likeness(Enum):
+    """How alike two references are; the more the greater."""
+
+    DIFFERENT = 0
+    SAME_VIEW = 1
+    """Taken from one place in one direction: between them there is no parallax to speak of."""
+    SAME_PHOTOGRAPH = 2
+    """One photograph, perhaps compressed again."""
+
+
+def likeness(first: PosedView, second: PosedView, matches: Matches, options: AuditOptions) -> Likeness:
+    """Compares where two photographs show the same things, whatever their poses.
+
+    Photographs of different sizes differ: they are compared in the pixels that features were found in.
+    """
+    if _is_same_file(first, second):
+        return Likeness.SAME_PHOTOGRAPH
+    cameras = first.view.camera, second.view.camera
+    if (cameras[0].width_px, cameras[0].height_px) != (cameras[1].width_px, cameras[1].height_px):
+        return Likeness.DIFFERENT
+    matched_share = len(matches) / max(1, min(len(first.view.features), len(second.view.features)))
+    if matched_share < min(options.same_photograph_share, options.same_view_matched_share):
+        return Likeness.DIFFERENT
+    shift = first.view.features.keypoints[matches[:, 0]] - second.view.features.keypoints[matches[:, 1]]
+    shift_px = float(np.median(np.linalg.norm(shift, axis=1)))
+    if shift_px < options.same_photograph_px and matched_share >= options.same_photograph_share:
+        return Likeness.SAME_PHOTOGRAPH
+    is_near = shift_px < options.same_view_share * cameras[0].width_px
+    return Likeness.SAME_VIEW if is_near and matched_share >= options.same_view_matched_share else Likeness.DIFFERENT
+
+
+def _is_same_file(first: PosedView, second: PosedView) -> bool:
+    photographs = first.view.photograph, second.view.photograph
+    if photographs[0] is None or photographs[1] is None:
+        return False
+    return photographs[0].sha256 == photographs[1].sha256

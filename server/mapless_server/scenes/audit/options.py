@@ -1,0 +1,75 @@
+"""Options of an audit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from mapless_server.method.structure import StructureOptions
+
+from .resection import ResectionOptions
+
+
+@dataclass(frozen=True)
+class AuditOptions:
+    """Options of an audit; figures are of six real scenes with 8 to 60 references, unaltered and with planted faults.
+
+    Attributes:
+        position_tolerance_m: smaller offsets are no fault. Of unaltered kitchen, fountain, church and office references
+            the worst is off by 0.027, and faults of 0.05 are found to be 0.043 to 0.059.
+        rotation_tolerance_deg: the same: 0.65, and faults of 2 are found to be 1.8 to 2.15.
+        focal_tolerance: the same as a share: 0.007, and faults of 0.05 are found to be 0.045 to 0.055.
+        significance_sigma: an offset must also be so many standard deviations, its own (from the matches, doubled as in
+            the method's final adjustment) along its direction.
+        neighbour_noise: and so many times what its neighbours are off in the median: where all poses of a place are off
+            by 10 cm, as at one end of a drive with GPS poses, one more is not the one to blame.
+        candidate_count: nearest references by position and heading that are matched.
+        neighbour_count: of these, how many with the most matches are used. Points need two, blame needs more.
+        wide_count: references that are matched when the nearest by pose do not show what the photograph shows.
+        epipolar_px: as for matching references.
+        min_inliers: fewer are no ground for a judgement. Repeated texture has fooled up to 23.
+        max_log10_false_alarms: as of the pose solver, with a reserve: an audit makes thousands of judgements.
+        swap_reach: a reference so many tolerances from where a photograph was taken may be its partner in a swap, since
+            that was found from neighbours of the wrong place. Whether it is, is then looked at from the right ones.
+        both_excess: robust cost per match that a changed pose or focal length alone must leave unexplained for both to
+            be blamed. One true cause leaves up to 0.75, two leave 4.
+        same_photograph_px: keypoints of the same photograph, recompressed, are closer than this in the median.
+        same_photograph_share: and so large a share of them match.
+        same_view_share: of the image's width: keypoints of views this near in the median add nothing to one another.
+        same_view_matched_share: and so large a share of them match.
+        structure: of the neighbours' points.
+        resection: of the reference's fits.
+    """
+
+    position_tolerance_m: float = 0.035
+    rotation_tolerance_deg: float = 1.0
+    focal_tolerance: float = 0.02
+    significance_sigma: float = 3.0
+    neighbour_noise: float = 3.0
+    candidate_count: int = 12
+    neighbour_count: int = 8
+    wide_count: int = 64
+    epipolar_px: float = 2.0
+    min_inliers: int = 25
+    max_log10_false_alarms: float = -6.0
+    swap_reach: float = 4.0
+    both_excess: float = 2.0
+    same_photograph_px: float = 0.5
+    same_photograph_share: float = 0.7
+    same_view_share: float = 0.003
+    same_view_matched_share: float = 0.3
+    structure: StructureOptions = field(default_factory=StructureOptions)
+    resection: ResectionOptions = field(default_factory=ResectionOptions)
+
+    def __post_init__(self) -> None:
+        tolerances = (self.position_tolerance_m, self.rotation_tolerance_deg, self.focal_tolerance, self.epipolar_px)
+        counts = (self.candidate_count, self.neighbour_count - 1, self.wide_count, self.min_inliers - 7)
+        factors = (
+            self.significance_sigma,
+            self.neighbour_noise,
+            self.swap_reach,
+            self.both_excess,
+            self.same_photograph_px,
+        )
+        shares = (self.same_photograph_share, self.same_view_share, self.same_view_matched_share)
+        if not (min(*tolerances, *counts, *factors) > 0 and 0 < min(shares) <= max(shares) <= 1):
+            raise ValueError(f"senseless options: {self}")

@@ -1,0 +1,156 @@
+"""The global descriptor of the paper: MegaLoc on the photograph's pixels, shortened.
+
+MegaLoc gives 8448 numbers. As float16 that is 17 KB a reference, 1.7 GB for 100,000 and 17 GB for a million, and exact
+search reads all of it for every query. So descriptors are reduced to 1056 by random sums of eight (`MegaLoc.reduce`):
+2.1 KB, 0.2 GB, 2.1 GB. A similarity s then has an error around zero with a standard deviation of
+(1 - s^2) / sqrt(1056): 0.02 at s = 0.6, 0.003 at 0.95; float16 adds 0.00002. It swaps references that are about as good
+as each other, which thinning by distance does as well. It needs no data and nothing learned, and the network's largest
+layer shrinks by the same eight: 0.42 GB of weights rather than 0.91.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812  its usual name
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mapless_server.method.views import View
+from mapless_server.networks.blocks import Attention
+from mapless_server.networks.checkpoint import load_strictly
+from mapless_server.networks.megaloc import MegaLoc, MegaLocSizes
+
+from .descriptor import Vector
+
+log = logging.getLogger(__name__)
+
+SIDE_PX = 322
+"""Photographs become squares of this side, whatever their shape: what the network was published and measured with."""
+
+_BAND_ROWS = 64
+"""Of a photograph, that are floating-point numbers at a time: 3 MB of one that is 4000 px wide."""
+
+_VERSION = 1
+"""Raised by any change of what the same weights and options make of the same photograph."""
+
+
+@dataclass(frozen=True)
+class MegaLocOptions:
+    """Options of the descriptor.
+
+    Attributes:
+        dimension: of the vectors, a divisor of 8448, which is the network's own; see the module about 1056.
+        batch: photographs described in one go by `describe_many`; 16 are 8,480 tokens, enough to fill a device, and
+            take about 0.3 GB beside the weights by calculation.
+        dtype: what the transformer computes in; None is bfloat16 on a CUDA device that has flash attention, else
+            float32. Not part of the name, so that servers with and without a GPU can share references: it changes
+            similarities by a thousandth of what they differ by among photographs of one scene (random weights).
+    """
+
+    dimension: int = 1056
+    batch: int = 16
+    dtype: torch.dtype | None = None
+
+    def __post_init__(self) -> None:
+        if self.dimension < 1 or self.batch < 1:
+            raise ValueError(f"senseless options: {self}")
+
+
+class MegaLocDescriptor:
+    """A `GlobalDescriptor`; safe to use from several threads. Any photograph has a vector, a blank wall too.
+
+    Attributes:
+        name: e.g. "megaloc-1056-322px-d4f9f2bc-1"; the letters are the beginning of the weights' SHA-256.
+        dimension: of the vectors.
+        extractor: None, since it looks at pixels.
+        dtype: what the transformer computes in.
+
+    Args:
+        weights: safetensors file, the names of the authors' checkpoint.
+        device: "cpu" or a CUDA device.
+        options: see there.
+        sizes: of the network; None is that of the authors' weights.
+
+    Raises:
+        CheckpointError: the weights do not fit.
+        ValueError: the dimension is no divisor of the network's own.
+    """
+
+    extractor: str | None = None
+
+    def __init__(
+        self,
+        weights: Path,
+        device: str = "cpu",
+        options: MegaLocOptions | None = None,
+        sizes: MegaLocSizes | None = None,
+    ) -> None:
+        self.options = options or MegaLocOptions()
+        self._device = torch.device(device)
+        self.dtype = self.options.dtype or _best_dtype(self._device)
+        with torch.device("meta"):
+            self._network = MegaLoc(sizes)
+        sha256 = load_strictly(self._network, weights, optional={})
+        self._network.reduce(self.options.dimension)
+        self._network.set_compute_type(self.dtype)
+        self._network.to(self._device).eval().requires_grad_(False)
+        self.dimension = self._network.length
+        self.name = f"megaloc-{self.dimension}-{SIDE_PX}px-{sha256[:8]}-{_VERSION}"
+
+    def describe(self, view: View) -> Vector:
+        """See GlobalDescriptor.describe.
+
+        Raises:
+            ValueError: the view has no photograph.
+            RequestError: the photograph cannot be read any more.
+        """
+        vector: Vector = self.describe_many([view])[0]
+        return vector
+
+    @torch.inference_mode()
+    def describe_many(self, views: Sequence[View]) -> NDArray[np.float32]:
+        """Vectors (N, D) of views, some at a time; of photographs one is in memory.
+
+        Company changes a vector by rounding only. Errors as `describe`.
+        """
+        described = np.empty((len(views), self.dimension), np.float32)
+        for begin in range(0, len(views), self.options.batch):
+            pictures = torch.stack([_picture(view) for view in views[begin : begin + self.options.batch]])
+            vectors = self._network(pictures.to(self._device))
+            described[begin : begin + len(pictures)] = vectors.cpu().numpy()
+        return described
+
+
+def _picture(view: View) -> Tensor:
+    """The photograph squeezed to a square, (3, SIDE_PX, SIDE_PX) float32 in [0, 1]: bilinear with antialiasing.
+
+    Across first, some rows at a time, then down. Both at once give the same to the bit, from a float copy of the whole
+    photograph, four times its size, and in thrice the time.
+    """
+    if view.photograph is None:
+        raise ValueError("MegaLoc looks at pixels, and the view has no photograph")
+    pixels = torch.from_numpy(np.ascontiguousarray(view.photograph.read())).permute(2, 0, 1)[None]
+    bands = [_resized(band.float(), (band.shape[2], SIDE_PX)) for band in pixels.split(_BAND_ROWS, dim=2)]
+    return _resized(torch.cat(bands, dim=2), (SIDE_PX, SIDE_PX))[0] / 255
+
+
+def _resized(images: Tensor, size: tuple[int, int]) -> Tensor:
+    return F.interpolate(images, size, mode="bilinear", antialias=True, align_corners=False)
+
+
+def _best_dtype(device: torch.device) -> torch.dtype:
+    if device.type != "cuda":
+        return torch.float32
+    token = torch.ones(1, 1, 1, 64, device=device, dtype=torch.bfloat16)
+    try:
+        Attention.attend(token, token, token)
+    except RuntimeError as error:
+        log.warning("retrieval megaloc: in float32, since there is no flash attention on %s: %s", device, error)
+        return torch.float32
+    return torch.bfloat16

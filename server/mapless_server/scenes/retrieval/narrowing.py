@@ -1,0 +1,167 @@
+"""What is known of where the camera is and where it looks, before its photograph is compared with any.
+
+Limits are hard: references beyond them are not considered, and neither is a pose. What is merely likely narrows the
+choice of references too, but not to nothing, and never judges a pose.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform
+from mapless_server.method.priors.known import PosePrior, PositionPrior, Priors
+
+PRIOR_MARGIN_M = 10.0
+"""References further from where the camera may be than this are not considered: they see other things."""
+
+PRIOR_MARGIN_DEG = 60.0
+"""References that look further beside a cone than this are not considered: two cameras with the usual 60 degrees of
+view have then nothing in common."""
+
+REACH_SIGMA = 4.0
+"""How many standard deviations from where it is likely a camera may be: further out is one of 2000 of three numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere:
+    """The camera is within `radius_m` of `position` (3,), world, metres."""
+
+    position: Array
+    radius_m: float
+
+    def distance_m(self, position: Array) -> float:
+        """How far from the sphere's surface a position lies; negative inside."""
+        return float(np.linalg.norm(position - self.position)) - self.radius_m
+
+    def keeps(self, centres: Array, margin_m: float) -> NDArray[np.bool_]:
+        """Which centres (N, 3) lie no further outside than the margin, (N,)."""
+        # Not squared: a radius may be any number.
+        return np.asarray(np.linalg.norm(centres - self.position, axis=1) <= self.radius_m + margin_m)
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoid:
+    """The camera is likely within `REACH_SIGMA` standard deviations of `position` (3,), world, metres.
+
+    Attributes:
+        covariance: (3, 3).
+    """
+
+    position: Array
+    covariance: Array
+
+    def keeps(self, centres: Array, margin_m: float) -> NDArray[np.bool_]:
+        """Which centres (N, 3) lie in the ellipsoid with each half-axis longer by the margin, (N,)."""
+        variances, axes = np.linalg.eigh(self.covariance)
+        half_axes_m = REACH_SIGMA * np.sqrt(variances.clip(min=0)) + margin_m
+        away = (centres - self.position) @ axes / half_axes_m
+        return np.asarray(np.einsum("ij,ij->i", away, away) <= 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Cone:
+    """The camera looks along `forward` (3,), unit length, world, give or take `max_angle_deg`."""
+
+    forward: Array
+    max_angle_deg: float
+
+    def __post_init__(self) -> None:
+        if not (abs(float(np.linalg.norm(self.forward)) - 1) < 1e-3 and 0 <= self.max_angle_deg <= 180):
+            raise ValueError(f"senseless heading: {self.forward}, {self.max_angle_deg} degrees")
+
+    def angle_deg(self, axis: Array) -> float:
+        """How far beside the cone an optical axis (3,) of unit length points; negative inside."""
+        return float(np.degrees(np.arccos(np.clip(self.forward @ axis, -1.0, 1.0)))) - self.max_angle_deg
+
+    def keeps(self, axes: Array, margin_deg: float) -> NDArray[np.bool_]:
+        """Which optical axes (N, 3) point no further beside the cone than the margin, (N,)."""
+        widest_deg = self.max_angle_deg + margin_deg
+        if widest_deg >= 180:
+            return np.ones(len(axes), bool)
+        # A hundredth of a degree forgives rounding.
+        return np.asarray(axes @ self.forward >= math.cos(math.radians(widest_deg + 0.01)))
+
+
+@dataclass(frozen=True, eq=False)
+class Narrowing:
+    """Which references come into question; without anything known, all do.
+
+    Attributes:
+        position: limit of the camera's.
+        heading: limit of the camera's.
+        margin_m: how far beyond the sphere, or where the camera is likely, a reference may stand.
+        margin_deg: how far beside a cone it may look.
+        likely_positions: where the camera likely is; all of them at once.
+        likely_headings: where it likely looks; all of them at once.
+    """
+
+    position: Sphere | None = None
+    heading: Cone | None = None
+    margin_m: float = PRIOR_MARGIN_M
+    margin_deg: float = PRIOR_MARGIN_DEG
+    likely_positions: tuple[Ellipsoid, ...] = ()
+    likely_headings: tuple[Cone, ...] = ()
+
+    @staticmethod
+    def of(priors: Priors) -> Narrowing:
+        """What soft priors say of where the references are to be looked for; gravity says nothing of it."""
+        positions, headings = [], []
+        for prior in priors:
+            if isinstance(prior, PositionPrior):
+                positions.append(Ellipsoid(prior.position, prior.covariance))
+            elif isinstance(prior, PosePrior):
+                pose, covariance = prior.world_from_camera, prior.covariance
+                positions.append(Ellipsoid(pose.translation, covariance[:3, :3]))
+                sigma = math.sqrt(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+                headings.append(_likely(pose.rotation[:, 2], math.degrees(sigma)))
+        if priors.heading is not None:
+            headings.append(_likely(priors.heading.in_world, priors.heading.sigma_deg))
+        return Narrowing(likely_positions=tuple(positions), likely_headings=tuple(headings))
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing is known."""
+        return not (self.position or self.heading or self.likely_positions or self.likely_headings)
+
+    @property
+    def centre(self) -> Array | None:
+        """About where the camera is, (3,) world; None if nothing says."""
+        if self.position is not None:
+            return self.position.position
+        return self.likely_positions[0].position if self.likely_positions else None
+
+    def contradiction(self, world_from_camera: RigidTransform) -> str:
+        """What limits speak against a pose of the camera itself, without the margins; empty if none does."""
+        if self.position is not None:
+            outside_m = self.position.distance_m(world_from_camera.translation)
+            if outside_m > 0:
+                return f"the pose lies {outside_m:.2f} m outside the prior's radius of {self.position.radius_m:g} m"
+        if self.heading is not None:
+            outside_deg = self.heading.angle_deg(world_from_camera.rotation[:, 2])
+            if outside_deg > 0:
+                angle_deg = self.heading.max_angle_deg
+                return f"the pose looks {outside_deg:.1f} degrees outside the prior's angle of {angle_deg:g} degrees"
+        return ""
+
+    def keeps(self, centres: Array, axes: Array) -> NDArray[np.bool_]:
+        """Whether cameras come into question, (N,), by centres (N, 3) and optical axes (N, 3), world."""
+        kept = np.ones(len(centres), bool)
+        if self.position is not None:
+            kept &= self.position.keeps(centres, self.margin_m)
+        if self.heading is not None:
+            kept &= self.heading.keeps(axes, self.margin_deg)
+        likely = kept.copy()
+        for position in self.likely_positions:
+            likely &= position.keeps(centres, self.margin_m)
+        for heading in self.likely_headings:
+            likely &= heading.keeps(axes, self.margin_deg)
+        # Where nothing is likely something said so is wrong, which the pose will tell; a limit stays one.
+        return likely if likely.any() else kept
+
+
+def _likely(forward: Array, sigma_deg: float) -> Cone:
+    return Cone(forward, min(180.0, REACH_SIGMA * sigma_deg))

@@ -1,0 +1,253 @@
+"""From settings to an engine and its store: what serves, and what does without where something is missing.
+
+Nothing here imports torch unless the settings ask for a network.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable
+
+from mapless_server.engine.engine import Engine, EngineOptions
+from mapless_server.engine.tiers import Tier
+from mapless_server.extras import install_hint
+from mapless_server.images.decode import ImageLimits
+from mapless_server.method.coarse.make import make_reconstructor
+from mapless_server.method.correspond import Matcher, make_matcher
+from mapless_server.method.features import FEATURES, FeatureExtractor, make_extractor
+from mapless_server.method.localize import Pipeline
+from mapless_server.networks.weights import CATALOGUE, WeightsError, WeightsMissing, find_weights
+from mapless_server.observability.metrics import Metrics
+from mapless_server.scenes.retrieval.descriptor import GlobalDescriptor
+from mapless_server.scenes.retrieval.vlad import VladDescriptor
+from mapless_server.scheduling.admission import ScheduleOptions
+from mapless_server.scheduling.work_queue import WorkQueueOptions
+from mapless_server.security.rate import RateLimiter
+from mapless_server.settings import Settings, available_cores
+from mapless_server.store import Store, StoreError
+
+log = logging.getLogger(__name__)
+
+CHEAP_FEATURES, STRONG_FEATURES = "sift", "aliked"
+"""What `auto` chooses from; both may be used for any purpose.
+
+On a CPU the first answers, and the second where the first is in doubt: of 159 photographs, 120 of them with 3 to 5
+references far apart, SIFT loses 16 at 0.1 s a photograph, ALIKED 3 at 1 to 3 s, and ALIKED after SIFT the same 3 though
+only 53 need it. On a GPU the second is as quick as the first, and answers alone.
+"""
+
+
+RETRIEVAL = ("auto", "vlad", "megaloc")
+
+WITH_WEIGHTS = frozenset(entry.name for entry in CATALOGUE)
+
+
+class StartupError(Exception):
+    """The server cannot start; the message is one sentence for the operator."""
+
+
+def image_limits(settings: Settings) -> ImageLimits:
+    """The limits of images that the settings ask for."""
+    return ImageLimits(
+        max_bytes=settings.max_image_mib * 2**20, max_pixels=round(settings.max_image_megapixels * 1_000_000)
+    )
+
+
+def engine_options(settings: Settings) -> EngineOptions:
+    """The engine's options that the settings ask for."""
+    return EngineOptions(
+        workers=settings.workers,
+        max_batch=settings.max_batch,
+        index_cache_bytes=settings.retrieval_cache_mib * 2**20,
+        image_limits=image_limits(settings),
+        coverage=settings.coverage,
+        queue=WorkQueueOptions(
+            ScheduleOptions(max_queued_s=settings.max_queued_s, max_bytes=settings.max_queued_mib * 2**20),
+            stall_limit_s=settings.stall_limit_s,
+        ),
+    )
+
+
+def open_store(settings: Settings) -> Store:
+    """The store of the settings' database or data folder; StartupError if it cannot be opened."""
+    cache_bytes = settings.reference_cache_mib * 2**20
+    try:
+        if settings.database_url is not None:
+            return Store.connect(settings.database_url.get_secret_value(), cache_bytes)
+        return Store.open(settings.data_dir, cache_bytes)
+    except StoreError as error:
+        raise StartupError(str(error)) from error
+
+
+MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], Engine]
+
+
+def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+    """The engine that the settings ask for; StartupError if they name what is not known or not there."""
+    try:
+        tiers = make_tiers(settings)
+        descriptor = make_descriptor(settings, tiers[0].extractor)
+        return Engine(store, tiers, engine_options(settings), metrics, quota, descriptor=descriptor)
+    except (ImportError, WeightsMissing) as error:
+        raise StartupError(what_is_missing(error)) from error
+    except (ValueError, WeightsError) as error:
+        raise StartupError(str(error)) from error
+
+
+def feature_names(features: str, device: str) -> tuple[str, ...]:
+    """The features that a setting means on "cpu" or "cuda...", the cheapest first.
+
+    Raises:
+        ValueError: unknown features.
+    """
+    if features not in ("auto", *FEATURES):
+        raise ValueError(f"unknown features {features!r}; known: auto, {', '.join(FEATURES)}")
+    if features != "auto":
+        return (features,)
+    return (CHEAP_FEATURES, STRONG_FEATURES) if device == "cpu" else (STRONG_FEATURES,)
+
+
+def make_tiers(settings: Settings) -> tuple[Tier, ...]:
+    """The tiers that the settings ask for, the cheapest first.
+
+    Of the features that `auto` means, those without weights or packages are left out, and the log says so; at the worst
+    the cheap ones serve alone.
+
+    Raises:
+        ValueError: unknown features or backend, or there is no such device.
+        WeightsError: weights are not there, or do not fit.
+        ImportError: a package that a network needs is not installed.
+    """
+    device = device_for(settings)
+    extractors = _make_extractors(settings, device)
+    reconstructor = make_reconstructor(
+        settings.backend, settings.weights_dir, device, compiled_views=settings.compiled_views
+    )
+    return tuple(
+        Tier(extractor, Pipeline(reconstructor, _make_matcher(name, settings, device)))
+        for name, extractor in extractors.items()
+    )
+
+
+def make_descriptor(settings: Settings, extractor: FeatureExtractor) -> GlobalDescriptor:
+    """What references are chosen by; `extractor` is the first tier's.
+
+    `auto` is MegaLoc where networks run on a CUDA device and its weights are present: on a CPU it takes seconds.
+
+    Raises:
+        ValueError: unknown kind of retrieval, or there is no such device.
+        WeightsError: weights are not there, or do not fit.
+        ImportError: a package that the network needs is not installed.
+    """
+    if settings.retrieval not in RETRIEVAL:
+        raise ValueError(f"unknown retrieval {settings.retrieval!r}; known: {', '.join(RETRIEVAL)}")
+    if settings.retrieval == "vlad":
+        return VladDescriptor.of(extractor)
+    if settings.retrieval == "auto" and device_for(settings) == "cpu":
+        return VladDescriptor.of(extractor)
+    try:
+        from mapless_server.scenes.retrieval.megaloc import MegaLocDescriptor
+
+        return MegaLocDescriptor(find_weights("megaloc", settings.weights_dir), choose_device(settings.device))
+    except (ImportError, WeightsMissing):
+        if settings.retrieval != "auto":
+            raise
+    return VladDescriptor.of(extractor)
+
+
+def make_first_features(settings: Settings) -> tuple[str, FeatureExtractor]:
+    """The first tier's features, and their extractor; errors as `make_tiers`."""
+    return next(iter(_make_extractors(settings, device_for(settings)).items()))
+
+
+def what_is_missing(error: ImportError | WeightsMissing) -> str:
+    """What is not there and what to do about it, for the operator."""
+    return install_hint(error) if isinstance(error, ImportError) else str(error)
+
+
+def device_for(settings: Settings) -> str:
+    """What networks run on; errors as `choose_device`.
+
+    Where there are none it does not matter, and finding out would take torch, a third of the server's memory.
+    """
+    if settings.device == "auto" and settings.backend == "geometric" and settings.features == CHEAP_FEATURES:
+        return "cpu"
+    return choose_device(settings.device)
+
+
+def choose_device(device: str) -> str:
+    """What networks run on; `auto` is a CUDA device if torch is there and finds one, else the CPU.
+
+    Raises:
+        ValueError: there is no such device.
+    """
+    chosen = _find_device(device)
+    if chosen != "cpu":
+        import torch
+
+        # On new GPUs torch prefers cuDNN's attention, which plans for half a second whenever LightGlue meets another
+        # number of keypoints; to be set once, before there are threads.
+        torch.backends.cuda.enable_cudnn_sdp(False)
+    return chosen
+
+
+def gpu_memory() -> dict[str, float]:
+    """Bytes of the device that networks use, by kind; empty without one. Imports nothing."""
+    torch = sys.modules.get("torch")
+    if torch is None or not torch.cuda.is_initialized():
+        return {}
+    return {
+        "allocated": torch.cuda.memory_allocated(),
+        "reserved": torch.cuda.memory_reserved(),
+        "peak": torch.cuda.max_memory_allocated(),
+    }
+
+
+def _find_device(device: str) -> str:
+    if device == "cpu":
+        return device
+    try:
+        import torch
+    except ImportError:
+        if device == "auto":
+            return "cpu"
+        raise
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if torch.device(device).index not in (None, *range(torch.cuda.device_count())) or not torch.cuda.is_available():
+        raise ValueError(f"there is no device {device}: torch finds {torch.cuda.device_count()} CUDA devices")
+    return device
+
+
+def _make_extractors(settings: Settings, device: str) -> dict[str, FeatureExtractor]:
+    *cheaper, last = feature_names(settings.features, device)
+    extractors = {name: _make_extractor(name, settings, device) for name in cheaper}
+    try:
+        return extractors | {last: _make_extractor(last, settings, device)}
+    except (ImportError, WeightsMissing) as error:
+        if settings.features != "auto":
+            raise
+        log.warning("features auto: %s serves without %s: %s", CHEAP_FEATURES, last, what_is_missing(error))
+    return extractors or {CHEAP_FEATURES: make_extractor(CHEAP_FEATURES)}
+
+
+def _make_extractor(name: str, settings: Settings, device: str) -> FeatureExtractor:
+    if name not in WITH_WEIGHTS:
+        return make_extractor(name)
+    return make_extractor(name, find_weights(name, settings.weights_dir), device)
+
+
+def _make_matcher(name: str, settings: Settings, device: str) -> Matcher:
+    """Nearest neighbours, or on a GPU LightGlue if its weights are there.
+
+    On a CPU LightGlue takes two seconds a pair and gains nothing measurable.
+    """
+    network = f"{name}-lightglue"
+    if device == "cpu" or network not in WITH_WEIGHTS:
+        return make_matcher(name, available_cores())
+    try:
+        return make_matcher(name, available_cores(), find_weights(network, settings.weights_dir), device)
+    except WeightsMissing as error:
+        log.warning("features %s: matched by nearest neighbours: %s", name, error)
+        return make_matcher(name, available_cores())

@@ -1,0 +1,85 @@
+"""The gRPC server of one process: the address it listens on, and what it allows connections."""
+
+from __future__ import annotations
+
+import grpc
+
+from mapless_server.services.handlers import Services
+from mapless_server.settings import Settings
+
+MAX_CONCURRENT_RPCS = 2048
+"""Calls at a time, from all connections. Far above what the queue admits; health probes count, and calls of which only
+the headers have come, each of which `receiving` gives but a time."""
+MAX_CALLS_PER_CONNECTION = 128
+"""Far below that, so that no connection can use it up; a client with more at a time sends them one after another."""
+
+_LAST_BYTES_S = 0.5
+"""For answers that are on their way when the last call has ended."""
+
+
+class AddressTaken(Exception):
+    """The address cannot be listened on; the message is for the operator."""
+
+
+class GrpcServer:
+    """Listens for the services' calls.
+
+    Attributes:
+        address: "host:port".
+    """
+
+    def __init__(
+        self, settings: Settings, services: Services, credentials: grpc.ServerCredentials | None = None
+    ) -> None:
+        """Binds its port.
+
+        Raises:
+            AddressTaken: another server has it, or it is not an address of ours.
+        """
+        self._server = grpc.aio.server(options=_options(settings), maximum_concurrent_rpcs=MAX_CONCURRENT_RPCS)
+        services.add_to(self._server)
+        host = f"[{settings.host}]" if ":" in settings.host else settings.host
+        self.address = f"{host}:{self._bind(f'{host}:{settings.port}', credentials)}"
+
+    def _bind(self, address: str, credentials: grpc.ServerCredentials | None) -> int:
+        try:
+            if credentials is None:
+                return int(self._server.add_insecure_port(address))
+            return int(self._server.add_secure_port(address, credentials))
+        except RuntimeError as error:
+            raise AddressTaken(f"cannot listen on {address}: in use, or not an address of ours") from error
+
+    async def start(self) -> None:
+        """Takes calls."""
+        await self._server.start()
+
+    async def stop(self) -> None:
+        """Takes no more calls; those whose answers are on their way get a moment."""
+        await self._server.stop(_LAST_BYTES_S)
+
+    async def close(self) -> None:
+        """Ends at once."""
+        await self._server.stop(0)
+
+
+def _options(settings: Settings) -> list[tuple[str, int]]:
+    max_message_bytes = settings.max_message_mib * 2**20
+    return [
+        ("grpc.max_receive_message_length", max_message_bytes),
+        ("grpc.max_send_message_length", max_message_bytes),
+        # With reuseport, the default, a second server silently shares the port and takes half of the calls.
+        ("grpc.so_reuseport", 0),
+        ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
+        ("grpc.max_metadata_size", 16 * 1024),
+        # Clients may ping every 30 s, but only while they have a call.
+        ("grpc.http2.min_ping_interval_without_data_ms", 30_000),
+        ("grpc.http2.max_ping_strikes", 2),
+        ("grpc.keepalive_permit_without_calls", 0),
+        # Notices clients that went away without a word, so that what they asked for is not computed.
+        ("grpc.keepalive_time_ms", 60_000),
+        ("grpc.keepalive_timeout_ms", 20_000),
+        ("grpc.max_connection_idle_ms", 15 * 60_000),
+        # Clients come back by another connection, and perhaps to another server that was added meanwhile.
+        ("grpc.max_connection_age_ms", 30 * 60_000),
+        ("grpc.max_connection_age_grace_ms", round(1000 * settings.max_deadline_s)),
+    ]

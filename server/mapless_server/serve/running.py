@@ -1,0 +1,238 @@
+"""A running server: its parts put together, and taken apart in order when its block is left."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import grpc
+
+from mapless_server import __version__
+from mapless_server.engine.engine import Engine
+from mapless_server.observability.event_loop import watch_event_loop
+from mapless_server.observability.exporter import MetricsServer
+from mapless_server.observability.metrics import Metrics
+from mapless_server.observability.tracing import Tracer, make_tracer
+from mapless_server.scheduling.work_queue import Fatal
+from mapless_server.security.errors import SecurityError
+from mapless_server.security.protection import Protection
+from mapless_server.security.reloading import keep_fresh
+from mapless_server.services.capture.errors import CaptureError
+from mapless_server.services.capture.opening import open_recorder
+from mapless_server.services.capture.recorder import Recorder
+from mapless_server.services.handlers import Services
+from mapless_server.settings import Settings
+from mapless_server.store import Store
+
+from .assembly import MakeEngine, StartupError, gpu_memory, make_engine, open_store, what_is_missing
+from .listening import AddressTaken, GrpcServer
+from .store_health import watch_store
+from .warm_up import warm_up
+
+log = logging.getLogger(__name__)
+
+_TRACES_FLUSH_S = 3.0
+
+_HEARTBEAT_LIMIT_S = 5.0
+
+
+class Listener(Protocol):
+    """Brings the services their calls; bound to its address when it is made.
+
+    Attributes:
+        address: "host:port".
+    """
+
+    address: str
+
+    async def start(self) -> None:
+        """Takes calls."""
+
+    async def stop(self) -> None:
+        """Takes no more calls; all have been answered, but the last bytes may be on their way."""
+
+    async def close(self) -> None:
+        """Ends at once; may follow `stop`."""
+
+
+Listen = Callable[[Settings, Services, "grpc.ServerCredentials | None"], Listener]
+
+
+@dataclass(frozen=True)
+class Running:
+    """A server that serves.
+
+    Attributes:
+        address: "host:port".
+        metrics_address: the same of the metrics; empty if there are none.
+        engine: what computes.
+        failed: done when something inside is broken and nothing will be computed any more.
+    """
+
+    address: str
+    metrics_address: str
+    engine: Engine
+    failed: asyncio.Future[Fatal]
+
+
+@asynccontextmanager
+async def running_server(
+    settings: Settings, make: MakeEngine = make_engine, store: Store | None = None, listen: Listen = GrpcServer
+) -> AsyncIterator[Running]:
+    """A running server, for use within a program; it is drained when the block is left.
+
+    It listens from the first moment on, and is opened when its engine is warm.
+
+    Args:
+        settings: port 0 takes any free one.
+        make: makes the engine, in a thread of its own: networks take long to load. Closed at the end.
+        store: what the engine reads; opened from the settings if None. Closed at the end either way, but not if the
+            settings' protection is refused.
+        listen: makes what brings the calls.
+
+    Raises:
+        StartupError: no such backend or features, the data folder or a file cannot be used, a port is taken, or the
+            first localization fails.
+    """
+    metrics = Metrics()
+    async with AsyncExitStack() as stack:
+        protection = _make_protection(settings)  # before there is a store: a refused start leaves none
+        store = store or open_store(settings)
+        store.observer = metrics
+        stack.push_async_callback(asyncio.to_thread, store.close)
+        tracer = _make_tracer(settings)
+        stack.push_async_callback(asyncio.to_thread, tracer.close, _TRACES_FLUSH_S)
+        metrics_address = _serve_metrics(settings, metrics, store, protection, stack)
+        recorder = await _open_recorder(settings, store, metrics)
+        if recorder is not None:
+            stack.push_async_callback(asyncio.to_thread, recorder.close)
+        authenticate = protection.authenticator.authenticate
+        services = Services(settings, store, metrics, authenticate=authenticate, tracer=tracer, recorder=recorder)
+        stack.push_async_callback(services.close)
+        await services.set_serving(False)
+        listener = _make_listener(listen, settings, services, protection)
+        stack.push_async_callback(listener.close)
+        await listener.start()
+        engine = await asyncio.to_thread(make, settings, store, metrics, protection.quota)
+        stack.push_async_callback(engine.close)
+        failed: asyncio.Future[Fatal] = asyncio.get_running_loop().create_future()
+        _watch_engine(engine, metrics)
+        engine.queue.on_fatal = lambda fatal: _announce_failure(fatal, failed, metrics)
+        _keep(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
+        _keep(stack, keep_fresh(protection.refreshable))
+        _keep(stack, watch_store(store, services.set_changeable))
+        _keep(stack, _stop_serving(services, failed))
+        await _warm_up(settings, engine, metrics)
+        await services.open(engine)
+        stack.push_async_callback(listener.stop)
+        stack.push_async_callback(services.drain, settings.drain_delay_s, settings.drain_grace_s)
+        yield Running(listener.address, metrics_address, engine, failed)
+
+
+async def _stop_serving(services: Services, failed: asyncio.Future[Fatal]) -> None:
+    """Health says so when the server has failed."""
+    await asyncio.wait({failed})
+    await services.set_serving(False)
+
+
+def _make_protection(settings: Settings) -> Protection:
+    try:
+        return Protection.of(settings)
+    except SecurityError as error:
+        raise StartupError(str(error)) from error
+
+
+def _make_tracer(settings: Settings) -> Tracer:
+    try:
+        return make_tracer(settings.otlp_endpoint)
+    except ImportError as error:
+        raise StartupError(what_is_missing(error)) from error
+
+
+def _serve_metrics(
+    settings: Settings, metrics: Metrics, store: Store, protection: Protection, stack: AsyncExitStack
+) -> str:
+    """Where the metrics are served, "host:port"; empty if they are not."""
+    metrics.watch_reference_cache(lambda: store.reference_cache)
+    if protection.tls is not None:
+        tls = protection.tls
+        metrics.watch_certificate(lambda: tls.expiry_s)
+    if not settings.metrics:
+        return ""
+    try:
+        exporter = MetricsServer(metrics.registry, settings.metrics_host, settings.metrics_port, metrics)
+    except OSError as error:
+        address = f"{settings.metrics_host}:{settings.metrics_port}"
+        raise StartupError(f"cannot serve metrics on {address}: {error.strerror or error}") from error
+    stack.push_async_callback(asyncio.to_thread, exporter.close)
+    address = f"{settings.metrics_host}:{exporter.port}"
+    log.info("metrics on http://%s/metrics", address)
+    return address
+
+
+def _watch_engine(engine: Engine, metrics: Metrics) -> None:
+    first = engine.tiers[0]
+    reconstructor = first.pipeline.reconstructor
+    metrics.built(__version__, reconstructor.name, first.extractor.name, reconstructor.weights_sha256)
+    metrics.watch_retrieval_index(lambda: engine.index_bytes)
+    metrics.watch_gpu_memory(gpu_memory)
+    cache = getattr(reconstructor, "cache", None)  # of tokens; only networks have one
+    if cache is not None:
+        metrics.watch_token_cache(lambda: cache.counters)
+
+
+async def _open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorder | None:
+    try:
+        return await asyncio.to_thread(open_recorder, settings, store, metrics)
+    except CaptureError as error:
+        raise StartupError(str(error)) from error
+
+
+def _make_listener(listen: Listen, settings: Settings, services: Services, protection: Protection) -> Listener:
+    try:
+        return listen(settings, services, None if protection.tls is None else protection.tls.server_credentials())
+    except AddressTaken as error:
+        raise StartupError(str(error)) from error
+
+
+async def _warm_up(settings: Settings, engine: Engine, metrics: Metrics) -> None:
+    engine.queue.start()
+    if not settings.warm_up:
+        return
+    start_s = time.monotonic()
+    try:
+        await warm_up(engine)
+    except Exception as error:
+        log.critical("the first localization failed", exc_info=error)
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise StartupError(f"the first localization failed, so none would succeed: {reason}") from error
+    metrics.warmed_up(time.monotonic() - start_s)
+    log.info("warm after %.1f s", time.monotonic() - start_s)
+
+
+def _announce_failure(fatal: Fatal, failed: asyncio.Future[Fatal], metrics: Metrics) -> None:
+    if not failed.done():
+        metrics.failed_fatally()
+        log.critical("the server cannot go on and ends: %s", fatal)
+        failed.set_result(fatal)
+
+
+def _keep(stack: AsyncExitStack, work: Coroutine[Any, Any, None]) -> None:
+    """Runs it until the stack is left; should it fail, the log says so at once."""
+    task = asyncio.ensure_future(work)
+
+    def complain(_: asyncio.Task[None]) -> None:
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log.critical("a task of the server ended", exc_info=error)
+
+    async def end() -> None:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    task.add_done_callback(complain)
+    stack.push_async_callback(end)

@@ -1,0 +1,143 @@
+"""A real localization before the first call: what is broken shows at the start, and what is slow once is done.
+
+Photographs are made on the spot: two walls with random patterns, one before the other, seen from four places.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Camera, RigidTransform
+from mapless_server.engine.engine import Engine
+from mapless_server.engine.query import Caller, Photo, Query
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.localize import Localization, LocalizeOptions
+from mapless_server.method.turns import Turn
+from mapless_server.method.views import Photograph, PosedView
+from mapless_server.scenes.retrieval.narrowing import Narrowing
+from mapless_server.scheduling.fair import Flow
+from mapless_server.security.tenancy import SceneKey
+from mapless_server.store import SceneAttributes
+
+log = logging.getLogger(__name__)
+
+ROUNDS = 2
+"""The first is slow and is forgotten; the second tells the queue what a query usually takes."""
+
+MAX_ERROR_M = 0.1
+"""The scene is easy: a pose that is further off means that something is broken."""
+
+_LIMIT_S = 600.0  # networks may be compiled by the first photograph
+_CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
+_CENTRES_X_M = (-0.6, 0.0, 0.6)
+_QUERY_X_M = 0.25
+_WALLS = ((4.0, 4.0), (2.5, 0.8))
+"""Distance and half the side of each, metres, the furthest first."""
+_TEXTURE_PX = 512
+
+
+class WarmUpFailed(Exception):
+    """The localization gave no pose, or a wrong one."""
+
+
+async def warm_up(engine: Engine) -> None:
+    """Localizes until the queue knows what to expect; WarmUpFailed if the answer is not right."""
+    # Before the queue's clock runs: describing references is no part of a usual query.
+    references = await asyncio.to_thread(_RenderedReferences, [tier.extractor for tier in engine.tiers])
+    query_pose = _pose(_QUERY_X_M)
+    image = await asyncio.to_thread(_photograph, query_pose)
+    query = Query(
+        scene_key=SceneKey("warm-up"),
+        reference_ids=tuple(f"r{i}" for i in range(len(_CENTRES_X_M))),
+        photo=Photo(image, _CAMERA, "image"),
+        narrowing=Narrowing(),
+        reference_count=len(_CENTRES_X_M),
+        options=LocalizeOptions(),
+    )
+    for number in range(ROUNDS):
+        # Of no tenant: nobody's computing time is charged for it.
+        caller = Caller(Flow("", "warm-up"), time.monotonic() + _LIMIT_S)
+        result, _ = await engine.localize(query, caller, references)
+        outcome = result.attempt.answer.outcome
+        if not isinstance(outcome, Localization):
+            raise WarmUpFailed(f"an easy photograph was rejected: {outcome.message}")
+        error_m = float(np.linalg.norm(outcome.world_from_camera.translation - query_pose.translation))
+        if error_m > MAX_ERROR_M:
+            raise WarmUpFailed(f"an easy photograph was placed {error_m:.2f} m off")
+        if number == 0:
+            engine.queue.forget_costs()
+
+
+class _RenderedReferences:
+    """Stands in for the store."""
+
+    def __init__(self, extractors: Sequence[FeatureExtractor]) -> None:
+        self._views = {
+            it.name: tuple(_posed_view(f"r{i}", _pose(x_m), it) for i, x_m in enumerate(_CENTRES_X_M))
+            for it in extractors
+        }
+
+    def load(
+        self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: FeatureExtractor, turn: Turn, waits: bool
+    ) -> tuple[int, tuple[PosedView, ...]]:
+        """See ReferenceSource."""
+        return 1, self._views[extractor.name]
+
+    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        """See ReferenceSource."""
+        return SceneAttributes()
+
+
+def _photograph(world_from_camera: RigidTransform) -> bytes:
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(_render(world_from_camera), cv2.COLOR_RGB2BGR))
+    return jpeg.tobytes()
+
+
+def _posed_view(name: str, world_from_camera: RigidTransform, extractor: FeatureExtractor) -> PosedView:
+    pixels = _render(world_from_camera)
+    photograph = Photograph(hashlib.sha256(pixels.tobytes()).hexdigest(), _CAMERA, lambda: pixels)
+    view = replace(extractor.extract(pixels, _CAMERA), photograph=photograph)
+    return PosedView(name, name, view, world_from_camera)
+
+
+def _pose(x_m: float) -> RigidTransform:
+    """At a place on a line along the walls, turned a little towards their middle."""
+    rotation, _ = cv2.Rodrigues(np.array([0.0, -0.15 * x_m, 0.0]))
+    return RigidTransform(np.asarray(rotation, np.float64), np.array([x_m, 0.1 * x_m, 0.0]))
+
+
+def _render(world_from_camera: RigidTransform) -> NDArray[np.uint8]:
+    """What a camera sees of the walls, (H, W, 3) RGB."""
+    canvas = np.zeros((_CAMERA.height_px, _CAMERA.width_px, 3), np.uint8)
+    camera_from_world = world_from_camera.inverse()
+    for seed, (distance_m, half_side_m) in enumerate(_WALLS):
+        texture = _texture(seed)
+        corners = half_side_m * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) + [0, 0, distance_m]
+        seen = _CAMERA.project(camera_from_world.apply(corners))
+        end = _TEXTURE_PX - 1
+        of_texture = np.array([[0, 0], [end, 0], [end, end], [0, end]], np.float32)
+        homography = cv2.getPerspectiveTransform(of_texture, seen.astype(np.float32))
+        size = (_CAMERA.width_px, _CAMERA.height_px)
+        picture = cv2.warpPerspective(texture, homography, size, flags=cv2.INTER_LINEAR)
+        covers = cv2.warpPerspective(np.full(texture.shape[:2], 255, np.uint8), homography, size) > 127
+        canvas[covers] = picture[covers]
+    return canvas
+
+
+def _texture(seed: int) -> NDArray[np.uint8]:
+    """Blobs of several sizes."""
+    random = np.random.default_rng(seed)
+    layers = [
+        cv2.resize(random.uniform(0, 255, (size, size, 3)), (_TEXTURE_PX, _TEXTURE_PX), interpolation=cv2.INTER_CUBIC)
+        for size in (16, 64, 128)
+    ]
+    return np.asarray(np.clip(np.mean(layers, axis=0) * 1.5 - 64, 0, 255), np.uint8)

@@ -1,0 +1,232 @@
+"""What is kept of a call, as one file: all that decided the answer, but for the references' photographs and features.
+
+    first 32   SHA-256 of everything after
+    header     one line of JSON; floats as the shortest decimal that reads back as the same float64
+    request    the message
+    response   the message
+
+Photographs and features of references are blobs beside it, named by their SHA-256: many calls have them in common.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from typing import Any
+
+import numpy as np
+
+from mapless.geometry import Camera, RigidTransform
+from mapless.names import check_id
+from mapless_server.scenes.retrieval.chosen import Choice
+from mapless_server.scenes.retrieval.ranking import RankedReference
+from mapless_server.security.tenancy import check_tenant
+from mapless_server.store import SceneAttributes, codec
+
+from .errors import CaptureError, DamagedCapture
+
+FORMAT_VERSION = 1
+_DIGEST_BYTES = 32
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedReference:
+    """A reference that a photograph was compared with.
+
+    Attributes:
+        reference_id: unique within its scene.
+        key: identifies this very reference for good.
+        camera: in pixels of its photograph.
+        world_from_camera: its pose, metric.
+        image_sha256: its photograph's blob.
+        views: blobs of its features, by the name of the extractor.
+    """
+
+    reference_id: str
+    key: str
+    camera: Camera
+    world_from_camera: RigidTransform
+    image_sha256: str
+    views: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedPart:
+    """What one photograph of a call was compared with.
+
+    Attributes:
+        field: path of the photograph in the request, "image" or "images[2].image".
+        generation: of the scene when its references were read.
+        references: all that it was compared with, those that were named or come into the choice.
+        choice: how they were chosen; None if they were used as they were named.
+    """
+
+    field: str
+    generation: int
+    references: tuple[CapturedReference, ...]
+    choice: Choice | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedCall:
+    """A call that was answered.
+
+    Attributes:
+        request_id: finds it in the log; callers may use one twice.
+        time_s: when it was answered, Unix seconds.
+        method: "Localize", "LocalizeRig" or "LocalizeSequence".
+        tenant: whose call.
+        scene_id: of the scene, as its tenant knows it.
+        scene_created_us: when the scene was made, Unix microseconds: another one of the same name is not this one.
+        circumstances: what else decides an answer, by name: versions, settings, weights.
+        attributes: of the scene.
+        parts: one for each photograph.
+        request: the message, as it was sent.
+        response: likewise.
+    """
+
+    request_id: str
+    time_s: float
+    method: str
+    tenant: str
+    scene_id: str
+    scene_created_us: int
+    circumstances: Mapping[str, str] = field(default_factory=dict)
+    attributes: SceneAttributes = field(default_factory=SceneAttributes)
+    parts: tuple[CapturedPart, ...] = ()
+    request: bytes = b""
+    response: bytes = b""
+
+    @property
+    def keys(self) -> frozenset[tuple[str, str]]:
+        """Id and key of every reference."""
+        return frozenset((it.reference_id, it.key) for part in self.parts for it in part.references)
+
+    @property
+    def blobs(self) -> frozenset[str]:
+        """Names of the blobs that belong to it."""
+        references = [it for part in self.parts for it in part.references]
+        return frozenset(name for it in references for name in (it.image_sha256, *it.views.values()))
+
+
+def encode_call(call: CapturedCall) -> bytes:
+    """The file of a call."""
+    header = {
+        "format": FORMAT_VERSION,
+        "request_id": call.request_id,
+        "time_s": call.time_s,
+        "method": call.method,
+        "tenant": call.tenant,
+        "scene_id": call.scene_id,
+        "scene_created_us": call.scene_created_us,
+        "circumstances": dict(call.circumstances),
+        "attributes": json.loads(codec.encode_attributes(call.attributes) or b"null"),
+        "parts": [_part_to_dict(part) for part in call.parts],
+        "request_bytes": len(call.request),
+    }
+    body = b"".join([json.dumps(header, separators=(",", ":")).encode(), b"\n", call.request, call.response])
+    return hashlib.sha256(body).digest() + body
+
+
+def decode_call(data: bytes) -> CapturedCall:
+    """The call of a file.
+
+    Whoever can write the file can make its digest, too: names, times and blobs are what they should be, whoever did.
+
+    Raises:
+        DamagedCapture: it is cut or changed.
+        CaptureError: its format is newer than this program.
+    """
+    digest, body = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
+    if hashlib.sha256(body).digest() != digest:
+        raise DamagedCapture("it is cut or damaged, or no captured call")
+    text, _, messages = body.partition(b"\n")
+    try:
+        header = json.loads(text)
+        if header["format"] != FORMAT_VERSION:
+            raise CaptureError(f"its format {header['format']} is another than this program's, {FORMAT_VERSION}")
+        datetime.fromtimestamp(header["time_s"], timezone.utc)  # or it is no time: NaN would be kept for ever
+        check_id(header["scene_id"])
+        check_tenant(header["tenant"])
+        names = ("request_id", "time_s", "method", "tenant", "scene_id", "scene_created_us", "circumstances")
+        return CapturedCall(
+            **{name: header[name] for name in names},
+            attributes=_attributes_of(header["attributes"]),
+            parts=tuple(_part_of(it) for it in header["parts"]),
+            request=messages[: header["request_bytes"]],
+            response=messages[header["request_bytes"] :],
+        )
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError, codec.Damaged) as error:
+        raise DamagedCapture(f"its header is not one of ours: {error}") from error
+
+
+def _attributes_of(content: object) -> SceneAttributes:
+    if content is None:
+        return SceneAttributes()
+    data = json.dumps(content).encode()
+    return codec.decode_attributes("", data, codec.sha256_for("", data))
+
+
+def _part_to_dict(part: CapturedPart) -> dict[str, Any]:
+    choice = part.choice
+    return {
+        "field": part.field,
+        "generation": part.generation,
+        "references": [_reference_to_dict(it) for it in part.references],
+        "choice": choice
+        and {
+            "descriptor": choice.descriptor,
+            "generation": choice.generation,
+            "references": [
+                {"reference_id": it.reference_id, "key": it.key, "similarity": it.similarity, **_pose_to_dict(it)}
+                for it in choice.references
+            ],
+        },
+    }
+
+
+def _part_of(content: Mapping[str, Any]) -> CapturedPart:
+    references, choice = tuple(map(_reference_of, content["references"])), content["choice"]
+    if choice is not None:
+        ranked = tuple(
+            RankedReference(it["reference_id"], it["key"], it["similarity"], _pose_of(it))
+            for it in choice["references"]
+        )
+        choice = Choice(ranked, choice["descriptor"], choice["generation"])
+    return CapturedPart(content["field"], content["generation"], references, choice)
+
+
+def _reference_to_dict(reference: CapturedReference) -> dict[str, Any]:
+    return {
+        "reference_id": reference.reference_id,
+        "key": reference.key,
+        "image": reference.image_sha256,
+        "views": dict(reference.views),
+        **json.loads(codec.encode_geometry(reference.camera, reference.world_from_camera)),
+    }
+
+
+def _reference_of(content: Mapping[str, Any]) -> CapturedReference:
+    geometry = json.dumps({name: content[name] for name in ("camera", "world_from_camera")}).encode()
+    camera, world_from_camera = codec.decode_geometry("", geometry, codec.sha256_for("", geometry))
+    views = {_text(name): _text(blob) for name, blob in content["views"].items()}
+    reference_id, key, image = check_id(content["reference_id"]), _text(content["key"]), _text(content["image"])
+    return CapturedReference(reference_id, key, camera, world_from_camera, image, views)
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{type(value).__name__} in place of text")
+    return value
+
+
+def _pose_to_dict(ranked: RankedReference) -> dict[str, Any]:
+    pose = ranked.world_from_camera
+    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+
+
+def _pose_of(content: Mapping[str, Any]) -> RigidTransform:
+    return RigidTransform(np.array(content["rotation"], float), np.array(content["translation"], float))

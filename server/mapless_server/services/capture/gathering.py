@@ -1,0 +1,151 @@
+"""What a photograph was compared with, gathered from the store when its call has been answered."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from mapless.names import parse_reference_name
+from mapless_server.engine.query import Query, Result
+from mapless_server.errors import DataLoss, NotFound
+from mapless_server.scenes.retrieval.chosen import Choice
+from mapless_server.security.tenancy import SceneKey, tenant_of
+from mapless_server.store import ReferenceRecord, SceneRecord, Store, codec
+
+from .calls import CapturedPart, CapturedReference
+from .folder import CaptureFolder
+
+_REMEMBERED = 100_000
+
+
+class Gone(Exception):
+    """What was used has been deleted since, so what was made of it is not to be kept either."""
+
+
+@dataclass(frozen=True, eq=False)
+class Used:
+    """What a photograph was compared with, by name: nothing large is held on to while it waits to be gathered.
+
+    Attributes:
+        field: path of the photograph in the request.
+        generation: of the scene when its references were read.
+        used: keys of those that the answer rests on.
+        wanted: keys by id of those that were named, or that come into the choice.
+        choice: how they were chosen; None if they were used as they were named.
+    """
+
+    field: str
+    generation: int
+    used: frozenset[str]
+    wanted: Mapping[str, str]
+    choice: Choice | None
+
+
+def used_of(query: Query, result: Result) -> Used:
+    """What is to be gathered of an answered photograph."""
+    attempt, choice = result.attempt, result.attempt.choice
+    if choice is not None:
+        wanted = {it.reference_id: it.key for it in choice.references}
+    else:
+        wanted = {parse_reference_name(it.name)[1]: it.key for it in attempt.references}
+    used = frozenset(it.key for it in attempt.references)
+    return Used(query.photo.field, attempt.generation, used, wanted, choice)
+
+
+class Gatherer:
+    """Reads references from the store; what the folder has already is not read again. For one thread."""
+
+    def __init__(self, store: Store, folder: CaptureFolder) -> None:
+        """A store that is `uncached`, since queries want to remember other references than captures."""
+        self._store = store
+        self._folder = folder
+        self._records: dict[str, ReferenceRecord] = {}  # by key; references never change
+        self._views: dict[tuple[str, str], str] = {}  # blobs by the reference's key and the extractor's name
+
+    def part(self, scene: SceneRecord, used: Used, extractors: Sequence[str], blobs: dict[str, bytes]) -> CapturedPart:
+        """What a photograph was compared with.
+
+        Args:
+            scene: as it is now.
+            used: the photograph's.
+            extractors: names of all that the server has: a replay may try each of them.
+            blobs: gets those that the folder lacks.
+
+        Raises:
+            Gone: a reference that was used was deleted meanwhile, or is another one by now; or none was used, so that
+                nothing says whether a scene that has changed is still the one that was asked.
+            DataLoss: it is damaged.
+            Unavailable: the store is not there.
+        """
+        if not used.used and used.generation != scene.generation:
+            raise Gone
+        wanted = dict(used.wanted)
+        read_at = {used.generation, used.generation if used.choice is None else used.choice.generation}
+        if read_at != {scene.generation}:
+            there = self._store.find_keys(scene.scene_key, list(wanted))
+            wanted = {it: key for it, key in wanted.items() if there.get(it) == key}
+        if max(len(self._records), len(self._views)) > _REMEMBERED:
+            self._records.clear()
+            self._views.clear()
+        for extractor in extractors:
+            self._read(scene.scene_key, wanted, extractor, blobs)
+        known = {key: self._records[key] for key in wanted.values() if key in self._records}
+        if not used.used <= known.keys():
+            raise Gone
+        for record in known.values():
+            self._image(record, blobs)
+        references = [
+            CapturedReference(
+                it.reference_id,
+                key,
+                it.camera,
+                it.world_from_camera,
+                it.image_sha256,
+                {name: self._views[key, name] for name in extractors if (key, name) in self._views},
+            )
+            for key, it in known.items()
+        ]
+        return CapturedPart(used.field, used.generation, tuple(references), used.choice)
+
+    def _read(self, scene_key: SceneKey, wanted: Mapping[str, str], extractor: str, blobs: dict[str, bytes]) -> None:
+        """Features of an extractor, of those references that have them and whose blob is not there yet."""
+        tenant = tenant_of(scene_key)
+
+        def is_there(key: str) -> bool:
+            name = self._views.get((key, extractor))
+            return name is not None and (name in blobs or self._folder.has_blob(tenant, name))
+
+        missing = [reference_id for reference_id, key in wanted.items() if not is_there(key)]
+        for reference_id in missing:
+            self._views.pop((wanted[reference_id], extractor), None)
+        self._load(scene_key, missing, extractor, blobs)
+
+    def _load(self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: str, blobs: dict[str, bytes]) -> None:
+        """All at once, or, where one of them is damaged or gone, each that is there."""
+        if not reference_ids:
+            return
+        try:
+            snapshot = self._store.load_references(scene_key, reference_ids, extractor)
+        except (NotFound, DataLoss) as error:
+            if error.field != "scene" and len(reference_ids) > 1:
+                for it in reference_ids:
+                    self._load(scene_key, [it], extractor, blobs)
+            return
+        for one in snapshot.references:
+            data = codec.encode_view(one.view)
+            name = hashlib.sha256(data).hexdigest()
+            if not self._folder.has_blob(tenant_of(scene_key), name):
+                blobs[name] = data
+            self._views[one.record.key, extractor] = name
+        for record in (*(it.record for it in snapshot.references), *snapshot.undescribed):
+            self._records[record.key] = record
+
+    def _image(self, record: ReferenceRecord, blobs: dict[str, bytes]) -> None:
+        name = record.image_sha256
+        if name in blobs or self._folder.has_blob(tenant_of(record.scene_key), name):
+            return
+        try:
+            blobs[name] = self._store.read_image_of(record.key)
+        except NotFound:
+            raise Gone from None

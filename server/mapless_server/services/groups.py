@@ -1,0 +1,112 @@
+"""LocalizeRig and LocalizeSequence: message to values, engine, values to message."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.engine.engine import Engine
+from mapless_server.engine.groups import (
+    MAX_FRAMES,
+    MAX_RIG_IMAGES,
+    MIN_FRAMES,
+    GroupResult,
+    localize_each,
+    localize_rig,
+    localize_sequence,
+)
+from mapless_server.engine.query import Query
+from mapless_server.method.rejection import Rejection
+from mapless_server.observability.metrics import LOCALIZED, Metrics
+from mapless_server.rpc.call import Call
+from mapless_server.scheduling.jobs import Visit
+
+from .capture.recorder import Recorder
+from .messages.groups import (
+    poses_from_message,
+    queries_from_message,
+    rig_to_message,
+    sequence_to_message,
+    session_from_rig_from_message,
+    session_poses_from_message,
+)
+
+
+async def answer_rig(
+    request: pb.LocalizeRigRequest, call: Call, engine: Engine, metrics: Metrics, recorder: Recorder | None = None
+) -> pb.LocalizeRigResponse:
+    """Implements LocalizationService.LocalizeRig; a recorder captures the call."""
+    bounds = (1, MAX_RIG_IMAGES)
+    queries = queries_from_message(request, "images", bounds, call.principal.tenant, engine.options)
+    rig_from_camera = poses_from_message(request.images, "images", "rig_from_camera")
+    session_from_rig = session_from_rig_from_message(request)
+    with engine.hold(queries, call.caller):
+        group = await _localize_each(engine, queries, call, "images")
+        outcome = await localize_rig(engine, group, rig_from_camera, call.caller)
+    response = rig_to_message(outcome, group, queries, request, session_from_rig)
+    _conclude(response, outcome, group, call, metrics)
+    if recorder is not None:
+        parts = list(zip(queries, group.results, strict=True))
+        recorder.answered("LocalizeRig", request, response, call, parts, engine.tiers)
+    return response
+
+
+async def answer_sequence(
+    request: pb.LocalizeSequenceRequest, call: Call, engine: Engine, metrics: Metrics, recorder: Recorder | None = None
+) -> pb.LocalizeSequenceResponse:
+    """Implements LocalizationService.LocalizeSequence; a recorder captures the call."""
+    bounds = (MIN_FRAMES, MAX_FRAMES)
+    queries = queries_from_message(request, "frames", bounds, call.principal.tenant, engine.options)
+    axes, session_from_camera = session_poses_from_message(request)
+    scale_is_free = request.estimate_session_scale
+    with engine.hold(queries, call.caller):
+        group = await _localize_each(engine, queries, call, "frames")
+        outcome = await localize_sequence(engine, group, session_from_camera, scale_is_free, call.caller)
+    response = sequence_to_message(outcome, group, queries, request, axes)
+    _conclude(response, outcome, group, call, metrics)
+    if recorder is not None:
+        parts = list(zip(queries, group.results, strict=True))
+        recorder.answered("LocalizeSequence", request, response, call, parts, engine.tiers)
+    return response
+
+
+async def _localize_each(engine: Engine, queries: Sequence[Query], call: Call, list_name: str) -> GroupResult:
+    call.note(scene=queries[0].scene_key, images=len(queries))
+    visits: list[list[Visit]] = [[] for _ in queries]
+    try:
+        return await localize_each(engine, queries, call.caller, list_name, visits)
+    finally:
+        for visit in itertools.chain.from_iterable(visits):
+            call.waited(visit.stage, visit.queued_s, visit.start_s)
+            if visit.jobs:
+                call.computed(visit.stage, visit.start_s, visit.end_s, batch=visit.batch, batch_size=visit.jobs)
+
+
+def _conclude(
+    response: pb.LocalizeRigResponse | pb.LocalizeSequenceResponse,
+    outcome: object,
+    group: GroupResult,
+    call: Call,
+    metrics: Metrics,
+) -> None:
+    """Tells the caller, the log and the metrics what each wants to know."""
+    for report in response.images:
+        report.diagnostics.request_id = call.request_id
+    for result in group.results:
+        metrics.stages(result.stage_seconds)
+    alone = sum(not report.HasField("alone") for report in response.images)
+    call.note(localized_alone=alone)
+    if isinstance(outcome, Rejection):
+        metrics.answered(outcome.reason.value)
+        call.note(outcome=outcome.reason.value)
+        return
+    found = response.localization
+    call.note(outcome="localized", inliers=found.inlier_count)
+    metrics.answered(
+        LOCALIZED,
+        inlier_count=found.inlier_count,
+        match_count=found.match_count,
+        reprojection_error_px=found.reprojection_error_px,
+        accuracy_radius_m=found.accuracy.position_68_m,
+    )

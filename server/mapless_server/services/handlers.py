@@ -1,0 +1,159 @@
+"""What is served: both services, health and reflection, behind one guard, whoever listens for their calls."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+import grpc
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection, reflection_pb2
+from grpc_reflection.v1alpha._async import ReflectionServicer
+
+from mapless.v1 import (
+    localization_service_pb2,
+    localization_service_pb2_grpc,
+    reference_service_pb2,
+    reference_service_pb2_grpc,
+)
+from mapless_server.engine.engine import Engine
+from mapless_server.errors import Unavailable
+from mapless_server.observability.metrics import Metrics
+from mapless_server.observability.tracing import Tracer
+from mapless_server.rpc.guard import Authenticate, CallGuard
+from mapless_server.settings import Settings
+from mapless_server.store import Store
+
+from .capture.recorder import Recorder
+from .localization import LocalizationService
+from .references import ReferenceService
+from .watching import Watchers
+
+SERVICE_NAMES = (
+    localization_service_pb2.DESCRIPTOR.services_by_name["LocalizationService"].full_name,
+    reference_service_pb2.DESCRIPTOR.services_by_name["ReferenceService"].full_name,
+)
+
+LOCALIZE_METHODS = frozenset(
+    f"/{SERVICE_NAMES[0]}/{name}" for name in ("Localize", "LocalizeProgressively", "LocalizeRig", "LocalizeSequence")
+)
+
+
+class Services:
+    """Answers UNAVAILABLE until it is given an engine, and is drained in order.
+
+    Attributes:
+        handlers: by service and method, to be added to whatever server listens.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        store: Store,
+        metrics: Metrics,
+        *,
+        authenticate: Authenticate | None = None,
+        tracer: Tracer | None = None,
+        recorder: Recorder | None = None,
+    ) -> None:
+        self._metrics = metrics
+        self._engine: Engine | None = None
+        self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]
+        self._is_serving = self._is_draining = False
+        self._is_changeable = True
+        self._guard = CallGuard(
+            settings.default_deadline_s,
+            settings.max_deadline_s,
+            authenticate=authenticate,
+            check_door=self._check_door,
+            observer=metrics,
+            tracer=tracer,
+        )
+        self._watchers = Watchers(settings.allow_watching, settings.max_message_mib * 2**20)
+        self._references = ReferenceService(self._ready_engine, store)
+        self.handlers: dict[str, dict[str, grpc.RpcMethodHandler]] = {}
+        reference_service_pb2_grpc.add_ReferenceServiceServicer_to_server(self._references, self)
+        localization_service_pb2_grpc.add_LocalizationServiceServicer_to_server(
+            LocalizationService(self._ready_engine, metrics, store, self._watchers, recorder), self
+        )
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, self)
+        if settings.reflection:
+            self._add_reflection((*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME))
+
+    def add_to(self, server: Any) -> None:
+        """Has a grpc.aio.Server that does not run yet answer the services' calls."""
+        for service, methods in self.handlers.items():
+            server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(service, methods),))
+
+    def add_registered_method_handlers(self, service: str, methods: Mapping[str, Any]) -> None:
+        """Takes a servicer's methods from grpc's generated code, to which this is a server."""
+        self.handlers[service] = {
+            name: self._guard.guarded(f"/{service}/{name}", handler) for name, handler in methods.items()
+        }
+
+    def add_generic_rpc_handlers(self, handlers: object) -> None:
+        """Ignores what generated code says a second time, in the way that older servers understand."""
+
+    def _add_reflection(self, service_names: tuple[str, ...]) -> None:
+        """Both versions of the protocol: the package has v1alpha only, and v1 is the same bytes under another name."""
+        method = grpc.stream_stream_rpc_method_handler(
+            ReflectionServicer(service_names).ServerReflectionInfo,
+            request_deserializer=reflection_pb2.ServerReflectionRequest.FromString,
+            response_serializer=reflection_pb2.ServerReflectionResponse.SerializeToString,
+        )
+        for service in (reflection.SERVICE_NAME, "grpc.reflection.v1.ServerReflection"):
+            self.add_registered_method_handlers(service, {"ServerReflectionInfo": method})
+
+    async def open(self, engine: Engine) -> None:
+        """Serves with an engine that is warm."""
+        self._engine = engine
+        await self.set_serving(True)
+
+    async def drain(self, delay_s: float, grace_s: float) -> None:
+        """Says that it stops, and after a delay refuses new calls and gives the running ones a time to finish.
+
+        Args:
+            delay_s: for load balancers, which go on sending until they have looked at the health.
+            grace_s: after which nothing is waited for any longer.
+        """
+        await self.set_serving(False)
+        if delay_s:
+            await asyncio.sleep(delay_s)
+        self._is_draining = True
+        self._watchers.close()
+        await self._guard.wait_until_idle(grace_s)
+        if self._engine is not None:
+            self._engine.queue.drain()
+
+    async def close(self) -> None:
+        """Returns when the store is not used any more; to be called when nothing listens."""
+        await asyncio.to_thread(self._references.close)
+
+    async def set_serving(self, is_serving: bool) -> None:
+        """What health says from now on, of every service that can be."""
+        status = health_pb2.HealthCheckResponse
+        self._is_serving = is_serving
+        for service in ("", *SERVICE_NAMES):
+            serves = is_serving and (self._is_changeable or service != SERVICE_NAMES[1])
+            await self._health.set(service, status.SERVING if serves else status.NOT_SERVING)
+        self._metrics.set_serving(is_serving)
+
+    async def set_changeable(self, is_changeable: bool) -> None:
+        """What health says of the ReferenceService: a store that cannot be written serves queries all the same."""
+        self._is_changeable = is_changeable
+        if self._is_serving:
+            await self.set_serving(True)
+
+    def _check_door(self, method: str) -> None:
+        """Raises Unavailable while the server starts or stops, and Overloaded while it has no room for any query."""
+        if self._is_draining:
+            raise Unavailable("the server is stopping", reason="DRAINING", retry_after_s=1.0)
+        engine = self._ready_engine()
+        if method in LOCALIZE_METHODS:
+            engine.check_room()
+
+    def _ready_engine(self) -> Engine:
+        if self._engine is None:
+            raise Unavailable("the server is starting", reason="STARTING", retry_after_s=1.0)
+        return self._engine

@@ -1,0 +1,185 @@
+"""What the method says of a query, as messages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mapless import wire
+from mapless.axes import Axes
+from mapless.geometry import Array, RigidTransform
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server import __version__
+from mapless_server.engine.query import Result
+from mapless_server.engine.tiers import Attempt
+from mapless_server.method.localize import Answer, Localization, LocalizeOptions
+from mapless_server.method.priors.known import PriorCheck
+from mapless_server.method.rejection import Hint, Rejection
+from mapless_server.method.scale import MetricScale
+from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
+from mapless_server.store import SceneAttributes
+
+from .enums import enum_to_message
+from .factors import Claimed, Conditions, claimed
+from .frames import axes_from_message, session_from_message, set_frames
+
+
+@dataclass(frozen=True, eq=False)
+class Addressee:
+    """Whom an answer is made for.
+
+    Attributes:
+        axes: in which the caller speaks of its camera.
+        session_from_camera: of the moment of capture, in these axes; None if the caller has said nothing of it.
+    """
+
+    axes: Axes
+    session_from_camera: RigidTransform | None
+
+
+def addressee_of(request: pb.LocalizeRequest) -> Addressee:
+    """Whom the answer to a request is made for; FieldError names what is wrong."""
+    return Addressee(axes_from_message(request.options), session_from_message(request))
+
+
+def outcome_to_message(result: Result, options: LocalizeOptions, addressee: Addressee) -> pb.LocalizeResponse:
+    """Message of an answer, with nothing in it but its outcome."""
+    attempt = result.attempt
+    outcome = attempt.answer.outcome
+    if isinstance(outcome, Rejection):
+        return pb.LocalizeResponse(rejection=rejection_to_message(outcome))
+    claim = claim_of(outcome.covariance, attempt, options)
+    return pb.LocalizeResponse(localization=_localization_to_message(outcome, claim, attempt.attributes, addressee))
+
+
+def claim_of(covariance: Array | None, attempt: Attempt, options: LocalizeOptions) -> Claimed | None:
+    """What is told of a pose's error, by its covariance (6, 6) and the scene's calibration; None if there is none."""
+    if covariance is None:
+        return None
+    backend = attempt.tier.pipeline.reconstructor.name
+    conditions = Conditions(attempt.tier.extractor.name, backend, options.variant.name, __version__)
+    return claimed(accuracy_from_covariance(covariance), covariance, conditions, attempt.attributes.calibration)
+
+
+def _localization_to_message(
+    localization: Localization, claim: Claimed | None, attributes: SceneAttributes, addressee: Addressee
+) -> pb.Localization:
+    message = pb.Localization(
+        world_from_camera=wire.transform_to_message(localization.world_from_camera),
+        pose_stage=enum_to_message(localization.pose_stage, pb.PoseStage),
+        inlier_count=localization.inlier_count,
+        match_count=localization.match_count,
+        reprojection_error_px=localization.reprojection_error_px,
+        trust=localization.trust,
+        prior_checks=[_check_to_message(check) for check in localization.prior_checks],
+    )
+    if claim is not None:
+        message.covariance.CopyFrom(covariance_to_message(claim.covariance))
+        message.accuracy.CopyFrom(accuracy_to_message(claim))
+    set_frames(
+        message,
+        localization.world_from_camera,
+        claim.covariance if claim else None,
+        addressee.axes,
+        addressee.session_from_camera,
+        attributes.datum,
+    )
+    return message
+
+
+def covariance_to_message(covariance: Array) -> pb.PoseCovariance:
+    """Message of a covariance (6, 6)."""
+    return pb.PoseCovariance(row_major=covariance.ravel().tolist())
+
+
+def accuracy_to_message(claim: Claimed) -> pb.Accuracy:
+    """Message of radii."""
+    radii = claim.accuracy
+    return pb.Accuracy(
+        position_68_m=radii.position_68_m,
+        position_95_m=radii.position_95_m,
+        rotation_68_deg=radii.rotation_68_deg,
+        rotation_95_deg=radii.rotation_95_deg,
+        calibrated=claim.calibrated,
+    )
+
+
+def _check_to_message(check: PriorCheck) -> pb.PriorCheck:
+    return pb.PriorCheck(
+        kind=enum_to_message(check.kind, pb.PriorKind),
+        mahalanobis=check.mahalanobis,
+        degrees_of_freedom=check.degrees_of_freedom,
+        conflict=check.conflict,
+        used=check.used,
+    )
+
+
+def rejection_to_message(rejection: Rejection) -> pb.Rejection:
+    """Message of a rejection."""
+    return pb.Rejection(
+        reason=enum_to_message(rejection.reason, pb.RejectionReason),
+        message=rejection.message,
+        hint=_hint_to_message(rejection.hint) if rejection.hint else None,
+        hypotheses=[
+            pb.Hypothesis(
+                world_from_camera=wire.transform_to_message(it.world_from_camera),
+                inlier_count=it.inlier_count,
+                references=it.references,
+            )
+            for it in rejection.hypotheses
+        ],
+    )
+
+
+def _hint_to_message(hint: Hint) -> pb.Hint:
+    return pb.Hint(
+        stage=hint.stage,
+        advice=enum_to_message(hint.advice, pb.Advice),
+        message=hint.message,
+        best_reference=hint.best_reference or "",
+    )
+
+
+def diagnostics_to_message(result: Result, options: LocalizeOptions) -> pb.Diagnostics:
+    """Message of what was used and where the time went; the caller knows the call's id and durations."""
+    attempt, answer = result.attempt, result.attempt.answer
+    reconstructor = attempt.tier.pipeline.reconstructor
+    message = pb.Diagnostics(
+        backend=reconstructor.name,
+        weights_sha256=reconstructor.weights_sha256,
+        features=attempt.tier.extractor.name,
+        variant=enum_to_message(options.variant, pb.Variant),
+        store_generation=attempt.generation,
+        scale=_scale_to_message(answer.scale) if answer.scale else None,
+        processed_width_px=attempt.processed.width_px,
+        processed_height_px=attempt.processed.height_px,
+        server_version=__version__,
+        retrieval=attempt.choice.descriptor if attempt.choice else "",
+    )
+    message.references.extend(_reference_uses(attempt, answer))
+    for stage, seconds in result.stage_seconds.items():
+        message.stages.add(stage=stage).duration.FromNanoseconds(round(1e9 * seconds))
+    return message
+
+
+def _reference_uses(attempt: Attempt, answer: Answer) -> list[pb.ReferenceUse]:
+    # Counts are missing when the stage that counts was not reached.
+    match_counts = answer.reference_match_counts or (0,) * len(attempt.references)
+    inlier_counts = answer.reference_inlier_counts or (0,) * len(attempt.references)
+    similarities = {it.key: it.similarity for it in attempt.choice.references} if attempt.choice else {}
+    return [
+        pb.ReferenceUse(
+            name=reference.name,
+            match_count=matches,
+            inlier_count=inliers,
+            similarity=similarities.get(reference.key, 0.0),
+        )
+        for reference, matches, inliers in zip(attempt.references, match_counts, inlier_counts, strict=True)
+    ]
+
+
+def _scale_to_message(scale: MetricScale) -> pb.ScaleEstimate:
+    return pb.ScaleEstimate(
+        metres_per_unit=scale.metres_per_unit,
+        stage=enum_to_message(scale.stage, pb.ScaleStage),
+        deviation=scale.deviation,
+    )

@@ -1,0 +1,83 @@
+"""What a pose rests on, as a message: pixels of the photographs as they were sent, points in the caller's world.
+
+The pipeline works on reduced photographs without distortion. Its pixels and those of the file that was sent show the
+same rays, so a pixel goes to a ray by the one camera and back by the other: that undoes the reduction, and distorts
+again, in one step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, normalize
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.method.support import Support
+from mapless_server.method.views import View
+
+MAX_MATCHES = 2000
+"""Some 100 KB of message, and more than a picture shows."""
+
+
+def debug_to_message(support: Support) -> pb.Debug:
+    """The matches of a support; where there are too many, inliers go first, thinned out evenly."""
+    estimate, matches = support.estimate, support.matches
+    inlier = np.zeros(len(matches), bool) if estimate is None else estimate.inliers
+    error_px = np.full(len(matches), np.nan) if estimate is None else estimate.errors_px
+    chosen = _chosen(inlier)
+    point = matches.point[chosen]
+    query_px = sent_pixels(support.query, support.query.features.keypoints[matches.keypoint[chosen]])
+    x_in_world = support.structure.x_in_world[point] + support.origin
+    reference, reference_px = _best_observations(support, point)
+    return pb.Debug(
+        query_x_px=query_px[:, 0].tolist(),
+        query_y_px=query_px[:, 1].tolist(),
+        point_x_m=x_in_world[:, 0].tolist(),
+        point_y_m=x_in_world[:, 1].tolist(),
+        point_z_m=x_in_world[:, 2].tolist(),
+        is_inlier=inlier[chosen].tolist(),
+        error_px=error_px[chosen].tolist(),
+        reference=reference.tolist(),
+        reference_x_px=reference_px[:, 0].tolist(),
+        reference_y_px=reference_px[:, 1].tolist(),
+    )
+
+
+def sent_pixels(view: View, pixels: NDArray[np.floating]) -> Array:
+    """Where pixels (N, 2) of a view are in the photograph as it was sent, (N, 2)."""
+    if view.photograph is None:
+        return np.asarray(pixels, np.float64)
+    return view.photograph.camera.project(view.camera.rays(pixels))
+
+
+def _chosen(inlier: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Which matches to tell of, in their order."""
+    inliers, others = np.flatnonzero(inlier), np.flatnonzero(~inlier)
+    inliers = _thinned(inliers, MAX_MATCHES)
+    return np.sort(np.concatenate([inliers, _thinned(others, MAX_MATCHES - len(inliers))]))
+
+
+def _thinned(rows: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    if len(rows) <= count:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, count).round().astype(np.intp)]
+
+
+def _best_observations(support: Support, points: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array]:
+    """For each point, the reference whose keypoint is nearest to its projection, and that keypoint as it was sent."""
+    tracks, x_in_world = support.structure.tracks, support.structure.x_in_world
+    error_px = np.full(len(tracks.point), np.inf)
+    pixels = np.zeros((len(tracks.point), 2))
+    for number, reference in enumerate(support.references):
+        rows = np.flatnonzero(tracks.view == number)
+        camera, keypoints = reference.view.camera, reference.view.features.keypoints[tracks.keypoint[rows]]
+        x_in_camera = reference.world_from_camera.inverse().apply(x_in_world[tracks.point[rows]])
+        offsets = normalize(x_in_camera) - camera.rays(keypoints)[:, :2]
+        error_px[rows] = np.nan_to_num(
+            np.linalg.norm(offsets * (camera.focal_x_px, camera.focal_y_px), axis=1), nan=np.inf
+        )
+        pixels[rows] = sent_pixels(reference.view, keypoints)
+    # Sorted by point, then error: the first row of each point is its best.
+    order = np.lexsort((error_px, tracks.point))
+    best = order[tracks.starts[points]] if len(points) else np.empty(0, np.intp)
+    return tracks.view[best], pixels[best]

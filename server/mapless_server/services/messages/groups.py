@@ -1,0 +1,213 @@
+"""Requests with several photographs, and what is answered to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mapless import wire
+from mapless.axes import WORLD_FROM_RIGHT_HANDED, Axes, pose_from
+from mapless.geometry import Array, RigidTransform, Similarity
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.wire import FieldError
+from mapless_server.engine.engine import EngineOptions
+from mapless_server.engine.groups import GroupResult, queued_s
+from mapless_server.engine.query import Query
+from mapless_server.method.groups.rig import RigEstimate
+from mapless_server.method.groups.sequence import SequenceEstimate
+from mapless_server.method.groups.sightings import MatchedSighting
+from mapless_server.method.localize import Variant
+from mapless_server.method.rejection import Rejection
+from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
+from mapless_server.scenes.retrieval.narrowing import Narrowing
+from mapless_server.security.tenancy import key_of
+
+from .answers import accuracy_to_message, covariance_to_message, diagnostics_to_message, rejection_to_message
+from .enums import enum_to_message
+from .factors import Claimed
+from .frames import MAX_SESSION_COORDINATE_M, axes_from_message, geo_pose_to_message
+from .naming import reference_ids_from_names
+from .photos import photo_from_message
+from .queries import MAX_CANDIDATES, MAX_REFERENCES, options_from_message, reference_count_from_message
+
+
+def queries_from_message(
+    request: pb.LocalizeRigRequest | pb.LocalizeSequenceRequest,
+    list_name: str,
+    bounds: tuple[int, int],
+    tenant: str,
+    engine: EngineOptions,
+) -> tuple[Query, ...]:
+    """The photographs of a request, each as a query.
+
+    Args:
+        request: the message.
+        list_name: its field that holds them.
+        bounds: how many there may be, at least and at most.
+        tenant: whose scene it is.
+        engine: its limits and defaults.
+
+    Raises:
+        FieldError, InvalidArgument: names the field that is wrong, "images[2].intrinsics".
+    """
+    scene_id = wire.scene_id_from_name(request.scene, "scene")
+    messages = getattr(request, list_name)
+    least, most = bounds
+    if not least <= len(messages) <= most:
+        raise FieldError(list_name, f"must be {least} to {most}, are {len(messages)}")
+    options = options_from_message(request.options, engine.coverage)
+    if options.variant is not Variant.BEST:
+        raise FieldError("options.variant", "several photographs are posed together by the default variant alone")
+    if isinstance(request, pb.LocalizeRigRequest) and axes_from_message(request.options) is not Axes.OPENCV:
+        raise FieldError("options.axes", "a rig is posed in OpenCV's axes alone")
+    reranks = request.options.rerank_references
+    count = reference_count_from_message(request.options)
+    return tuple(
+        Query(
+            scene_key=key_of(tenant, scene_id),
+            reference_ids=_reference_ids(
+                message.references, scene_id, MAX_CANDIDATES if reranks else MAX_REFERENCES, path
+            ),
+            photo=photo_from_message(message, path, engine.image_limits),
+            narrowing=Narrowing(),
+            reference_count=count,
+            options=options,
+            rerank=reranks and bool(message.references),
+            is_part=True,
+        )
+        for path, message in ((f"{list_name}[{i}]", message) for i, message in enumerate(messages))
+    )
+
+
+def _reference_ids(names: Sequence[str], scene_id: str, most: int, path: str) -> tuple[str, ...]:
+    try:
+        return reference_ids_from_names(names, scene_id, most)
+    except FieldError as error:
+        told = str(error).removeprefix(f"{error.field}: ")
+        raise FieldError(wire.joined(path, error.field), told) from None
+
+
+def poses_from_message(messages: Sequence[Any], list_name: str, pose_name: str) -> tuple[RigidTransform, ...]:
+    """The pose that each photograph of a list comes with; FieldError names the one that is none."""
+    poses = []
+    for i, message in enumerate(messages):
+        path = f"{list_name}[{i}].{pose_name}"
+        if not message.HasField(pose_name):
+            raise FieldError(path, "is required")
+        poses.append(wire.transform_from_message(getattr(message, pose_name), path, MAX_SESSION_COORDINATE_M))
+    return tuple(poses)
+
+
+def session_poses_from_message(request: pb.LocalizeSequenceRequest) -> tuple[Axes, tuple[RigidTransform, ...]]:
+    """The axes of the caller, and where its device believed its camera to be, both in OpenCV's axes."""
+    axes = axes_from_message(request.options)
+    poses = poses_from_message(request.frames, "frames", "session_from_camera")
+    return axes, tuple(pose_from(axes, pose) for pose in poses)
+
+
+def session_from_rig_from_message(request: pb.LocalizeRigRequest) -> RigidTransform | None:
+    """Where the device believed its rig to be, OpenCV's axes; FieldError if it is no pose."""
+    if not request.HasField("session_from_rig"):
+        return None
+    return wire.transform_from_message(request.session_from_rig, "session_from_rig", MAX_SESSION_COORDINATE_M)
+
+
+def rig_to_message(
+    outcome: RigEstimate | Rejection,
+    group: GroupResult,
+    queries: Sequence[Query],
+    request: pb.LocalizeRigRequest,
+    session_from_rig: RigidTransform | None,
+) -> pb.LocalizeRigResponse:
+    """The answer, but for what the call alone knows."""
+    if isinstance(outcome, Rejection):
+        response = pb.LocalizeRigResponse(rejection=rejection_to_message(outcome))
+    else:
+        message = pb.RigLocalization(world_from_rig=wire.transform_to_message(outcome.world_from_rig))
+        _set_support(message, outcome.matched, outcome.covariance)
+        if session_from_rig is not None:
+            world_from_session = outcome.world_from_rig.compose(session_from_rig.inverse())
+            message.world_from_session.CopyFrom(wire.transform_to_message(world_from_session))
+        datum = group.results[0].attempt.attributes.datum
+        if datum is not None:
+            message.geo_pose.CopyFrom(geo_pose_to_message(outcome.world_from_rig, datum))
+        response = pb.LocalizeRigResponse(localization=message)
+    response.images.extend(_reports(outcome, group, queries))
+    for echoed in ("capture_time", "session_from_rig"):
+        if request.HasField(echoed):
+            getattr(response, echoed).CopyFrom(getattr(request, echoed))
+    return response
+
+
+def sequence_to_message(
+    outcome: SequenceEstimate | Rejection,
+    group: GroupResult,
+    queries: Sequence[Query],
+    request: pb.LocalizeSequenceRequest,
+    axes: Axes,
+) -> pb.LocalizeSequenceResponse:
+    """The answer, but for what the call alone knows."""
+    if isinstance(outcome, Rejection):
+        response = pb.LocalizeSequenceResponse(rejection=rejection_to_message(outcome))
+    else:
+        session = outcome.world_from_session
+        message = pb.SequenceLocalization(
+            world_from_session=wire.transform_to_message(_in_axes(session, axes)),
+            session_scale=session.scale,
+            session_scale_sigma=session.scale * outcome.scale_sigma,
+            axes=enum_to_message(axes, pb.Axes),
+        )
+        for frame, pose in zip(request.frames, outcome.world_from_camera, strict=True):
+            captured = message.poses.add(world_from_camera=wire.transform_to_message(pose))
+            if frame.HasField("capture_time"):
+                captured.capture_time.CopyFrom(frame.capture_time)
+        _set_support(message, outcome.matched, outcome.covariances[-1])
+        response = pb.LocalizeSequenceResponse(localization=message)
+    response.images.extend(_reports(outcome, group, queries))
+    return response
+
+
+def _in_axes(world_from_session: Similarity, axes: Axes) -> RigidTransform:
+    """Rotation and translation of a similarity between frames that are both told in these axes."""
+    mirror = WORLD_FROM_RIGHT_HANDED[axes]
+    return RigidTransform(mirror @ world_from_session.rotation @ mirror.T, mirror @ world_from_session.translation)
+
+
+def _set_support(
+    message: pb.RigLocalization | pb.SequenceLocalization,
+    matched: Sequence[MatchedSighting],
+    covariance: Array,
+) -> None:
+    """What the two kinds of answers have in common."""
+    # A scene's calibration was measured of single photographs.
+    claim = Claimed(accuracy_from_covariance(covariance), covariance, False)
+    message.covariance.CopyFrom(covariance_to_message(claim.covariance))
+    message.accuracy.CopyFrom(accuracy_to_message(claim))
+    message.inlier_count = sum(int(it.inliers.sum()) for it in matched)
+    message.match_count = sum(len(it.matches) for it in matched)
+    message.reprojection_error_px = float(np.median(np.concatenate([it.errors_px[it.inliers] for it in matched])))
+
+
+def _reports(
+    outcome: RigEstimate | SequenceEstimate | Rejection, group: GroupResult, queries: Sequence[Query]
+) -> list[pb.ImageReport]:
+    matched = {} if isinstance(outcome, Rejection) else {it.sighting.image: it for it in outcome.matched}
+    reports = []
+    for i, (result, query) in enumerate(zip(group.results, queries, strict=True)):
+        alone = result.attempt.answer
+        report = pb.ImageReport(diagnostics=diagnostics_to_message(result, query.options))
+        report.diagnostics.queue_duration.FromNanoseconds(round(1e9 * queued_s(group.visits[i])))
+        report.diagnostics.total_duration.FromNanoseconds(round(1e9 * group.seconds[i]))
+        if isinstance(alone.outcome, Rejection):
+            report.alone.CopyFrom(rejection_to_message(alone.outcome))
+        if i in matched:
+            report.inlier_count = int(matched[i].inliers.sum())
+            report.match_count = len(matched[i].matches)
+            for use, count in zip(report.diagnostics.references, matched[i].inliers_by_reference(), strict=True):
+                use.inlier_count = count
+        elif alone.support is not None:
+            report.match_count = len(alone.support.matches)
+        reports.append(report)
+    return reports

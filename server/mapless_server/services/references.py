@@ -1,0 +1,243 @@
+"""ReferenceService: scenes and references as resources; images are described before the store is touched."""
+# ruff: noqa: N802  methods carry the names of their RPCs
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import TypeVar
+
+from mapless import names, wire
+from mapless.geometry import MAX_COORDINATE_M, RigidTransform
+from mapless.v1 import reference_service_pb2 as pb
+from mapless.v1 import reference_service_pb2_grpc as rpcs
+from mapless.wire import FieldError
+from mapless_server.engine.engine import Engine
+from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo
+from mapless_server.errors import AlreadyExists
+from mapless_server.rpc.call import Call
+from mapless_server.scenes.auditing import Viewpoint
+from mapless_server.security.tenancy import SceneKey, key_of, scene_id_of
+from mapless_server.store import ContradictingDown, NewReference, ReferenceRecord, Store
+
+from .messages.naming import reference_ids_from_names, reference_key_from_name, scene_key_from_name
+from .messages.pages import Page, Record
+from .messages.photos import photo_from_message
+from .messages.priors import narrowing_from_message
+from .messages.references import audit_to_message, choice_to_message, coverage_to_message, reference_to_message
+from .messages.scenes import attributes_from_message, changes_from_message, scene_to_message
+
+MAX_BATCH = 1000
+MAX_RETRIEVED = 1000
+DEFAULT_AUDITS, MAX_AUDITS = 10, 100
+STORE_THREADS = 4  # writers queue for one lock anyhow; these keep readers from waiting behind them
+
+T = TypeVar("T")
+M = TypeVar("M", pb.Scene, pb.Reference)
+Draft = tuple[str, Photo, RigidTransform]
+"""Reference id, photograph and world_from_camera."""
+
+
+class ReferenceService(rpcs.ReferenceServiceServicer):
+    """Keeps scenes and their references."""
+
+    def __init__(self, engine: Callable[[], Engine], store: Store) -> None:
+        """`engine` gives it, or raises Unavailable as long as there is none."""
+        self._engine = engine
+        self._store = store
+        self._threads = ThreadPoolExecutor(STORE_THREADS, thread_name_prefix="store")
+
+    def close(self) -> None:
+        """Waits for what the store is doing."""
+        self._threads.shutdown(wait=True)
+
+    async def CreateScene(self, request: pb.CreateSceneRequest, call: Call) -> pb.CreateSceneResponse:
+        """Implements ReferenceService.CreateScene."""
+        scene_id = wire.checked_id(request.scene_id, "scene_id")
+        key, attributes = key_of(call.principal.tenant, scene_id), attributes_from_message(request)
+        scene = await self._stored(self._store.create_scene, key, attributes)
+        return pb.CreateSceneResponse(scene=scene_to_message(scene))
+
+    async def GetScene(self, request: pb.GetSceneRequest, call: Call) -> pb.GetSceneResponse:
+        """Implements ReferenceService.GetScene."""
+        scene = await self._stored(
+            self._store.get_scene, scene_key_from_name(request.name, "name", call.principal.tenant)
+        )
+        return pb.GetSceneResponse(scene=scene_to_message(scene))
+
+    async def UpdateScene(self, request: pb.UpdateSceneRequest, call: Call) -> pb.UpdateSceneResponse:
+        """Implements ReferenceService.UpdateScene."""
+        key = scene_key_from_name(request.scene.name, "scene.name", call.principal.tenant)
+        changes = changes_from_message(request)
+        try:
+            scene = await self._stored(partial(self._store.update_scene, key, **changes))
+        except ContradictingDown as error:
+            guilty = "down_in_world" if changes.get("down_in_world") else "datum"
+            raise FieldError(f"scene.{guilty}", str(error)) from None
+        return pb.UpdateSceneResponse(scene=scene_to_message(scene))
+
+    async def ListScenes(self, request: pb.ListScenesRequest, call: Call) -> pb.ListScenesResponse:
+        """Implements ReferenceService.ListScenes."""
+        tenant = call.principal.tenant
+        page = Page(request, tenant, "scenes")
+        found = await self._stored(self._store.list_scenes, tenant, page.limit, page.after)
+        scenes, token = page.cut(found, lambda scene: scene.scene_id)
+        return pb.ListScenesResponse(scenes=await _many(scene_to_message, scenes), next_page_token=token)
+
+    async def DeleteScene(self, request: pb.DeleteSceneRequest, call: Call) -> pb.DeleteSceneResponse:
+        """Implements ReferenceService.DeleteScene."""
+        scene_key = scene_key_from_name(request.name, "name", call.principal.tenant)
+        await self._stored(self._delete_scene, self._engine(), scene_key)
+        return pb.DeleteSceneResponse()
+
+    def _delete_scene(self, engine: Engine, scene_key: SceneKey) -> None:
+        # Gone it may be even where this fails late, or where nobody waits for it any more.
+        try:
+            engine.forget_references(self._store.delete_scene(scene_key))
+        finally:
+            engine.forget_scene(scene_key)
+
+    async def CreateReference(self, request: pb.CreateReferenceRequest, call: Call) -> pb.CreateReferenceResponse:
+        """Implements ReferenceService.CreateReference."""
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        draft = self._draft(request, "")
+        try:
+            (record,) = await self._add(scene_key, [draft], call)
+        except AlreadyExists as error:
+            raise AlreadyExists(str(error), field="reference_id") from error
+        return pb.CreateReferenceResponse(reference=reference_to_message(record))
+
+    async def BatchCreateReferences(
+        self, request: pb.BatchCreateReferencesRequest, call: Call
+    ) -> pb.BatchCreateReferencesResponse:
+        """Implements ReferenceService.BatchCreateReferences."""
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        if not 1 <= len(request.requests) <= MAX_BATCH:
+            raise FieldError("requests", f"must be 1 to {MAX_BATCH}, are {len(request.requests)}")
+        seen: set[str] = set()
+        for i, item in enumerate(request.requests):
+            if item.scene not in ("", request.scene):
+                raise FieldError(f"requests[{i}].scene", f"must be empty or {request.scene!r}")
+            if item.reference_id in seen:
+                raise FieldError(f"requests[{i}].reference_id", f"{names.shown(item.reference_id)} stands twice")
+            seen.add(item.reference_id)
+        # Every look at a photograph copies it: too much for the event loop.
+        drafts = await asyncio.to_thread(
+            lambda: [self._draft(item, f"requests[{i}]") for i, item in enumerate(request.requests)]
+        )
+        records = await self._add(scene_key, drafts, call)
+        return pb.BatchCreateReferencesResponse(references=await _many(reference_to_message, records))
+
+    async def GetReference(self, request: pb.GetReferenceRequest, call: Call) -> pb.GetReferenceResponse:
+        """Implements ReferenceService.GetReference."""
+        key, reference_id = reference_key_from_name(request.name, "name", call.principal.tenant)
+        message = reference_to_message(await self._stored(self._store.get_reference, key, reference_id))
+        if request.include_image:
+            message.image = await self._stored(self._store.read_image, key, reference_id)
+        return pb.GetReferenceResponse(reference=message)
+
+    async def ListReferences(self, request: pb.ListReferencesRequest, call: Call) -> pb.ListReferencesResponse:
+        """Implements ReferenceService.ListReferences."""
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        page = Page(request, call.principal.tenant, request.scene)
+        found = await self._stored(self._store.list_references, scene_key, page.limit, page.after)
+        references, token = page.cut(found, lambda reference: reference.reference_id)
+        messages = await _many(reference_to_message, references)
+        return pb.ListReferencesResponse(references=messages, next_page_token=token)
+
+    async def DeleteReference(self, request: pb.DeleteReferenceRequest, call: Call) -> pb.DeleteReferenceResponse:
+        """Implements ReferenceService.DeleteReference."""
+        named = reference_key_from_name(request.name, "name", call.principal.tenant)
+        await self._stored(self._delete_reference, self._engine(), *named)
+        return pb.DeleteReferenceResponse()
+
+    def _delete_reference(self, engine: Engine, scene_key: SceneKey, reference_id: str) -> None:
+        engine.forget_references({self._store.delete_reference(scene_key, reference_id)})
+
+    async def RetrieveReferences(
+        self, request: pb.RetrieveReferencesRequest, call: Call
+    ) -> pb.RetrieveReferencesResponse:
+        """Implements ReferenceService.RetrieveReferences."""
+        engine = self._engine()
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        if not 0 <= request.count <= MAX_RETRIEVED:
+            raise FieldError("count", f"must be 0 to {MAX_RETRIEVED}, is {request.count}")
+        narrowing = narrowing_from_message(request)
+        photo = photo_from_message(request, "", engine.options.image_limits)
+        count = request.count or DEFAULT_REFERENCE_COUNT
+        choice = await engine.retrieve(scene_key, photo, count, narrowing, call.caller)
+        return await asyncio.to_thread(choice_to_message, choice, scene_id_of(scene_key))
+
+    async def AuditScene(self, request: pb.AuditSceneRequest, call: Call) -> pb.AuditSceneResponse:
+        """Implements ReferenceService.AuditScene."""
+        engine = self._engine()
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        reference_ids, token = await self._audit_page(request, scene_key, call)
+        if not reference_ids:
+            generation = await self._stored(self._store.get_generation, scene_key)
+            return pb.AuditSceneResponse(store_generation=generation)
+        are_listed = not request.references
+        generation, audits = await engine.audit(scene_key, reference_ids, call.caller, are_listed)
+        messages = map(audit_to_message, audits)
+        return pb.AuditSceneResponse(audits=messages, next_page_token=token, store_generation=generation)
+
+    async def _audit_page(
+        self, request: pb.AuditSceneRequest, scene_key: SceneKey, call: Call
+    ) -> tuple[Sequence[str], str]:
+        """Ids of the references to audit, and the token of the next page."""
+        if request.references:
+            return reference_ids_from_names(request.references, scene_id_of(scene_key), MAX_AUDITS), ""
+        page = Page(request, call.principal.tenant, f"{request.scene} audit", DEFAULT_AUDITS, MAX_AUDITS)
+        found = await self._stored(self._store.list_reference_ids, scene_key, page.limit, page.after)
+        return page.cut(found, lambda reference_id: reference_id)
+
+    async def CheckCoverage(self, request: pb.CheckCoverageRequest, call: Call) -> pb.CheckCoverageResponse:
+        """Implements ReferenceService.CheckCoverage."""
+        engine = self._engine()
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        for field in ("world_from_camera", "intrinsics"):
+            if not request.HasField(field):
+                raise FieldError(field, "is required")
+        pose = wire.transform_from_message(request.world_from_camera, "world_from_camera", MAX_COORDINATE_M)
+        view = Viewpoint(wire.camera_from_message(request.intrinsics, "intrinsics"), pose)
+        generation, coverage = await engine.check_coverage(scene_key, view, call.caller)
+        message = coverage_to_message(coverage)
+        message.store_generation = generation
+        return message
+
+    def _draft(self, request: pb.CreateReferenceRequest, path: str) -> Draft:
+        """What a request asks to store, all checked but the pixels; FieldError or InvalidArgument names the field."""
+        reference_id = wire.checked_id(request.reference_id, wire.joined(path, "reference_id"))
+        path = wire.joined(path, "reference")
+        if not request.HasField("reference"):
+            raise FieldError(path, "is required")
+        reference = request.reference
+        if not reference.HasField("world_from_camera"):
+            raise FieldError(f"{path}.world_from_camera", "is required")
+        world_from_camera = wire.transform_from_message(
+            reference.world_from_camera, f"{path}.world_from_camera", MAX_COORDINATE_M
+        )
+        photo = photo_from_message(reference, path, self._engine().options.image_limits)
+        return reference_id, photo, world_from_camera
+
+    async def _add(self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call) -> Sequence[ReferenceRecord]:
+        # Describing takes long: an unknown scene is worth noticing before. The store looks again when it adds.
+        await self._stored(self._store.get_generation, scene_key)
+        described = await self._engine().describe([photo for _, photo, _ in drafts], call.caller)
+        references = [
+            NewReference(reference_id, photo.image, photo.camera, world_from_camera, found.views, found.descriptors)
+            for (reference_id, photo, world_from_camera), found in zip(drafts, described, strict=True)
+        ]
+        return await self._stored(self._store.add_references, scene_key, references)
+
+    async def _stored(self, operation: Callable[..., T], *arguments: object) -> T:
+        """An operation of the store, off the event loop; Unavailable while the server starts."""
+        self._engine()
+        return await asyncio.get_running_loop().run_in_executor(self._threads, operation, *arguments)
+
+
+async def _many(to_message: Callable[[Record], M], records: Sequence[Record]) -> list[M]:
+    """The messages of a page; a thousand take tens of milliseconds, too long for the event loop."""
+    return await asyncio.to_thread(lambda: [to_message(record) for record in records])

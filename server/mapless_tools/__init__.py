@@ -1,0 +1,13 @@
+"""What is run beside the server, each a command of `mapless-server`; the server imports none of it.
+
+cli/            the command line
+evaluate/       accuracy on benchmarks, as in the paper
+bench/          accuracy and latency of a version, against targets
+bench_network/  the networks' speed
+load/           load, soak
+calibrate/      radii of a scene, measured
+ingest/         import and export; formats/ reads what other programs write
+replay/         captured calls computed again
+view/           the viewer in the browser
+demo/           the rendered room and `make demo`
+"""

@@ -1,0 +1,176 @@
+"""A benchmark for people (Markdown, fit for BENCHMARKS.md) and for programs (JSON)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mapless_server import __version__
+from mapless_tools.evaluate.metrics import QueryResult, Summary, quantile, stage_share, summarize
+from mapless_tools.evaluate.report import (
+    RULES,
+    SCALE_FREE,
+    format_length,
+    format_rotation,
+    format_share,
+    format_stages,
+    to_json,
+)
+from mapless_tools.evaluate.run import Evaluation
+
+from .latency import REFERENCE_COUNT, Latency
+from .scenes import KITCHEN, BenchScene, Figures, met
+
+
+@dataclass(frozen=True, eq=False)
+class BenchResult:
+    """All that was measured.
+
+    Attributes:
+        machine: processor and cores.
+        scenes: those with a target.
+        others: those without.
+        latency: None if its scene is absent.
+        absent: folders that are not there.
+        quick: whether queries were left out, so that targets do not apply.
+    """
+
+    machine: str
+    scenes: Sequence[tuple[BenchScene, Evaluation]]
+    others: Sequence[Evaluation]
+    latency: Latency | None
+    absent: Sequence[str]
+    quick: bool
+
+
+def markdown(result: BenchResult) -> list[str]:
+    """The lines of the report."""
+    lines = [f"mapless {__version__}; {result.machine}.", ""]
+    if result.quick:
+        lines += ["**Quick run, few queries a scene: not comparable with the targets.**", ""]
+    if result.absent:
+        lines += [f"Not measured, their folders are absent: {', '.join(result.absent)}.", ""]
+    lines += [
+        "| scene | references | localized | median | target | met | COLMAP 4.2, prebuilt map | p50 ms |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    lines += [*(_row(scene, summarize(evaluation.results), result.quick) for scene, evaluation in result.scenes), ""]
+    if result.others:
+        lines += [
+            "| scene | localized | median | of the references' radius | of the distance to the references |",
+            "|---|---|---|---|---|",
+            *map(_other_row, result.others),
+            "",
+        ]
+    for evaluation in [*(e for _, e in result.scenes), *result.others]:
+        rejections = summarize(evaluation.results).rejections
+        if rejections:
+            lines += [f"Rejected in {evaluation.dataset.name}, {_split(evaluation)}: {_counts(rejections)}.", ""]
+    if result.latency is not None:
+        lines += _latency_lines(result.latency)
+    scale_free = any(not evaluation.dataset.metric for evaluation in result.others)
+    return [*lines, *(f"- {rule}" for rule in RULES), *([f"- {SCALE_FREE}"] if scale_free else [])]
+
+
+def as_json(result: BenchResult) -> dict[str, Any]:
+    """The same for programs, with every query."""
+    return {
+        "version": __version__,
+        "machine": result.machine,
+        "quick": result.quick,
+        "absent": list(result.absent),
+        "scenes": [
+            {
+                "target": vars(scene.target),
+                "colmap_with_map": vars(scene.with_map),
+                "target_met": None if result.quick else met(scene.target, summarize(evaluation.results)),
+                **to_json(evaluation),
+            }
+            for scene, evaluation in result.scenes
+        ],
+        "others": [to_json(evaluation) for evaluation in result.others],
+        "latency": None if result.latency is None else _latency_json(result.latency),
+    }
+
+
+def _row(scene: BenchScene, summary: Summary, quick: bool) -> str:
+    reached = "yes" if met(scene.target, summary) else "no"
+    cells = [
+        scene.folder,
+        "leave one out" if scene.references is None else str(scene.references),
+        f"{summary.localized_count} of {summary.query_count}",
+        f"{format_length(summary.median_translation, True)} / {format_rotation(summary.median_rotation_deg)}",
+        _figures(scene.target),
+        "-" if quick else reached,
+        _figures(scene.with_map),
+        f"{summary.latency_p50_ms:.0f}",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def _other_row(evaluation: Evaluation) -> str:
+    summary = summarize(evaluation.results)
+    cells = [
+        evaluation.dataset.name,
+        f"{summary.localized_count} of {summary.query_count}",
+        f"{format_length(summary.median_translation, evaluation.dataset.metric)} / "
+        f"{format_rotation(summary.median_rotation_deg)}",
+        format_share(summary.median_translation / evaluation.trajectory_radius),
+        format_share(summary.median_relative),
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def _split(evaluation: Evaluation) -> str:
+    chosen = evaluation.options.reference_count
+    return "leave one out" if chosen is None else f"{chosen} references"
+
+
+def _counts(rejections: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in rejections.items())
+
+
+def _figures(figures: Figures) -> str:
+    localized = "" if figures.localized is None else f", {figures.localized} of 40"
+    return f"{figures.translation_cm:.2f} cm / {figures.rotation_deg:.3f}°{localized}"
+
+
+def _latency_lines(latency: Latency) -> list[str]:
+    first, warm, cold = _milliseconds(latency.first_pass), _milliseconds(latency.warm), latency.cold_ms
+    lines = [
+        f"Localize on {KITCHEN}, {REFERENCE_COUNT} stored references, K = 10, one call at a time:",
+        "",
+        "| | p50 ms | p95 ms |",
+        "|---|---|---|",
+        f"| every photograph for the first time | {quantile(first, 0.5):.0f} | {quantile(first, 0.95):.0f} |",
+        f"| the same again (warm) | {quantile(warm, 0.5):.0f} | {quantile(warm, 0.95):.0f} |",
+        f"| first call of a fresh server (cold), median of {len(cold)} | {quantile(cold, 0.5):.0f} | |",
+        "",
+        f"Time by stage, warm: {format_stages(stage_share(latency.warm))}.",
+    ]
+    if latency.memory is not None:
+        lines.append(
+            f"Memory of the server process: peak {latency.memory.peak_mib:.0f} MiB (VmHWM), "
+            f"{latency.memory.resident_mib:.0f} MiB at the end."
+        )
+    return [*lines, ""]
+
+
+def _latency_json(latency: Latency) -> dict[str, Any]:
+    return {
+        "scene": KITCHEN,
+        "references": REFERENCE_COUNT,
+        "k": 10,
+        "cold_ms": list(latency.cold_ms),
+        "first_pass_ms": _milliseconds(latency.first_pass),
+        "warm_ms": _milliseconds(latency.warm),
+        "warm_p50_ms": quantile(_milliseconds(latency.warm), 0.5),
+        "warm_p95_ms": quantile(_milliseconds(latency.warm), 0.95),
+        "stage_share": stage_share(latency.warm),
+        "memory_mib": None if latency.memory is None else vars(latency.memory),
+    }
+
+
+def _milliseconds(results: Sequence[QueryResult]) -> list[float]:
+    return [result.latency_ms for result in results]

@@ -1,0 +1,175 @@
+"""All parts in order. A part that fails says so in the table, and the rest goes on: device time is scarce."""
+
+from __future__ import annotations
+
+import gc
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mapless_server.observability.provenance import cpu_model
+
+from . import host
+from .ceilings import measure_rates
+from .forward import measure_forward, measure_kernels, reason_of
+from .operations import H200, Rates
+from .report import Figure, as_json, markdown, table
+from .subject import make_network
+from .variants import measure_attention, measure_variants
+
+OUTPUT = Path("bench-output")
+HOST_PARTS = ("operations", "blocks", "kept", "rounding", "compilations")
+CUDA_PARTS = (
+    "attention",
+    "memory-pi3",
+    "forward-pi3",
+    "query-pi3",
+    "kernels-pi3",
+    "variants-pi3",
+    "forward-pi3x",
+    "query-pi3x",
+    "memory-pi3x",
+)
+PARTS = (*HOST_PARTS, *CUDA_PARTS)
+REPEATS, QUICK_REPEATS = 20, 3
+
+
+def bench_network(quick: bool = False, only: Sequence[str] | None = None, output: Path = OUTPUT) -> list[Figure]:
+    """Measures, and prints a table; writes `network.json` and `network.md`, anew after each part.
+
+    Args:
+        quick: few repetitions and nothing compiled: to see that it runs.
+        only: of `PARTS`; None for all that this machine can run.
+        output: folder, made if needed.
+
+    Returns:
+        All figures.
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if device.type == "cpu":
+        print("There is no CUDA device: no figure below is a GPU's, and what needs one is not measured.", flush=True)
+        torch.set_num_threads(1)  # so that figures do not depend on who else uses the cores
+    bench = _Bench(device, quick)
+    output.mkdir(parents=True, exist_ok=True)
+    for part in only or (CUDA_PARTS if device.type == "cuda" else HOST_PARTS):
+        bench.run(part)
+        bench.write(output)
+    print("\n".join(["", bench.title, "", *table(bench.figures), "", f"With notes: {output / 'network.md'}"]))
+    return bench.figures
+
+
+class _Bench:
+    """The parts, and what they gave so far."""
+
+    def __init__(self, device: torch.device, quick: bool) -> None:
+        self.device = device
+        self.quick = quick
+        self.figures: list[Figure] = []
+        self._repeats = QUICK_REPEATS if quick else REPEATS
+        self._details: dict[str, Any] = {}
+        cuda = device.type == "cuda"
+        name = torch.cuda.get_device_name(device) if cuda else f"{cpu_model()}, one thread"
+        quickly = ", quick run: not comparable" if quick else ""
+        self.title = f"{name}, torch {torch.__version__}{quickly}"
+        self.rates = self._ceilings() if cuda else H200
+
+    def _ceilings(self) -> Rates:
+        rates = measure_rates(self.device)
+        self.figures += [
+            Figure("ceilings", "bfloat16 matrix product, 8192^3", rates.matrix_flops / 1e12, "TFLOP/s"),
+            Figure("ceilings", "copy on the device, bytes read and written", rates.copy_bytes / 1e12, "TB/s"),
+            Figure("ceilings", "launch of a kernel", 1e6 * rates.launch_s, "us"),
+        ]
+        return rates
+
+    def run(self, part: str) -> None:
+        """Adds the figures of a part."""
+        start_s = time.perf_counter()
+        print(f"{part}: ", end="", flush=True)
+        figures = [*self._tried(self._part(part), part)]
+        self.figures += figures
+        missing = sum(figure.value is None for figure in figures)
+        failed = f", {missing} not measured" if missing else ""
+        print(f"{len(figures) - missing} figures{failed}, {time.perf_counter() - start_s:.0f} s", flush=True)
+        torch._dynamo.reset()
+        gc.collect()
+        if self.device.type == "cuda":
+            torch.cuda.empty_cache()
+
+    def _part(self, part: str) -> Iterator[Figure]:
+        if part in HOST_PARTS:
+            yield from self._host_part(part)
+            return
+        if self.device.type != "cuda":
+            raise RuntimeError("there is no CUDA device")
+        kind, _, name = part.partition("-")
+        device, compiles = self.device, not self.quick
+        parts: dict[str, Callable[[], Iterator[Figure]]] = {
+            "attention": lambda: measure_attention(self.rates, device, self._repeats),
+            "memory": lambda: self._memory(name),
+            "forward": lambda: measure_forward(name, self.rates, device, self._repeats, compiles),
+            "query": lambda: self._query(name),
+            "kernels": lambda: self._kernels(name),
+            "variants": lambda: measure_variants(name, device, self._repeats),
+        }
+        yield from parts[kind]()
+
+    def _host_part(self, part: str) -> Iterator[Figure]:
+        if part == "operations":
+            yield from host.count_forward(self.rates, self.quick)
+            yield from host.count_memory()
+            yield from host.count_pixel_heads()
+        elif part == "blocks":
+            yield from host.measure_blocks(1 if self.quick else 3)
+        elif part == "kept":
+            yield from host.compare_kept_tokens()
+        elif part == "rounding":
+            yield from host.compare_rounding()
+        else:
+            yield from host.count_compilations()
+
+    def _memory(self, name: str) -> Iterator[Figure]:
+        from .memory import measure_memory
+        from .query import make_runner
+
+        def runner() -> Any:
+            return make_runner(make_network(name), name, self.device, self._backend)
+
+        return measure_memory(runner, self.device)
+
+    def _query(self, name: str) -> Iterator[Figure]:
+        from . import query
+
+        options = query.QueryOptions(compile_backend=self._backend, query_count=2 if self.quick else 8)
+        tier, note = query.make_tier(options.features, self.device)
+        room = query.render(options)
+        bench = query.Bench(room, tier)
+        runner = query.make_runner(make_network(name, device=self.device), name, self.device, self._backend)
+        for on_device in (True, False):
+            yield from self._tried(query.measure_queries(runner, bench, options, note, on_device), f"query-{name}")
+        runner.close()
+
+    def _tried(self, figures: Iterator[Figure], part: str) -> Iterator[Figure]:
+        """The figures until one fails."""
+        try:
+            yield from figures
+        except Exception as error:  # what comes after can still be measured
+            yield Figure(part, "failed", None, "", note=reason_of(error))
+
+    def _kernels(self, name: str) -> Iterator[Figure]:
+        figures, self._details["kernels"] = measure_kernels(name, self.device)
+        yield from figures
+
+    @property
+    def _backend(self) -> str | None:
+        return None if self.quick else "inductor"
+
+    def write(self, output: Path) -> None:
+        """Writes what there is so far."""
+        content = as_json(self.title, self.figures, self._details)
+        (output / "network.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        (output / "network.md").write_text("\n".join(markdown(self.title, self.figures)) + "\n", encoding="utf-8")

@@ -1,0 +1,203 @@
+"""The network's forward pass on a CUDA device, step by step, each beside its floor and what was predicted of it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+from unittest.mock import patch
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor
+from torch._C._autograd import DeviceType
+from torch.nn.attention import SDPBackend, sdpa_kernel
+
+from mapless_server.networks.blocks import Attention
+from mapless_server.networks.network import Network, NetworkOutput
+
+from .ceilings import median_s
+from .operations import Rates
+from .report import Figure
+from .subject import GRID, REFERENCES, Scene, Work, make_network, operations_of
+
+VIEWS = REFERENCES + 1
+PLAIN_MS, KEPT_MS = 90.0, 60.0
+"""Targets: without and with what is kept."""
+MAX_DIFFERENCE = 0.2
+"""Between two ways to compute the same in bfloat16, largest of all pixels, as a share of the largest value: rounding in
+sixty blocks makes some hundredths of it, a wrong block about 1."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One way to compute a query."""
+
+    name: str
+    work: Work
+    compiled: bool
+    target_ms: float | None = None
+
+
+STEPS = (
+    Step("eager, everything", Work(VIEWS, VIEWS), False),
+    Step("eager, no map of the query", Work(VIEWS, REFERENCES), False),
+    Step("eager, references' tokens kept", Work(1, REFERENCES), False),
+    Step("eager, tokens kept, cameras only", Work(1, 0), False),
+    Step("compiled, references' tokens kept", Work(1, REFERENCES), True, KEPT_MS),
+    Step("compiled, tokens kept, cameras only", Work(1, 0), True, KEPT_MS),
+    Step("compiled, everything", Work(VIEWS, VIEWS), True, PLAIN_MS),
+)
+"""The ones that matter most before those that compile longest."""
+
+
+class Forward:
+    """A network in bfloat16, with one kind of attention and no other, and one scene."""
+
+    def __init__(
+        self,
+        network: Network,
+        backend: SDPBackend = SDPBackend.FLASH_ATTENTION,
+        views: int = VIEWS,
+        grid: tuple[int, int] = GRID,
+    ) -> None:
+        network.set_compute_type(torch.bfloat16)
+        self.network = network
+        self.backend = backend
+        self.scene = Scene(network, views, grid)
+        self._compiled = _compiled(network)
+        with self.kernels():
+            self.kept = self.scene.encode(network, slice(None)).to(torch.bfloat16)
+
+    @contextmanager
+    def kernels(self) -> Iterator[None]:
+        """The wanted attention alone: where it cannot run, that is an error. Flash is what the network takes itself."""
+        with torch.no_grad():
+            if self.backend is SDPBackend.FLASH_ATTENTION:
+                yield
+                return
+            with sdpa_kernel(self.backend), patch.object(Attention, "attend", staticmethod(_any_attention)):
+                yield
+
+    def run(self, work: Work, compiled: bool = False) -> NetworkOutput:
+        """Encodes the last views, the query's the very last, takes the tokens of the others, and reconstructs."""
+        encode, reconstruct = self._compiled if compiled else (self.network.encode, self.network.reconstruct)
+        scene, kept = self.scene, work.views - work.encoded
+        with self.kernels():
+            intrinsics = None if scene.intrinsics is None else scene.intrinsics[kept:]
+            encoded: Tensor = encode(scene.images[kept:], scene.layout, intrinsics)
+            # Recorded graphs write into the same memory again and again: joining copies.
+            tokens = torch.cat([self.kept[:kept], encoded.to(torch.bfloat16)])[None]
+            output: NetworkOutput = reconstruct(tokens, scene.layout, work.mapped, scene.poses, scene.posed)
+            return output
+
+
+def _any_attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    return F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
+
+
+def _compiled(network: Network) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """As the runner compiles; nothing happens before the first call."""
+    options: dict[str, str | int | bool | Callable[..., Any]] = {"triton.cudagraphs": True}
+    encode = torch.compile(network.encode, backend="inductor", fullgraph=True, dynamic=False, options=options)
+    reconstruct = torch.compile(network.reconstruct, backend="inductor", fullgraph=True, dynamic=False, options=options)
+    return encode, reconstruct
+
+
+def measure_forward(name: str, rates: Rates, device: torch.device, repeats: int, compiles: bool) -> Iterator[Figure]:
+    """A figure for each step, as it comes."""
+    part = f"{name} forward, {VIEWS} views of {GRID[1] * 14}x{GRID[0] * 14}"
+    forward = Forward(make_network(name, device=device))
+    for step in STEPS:
+        if step.compiled and not compiles:
+            continue
+        operations = operations_of(name, step.work)
+        floor_ms = 1e3 * operations.floor_s(rates)
+        predicted_ms = 1e3 * operations.predicted_s(rates, step.compiled)
+        figure = Figure(part, step.name, None, "ms", None, floor_ms, predicted_ms, step.target_ms)
+        try:
+            difference = _check(forward, step)
+            times = median_s(partial(forward.run, step.work, step.compiled), device, repeats)
+        except Exception as error:  # the other steps can still be measured
+            yield replace(figure, note=reason_of(error))
+            continue
+        note = f"{operations.flop / 1e12:.2f} TFLOP, {operations.kernels} kernels"
+        note += f"; from eager by {difference:.2g} of the largest" if step.compiled else ""
+        yield replace(figure, value=1e3 * times[0], again=1e3 * times[1], note=note)
+
+
+def _check(forward: Forward, step: Step) -> float:
+    """Runs a step; its largest difference from the eager pass.
+
+    Raises:
+        ArithmeticError: the output is not finite, or another one.
+    """
+    output = forward.run(step.work, step.compiled)
+    if not all(bool(tensor.isfinite().all()) for tensor in vars(output).values()):
+        raise ArithmeticError("the output is not finite")
+    output = NetworkOutput(*(tensor.clone() for tensor in vars(output).values()))
+    difference = max_difference(output, forward.run(step.work))
+    if not difference <= MAX_DIFFERENCE:
+        raise ArithmeticError(f"the output differs from the eager one by {difference:.2g} of the largest")
+    return difference
+
+
+def max_difference(output: NetworkOutput, reference: NetworkOutput) -> float:
+    """The largest difference of any output, as a share of the largest absolute value of that output."""
+    parts = zip(vars(output).values(), vars(reference).values(), strict=True)
+    return max((float((a - b).abs().max() / b.abs().max()) for a, b in parts if a.numel()), default=0.0)
+
+
+def reason_of(error: Exception) -> str:
+    """What failed, in one line that fits a table."""
+    return f"{type(error).__name__}: {error}".splitlines()[0][:160].replace("|", "/")
+
+
+def measure_kernels(name: str, device: torch.device) -> tuple[list[Figure], dict[str, Any]]:
+    """Which kernels an eager forward pass launches; and how often it is flash attention, and the host waits."""
+    forward = Forward(make_network(name, device=device))
+    work = Work(1, REFERENCES)
+    forward.run(work)
+    activities = [torch.profiler.ProfilerActivity.CUDA, torch.profiler.ProfilerActivity.CPU]
+    with torch.profiler.profile(activities=activities) as profile:
+        forward.run(work)
+        torch.cuda.synchronize(device)
+    kernels = [event for event in profile.key_averages() if event.device_type == DeviceType.CUDA]
+    milliseconds: dict[str, float] = {"attention": 0.0, "matrix products": 0.0, "between": 0.0}
+    flash_count = 0
+    for event in kernels:
+        milliseconds[_kind(event.key)] += event.self_device_time_total / 1000
+        flash_count += event.count if "flash" in event.key else 0
+    sizes = forward.network.sizes
+    blocks = sizes.encoder_depth + sizes.decoder_depth + 3 * sizes.head_depth
+    part = f"{name} kernels, eager, tokens kept"
+    figures = [Figure(part, kind, value, "ms") for kind, value in milliseconds.items()]
+    note = f"{blocks} blocks; and whatever else attends"
+    figures += [Figure(part, "flash attention", flash_count, "calls", target=blocks, target_is_least=True, note=note)]
+    figures += [Figure(part, "the host waits", _waits(forward, work), "times", target=0)]
+    longest = sorted(kernels, key=lambda event: -event.self_device_time_total)[:25]
+    return figures, {"kernels": [[it.key, it.count, it.self_device_time_total / 1000] for it in longest]}
+
+
+def _waits(forward: Forward, work: Work) -> int:
+    """How often the host waits for the device, as far as torch notices."""
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            forward.run(work)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    return sum("synchroniz" in str(warning.message) for warning in caught)
+
+
+def _kind(kernel: str) -> str:
+    name = kernel.lower()
+    if any(word in name for word in ("flash", "fmha", "attention")):
+        return "attention"
+    if any(word in name for word in ("gemm", "cutlass", "nvjet", "xmma", "cublas", "conv", "wgrad", "dgrad")):
+        return "matrix products"
+    return "between"

@@ -1,0 +1,118 @@
+"""A network's backend whose answer is replaced by the truth, so that the stages after it have real work.
+
+Random weights say nothing about a scene, and what the stages after them do depends on it. Here the network computes all
+that it would, and instead of its output the rendered room's true depths and poses are handed on, up to a scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform
+from mapless_server.method.coarse import Bucket, Outcome, ReconstructedView, Reconstruction, Request
+from mapless_server.method.coarse.device import DeviceReconstruction
+from mapless_server.method.coarse.grids import GridOptions, common_grid, lay_out
+from mapless_server.method.coarse.network import NetworkReconstructor
+from mapless_server.method.rejection import Rejection
+from mapless_server.method.views import PosedView, View
+from mapless_tools.demo.room import Photo
+
+UNITS_PER_METRE = 0.3
+"""Of the planted reconstruction, so that there is a scale to find."""
+
+
+class PlantedReconstructor:
+    """A `Reconstructor` that waits for the network and answers the truth.
+
+    Attributes:
+        network: what computes.
+    """
+
+    uses_correspondences = False
+
+    def __init__(self, network: NetworkReconstructor, photos: Mapping[str, Photo], device: torch.device) -> None:
+        """`photos` are the views' by the SHA-256 of their images; their truth lies on the device beforehand."""
+        self.network = network
+        self._photos = photos
+        self._maps = {sha256: torch.from_numpy(true_points(photo)).to(device) for sha256, photo in photos.items()}
+
+    @property
+    def name(self) -> str:
+        """Of the network."""
+        return self.network.name
+
+    @property
+    def weights_sha256(self) -> str:
+        """Of the network."""
+        return self.network.weights_sha256
+
+    def close(self) -> None:
+        """Ends the network's thread."""
+        self.network.close()
+
+    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
+        """Of the network."""
+        return self.network.bucket(query, references)
+
+    def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
+        """See Reconstructor.reconstruct_many."""
+        outcomes = self.network.reconstruct_many(requests)
+        return [self._planted(request, outcome) for request, outcome in zip(requests, outcomes, strict=True)]
+
+    def _planted(self, request: Request, outcome: Outcome | Exception) -> Outcome | Exception:
+        if isinstance(outcome, Rejection | Exception):
+            return outcome
+        query, references = request.query, request.references
+        keys = [_sha256(view) for view in (*(reference.view for reference in references), query)]
+        poses = np.stack([self._local_pose(key, keys[0]) for key in keys])
+        if isinstance(outcome, DeviceReconstruction):
+            return self._on_device(outcome, keys[:-1], poses)
+        views = [
+            replace(view, point_map=self._maps[key].numpy(), confidence=np.ones_like(view.confidence))
+            for view, key in zip(outcome.references, keys, strict=False)
+        ]
+        parts = zip((*views, outcome.query), poses, strict=True)
+        posed: list[ReconstructedView] = [_posed(view, pose) for view, pose in parts]
+        return Reconstruction(posed[-1], tuple(posed[:-1]))
+
+    def _on_device(self, outcome: DeviceReconstruction, keys: Sequence[str], poses: Array) -> DeviceReconstruction:
+        # Launched after the network on the same stream, so whoever waits for this waits for the network as well.
+        maps = torch.stack([self._maps[key] for key in keys])
+        confidence = torch.ones_like(outcome.confidence)
+        on_device = torch.from_numpy(poses.astype(np.float32)).to(maps.device, non_blocking=True)
+        return replace(outcome, point_maps=maps, confidence=confidence, local_from_camera=on_device)
+
+    def _local_pose(self, key: str, anchor: str) -> Array:
+        """(4, 4) in the planted frame, which is the first reference's camera."""
+        local_from_world = self._photos[anchor].world_from_camera.inverse()
+        pose = local_from_world.compose(self._photos[key].world_from_camera).matrix()
+        pose[:3, 3] *= UNITS_PER_METRE
+        return pose
+
+
+def true_points(photo: Photo) -> NDArray[np.float32]:
+    """(H, W, 3) what the pixels of the network's picture see, in the camera's frame, planted units."""
+    options = GridOptions()
+    camera = lay_out(photo.camera, common_grid([photo.camera], options), options).camera
+    rows, columns = np.indices((camera.height_px, camera.width_px))
+    rays = camera.rays(np.stack([columns, rows], axis=-1))
+    pixels = np.rint(photo.camera.project(rays)).astype(int)
+    limits = (photo.camera.width_px - 1, photo.camera.height_px - 1)
+    column, row = np.moveaxis(np.clip(pixels, 0, limits), -1, 0)
+    points = rays / rays[..., 2:] * photo.depth_m[row, column][..., None]
+    return np.ascontiguousarray(UNITS_PER_METRE * points, np.float32)
+
+
+def _sha256(view: View) -> str:
+    if view.photograph is None:
+        raise ValueError("a network looks at photographs")
+    return view.photograph.sha256
+
+
+def _posed(view: ReconstructedView, pose: Array) -> ReconstructedView:
+    return replace(view, local_from_camera=RigidTransform(pose[:3, :3], pose[:3, 3]))

@@ -1,0 +1,203 @@
+"""Whole queries on photographs of the rendered room: K = 10 stored references, everything in this process.
+
+A query is what the server does from the encoded photograph to the answer: it decodes, finds features, matches, runs the
+network, finds the scale, refines. What a call adds to that, protocol and store, is not in it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from mapless_server.engine.tiers import Tier
+from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline, localize
+from mapless_server.method.views import Photograph, PosedView
+from mapless_server.networks.network import Network
+from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions
+from mapless_server.networks.weights import WeightsError
+from mapless_server.serve.assembly import make_tiers
+from mapless_server.settings import load_settings
+from mapless_tools.demo.room import Photo, jpeg, render_room
+
+from .operations import compiled_graphs
+from .planted import PlantedReconstructor
+from .report import Figure
+from .subject import GRID, REFERENCES
+
+LATENCY_MS, QUERIES_PER_S = 150.0, 12.0
+THREADS = 8
+"""Queries side by side when it is how many a second that counts; the network takes them one after the other."""
+
+
+@dataclass(frozen=True)
+class QueryOptions:
+    """What to measure.
+
+    Attributes:
+        features: local features, by name; `sift` serves if their weights are not there.
+        compile_backend: see RunnerOptions.
+        query_count: different photographs.
+        rounds: how often each is localized in one measurement.
+        reference_count: stored; the nearest ten are used.
+    """
+
+    features: str = "aliked"
+    compile_backend: str | None = "inductor"
+    query_count: int = 8
+    rounds: int = 3
+    reference_count: int = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """The rendered room: photographs and encoded images by the SHA-256 of these."""
+
+    references: dict[str, Photo]
+    queries: dict[str, Photo]
+    data: dict[str, bytes]
+
+
+def render(options: QueryOptions) -> Room:
+    """Renders and encodes all photographs."""
+    photos = render_room(0, options.reference_count, options.query_count)
+    encoded = [[(jpeg(photo.image), photo) for photo in some] for some in photos]
+    named = [{hashlib.sha256(data).hexdigest(): photo for data, photo in some} for some in encoded]
+    images = {hashlib.sha256(data).hexdigest(): data for some in encoded for data, _ in some}
+    references, queries = named
+    return Room(references, queries, images)
+
+
+def make_tier(features: str, device: torch.device) -> tuple[Tier, str]:
+    """Features and their matcher, and what to say about them."""
+
+    def made(name: str) -> Tier:
+        flags = {"features": name, "backend": "geometric", "device": str(device)}
+        return make_tiers(load_settings(flags).settings)[0]
+
+    try:
+        return made(features), f"features {features}"
+    except (WeightsError, ImportError) as error:
+        return made("sift"), f"features sift, since {features} cannot be had: {error}"
+
+
+class Bench:
+    """Everything that a query needs, in place."""
+
+    def __init__(self, room: Room, tier: Tier) -> None:
+        self.room = room
+        self.tier = tier
+        self._stored = {key: self._store(key, photo, tier.extractor) for key, photo in room.references.items()}
+
+    def _store(self, key: str, photo: Photo, extractor: FeatureExtractor) -> PosedView:
+        pixels = decode_image(self.room.data[key], ImageLimits())
+        view = replace(
+            extractor.extract(pixels, photo.camera), photograph=Photograph(key, photo.camera, lambda: pixels)
+        )
+        return PosedView(key, photo.name, view, photo.world_from_camera)
+
+    def nearest(self, photo: Photo) -> list[PosedView]:
+        """The ten references whose cameras stand the nearest."""
+        centre = photo.world_from_camera.translation
+
+        def distance(view: PosedView) -> float:
+            return float(np.linalg.norm(view.world_from_camera.translation - centre))
+
+        return sorted(self._stored.values(), key=distance)[:REFERENCES]
+
+    def localize(self, key: str, pipeline: Pipeline) -> tuple[Answer, dict[str, float]]:
+        """One query; its answer, and the seconds of each stage and of all ("total")."""
+        photo, stages = self.room.queries[key], {}
+        start_s = time.perf_counter()
+        pixels = decode_image(self.room.data[key], ImageLimits())
+        stages["decode"] = time.perf_counter() - start_s
+        view = self.tier.extractor.extract(pixels, photo.camera)
+        stages["features"] = time.perf_counter() - start_s - stages["decode"]
+        view = replace(view, photograph=Photograph(key, photo.camera, lambda: pixels))
+        answer = localize(view, self.nearest(photo), pipeline, LocalizeOptions())
+        return answer, {**stages, **answer.stage_seconds, "total": time.perf_counter() - start_s}
+
+
+def make_runner(network: Network, name: str, device: torch.device, compile_backend: str | None) -> NetworkRunner:
+    """The network as the server runs it, with the shapes of a query of ten references compiled."""
+    runner = NetworkRunner(network, name, "random weights", device, RunnerOptions(compile_backend=compile_backend))
+    runner.warm_up([Bucket(GRID, REFERENCES + 1)])
+    return runner
+
+
+def measure_queries(
+    runner: NetworkRunner, bench: Bench, options: QueryOptions, note: str, keep_on_device: bool
+) -> Iterator[Figure]:
+    """Latency, its stages, and throughput, on a planted reconstruction; and what the random network's own leads to."""
+    where = "device" if keep_on_device else "host"
+    features = bench.tier.extractor.name.split("-")[0]
+    part = f"{runner.name} query, {features}, K = {REFERENCES}, stages after the network on the {where}"
+    network = NetworkReconstructor(runner, NetworkOptions(keep_on_device=keep_on_device))
+    photos = {**bench.room.references, **bench.room.queries}
+    planted = Pipeline(PlantedReconstructor(network, photos, runner.device), bench.tier.pipeline.matcher)
+    _runs(bench, planted, 1)  # fills caches
+    graphs = compiled_graphs()
+    runs, again = (_runs(bench, planted, options.rounds) for _ in range(2))
+    outcomes = f"{_outcomes([*runs, *again])}; {note}"
+    yield Figure(part, "p50", _p50_ms(runs), "ms", _p50_ms(again), target=LATENCY_MS, note=outcomes)
+    yield Figure(part, "localized", 100 * _localized_share([*runs, *again]), "%")
+    yield from _stages(part, [*runs, *again])
+    yield _throughput(part, bench, planted, options)
+    alone = _runs(bench, Pipeline(network, bench.tier.pipeline.matcher), 1)
+    yield Figure(part, "p50, the random network's own answer", _p50_ms(alone), "ms", note=_outcomes(alone))
+    yield Figure(part, "compiled after the warm-up", compiled_graphs() - graphs, "graphs", target=0)
+
+
+Runs = Sequence[tuple[Answer, dict[str, float]]]
+
+
+def _runs(bench: Bench, pipeline: Pipeline, rounds: int) -> Runs:
+    """Every query as often as asked, one after the other."""
+    return [bench.localize(key, pipeline) for _ in range(rounds) for key in bench.room.queries]
+
+
+def _stages(part: str, runs: Runs) -> Iterator[Figure]:
+    stages: dict[str, list[float]] = defaultdict(list)
+    for _, seconds in runs:
+        for stage, value in seconds.items():
+            stages[stage].append(value)
+    for stage, values in stages.items():
+        if stage != "total":
+            yield Figure(part, f"of it {stage}, median", 1e3 * statistics.median(values), "ms")
+
+
+def _p50_ms(runs: Runs) -> float:
+    return 1e3 * statistics.median(seconds["total"] for _, seconds in runs)
+
+
+def _outcomes(runs: Runs) -> str:
+    outcomes = [answer.outcome for answer, _ in runs]
+    names = ["localized" if isinstance(it, Localization) else it.reason.name for it in outcomes]
+    return ", ".join(f"{names.count(name)} {name}" for name in sorted(set(names)))
+
+
+def _localized_share(runs: Runs) -> float:
+    return sum(isinstance(answer.outcome, Localization) for answer, _ in runs) / len(runs)
+
+
+def _throughput(part: str, bench: Bench, pipeline: Pipeline, options: QueryOptions) -> Figure:
+    keys = [*bench.room.queries] * (2 * options.rounds)
+    rates = []
+    with ThreadPoolExecutor(THREADS) as pool:
+        for _ in range(2):
+            start_s = time.perf_counter()
+            for _ in pool.map(lambda key: bench.localize(key, pipeline), keys):
+                pass
+            rates.append(len(keys) / (time.perf_counter() - start_s))
+    name = f"sustained, {THREADS} threads"
+    return Figure(part, name, rates[0], "queries/s", rates[1], target=QUERIES_PER_S, target_is_least=True)

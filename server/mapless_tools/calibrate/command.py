@@ -1,0 +1,102 @@
+"""`mapless-server calibrate`: its flags. Imports what it needs when it runs, so that --help answers at once."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from mapless_tools.ingest.command import FORMAT_NAMES, Address, Ca, Cert, ClientId, Key, Tls, TokenFile
+
+OUTPUT = Path("calibration-output")
+
+
+def calibrate_command(
+    folder: Annotated[
+        Path | None, typer.Argument(help="Folder with photographs and their poses; not needed with --clear.")
+    ] = None,
+    scene: Annotated[
+        str,
+        typer.Option(
+            help="Id of the scene to calibrate, in whose world the folder's poses are. Default: the folder is measured "
+            "by itself, on a server of its own, and nothing is stored."
+        ),
+    ] = "",
+    layout: Annotated[
+        str, typer.Option("--layout", "--format", help=f"Layout of the folder: {FORMAT_NAMES}.")
+    ] = "auto",
+    references: Annotated[
+        int | None,
+        typer.Option(help="Without --scene: references, evenly spread over the photographs; default: leave one out."),
+    ] = None,
+    query_count: Annotated[
+        int | None,
+        typer.Option(help="Photographs to localize, evenly spread; default: all, or 40 with --references."),
+    ] = None,
+    k: Annotated[int, typer.Option(help="References that a photograph is compared with.")] = 10,
+    variant: Annotated[str, typer.Option(help="Form of the method: coarse, no_structure, full or best.")] = "best",
+    right_cm: Annotated[float, typer.Option(help="A right answer is at most this far off.")] = 10.0,
+    right_deg: Annotated[float, typer.Option(help="And turned by this at most, degrees.")] = 5.0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="With --scene: measure, store nothing.")] = False,
+    clear: Annotated[bool, typer.Option("--clear", help="Take the calibration of --scene away; measures nothing.")] = (
+        False
+    ),
+    output: Annotated[Path, typer.Option(help="Folder for report.html and report.json.")] = OUTPUT,
+    address: Address = "",
+    tls: Tls = False,
+    ca: Ca = None,
+    cert: Cert = None,
+    key: Key = None,
+    token_file: TokenFile = None,
+    client_id: ClientId = "",
+) -> None:
+    """Measure how often the truth lies within the radii that answers claim, and store what makes them right.
+
+    With --scene, photographs with known poses are localized in a scene that is there, none of them compared with
+    itself; the factors by which its answers' radii are wrong are stored with it, and from then on its answers are
+    calibrated. Exit code 1 when there is nothing to calibrate from.
+    """
+    from mapless import MaplessError
+    from mapless_tools.child import ServerFailed
+    from mapless_tools.evaluate.command import usage_errors
+    from mapless_tools.evaluate.plan import UsageError
+    from mapless_tools.ingest.connection import Connection
+
+    from .run import CalibrateOptions, calibrate, clear_calibration
+
+    try:
+        connection = Connection(address, tls, ca, cert, key, token_file, client_id)
+        if clear:
+            clear_calibration(folder, scene, connection)
+            print(f"answers in scene {scene} are uncalibrated now")
+            return
+        if folder is None:
+            raise UsageError("name the folder with photographs and their poses")
+        with usage_errors():
+            options = CalibrateOptions(
+                scene=scene,
+                layout=layout,
+                reference_count=references,
+                query_count=query_count,
+                k=k,
+                variant=variant,
+                right_m=right_cm / 100,
+                right_deg=right_deg,
+                dry_run=dry_run,
+            )
+        went_well = calibrate(folder, options, connection, output)
+    except UsageError as error:
+        _fail(str(error), 2)
+    except (ServerFailed, MaplessError, OSError) as error:
+        _fail(str(error), 1)
+    except KeyboardInterrupt:
+        _fail("interrupted; nothing is stored", 128 + signal.SIGINT)
+    raise typer.Exit(0 if went_well else 1)
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    print(f"mapless-server: {message}", file=sys.stderr)
+    raise typer.Exit(code)

@@ -1,0 +1,166 @@
+"""What a calibration found: how often claims hold, before and after; what trust is worth; what was rejected."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import betaincinv
+
+from mapless_server.services.messages.factors import Conditions, Factors
+
+from .claims import Claim
+from .fit import Sample, TooFewQueries, fit_factors, left_one_out
+from .queries import Outcome
+from .selective import Operating, auroc, risk_coverage
+
+DIAGRAM = tuple(p / 100 for p in range(5, 100))
+"""Claimed probabilities of the reliability diagram."""
+
+
+@dataclass(frozen=True)
+class RightRule:
+    """What counts as a right answer: both errors are at most this."""
+
+    position_m: float = 0.10
+    rotation_deg: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not (0 < self.position_m < math.inf and 0 < self.rotation_deg <= 180):
+            raise ValueError(f"an answer is right within some metres and degrees, not {self}")
+
+    def __call__(self, outcome: Outcome) -> bool:
+        """Whether an answer is right; one that is none is not."""
+        return outcome.error_m <= self.position_m and outcome.error_deg <= self.rotation_deg
+
+
+@dataclass(frozen=True)
+class Share:
+    """How many of some, and between which shares the true one lies with 95 % confidence (Clopper and Pearson 1934)."""
+
+    part: int
+    whole: int
+    low: float
+    high: float
+
+    @property
+    def value(self) -> float:
+        """The share; NaN of none."""
+        return self.part / self.whole if self.whole else math.nan
+
+    @classmethod
+    def of(cls, part: int, whole: int, confidence: float = 0.95) -> Share:
+        """With the interval: shares under which a count as extreme is not rarer than half of 1 - confidence."""
+        tail = (1 - confidence) / 2
+        low = float(betaincinv(part, whole - part + 1, tail)) if part else 0.0
+        high = float(betaincinv(part + 1, whole - part, 1 - tail)) if part < whole else 1.0
+        return cls(part, whole, low, high)
+
+
+@dataclass(frozen=True)
+class Held:
+    """How often a claimed radius held.
+
+    Attributes:
+        claim: "position" or "rotation".
+        probability: claimed.
+        before: as the server claims it, without any factor.
+        factor: what makes it right; None where there are too few answers.
+        after: with the factor that all other answers give; None likewise.
+    """
+
+    claim: str
+    probability: float
+    before: Share
+    factor: float | None
+    after: Share | None
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """All that a calibration found.
+
+    Attributes:
+        outcomes: of all photographs, in their order.
+        conditions: what computed the answers that are calibrated: most of all.
+        sample: of those.
+        others: how many answers something else computed; they are left out.
+        factors: of the sample; None if it is too small, and `refusal` says so.
+        after: the sample with the factors that all others give; None likewise.
+        held: a row for each kind and probability.
+        rejections: how many by reason.
+        right: how many answers are.
+        trusted: risk against coverage, by trust; empty if answers have none.
+        auroc: probability that a right answer has more trust than a wrong one; NaN if there is none of either.
+    """
+
+    outcomes: tuple[Outcome, ...]
+    conditions: Conditions | None
+    sample: Sample
+    others: int
+    factors: Factors | None
+    refusal: str
+    after: Sample | None
+    held: tuple[Held, ...]
+    rejections: Mapping[str, int]
+    right: Share
+    trusted: tuple[Operating, ...]
+    auroc: float
+
+
+def find(outcomes: Sequence[Outcome], right: RightRule) -> Findings:
+    """Everything, from what became of the photographs."""
+    answered = [it for it in outcomes if it.pose is not None]
+    counts = Counter(it.conditions for it in answered if it.position is not None)
+    conditions = counts.most_common(1)[0][0] if counts else None
+    measured = [it for it in answered if it.position is not None and it.conditions == conditions]
+    sample = Sample(
+        tuple(it.position for it in measured if it.position), tuple(it.rotation for it in measured if it.rotation)
+    )
+    refusal, factors, after = "", None, None
+    try:
+        factors = fit_factors(sample)
+        after = left_one_out(sample)
+    except TooFewQueries as error:
+        refusal = str(error)
+    is_right = [right(it) for it in answered]
+    has_trust = bool(answered) and all(it.trust is not None for it in answered)
+    trust = [it.trust or 0.0 for it in answered]
+    return Findings(
+        outcomes=tuple(outcomes),
+        conditions=conditions,
+        sample=sample,
+        others=len(answered) - len(measured),
+        factors=factors,
+        refusal=refusal,
+        after=after,
+        held=tuple(_held(sample, factors, after)),
+        rejections=dict(Counter(it.rejection for it in outcomes if it.rejection).most_common()),
+        right=Share.of(sum(is_right), len(answered)),
+        trusted=tuple(risk_coverage(trust, is_right)) if has_trust else (),
+        auroc=auroc(trust, is_right) if has_trust else math.nan,
+    )
+
+
+def reliability(claims: Sequence[Claim]) -> list[tuple[float, float]]:
+    """The reliability diagram: claimed probability against the share of claims (at least one) that hold at it."""
+    return [(p, float(np.mean([claim.held(p) for claim in claims]))) for p in DIAGRAM]
+
+
+def _held(sample: Sample, factors: Factors | None, after: Sample | None) -> list[Held]:
+    rows = []
+    for kind in ("position", "rotation"):
+        for percent in (68, 95):
+            factor = getattr(factors, f"{kind}_{percent}") if factors else None
+            calibrated = _share(getattr(after, kind), percent) if after else None
+            rows.append(Held(kind, percent / 100, _share(getattr(sample, kind), percent), factor, calibrated))
+    return rows
+
+
+def _share(claims: Sequence[Claim], percent: int) -> Share:
+    radii = [claim.radius_68 if percent == 68 else claim.radius_95 for claim in claims]
+    held = [claim.error <= radius for claim, radius in zip(claims, radii, strict=True)]
+    return Share.of(int(np.sum(held)), len(claims))

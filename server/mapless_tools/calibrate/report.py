@@ -1,0 +1,224 @@
+"""A calibration for people (a table) and for programs (JSON)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from mapless_server import __version__
+from mapless_tools.dataset import Dataset
+
+from .findings import Findings, Held, RightRule, Share, reliability
+from .fit import MIN_QUERIES, PRIOR_QUERIES
+from .queries import Outcome
+
+RULES = (
+    "Shares are of answers that have a pose and radii, right and wrong ones; with the interval in which the true share "
+    "lies with 95 % confidence (Clopper and Pearson). Photographs of one walk resemble each other, so they say less "
+    "than as many of different places.",
+    "Errors are distances to the poses of the folder, so whatever these are off by is in them.",
+    f"A factor is where the distribution of error / radius reaches the stated probability; that of n answers is mixed "
+    f"with {PRIOR_QUERIES:g} of answers that are as claimed, so that few answers say little. Fewer than {MIN_QUERIES} "
+    "calibrate nothing.",
+    "Dotted in the diagrams: what exactly right claims would show, and how far from that chance alone leads with so "
+    "many answers, in 95 % of cases at each probability.",
+    "With the factors of all others: each answer with those that all others give, so that none is judged by itself.",
+    "Radii for other probabilities than 68 and 95 % are the covariance's, times what the stated radii are of its own: "
+    "exactly at both, linear between, constant beyond.",
+    "Trust is shown of the answers that were given; what the server rejected is counted by its reason alone.",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationReport:
+    """What was measured, and on what.
+
+    Attributes:
+        dataset: the folder.
+        scene: the scene that was asked; empty if the folder was its own.
+        references: how many the scene has.
+        count: references that a query was given.
+        stored: what was done with the factors, a sentence.
+        found: all figures.
+    """
+
+    dataset: Dataset
+    scene: str
+    references: int
+    count: int
+    right: RightRule
+    stored: str
+    found: Findings
+
+    @property
+    def unit(self) -> str:
+        """Of lengths; that of a scene which was asked is the metre."""
+        return "m" if self.dataset.metric or self.scene else "units"
+
+    @property
+    def title(self) -> str:
+        """The scene or the folder."""
+        return f"scene {self.scene}, on {self.dataset.name}" if self.scene else self.dataset.name
+
+    def facts(self) -> dict[str, str]:
+        """What figures are of, name by name."""
+        found, conditions = self.found, self.found.conditions
+        answered = sum(it.pose is not None for it in found.outcomes)
+        return {
+            "photographs": f"{len(found.outcomes)} of {self.dataset.name}",
+            "references": f"{self.references}, {self.count} a query; no photograph is compared with itself",
+            "answered": f"{answered} of {len(found.outcomes)}",
+            "rejected": ", ".join(f"{count} {reason}" for reason, count in found.rejections.items()) or "none",
+            "right answers": f"{share_text(found.right)} within {self.right.position_m:g} {self.unit} and "
+            f"{self.right.rotation_deg:g}°",
+            "trust": trust_text(found),
+            "computed by": "-"
+            if conditions is None
+            else f"{conditions.variant.lower()}; {conditions.backend}, {conditions.features}; mapless {__version__}"
+            + (f"; {found.others} answers by something else are left out" if found.others else ""),
+            "ground truth": self.dataset.ground_truth or self.dataset.source or "not named",
+            "calibration": self.stored,
+        }
+
+
+def share_text(share: Share) -> str:
+    """For people: per cent, the count, and the interval."""
+    if not share.whole:
+        return "-"
+    return (
+        f"{100 * share.value:.1f} % ({share.part} of {share.whole}; {100 * share.low:.0f} to {100 * share.high:.0f} %)"
+    )
+
+
+def trust_text(found: Findings) -> str:
+    """What trust is worth, for people."""
+    if not found.right.whole:
+        return "nothing was answered"
+    if not found.trusted:
+        return "answers have none"
+    if math.isnan(found.auroc):
+        return "nothing to tell apart: all answers are right" if found.right.part else "no answer is right"
+    return f"a right answer has more of it than a wrong one in {100 * found.auroc:.1f} % of pairs (AUROC)"
+
+
+def held_rows(report: CalibrationReport) -> Iterator[tuple[str, ...]]:
+    """A row for each radius, cells as in `COLUMNS`."""
+    for it in report.found.held:
+        yield (
+            f"{it.claim}, {100 * it.probability:.0f} %",
+            share_text(it.before),
+            "-" if it.factor is None else f"{it.factor:.2f}",
+            "-" if it.after is None else share_text(it.after),
+        )
+
+
+COLUMNS = ("radius", "held, as claimed", "factor", "with the factors of all others")
+
+
+def worst(report: CalibrationReport, count: int = 10) -> list[Outcome]:
+    """The answers that exceed a radius of 95 % that they claim, by most first."""
+    answered = [it for it in report.found.outcomes if it.position is not None and it.rotation is not None]
+    return sorted((it for it in answered if _excess(it) > 1), key=lambda it: -_excess(it))[:count]
+
+
+def print_report(report: CalibrationReport, console: Console) -> None:
+    """The figures."""
+    table = Table("", "", title=report.title, show_header=False, title_justify="left")
+    for name, value in report.facts().items():
+        table.add_row(name, value)
+    console.print(table, highlight=False, markup=False)
+    shares = Table(*COLUMNS)
+    for row in held_rows(report):
+        shares.add_row(*row)
+    console.print(shares, highlight=False, markup=False)
+
+
+def to_json(report: CalibrationReport) -> dict[str, Any]:
+    """Everything as JSON values; what is infinite or unknown is null."""
+    found = report.found
+    return {
+        "folder": report.dataset.name,
+        "scene": report.scene or None,
+        "metric": report.unit == "m",
+        "ground_truth": report.dataset.ground_truth or report.dataset.source,
+        "version": __version__,
+        "references": report.references,
+        "k": report.count,
+        "photographs": len(found.outcomes),
+        "computed_by": asdict(found.conditions) if found.conditions else None,
+        "left_out": found.others,
+        "rejections": dict(found.rejections),
+        "factors": asdict(found.factors) if found.factors else None,
+        "refusal": found.refusal,
+        "stored": report.stored,
+        "held": [_held(it) for it in found.held],
+        "reliability": {kind: _reliability(report, kind) for kind in ("position", "rotation")},
+        "right": {"position_m": report.right.position_m, "rotation_deg": report.right.rotation_deg}
+        | _share(found.right),
+        "auroc": _finite(found.auroc),
+        "risk_coverage": [asdict(point) for point in found.trusted],
+        "rules": [*RULES],
+        "per_query": [_query(it, report.unit) for it in found.outcomes],
+    }
+
+
+def _excess(outcome: Outcome) -> float:
+    claims = [claim for claim in (outcome.position, outcome.rotation) if claim]
+    return max(claim.error / max(claim.radius_95, 1e-300) for claim in claims)
+
+
+def _held(it: Held) -> dict[str, Any]:
+    after = None if it.after is None else _share(it.after)
+    return {
+        "claim": it.claim,
+        "probability": it.probability,
+        "before": _share(it.before),
+        "factor": it.factor,
+        "after": after,
+    }
+
+
+def _share(share: Share) -> dict[str, Any]:
+    return {
+        "part": share.part,
+        "whole": share.whole,
+        "share": _finite(share.value),
+        "low": share.low,
+        "high": share.high,
+    }
+
+
+def _reliability(report: CalibrationReport, kind: str) -> dict[str, Any]:
+    found = report.found
+    before, after = getattr(found.sample, kind), getattr(found.after, kind) if found.after else ()
+    return {
+        "before": reliability(before) if before else [],
+        "after": reliability(after) if after else [],
+    }
+
+
+def _query(it: Outcome, unit: str) -> dict[str, Any]:
+    position, rotation = it.position, it.rotation
+    return {
+        "name": it.name,
+        f"error_{unit}": _finite(it.error_m),
+        "error_deg": _finite(it.error_deg),
+        f"claimed_68_{unit}": position.radius_68 if position else None,
+        f"claimed_95_{unit}": position.radius_95 if position else None,
+        "claimed_68_deg": rotation.radius_68 if rotation else None,
+        "claimed_95_deg": rotation.radius_95 if rotation else None,
+        "trust": it.trust,
+        "inliers": it.inlier_count,
+        "matches": it.match_count,
+        "rejection": {"reason": it.rejection, "message": it.message} if it.rejection else None,
+        "features": it.conditions.features if it.conditions else None,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

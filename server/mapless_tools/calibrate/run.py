@@ -1,0 +1,223 @@
+"""A calibration from end to end: read, localize, find, store, report."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from mapless import Client
+from mapless.names import check_id
+from mapless.scenes import Calibration
+from mapless_server.serve.assembly import image_limits
+from mapless_server.serve.signals import terminable
+from mapless_server.services.messages.factors import Factors
+from mapless_server.settings import Settings, load_settings
+from mapless_tools.child import child_server
+from mapless_tools.dataset import Dataset, Frame
+from mapless_tools.evaluate.command import usage_errors
+from mapless_tools.evaluate.plan import EvaluationOptions, UsageError, check_images
+from mapless_tools.evaluate.run import CONNECT, plan_for, store_references
+from mapless_tools.ingest.connection import Connection, connected
+from mapless_tools.ingest.formats import read_dataset
+from mapless_tools.output_files import write_json
+from mapless_tools.progress import Progress, progress_bars
+
+from .findings import Findings, RightRule, find
+from .page import page
+from .queries import Outcome, Question, ask, planned_questions, scene_questions
+from .report import CalibrationReport, print_report, to_json
+from .worlds import other_world
+
+OWN_SCENE = "calibration"
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """Options of a calibration.
+
+    Attributes:
+        scene: the scene to ask; empty for the folder by itself.
+        layout: of the folder.
+        reference_count, query_count, k, variant: as EvaluationOptions has them.
+        right_m, right_deg: what counts as a right answer.
+        dry_run: whether to store nothing.
+    """
+
+    scene: str = ""
+    layout: str = "auto"
+    reference_count: int | None = None
+    query_count: int | None = None
+    k: int = 10
+    variant: str = "best"
+    right_m: float = 0.10
+    right_deg: float = 5.0
+    dry_run: bool = False
+
+    def __post_init__(self) -> None:
+        if self.scene:
+            check_id(self.scene)
+            if self.reference_count is not None:
+                raise ValueError("--references: only without --scene, which has its own")
+        elif self.dry_run:
+            raise ValueError("--dry-run: only with --scene, nothing is stored without one")
+        self.evaluation()
+        self.right()
+
+    def evaluation(self) -> EvaluationOptions:
+        """How the folder is split; ValueError where that is senseless."""
+        return EvaluationOptions(self.reference_count, self.query_count, self.k, self.variant)
+
+    def right(self) -> RightRule:
+        """What is right; ValueError likewise."""
+        return RightRule(self.right_m, self.right_deg)
+
+
+def clear_calibration(folder: Path | None, scene: str, connection: Connection) -> None:
+    """Takes a scene's calibration away.
+
+    Raises:
+        UsageError: no scene is named, or a folder is.
+        ServerFailed: the server did not start.
+        MaplessError: the call failed.
+    """
+    with usage_errors():
+        if folder is not None or not scene:
+            raise ValueError("--clear takes --scene and no folder")
+        check_id(scene)
+        settings = load_settings({}).settings
+    with terminable(), _connected(connection, settings) as client:
+        client.update_scene(scene, calibration=None)
+
+
+def calibrate(folder: Path, options: CalibrateOptions, connection: Connection, output: Path) -> bool:
+    """Measures, prints, writes the report, and stores the factors where there is a scene.
+
+    Args:
+        folder: with photographs and their poses.
+        options: see there.
+        connection: of the scene's server.
+        output: folder for the report; made if it is not there.
+
+    Returns:
+        Whether there were factors to be found.
+
+    Raises:
+        UsageError: a wrong folder, file or setting; or the folder's poses are not in the scene's world.
+        ServerFailed: the server did not start.
+        MaplessError: a call failed.
+        OSError: the report cannot be written.
+    """
+    with usage_errors():
+        settings = load_settings({}).settings
+        dataset = read_dataset(folder, options.layout)
+    output.mkdir(parents=True, exist_ok=True)
+    measure = _measure_scene if options.scene else _measure_folder
+    with terminable(), progress_bars() as progress:
+        report = measure(dataset, options, connection, settings, progress)
+    print_report(report, Console())
+    write_json(output / "report.json", to_json(report))
+    (output / "report.html").write_text(page(report), encoding="utf-8")
+    print(f"{output / 'report.html'}, {output / 'report.json'}")
+    return report.found.factors is not None
+
+
+def _measure_folder(
+    dataset: Dataset, options: CalibrateOptions, _: Connection, settings: Settings, progress: Progress
+) -> CalibrationReport:
+    """The folder by itself, as `evaluate` splits it, on a server of its own."""
+    plan = plan_for(dataset, options.evaluation(), settings, progress)
+    with (
+        tempfile.TemporaryDirectory(prefix="mapless-calibrate-") as data_dir,
+        child_server(Path(data_dir)) as server,
+        Client(server.address, CONNECT) as client,
+    ):
+        store_references(client, OWN_SCENE, plan.references, progress)
+        outcomes = _ask_all(client, OWN_SCENE, planned_questions(plan.queries), options, None, progress)
+    stored = "not stored: no --scene was given"
+    return CalibrationReport(
+        dataset, "", len(plan.references), options.k, options.right(), stored, find(outcomes, options.right())
+    )
+
+
+def _measure_scene(
+    dataset: Dataset, options: CalibrateOptions, connection: Connection, settings: Settings, progress: Progress
+) -> CalibrationReport:
+    """A scene that is there; its calibration is replaced by what was found, unless that is nothing or a dry run."""
+    frames = _spread(dataset.frames, options.query_count)
+    check_images(frames, image_limits(settings))
+    with _connected(connection, settings) as client:
+        scene = client.get_scene(options.scene)
+        before = Factors.of(scene.calibration) if scene.calibration else None
+        questions = scene_questions(client, options.scene, frames, progress)
+        outcomes = _ask_all(client, options.scene, questions, options, before, progress)
+        other = other_world(outcomes)
+        if other is not None:
+            raise UsageError(str(other))
+        found = find(outcomes, options.right())
+        stored = _store(client, options, found, scene.calibration)
+    return CalibrationReport(dataset, options.scene, scene.reference_count, options.k, options.right(), stored, found)
+
+
+def _store(client: Client, options: CalibrateOptions, found: Findings, before: Calibration | None) -> str:
+    """What was done with the factors; `before` is what they were measured under."""
+    if found.factors is None or found.conditions is None:
+        return f"not stored: {found.refusal}"
+    if options.dry_run:
+        return "not stored: a dry run"
+    if client.get_scene(options.scene).calibration != before:
+        return "not stored: somebody else calibrated the scene meanwhile"
+    client.update_scene(options.scene, calibration=calibration_of(found))
+    return f"stored with scene {options.scene}, from {len(found.sample)} answers"
+
+
+def calibration_of(found: Findings) -> Calibration:
+    """What a scene keeps of findings that have factors."""
+    assert found.factors is not None
+    assert found.conditions is not None
+    return Calibration(
+        position_factor_68=found.factors.position_68,
+        position_factor_95=found.factors.position_95,
+        rotation_factor_68=found.factors.rotation_68,
+        rotation_factor_95=found.factors.rotation_95,
+        query_count=len(found.sample),
+        features=found.conditions.features,
+        backend=found.conditions.backend,
+        variant=found.conditions.variant,
+        server_version=found.conditions.server_version,
+    )
+
+
+def _ask_all(
+    client: Client,
+    scene: str,
+    questions: Sequence[Question],
+    options: CalibrateOptions,
+    scaled: Factors | None,
+    progress: Progress,
+) -> list[Outcome]:
+    outcomes: list[Outcome] = []
+    progress("localizing", 0, len(questions))
+    for question in questions:
+        outcomes.append(ask(client, scene, question, count=options.k, variant=options.variant, scaled=scaled))
+        progress("localizing", len(outcomes), len(questions))
+    return outcomes
+
+
+@contextmanager
+def _connected(connection: Connection, settings: Settings) -> Iterator[Client]:
+    """As `connected`; what is wrong with the connection's options is a UsageError."""
+    with ExitStack() as stack:
+        with usage_errors():
+            client = stack.enter_context(connected(connection, settings))
+        yield client
+
+
+def _spread(frames: Sequence[Frame], count: int | None) -> list[Frame]:
+    wanted = len(frames) if count is None else min(count, len(frames))
+    return [frames[i] for i in np.linspace(0, len(frames) - 1, wanted).round().astype(int)]

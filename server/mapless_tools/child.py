@@ -1,0 +1,142 @@
+"""A server of one's own: the real one, as a child process on the loopback interface."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import SecretStr
+
+from mapless_server.settings import PREFIX
+
+START_TIMEOUT_S = 120.0
+GRACE_S = 1.0
+_ANNOUNCEMENT = "mapless-server listening on "
+
+
+class ServerFailed(Exception):
+    """The server did not start; it has said why on standard error."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Memory of a process.
+
+    Attributes:
+        resident_mib: now.
+        peak_mib: the most it ever was (VmHWM).
+    """
+
+    resident_mib: float
+    peak_mib: float
+
+
+@dataclass(frozen=True)
+class ChildServer:
+    """A running server."""
+
+    address: str
+    process_id: int
+
+    def memory(self) -> Memory | None:
+        """What the process holds; None where the system does not tell (it is read from /proc)."""
+        try:
+            status = Path(f"/proc/{self.process_id}/status").read_text()
+        except OSError:
+            return None
+        fields = dict(line.split(":", 1) for line in status.splitlines())
+        if "VmRSS" not in fields or "VmHWM" not in fields:
+            return None
+        return Memory(int(fields["VmRSS"].split()[0]) / 1024, int(fields["VmHWM"].split()[0]) / 1024)
+
+
+@contextmanager
+def child_server(
+    store: Path | SecretStr,
+    more_flags: Mapping[str, str] | None = None,
+    environment: Mapping[str, str] | None = None,
+    log: Path | None = None,
+) -> Iterator[ChildServer]:
+    """A server on a free port of the loopback interface until the block is left, by whatever way.
+
+    Settings of the environment hold for it, except where it listens and stores, and those of `more_flags`.
+
+    Args:
+        store: a data folder, or the URL of a database that servers share.
+        more_flags: of the command `serve`, with their values.
+        environment: variables that are added to our own.
+        log: file that its log is added to; None for our own standard error.
+
+    Raises:
+        ServerFailed: it ended, or did not listen within `START_TIMEOUT_S`.
+    """
+    flags = {
+        "--host": "127.0.0.1",
+        "--port": "0",
+        "--log-level": "warning",
+        "--drain-grace-s": str(GRACE_S),
+        "--metrics-port": "0",
+    } | dict(more_flags or {})
+    environment = dict(environment or {})
+    if isinstance(store, Path):
+        flags["--data-dir"] = str(store)  # as a flag, it stands above any database of the environment
+    else:
+        environment[f"{PREFIX}DATABASE_URL"] = store.get_secret_value()  # all users can read a command line
+    arguments = [part for flag in flags.items() for part in flag]
+    with child_module("mapless_tools", "serve", *arguments, environment=environment, log=log) as server:
+        yield server
+
+
+@contextmanager
+def child_module(
+    module: str, *arguments: str, environment: Mapping[str, str] | None = None, log: Path | None = None
+) -> Iterator[ChildServer]:
+    """A module that runs as a server and announces itself as ours does; otherwise as `child_server`.
+
+    Args:
+        module: its name.
+        arguments: of its command line.
+        environment: variables that are added to our own, or replace them.
+        log: file that its standard error is added to; None for our own.
+    """
+    with nullcontext() if log is None else log.open("ab") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            env=os.environ | (environment or {}),
+        )
+    try:
+        yield ChildServer(_read_address(process, "above" if log is None else f"in {log}"), process.pid)
+    finally:
+        process.terminate()
+        try:
+            process.wait(GRACE_S + 30)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def _read_address(process: subprocess.Popen[str], where: str) -> str:
+    assert process.stdout is not None
+    # Reading a pipe has no deadline; a child that is gone ends it.
+    deadline = threading.Timer(START_TIMEOUT_S, process.kill)
+    deadline.daemon = True
+    deadline.start()
+    try:
+        for line in process.stdout:
+            if line.startswith(_ANNOUNCEMENT):
+                return line.removeprefix(_ANNOUNCEMENT).strip()
+    finally:
+        deadline.cancel()
+    raise ServerFailed(f"the server did not start (exit code {process.wait()}); its own message is {where}")

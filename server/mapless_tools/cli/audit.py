@@ -1,0 +1,220 @@
+"""`mapless-server audit`: examines the references of a scene on a server and prints what it found, the worst first."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from mapless_tools.ingest.command import Address, Ca, Cert, ClientId, Key, Scene, Tls, TokenFile
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from mapless import ReferenceAudit
+
+ALARMS = ("SWAPPED_IMAGE", "WRONG_POSE_AND_INTRINSICS", "WRONG_POSE", "WRONG_INTRINSICS", "SCENE_CHANGED")
+"""Findings that mislead whoever is localized, the worst first."""
+
+MAX_PAGE = 100
+MAX_TIMEOUT_S = 600.0
+"""Servers give no call more, unless they are set to."""
+
+_ORDER = (*ALARMS, "DUPLICATE", "UNVERIFIABLE", "CONSISTENT")
+
+
+def audit_command(
+    scene: Scene,
+    report: Annotated[Path | None, typer.Option(help="JSON file for the whole report.")] = None,
+    html: Annotated[Path | None, typer.Option(help="HTML file for the whole report.")] = None,
+    page_size: Annotated[int, typer.Option(help="References a call, 1 to 100; each takes up to a second.")] = 10,
+    everything: Annotated[bool, typer.Option("--all", help="Print consistent references, too.")] = False,
+    address: Address = "",
+    tls: Tls = False,
+    ca: Ca = None,
+    cert: Cert = None,
+    key: Key = None,
+    token_file: TokenFile = None,
+    client_id: ClientId = "",
+) -> None:
+    """Examine the references of a scene against their neighbours; exit code 1 when any of them is wrong.
+
+    What was found by then is told, too, when it ends early: exit code 1 after an error, 130 after Ctrl-C.
+    """
+    from mapless import MaplessError
+    from mapless_server.serve.signals import terminable
+    from mapless_server.settings import ConfigError, load_settings
+    from mapless_tools.child import ServerFailed
+    from mapless_tools.ingest.connection import Connection, connected
+    from mapless_tools.output_files import check_writable
+    from mapless_tools.progress import progress_bars
+
+    examined = Examined(scene)
+    try:
+        for file in filter(None, (report, html)):
+            check_writable(file)
+        settings = load_settings({}).settings
+        connection = Connection(address, tls, ca, cert, key, token_file, client_id)
+        with terminable(), connected(connection, settings) as client, progress_bars() as progress:
+            examined.total = client.get_scene(scene).reference_count
+            progress("audit", 0, examined.total)
+            for found in client.audit_scene(scene, page_size=page_size, timeout_s=timeout_s(page_size)):
+                examined.audits.append(found)
+                progress("audit", len(examined.audits), examined.total)
+    except (ValueError, ConfigError) as error:
+        _fail(str(error), code=2)
+    except (MaplessError, ServerFailed) as error:
+        examined.stopped = str(error)
+        print(f"mapless-server: {error}", file=sys.stderr)
+        raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        examined.stopped = "interrupted"
+        raise typer.Exit(128 + signal.SIGINT) from None
+    except SystemExit:
+        examined.stopped = "terminated"
+        raise
+    finally:
+        if examined.total is not None:
+            _tell(examined, everything, report, html)
+    if any(a.verdict in ALARMS for a in examined.audits):
+        raise typer.Exit(1)
+
+
+@dataclass
+class Examined:
+    """How far an audit came.
+
+    Attributes:
+        scene: which.
+        audits: of the references so far, in the order they came.
+        total: how many references the scene has; None before that is known.
+        stopped: why it ended early; empty if it did not.
+    """
+
+    scene: str
+    audits: list[ReferenceAudit] = field(default_factory=list)
+    total: int | None = None
+    stopped: str = ""
+
+
+def timeout_s(page_size: int) -> float:
+    """Deadline of a page: some seconds, and three times what a reference takes at most, as far as servers go along."""
+    return min(5.0 + 3.0 * (page_size or MAX_PAGE), MAX_TIMEOUT_S)
+
+
+def _tell(examined: Examined, everything: bool, report: Path | None, html: Path | None) -> None:
+    """Prints and writes what was found, all of it or as far as it came."""
+    from rich.console import Console
+
+    from mapless_tools.output_files import write_json
+
+    examined = replace(examined, audits=worst_first(examined.audits))
+    shown = [a for a in examined.audits if everything or a.verdict != "CONSISTENT"]
+    console = Console(soft_wrap=True)
+    if shown:
+        Console().print(table_of(shown))
+        for audit in shown:
+            console.print(f"{reference_id_of(audit)}: {audit.message}", markup=False, highlight=False)
+    console.print(summary_of(examined), markup=False)
+    if report is not None:
+        write_json(report, to_json(examined))
+    if html is not None:
+        html.write_text(to_html(examined), encoding="utf-8")
+
+
+def worst_first(audits: Iterable[ReferenceAudit]) -> list[ReferenceAudit]:
+    """By finding, then by how far the position is off, then by name."""
+    return sorted(audits, key=lambda a: (_rank(a.verdict), -a.position_offset_m, -a.rotation_offset_deg, a.name))
+
+
+def _rank(verdict: str) -> int:
+    return _ORDER.index(verdict) if verdict in _ORDER else len(_ORDER)
+
+
+def summary_of(examined: Examined) -> str:
+    """How many there are of each finding, in one line."""
+    counts = Counter(a.verdict for a in examined.audits)
+    parts = [f"{counts[v]} {v.lower().replace('_', ' ')}" for v in sorted(counts, key=_rank)]
+    found = f"{len(examined.audits)} references: {', '.join(parts) or 'none'}"
+    if not examined.stopped:
+        return found
+    return f"stopped after {len(examined.audits)} of {examined.total} references ({examined.stopped}); {found}"
+
+
+def reference_id_of(audit: ReferenceAudit) -> str:
+    """The reference's id within its scene."""
+    return audit.name.rsplit("/", 1)[-1]
+
+
+def cells_of(audit: ReferenceAudit) -> tuple[str, ...]:
+    """The figures of one reference, in the order of `COLUMNS`; a dash where one is not known."""
+    is_known = audit.focal_ratio > 0
+    return (
+        reference_id_of(audit),
+        audit.verdict.lower().replace("_", " "),
+        f"{100 * audit.position_offset_m:.1f}" if is_known else "-",
+        f"{audit.rotation_offset_deg:.2f}" if is_known else "-",
+        f"{100 * (1 / audit.focal_ratio - 1):+.1f}" if is_known else "-",
+        f"{audit.inlier_count}/{audit.match_count}",
+        f"{audit.reprojection_error_px:.1f}" if audit.inlier_count else "-",
+        audit.message,
+    )
+
+
+COLUMNS = ("reference", "finding", "off, cm", "turned, deg", "focal, %", "agree", "error, px", "in words")
+
+
+def table_of(audits: Sequence[ReferenceAudit]) -> Table:
+    """The table for a terminal: the figures; words would not fit beside them."""
+    from rich.table import Table
+
+    table = Table()
+    for i, column in enumerate(COLUMNS[:-1]):
+        table.add_column(column, justify="right" if 2 <= i <= 6 else "left", overflow="fold")
+    for audit in audits:
+        style = "red" if audit.verdict in ALARMS else "" if audit.verdict == "CONSISTENT" else "yellow"
+        table.add_row(*cells_of(audit)[:-1], style=style)
+    return table
+
+
+def to_json(examined: Examined) -> dict[str, Any]:
+    """The report for programs; `stopped` says why it ended early and is empty if it did not."""
+    return {
+        "scene": examined.scene,
+        "summary": summary_of(examined),
+        "stopped": examined.stopped,
+        "reference_count": examined.total,
+        "references": [asdict(a) for a in examined.audits],
+    }
+
+
+_STYLE = """body{font:14px sans-serif;margin:2em}table{border-collapse:collapse}td,th{padding:.3em .6em;
+border-bottom:1px solid #ccc;text-align:left}.alarm{background:#fdd}.note{background:#ffd}"""
+
+
+def to_html(examined: Examined) -> str:
+    """The report as one page that needs nothing else."""
+    from html import escape
+
+    rows = []
+    for audit in examined.audits:
+        kind = "alarm" if audit.verdict in ALARMS else "" if audit.verdict == "CONSISTENT" else "note"
+        cells = "".join(f"<td>{escape(cell)}</td>" for cell in cells_of(audit))
+        rows.append(f'<tr class="{kind}">{cells}</tr>')
+    head = "".join(f"<th>{escape(column)}</th>" for column in COLUMNS)
+    title = escape(f"Audit of scene {examined.scene}")
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
+        f"<h1>{title}</h1><p>{escape(summary_of(examined))}</p><table><tr>{head}</tr>{''.join(rows)}</table></html>\n"
+    )
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    print(f"mapless-server: {message}", file=sys.stderr)
+    raise typer.Exit(code)

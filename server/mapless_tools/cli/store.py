@@ -1,0 +1,159 @@
+"""`mapless-server store`: migrate, verify, back up and restore the store that the settings name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+
+if TYPE_CHECKING:
+    from mapless_server.store.database import Database
+    from mapless_server.store.verify import Progress, Verification
+
+store_app = typer.Typer(help="The store: bring it up to date, check it, back it up, restore it.", no_args_is_help=True)
+
+FAULTS_SHOWN = 50
+
+Config = Annotated[Path | None, typer.Option(help="TOML file of settings; also MAPLESS_CONFIG.")]
+DataDir = Annotated[Path | None, typer.Option(help="Folder of the store; default: the server's setting.")]
+
+
+@store_app.command("migrate")
+def migrate_command(config: Config = None, data_dir: DataDir = None) -> None:
+    """Bring the store to this program's schema, as the server does when it starts; makes one where there is none."""
+    with _faults_said(), closing(_open(config, data_dir)) as database:
+        from mapless_server.store.tables import SCHEMA_VERSION
+
+        print(f"database {database.name} has schema version {SCHEMA_VERSION}")
+
+
+@store_app.command("verify")
+def verify_command(
+    file: Annotated[Path | None, typer.Argument(help="A backup; default: the store.")] = None,
+    config: Config = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Read every row of the store or of a backup and say what is damaged; exit code 1 if anything is."""
+    from mapless_server.store.sqlite import SqliteDatabase
+    from mapless_server.store.verify import verify
+
+    with (
+        _faults_said(),
+        _progress() as on_progress,
+        closing(SqliteDatabase.look_at(file) if file else _look(config, data_dir)) as database,
+        database.read() as connection,
+    ):
+        database.take_your_time(connection)
+        found = verify(connection, on_progress)
+    _report(found, "whole")
+
+
+@store_app.command("backup")
+def backup_command(
+    file: Annotated[Path, typer.Argument(help="File to write; it must not exist.")],
+    config: Config = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Copy the store to one file, whether it is served or not; exit code 1 if something in the store is damaged."""
+    from mapless_server.store.backup import back_up
+
+    with _faults_said(), _progress() as on_progress, closing(_look(config, data_dir)) as database:
+        found = back_up(database, file, on_progress)
+    _report(found, f"written to {file}, read again and found whole")
+
+
+@store_app.command("restore")
+def restore_command(
+    file: Annotated[Path, typer.Argument(help="A backup, of either database.")],
+    config: Config = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Check a backup and copy it into the store, which must be empty: all of it or nothing."""
+    from mapless_server.store.backup import restore
+    from mapless_server.store.sqlite import SqliteDatabase
+
+    with _faults_said(), _progress() as on_progress:
+        SqliteDatabase.look_at(file).close()  # before a store is made for it
+        with closing(_open(config, data_dir)) as database:
+            found = restore(file, database, on_progress)
+    _report(found, "restored, read again and found whole")
+
+
+def _open(config: Path | None, data_dir: Path | None) -> Database:
+    """The settings' store, brought up to date; created if missing."""
+    from mapless_server.store.postgresql import PostgresqlDatabase
+    from mapless_server.store.sqlite import SqliteDatabase
+
+    url, folder = _settings(config, data_dir)
+    return PostgresqlDatabase.open(url) if url else SqliteDatabase.open(folder)
+
+
+def _look(config: Path | None, data_dir: Path | None) -> Database:
+    """The settings' store as it is, whoever else uses it."""
+    from mapless_server.store.postgresql import PostgresqlDatabase
+    from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
+
+    url, folder = _settings(config, data_dir)
+    return PostgresqlDatabase.look_at(url) if url else SqliteDatabase.look_at(folder / DATABASE_FILE)
+
+
+def _settings(config: Path | None, data_dir: Path | None) -> tuple[str | None, Path]:
+    """URL of the shared database, if there is one, and the data folder."""
+    from mapless_server.settings import load_settings
+
+    settings = load_settings({"data_dir": data_dir}, config).settings
+    url = settings.database_url
+    return url.get_secret_value() if url else None, settings.data_dir
+
+
+@contextmanager
+def _faults_said() -> Iterator[None]:
+    """What goes wrong with the store ends the command with one line."""
+    from mapless_server.errors import RequestError
+    from mapless_server.settings import ConfigError
+    from mapless_server.store.database import StoreError
+
+    try:
+        yield
+    except ConfigError as error:
+        _fail(str(error), code=2)
+    except (StoreError, RequestError, ValueError) as error:
+        _fail(str(error), code=1)
+
+
+@contextmanager
+def _progress() -> Iterator[Progress]:
+    from rich.console import Console
+    from rich.progress import Progress as Bars
+    from rich.progress import TaskID
+
+    tasks: dict[str, TaskID] = {}
+    with Bars(console=Console(stderr=True)) as bars:
+
+        def on_progress(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = bars.add_task(what)
+            bars.update(tasks[what], completed=done, total=total)
+
+        yield on_progress
+
+
+def _report(found: Verification, verdict: str) -> None:
+    contents = ", ".join(f"{name.replace('_', ' ')}: {count}" for name, count in found.counts.items())
+    print(f"schema version {found.version}; {contents}")
+    for fault in found.faults[:FAULTS_SHOWN]:
+        print(f"damaged: {fault}")
+    if found.faults:
+        print(f"{len(found.faults)} faults; delete the references that are named and add them again")
+        if not found.is_file_whole:
+            print("the file itself is damaged: restore a backup, or export each scene and import it into a new store")
+        raise typer.Exit(1)
+    print(verdict)
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    typer.echo(f"mapless-server: {message}", err=True)
+    raise typer.Exit(code)

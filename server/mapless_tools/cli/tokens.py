@@ -1,0 +1,96 @@
+"""`mapless-server token`: create, list, revoke. The token alone goes to standard output, for programs to catch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from mapless_server.security.principal import DEFAULT_TENANT
+
+token_app = typer.Typer(help="Tokens that callers must show: make, list and revoke them.", no_args_is_help=True)
+
+TokensFile = Annotated[Path | None, typer.Option(help="The file of tokens; default: the server's setting.")]
+
+
+@token_app.command("create")
+def create_command(
+    name: Annotated[str, typer.Option(help="Whose it is; unique, and what the server's log will say.")],
+    role: Annotated[str, typer.Option(help="What it allows: read, localize (and read), or write (everything).")],
+    tenant: Annotated[str, typer.Option(help="Whose scenes it opens.")] = DEFAULT_TENANT,
+    expires: Annotated[str | None, typer.Option(help="When it ends, 2027-01-01T00:00:00Z; default: never.")] = None,
+    tokens_file: TokensFile = None,
+) -> None:
+    """Make a token and print it, once: the file keeps its hash only."""
+    from mapless_server.security.tokens import create_token
+
+    with _tokens_file(tokens_file) as path:
+        token = create_token(path, name, tenant, role, _read_time(expires) if expires else None)
+    typer.echo(f"the token {name!r} of tenant {tenant!r}; it is not shown again:", err=True)
+    print(token)
+
+
+@token_app.command("list")
+def list_command(tokens_file: TokensFile = None) -> None:
+    """Show whose tokens there are, and what they allow."""
+    from mapless_server.security.tokens import read_tokens
+
+    with _tokens_file(tokens_file) as path:
+        tokens = read_tokens(path).tokens
+    now = datetime.now(timezone.utc)
+    width = max((len(it.name) for it in tokens), default=0)
+    for it in sorted(tokens, key=lambda token: (token.tenant, token.name)):
+        end = "never expires"
+        if it.expires is not None:
+            end = f"{'expired' if it.expires <= now else 'expires'} {it.expires.isoformat()}"
+        print(f"{it.name:<{width}}  {it.role:<8}  tenant {it.tenant}  {end}")
+
+
+@token_app.command("revoke")
+def revoke_command(
+    name: Annotated[str, typer.Argument(help="The token's name, as listed.")], tokens_file: TokensFile = None
+) -> None:
+    """Remove a token; a running server refuses it about a second later."""
+    from mapless_server.security.tokens import revoke_token
+
+    with _tokens_file(tokens_file) as path:
+        revoke_token(path, name)
+
+
+@contextmanager
+def _tokens_file(given: Path | None) -> Iterator[Path]:
+    """The file of tokens; what goes wrong with it ends the command with one line."""
+    from mapless_server.security.errors import SecurityError
+    from mapless_server.settings import ConfigError, load_settings
+
+    try:
+        path = load_settings({"tokens_file": given}).settings.tokens_file
+        if path is None:
+            _fail("which file? give --tokens-file, or set MAPLESS_TOKENS_FILE", code=2)
+        yield path
+    except ConfigError as error:
+        _fail(str(error), code=2)
+    except SecurityError as error:
+        _fail(str(error), code=1)
+
+
+def _read_time(text: str) -> datetime:
+    """A moment to come; ends the command if it is none."""
+    from pydantic import AwareDatetime, TypeAdapter, ValidationError
+
+    try:
+        time: datetime = TypeAdapter(AwareDatetime).validate_strings(text)
+    except ValidationError:
+        _fail(f"--expires takes a time with its zone, 2027-01-01T00:00:00Z, not {text!r}", code=2)
+    if time <= datetime.now(timezone.utc):
+        _fail(f"--expires: {text} is over already", code=2)
+    return time
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    typer.echo(f"mapless-server: {message}", err=True)
+    raise typer.Exit(code)

@@ -1,0 +1,175 @@
+"""The paper's benchmarks: their scenes, the numbers of references it tries, and where scenes lie in a folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapless_tools.ingest.formats import cambridge, cameras, seven_scenes, twelve_scenes
+
+from .paper import CAMBRIDGE, SEVEN_SCENES, TWELVE_SCENES, PaperTables
+from .plan import UsageError
+
+MAX_DEPTH = 2
+"""12-Scenes keeps its rooms in folders of buildings."""
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A benchmark of the paper.
+
+    Attributes:
+        layout: name of its layout on the disk, as `formats` has it.
+        title: as printed.
+        scenes: by name of the folder and in the paper's order, what the paper's tables call each.
+        sparse: numbers of references that the paper keeps, the densest first.
+        ground_truth: what the paper's figures are against.
+        paper: its figures.
+    """
+
+    layout: str
+    title: str
+    scenes: dict[str, str]
+    sparse: tuple[int, ...]
+    ground_truth: str
+    paper: PaperTables
+
+
+_ROOMS = {
+    "apt1": ("kitchen", "living"),
+    "apt2": ("bed", "kitchen", "living", "luke"),
+    "office1": ("gates362", "gates381", "lounge", "manolis"),
+    "office2": ("5a", "5b"),
+}
+
+BENCHMARKS = {
+    benchmark.layout: benchmark
+    for benchmark in (
+        Benchmark(
+            "7scenes",
+            "7Scenes",
+            {
+                name: name.capitalize()
+                for name in ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs")
+            },
+            (30, 20, 10, 5),
+            "SfM pseudo ground truth (Brachmann et al., ICCV 2021)",
+            SEVEN_SCENES,
+        ),
+        Benchmark(
+            "12scenes",
+            "12Scenes",
+            {f"{house}/{room}": f"{house.capitalize()}_{room}" for house, rooms in _ROOMS.items() for room in rooms},
+            (30, 20, 10, 5),
+            "SfM pseudo ground truth (Brachmann et al., ICCV 2021)",
+            TWELVE_SCENES,
+        ),
+        Benchmark(
+            "cambridge",
+            "Cambridge Landmarks",
+            {
+                "KingsCollege": "Kings",
+                "OldHospital": "Hospital",
+                "ShopFacade": "Shop",
+                "StMarysChurch": "Church",
+            },
+            (60, 50, 40, 30),
+            "the benchmark's own SfM poses",
+            CAMBRIDGE,
+        ),
+    )
+}
+
+_FITS = {
+    "7scenes": seven_scenes.fits,
+    "12scenes": twelve_scenes.fits,
+    "cambridge": cambridge.fits,
+    "cameras": cameras.fits,
+}
+_MARKS = {
+    "7scenes": "seq-01 and so on with TrainSplit.txt and TestSplit.txt",
+    "12scenes": "data, info.txt and split.txt",
+    "cambridge": "dataset_train.txt and dataset_test.txt",
+    "cameras": "cameras.json",
+}
+
+LAYOUTS = ("auto", *BENCHMARKS, "cameras")
+"""What `--layout` takes."""
+
+
+@dataclass(frozen=True)
+class ScenePlace:
+    """A scene on the disk.
+
+    Attributes:
+        name: unique among those found; the paper's folder name where it has one, in whatever case it is written.
+        path: its folder.
+        layout: how it lies there.
+    """
+
+    name: str
+    path: Path
+    layout: str
+
+    @property
+    def benchmark(self) -> Benchmark | None:
+        """The benchmark whose layout it has; None for a folder with cameras.json."""
+        return BENCHMARKS.get(self.layout)
+
+
+def find_scenes(folder: Path, layout: str = "auto") -> tuple[ScenePlace, ...]:
+    """The scene that a folder is, or those in it, in the paper's order, others after them by name.
+
+    Raises:
+        UsageError: there is no such folder, or no scene of this layout in it.
+    """
+    if layout not in LAYOUTS:
+        raise UsageError(f"layout must be one of {', '.join(LAYOUTS)}, not {layout!r}")
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is not a folder")
+    wanted = LAYOUTS[1:] if layout == "auto" else (layout,)
+    found, other = _search(folder, wanted, MAX_DEPTH)
+    if not found:
+        marks = ", or ".join(f"{_MARKS[name]} ({name})" for name in wanted)
+        seen = f"; what is there has the layout {other}" if other else ""
+        raise UsageError(f"{folder} is no scene, nor are the folders in it: a scene has {marks}{seen}")
+    places = [ScenePlace(_name(path, folder, its), path, its) for path, its in found]
+    return tuple(sorted(places, key=_order))
+
+
+def _search(folder: Path, wanted: tuple[str, ...], depth: int) -> tuple[list[tuple[Path, str]], str]:
+    """Scenes with their layouts, and a layout that was seen and is not wanted."""
+    layout = _layout(folder, wanted)
+    if layout in wanted:
+        return [(folder, layout)], ""
+    if layout or not depth:
+        return [], layout
+    found: list[tuple[Path, str]] = []
+    other = ""
+    for child in sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")):
+        scenes, seen = _search(child, wanted, depth - 1)
+        found += scenes
+        other = other or seen
+    return found, other
+
+
+def _layout(folder: Path, wanted: tuple[str, ...]) -> str:
+    """The layout that a folder has, of the wanted ones if it has several; empty if it has none."""
+    found = [layout for layout, fits in _FITS.items() if fits(folder)]
+    return next((layout for layout in found if layout in wanted), next(iter(found), ""))
+
+
+def _name(path: Path, folder: Path, layout: str) -> str:
+    """The paper's folder name if the path ends like it, else the path from the folder that was given."""
+    path = path.resolve()
+    tail = "/".join(path.parts[-2:]).lower()
+    for name in BENCHMARKS[layout].scenes if layout in BENCHMARKS else ():
+        if tail == name.lower() or tail.endswith("/" + name.lower()):
+            return name
+    relative = path.relative_to(folder.resolve()).as_posix()
+    return path.name if relative == "." else relative
+
+
+def _order(place: ScenePlace) -> tuple[str, int, str]:
+    known = list(place.benchmark.scenes) if place.benchmark else []
+    return place.layout, known.index(place.name) if place.name in known else len(known), place.name

@@ -1,0 +1,136 @@
+"""The worst queries as pictures: the photograph beside the reference that served it best, and their matches.
+
+A match is drawn green where it fits the true poses, red where it does not. Red alone: the wrong things were matched.
+Green and a wrong pose: the fault lies after matching. Neither: the two photographs share nothing.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, cross_matrix
+from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.method.correspond import mutual_matches
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.views import View
+from mapless_tools.dataset import Frame
+
+from .metrics import QueryResult
+from .suite import Run
+
+HEIGHT_PX, GAP_PX = 260, 6
+EPIPOLAR_PX = 4.0
+"""A match farther from the epipolar line of the true poses is wrong; in pixels of the processed query."""
+MAX_DRAWN = 60
+QUALITY = 72
+Picture = NDArray[np.uint8]
+GREEN, RED = (40, 200, 90), (230, 60, 50)
+
+
+@dataclass(frozen=True)
+class WorstQuery:
+    """A query and its picture.
+
+    Attributes:
+        data_uri: the picture, a JPEG file.
+        reference: name of the one beside it; empty if it had none.
+        matches, fitting: how many there are, and how many of them fit the true poses.
+    """
+
+    run: Run
+    result: QueryResult
+    data_uri: str
+    reference: str
+    matches: int
+    fitting: int
+
+
+def worst_of(run: Run, count: int, extractor: FeatureExtractor, ratio: float, limits: ImageLimits) -> list[WorstQuery]:
+    """The queries with the largest translation errors, the rejected first, each with its picture."""
+    order = sorted(run.results, key=lambda it: (-it.translation_error, -it.rotation_error_deg, it.name))
+    frames = {frame.name: frame for frame in (*run.split.references, *run.split.queries)}
+    worst = []
+    for result in order[:count]:
+        beside = result.best_reference or next(iter(result.references), "")
+        query = _Shown.of(frames[result.name], extractor, limits)
+        if not beside:
+            worst.append(WorstQuery(run, result, data_uri(query.image), "", 0, 0))
+            continue
+        reference = _Shown.of(frames[beside], extractor, limits)
+        matches = mutual_matches(query.view.features, reference.view.features, ratio)
+        fits = fit_true_poses(query.frame, reference.frame, query.view, reference.view, matches)
+        picture = _side_by_side(query, reference, matches, fits)
+        worst.append(WorstQuery(run, result, data_uri(picture), beside, len(matches), int(fits.sum())))
+    return worst
+
+
+def fit_true_poses(
+    query: Frame, reference: Frame, query_view: View, reference_view: View, matches: NDArray[np.int32]
+) -> NDArray[np.bool_]:
+    """Which matches (M, 2), query and reference keypoint, lie within `EPIPOLAR_PX` of the true epipolar line, (M,)."""
+    query_from_reference = query.world_from_camera.inverse().compose(reference.world_from_camera)
+    essential = cross_matrix(query_from_reference.translation) @ query_from_reference.rotation
+    x_query = query_view.camera.rays(query_view.features.keypoints[matches[:, 0]])
+    x_reference = reference_view.camera.rays(reference_view.features.keypoints[matches[:, 1]])
+    lines = x_reference @ essential.T
+    distance = np.abs((x_query * lines).sum(axis=1)) / np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-12)
+    return np.asarray(distance * query_view.camera.focal_x_px <= EPIPOLAR_PX)
+
+
+def data_uri(picture: Picture) -> str:
+    """The picture (H, W, 3) RGB as a JPEG file inside an address."""
+    quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+    encoded = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), quality)[1]
+    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """A photograph, reduced for the page, and its features.
+
+    Attributes:
+        keypoints: (N, 2) pixels of `image`, with the lens distortion that it has.
+    """
+
+    frame: Frame
+    view: View
+    image: Picture
+    keypoints: Array
+
+    @staticmethod
+    def of(frame: Frame, extractor: FeatureExtractor, limits: ImageLimits) -> _Shown:
+        image = decode_image(frame.image_path.read_bytes(), limits)
+        view = extractor.extract(image, frame.camera)
+        scale = HEIGHT_PX / image.shape[0]
+        size = (round(image.shape[1] * scale), HEIGHT_PX)
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        pixels = frame.camera.project(view.camera.rays(view.features.keypoints))
+        return _Shown(frame, view, np.asarray(small, np.uint8), pixels * scale)
+
+
+def _side_by_side(query: _Shown, reference: _Shown, matches: NDArray[np.int32], fits: NDArray[np.bool_]) -> Picture:
+    gap: Picture = np.full((HEIGHT_PX, GAP_PX, 3), 128, np.uint8)
+    canvas = np.ascontiguousarray(np.concatenate([query.image, gap, reference.image], axis=1))
+    offset = np.array([query.image.shape[1] + GAP_PX, 0])
+    for i in _some(len(matches)):
+        a, b = query.keypoints[matches[i, 0]], reference.keypoints[matches[i, 1]] + offset
+        colour = GREEN if fits[i] else RED
+        cv2.line(canvas, _pixel(a), _pixel(b), colour, 1, cv2.LINE_AA)
+        for end in (a, b):
+            cv2.circle(canvas, _pixel(end), 2, colour, -1, cv2.LINE_AA)
+    return canvas
+
+
+def _some(count: int) -> Sequence[int]:
+    """Evenly spread indices, so that no part of the matches is preferred."""
+    return [int(i) for i in np.unique(np.linspace(0, count - 1, min(count, MAX_DRAWN)).round())] if count else []
+
+
+def _pixel(place: Array) -> tuple[int, int]:
+    return round(float(place[0])), round(float(place[1]))

@@ -1,0 +1,66 @@
+"""What figures come from: code, weights, settings, machine, day. Figures without them cannot be reproduced."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, timezone
+
+from mapless_server import __version__
+from mapless_server.networks.weights import CATALOGUE
+from mapless_server.networks.weights.folder import Status, look_up, recorded
+from mapless_server.observability.provenance import ROOT, commit_of, cpu_model
+from mapless_server.serve.assembly import device_for, feature_names
+from mapless_server.settings import Settings, available_cores
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What figures come from.
+
+    Attributes:
+        version: of mapless.
+        commit: `git describe` of a checkout, with a digest of what is not committed; empty for an installed package.
+        weights: SHA-256 of each network's file that these settings use; "not recorded" for one put there by hand.
+        settings: those that figures depend on.
+        machine: processor, cores, and the GPU where networks run on one.
+        date: when it began, UTC.
+    """
+
+    version: str
+    commit: str
+    weights: dict[str, str]
+    settings: dict[str, str]
+    machine: str
+    date: str
+
+
+def provenance_of(settings: Settings) -> Provenance:
+    """Of a server with these settings, here and now; errors as `device_for` and `feature_names`."""
+    device = device_for(settings)
+    features = feature_names(settings.features, device)
+    used = {settings.backend, *features, *(f"{name}-lightglue" for name in features if device != "cpu")}
+    if settings.retrieval == "megaloc" or (settings.retrieval == "auto" and device != "cpu"):
+        used.add("megaloc")
+    weights = {}
+    for entry in CATALOGUE:
+        stored = look_up(entry, settings.weights_dir)
+        if entry.name in used and stored.status not in (Status.ABSENT, Status.NO_FILE):
+            known = stored.status is not Status.UNCHECKED and recorded(stored.path)
+            weights[entry.name] = known or "not recorded"
+    told = {
+        "backend": settings.backend,
+        "features": ", ".join(features),
+        "device": device,
+        "retrieval": settings.retrieval,
+    }
+    date = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return Provenance(__version__, commit_of(ROOT), weights, told, _machine(device), date)
+
+
+def _machine(device: str) -> str:
+    machine = f"{cpu_model()}, {available_cores()} cores"
+    if device == "cpu":
+        return machine
+    import torch
+
+    return f"{machine}; {torch.cuda.get_device_name(torch.device(device))}"

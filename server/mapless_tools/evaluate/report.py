@@ -1,0 +1,184 @@
+"""An evaluation for people (tables) and for programs (JSON)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from mapless_server import __version__
+from mapless_server.method.retrieve import RetrieveOptions
+
+from .metrics import QueryResult, Summary, summarize
+from .run import Evaluation
+
+RULES = (
+    "Medians, p90 and recall are over all queries; one that was rejected counts as infinitely wrong.",
+    f"References of a query: those with the most feature matches; within {RetrieveOptions().apart_m:g} m of one chosen "
+    f"before, matches count {RetrieveOptions().nearby_weight:g}. Its true pose is not looked at.",
+    "Latency: time of one Localize call as the client sees it, one after the other, on this machine; choosing the "
+    "references is not in it, nor is the first call in p50 and p95.",
+)
+SCALE_FREE = (
+    "Where a folder's unit of length is arbitrary, errors are in it, and the method's own thresholds, in metres, "
+    "do not mean what they say: compare the relative errors only."
+)
+
+
+def to_json(evaluation: Evaluation) -> dict[str, Any]:
+    """Everything as JSON values; what is infinite or unknown is null."""
+    dataset, options = evaluation.dataset, evaluation.options
+    summary = summarize(evaluation.results)
+    metric = dataset.metric
+    return {
+        "scene": dataset.name,
+        "metric": metric,
+        "ground_truth": dataset.source,
+        "split": "leave_one_out" if options.reference_count is None else "references_and_queries",
+        "references": evaluation.reference_count,
+        "k": options.k,
+        "variant": options.variant,
+        "scale": options.scale_strategy,
+        "backend": evaluation.results[0].backend,
+        "features": next(iter(summary.features)) if len(summary.features) == 1 else dict(summary.features),
+        "version": __version__,
+        "queries": summary.query_count,
+        "localized": summary.localized_count,
+        "median_translation_m": _finite(summary.median_translation) if metric else None,
+        "median_rotation_deg": _finite(summary.median_rotation_deg),
+        "p90_translation_m": _finite(summary.p90_translation) if metric else None,
+        "recall": dict(summary.recall) if metric else dict.fromkeys(summary.recall),
+        "relative": _relative(evaluation, summary),
+        "claimed_68_held": summary.claim_held,
+        "latency_ms": {
+            "p50": summary.latency_p50_ms,
+            "p95": summary.latency_p95_ms,
+            "first": summary.latency_first_ms,
+        },
+        "stage_share": dict(summary.stage_share),
+        "rejections": dict(summary.rejections),
+        "rules": [*RULES] if metric else [*RULES, SCALE_FREE],
+        "per_query": [_query(result, metric) for result in evaluation.results],
+    }
+
+
+def print_report(evaluation: Evaluation, console: Console) -> None:
+    """The table, what was rejected, and the rules that the figures follow."""
+    dataset, options = evaluation.dataset, evaluation.options
+    summary = summarize(evaluation.results)
+    split = "leave one out" if options.reference_count is None else f"{evaluation.reference_count} references"
+    table = Table("", "", title=f"{dataset.name}: {split}, K = {options.k}", show_header=False, title_justify="left")
+    for name, value in {
+        "localized": f"{summary.localized_count} of {summary.query_count}",
+        **_accuracy_rows(evaluation, summary),
+        "latency": f"p50 {summary.latency_p50_ms:.0f} ms, p95 {summary.latency_p95_ms:.0f} ms, "
+        f"first call {summary.latency_first_ms:.0f} ms",
+        "time by stage": format_stages(summary.stage_share),
+        "rejected": ", ".join(f"{count} {reason}" for reason, count in summary.rejections.items()) or "none",
+        "method": f"{options.variant}, scale {options.scale_strategy}; {evaluation.results[0].backend}, "
+        f"{_format_features(summary.features)}; mapless {__version__}",
+        "ground truth": dataset.source or "not named",
+    }.items():
+        table.add_row(name, value)
+    console.print(table, highlight=False, markup=False)
+    for rejected in (r for r in evaluation.results if not r.localized):
+        console.print(f"  {rejected.name}: {rejected.rejection}: {rejected.message}", highlight=False, markup=False)
+    for rule in RULES if dataset.metric else (*RULES, SCALE_FREE):
+        console.print(rule, highlight=False, markup=False)
+
+
+def format_length(value: float, metric: bool) -> str:
+    """Centimetres, or the folder's own unit."""
+    if math.isinf(value):
+        return "infinite"
+    return f"{100 * value:.2f} cm" if metric else f"{value:.4g} units"
+
+
+def format_rotation(degrees: float) -> str:
+    """Degrees, three decimals."""
+    return "infinite" if math.isinf(degrees) else f"{degrees:.3f}°"
+
+
+def format_share(share: float) -> str:
+    """Per cent, three decimals."""
+    return "infinite" if math.isinf(share) else f"{100 * share:.3f} %"
+
+
+def format_stages(shares: Mapping[str, float]) -> str:
+    """Shares of the time, per cent; the stages of each stronger tier, "aliked-2048-1024px/coarse", in one sum."""
+    sums: dict[str, float] = {}
+    for stage, share in shares.items():
+        features, slash, _ = stage.partition("/")
+        name = features.split("-")[0] if slash else stage
+        sums[name] = sums.get(name, 0.0) + share
+    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in sums.items())
+
+
+def _format_features(counts: Mapping[str, int]) -> str:
+    """The features, and how many answers are of them unless all are."""
+    if len(counts) == 1:
+        return next(iter(counts))
+    return ", ".join(f"{name} {count}" for name, count in counts.items())
+
+
+def _accuracy_rows(evaluation: Evaluation, summary: Summary) -> dict[str, str]:
+    metric = evaluation.dataset.metric
+    of_radius = summary.median_translation / evaluation.trajectory_radius if evaluation.trajectory_radius else math.inf
+    rows = {
+        "median translation": format_length(summary.median_translation, metric),
+        "median rotation": format_rotation(summary.median_rotation_deg),
+        "p90 translation": format_length(summary.p90_translation, metric),
+        "median relative translation": f"{format_share(of_radius)} of the references' radius, "
+        f"{format_share(summary.median_relative)} of the distance to them",
+    }
+    if metric:
+        rows["recall"] = ", ".join(
+            f"{name.replace('_', ' ')} {100 * share:.0f} %" for name, share in summary.recall.items()
+        )
+    if summary.claim_held is not None:
+        rows["claimed 68 % radius held"] = f"{100 * summary.claim_held:.0f} % of localized queries"
+    return rows
+
+
+def _relative(evaluation: Evaluation, summary: Summary) -> dict[str, Any]:
+    """Lengths for which the unit does not matter, and the unit's own where it is not the metre."""
+    radius = evaluation.trajectory_radius
+    relative: dict[str, Any] = {
+        "median_translation_of_reference_radius": _finite(summary.median_translation / radius) if radius else None,
+        "p90_translation_of_reference_radius": _finite(summary.p90_translation / radius) if radius else None,
+        "median_translation_of_reference_distance": _finite(summary.median_relative),
+    }
+    if not evaluation.dataset.metric:
+        relative["median_translation_units"] = _finite(summary.median_translation)
+        relative["p90_translation_units"] = _finite(summary.p90_translation)
+    return relative
+
+
+def _query(result: QueryResult, metric: bool) -> dict[str, Any]:
+    unit = "m" if metric else "units"
+    return {
+        "name": result.name,
+        "localized": result.localized,
+        f"translation_{unit}": _finite(result.translation_error),
+        "rotation_deg": _finite(result.rotation_error_deg),
+        f"claimed_68_{unit}": result.position_68,
+        f"reference_distance_{unit}": result.reference_distance,
+        "inliers": result.inlier_count,
+        "matches": result.match_count,
+        "rejection": _rejection(result),
+        "features": result.features,
+        "latency_ms": result.latency_ms,
+        "stage_ms": dict(result.stage_ms),
+        "references": list(result.references),
+    }
+
+
+def _rejection(result: QueryResult) -> Mapping[str, str] | None:
+    return None if result.localized else {"reason": result.rejection, "message": result.message}
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

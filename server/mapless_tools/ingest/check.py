@@ -1,0 +1,104 @@
+"""The epipolar check of a dataset: photographs are read and described, pairs matched and judged.
+
+It comes before anything is uploaded. Poses that are wrong may not tell who stands near whom, so when they do not fit,
+photographs that are near in the folder's order are compared as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+from mapless_server.errors import InvalidArgument
+from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.method.epipolar import consistent_matches
+from mapless_server.method.features import FeatureExtractor, SiftExtractor
+from mapless_server.method.views import PosedView
+from mapless_server.settings import available_cores
+from mapless_tools.dataset import Frame
+from mapless_tools.progress import Progress
+
+from .pair_errors import MatchedPair
+from .pairs import Pair, more_pairs, pairs_by_order, pairs_by_pose
+from .verdict import Verdict, judge
+
+MAX_ACCUSED = 12
+"""Photographs of bad pairs that are compared with more neighbours, to tell which of the two it is."""
+
+MORE_PAIRS = 3
+
+LIMITS = ImageLimits(max_bytes=2**28, max_pixels=200_000_000)
+"""Of photographs that are looked at here; what a server accepts is the server's business."""
+
+
+def check_frames(frames: Sequence[Frame], progress: Progress, extractor: FeatureExtractor | None = None) -> Verdict:
+    """The verdict on frames; pairs and suspects are indices among them.
+
+    Photographs that cannot be read are left out: the upload reports them.
+
+    Args:
+        frames: with the poses to check.
+        progress: told how far it is.
+        extractor: SIFT if none.
+    """
+    poses = [frame.world_from_camera for frame in frames]
+    if len(frames) < 2:
+        return judge({}, [])
+    work = _Comparison(frames, extractor or SiftExtractor(), progress)
+    work.compare(pairs_by_pose(poses))
+    verdict = work.verdict()
+    if verdict.is_wrong or len(verdict.pairs) <= verdict.unmatched_count:
+        work.compare(pairs_by_order(len(frames)))
+        return work.verdict()
+    accused = list(dict.fromkeys(i for error in verdict.pairs if error.is_bad for i in error.pair))[:MAX_ACCUSED]
+    for reference in accused:
+        work.compare(more_pairs(poses, reference, work.pairs, MORE_PAIRS))
+    return work.verdict() if accused else verdict
+
+
+@dataclass
+class _Comparison:
+    """Pairs compared so far, and the views that it took."""
+
+    frames: Sequence[Frame]
+    extractor: FeatureExtractor
+    progress: Progress
+    views: dict[int, PosedView | None] = field(default_factory=dict)
+    matched: list[MatchedPair] = field(default_factory=list)
+    pairs: list[Pair] = field(default_factory=list)
+
+    def compare(self, pairs: Sequence[Pair]) -> None:
+        """Describes and matches pairs that were not compared yet."""
+        new = [pair for pair in pairs if pair not in self.pairs]
+        missing = sorted({i for pair in new for i in pair} - self.views.keys())
+        with ThreadPoolExecutor(available_cores()) as threads:
+            for done, (i, view) in enumerate(zip(missing, threads.map(self._view, missing), strict=True), 1):
+                self.views[i] = view
+                self.progress("checking poses", done, len(missing))
+            found = list(threads.map(self._match, new))
+        self.pairs += new
+        self.matched += [item for item in found if item is not None and len(item.matches)]
+
+    def verdict(self) -> Verdict:
+        """On all pairs so far."""
+        views = {i: view for i, view in self.views.items() if view is not None}
+        readable = sum(views.keys() >= set(pair) for pair in self.pairs)
+        return judge(views, self.matched, readable - len(self.matched))
+
+    def _view(self, index: int) -> PosedView | None:
+        frame = self.frames[index]
+        try:
+            image = decode_image(frame.image_path.read_bytes(), LIMITS)
+        except (OSError, InvalidArgument):
+            return None
+        if image.shape[:2] != (frame.camera.height_px, frame.camera.width_px):
+            return None
+        view = self.extractor.extract(image, frame.camera)
+        return PosedView(str(index), frame.name, view, frame.world_from_camera)
+
+    def _match(self, pair: Pair) -> MatchedPair | None:
+        first, second = (self.views[i] for i in pair)
+        if first is None or second is None:
+            return None
+        return MatchedPair(pair, consistent_matches(first.view, second.view))

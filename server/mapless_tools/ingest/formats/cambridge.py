@@ -1,0 +1,122 @@
+"""Cambridge Landmarks (Kendall et al. 2015): dataset_train.txt, dataset_test.txt, reconstruction.nvm and seq1/*.png.
+
+A line of the first two is an image's path, the camera's centre X Y Z and a quaternion W P Q R, which is the rotation of
+camera_from_world; three lines go before. VisualSFM's reconstruction.nvm, which the poses come from, has the focal
+length and radial distortion of each image; its paths end in .jpg, the files in .png. The principal point is the
+image's centre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from mapless.geometry import Camera, Quaternion, RadialTangential, RigidTransform
+from mapless_tools.dataset import Dataset
+
+from .collecting import Collector, from_corner, natural_order, numbers, read_text, size_of
+from .options import ReadOptions
+
+SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
+RECONSTRUCTION = "reconstruction.nvm"
+_HEADER_LINES = 3
+
+
+def fits(path: Path) -> bool:
+    """Whether a folder has this layout."""
+    return all((path / file).is_file() for file in SPLIT_FILES.values())
+
+
+def read(path: Path, options: ReadOptions) -> Dataset:
+    """Reads it; see `read_dataset`."""
+    collector = Collector(path)
+    lenses = _lenses(path / RECONSTRUCTION) if options.intrinsics is None else {}
+    lines = [(words[0], words[1:], split) for split, file in SPLIT_FILES.items() for words in _pose_lines(path / file)]
+    for image, words, split in sorted(lines, key=lambda line: natural_order(line[0])):
+        with collector.attempt(image):
+            pose = _world_from_camera(words)
+            size = size_of(collector.image(image))
+            if options.intrinsics is not None:
+                camera = options.intrinsics.camera(*size)
+            elif _stem(image) in lenses:
+                camera = lenses[_stem(image)].camera(size)
+            else:
+                raise ValueError(f"focal length: {RECONSTRUCTION} has no such image")
+            collector.add(image, camera, pose, split)
+    return collector.dataset(
+        path.resolve().name,
+        "cambridge",
+        metric=True,
+        source="Cambridge Landmarks",
+        ground_truth="SfM (VisualSFM, original)",
+    )
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What VisualSFM found for an image.
+
+    Attributes:
+        focal_px: focal length.
+        k: its radial distortion: a pixel at distance r from the centre, in focal lengths, is seen where an ideal camera
+            sees it at r (1 + k r^2).
+    """
+
+    focal_px: float
+    k: float
+
+    def camera(self, size: tuple[int, int]) -> Camera:
+        """As one of ours, whose distortion goes from the ideal camera to the lens's.
+
+        That is the inverse of VisualSFM's: u = d + k d^3 solved for d = u - k u^3 + 3 k^2 u^5 - 12 k^3 u^7 + ...
+        """
+        k = self.k
+        distortion = RadialTangential(k1=-k, k2=3 * k * k, k3=-12 * k * k * k) if k else None
+        return from_corner(Camera(*size, self.focal_px, self.focal_px, size[0] / 2, size[1] / 2, distortion))
+
+
+def _stem(image: str) -> str:
+    """Path without ending, by which both files' paths are the same."""
+    return str(PurePosixPath(image.replace("\\", "/")).with_suffix(""))
+
+
+def _pose_lines(file: Path) -> Iterator[list[str]]:
+    for line in read_text(file).splitlines()[_HEADER_LINES:]:
+        if line.strip():
+            yield line.split()
+
+
+def _world_from_camera(words: list[str]) -> RigidTransform:
+    x, y, z, qw, qx, qy, qz = numbers(words, 7, "pose").tolist()
+    try:
+        rotation = Quaternion(qx, qy, qz, qw).matrix()
+    except ValueError as error:
+        raise ValueError(f"pose: {error}") from error
+    return RigidTransform(rotation.T, numbers([str(x), str(y), str(z)], 3, "pose"))
+
+
+def _lenses(file: Path) -> Mapping[str, Lens]:
+    """Lenses by image path without ending."""
+    lines = enumerate(read_text(file).splitlines(), 1)
+    _, first = next(lines, (0, ""))
+    if not first.startswith("NVM_V3"):
+        raise ValueError(f"{file}:1: expected NVM_V3, found {first[:60]!r}")
+    filled = ((number, line) for number, line in lines if line.strip())
+    number, line = next(filled, (0, ""))
+    try:
+        count = int(line)
+    except ValueError as error:
+        raise ValueError(f"{file}:{number}: expected the number of cameras, found {line[:60]!r}") from error
+    lenses: dict[str, Lens] = {}
+    for _ in range(count):
+        number, line = next(filled, (number + 1, ""))
+        words = line.rsplit(maxsplit=10)  # a name may have spaces
+        try:
+            values = numbers(words[1:], 10, "focal length, quaternion, centre, distortion and a zero")
+            if not values[0] > 0:
+                raise ValueError("the focal length must be above 0")
+        except ValueError as error:
+            raise ValueError(f"{file}:{number}: {error}; {count} cameras are announced") from error
+        lenses[_stem(words[0])] = Lens(float(values[0]), float(values[8]))
+    return lenses

@@ -1,0 +1,166 @@
+"""What all readers share: a frame that is wrong is set aside with the reason, the rest goes on.
+
+Only what concerns a layout as a whole ends its reading. Checks that no layout may forget are made here: the image lies
+in the folder, is there and is named once; the pose can be one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from mapless.geometry import MAX_COORDINATE_M, Array, Camera, RigidTransform
+from mapless_server.errors import InvalidArgument
+from mapless_server.images.decode import ImageLimits, image_size
+from mapless_tools.dataset import MAX_SIDE_PX, Dataset, Frame, Refusal, image_file, legal_id
+
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+"""Camera axes x right, y up, z back to x right, y down, z forward; its own inverse."""
+
+ANY_SIZE = ImageLimits(max_bytes=2**40, max_pixels=2**40, min_side_px=1, max_side_px=2**30)
+"""Headers are read to learn sizes, not to judge them: what a server accepts is the server's business."""
+
+_HEAD_BYTES = 2**16
+
+
+class Collector:
+    """Frames of a layout as they are read, and those that were refused."""
+
+    def __init__(self, folder: Path) -> None:
+        """`folder` is what image paths are relative to."""
+        self.folder = folder
+        self.frames: list[Frame] = []
+        self.refused: list[Refusal] = []
+        self.notes: list[str] = []
+        self._ids: set[str] = set()
+        self._images: set[Path] = set()
+
+    @contextmanager
+    def attempt(self, frame: str) -> Iterator[None]:
+        """A ValueError within the block refuses the frame."""
+        try:
+            yield
+        except ValueError as error:
+            self.refused.append(Refusal(frame, str(error)))
+
+    def image(self, image: str) -> Path:
+        """The file of an image, which no frame before had; ValueError as `image_file`, or if one had."""
+        file = image_file(self.folder, image)
+        if file in self._images:
+            raise ValueError(f"image: {image!r} is named twice")
+        return file
+
+    def add(
+        self, image: str, camera: Camera, world_from_camera: RigidTransform, split: str = "", name: str = ""
+    ) -> None:
+        """Takes a frame.
+
+        Args:
+            image: path from the folder, with slashes.
+            camera: of the file's pixels.
+            world_from_camera: its pose.
+            split: see Frame.
+            name: what to make the frame's id of; the image's path without its ending if empty.
+
+        Raises:
+            ValueError: something is wrong with one of them; names it.
+        """
+        file = self.image(image)
+        check_camera(camera)
+        if not np.abs(world_from_camera.translation).max() <= MAX_COORDINATE_M:  # NaN where a reader's sums overflowed
+            raise ValueError(f"pose: lies more than {MAX_COORDINATE_M:g} m from the origin")
+        # The folders belong to the id: sequences count their frames from 0, each of them.
+        parts = PurePosixPath(name or image.removesuffix(PurePosixPath(image).suffix)).parts
+        identifier = legal_id("_".join(parts), self._ids)
+        self.frames.append(Frame(identifier, file, camera, world_from_camera, split))
+        self._ids.add(identifier)
+        self._images.add(file)
+
+    def dataset(self, name: str, layout: str, *, metric: bool, source: str = "", ground_truth: str = "") -> Dataset:
+        """The dataset of all that was taken; ValueError if that is nothing."""
+        if not self.frames:
+            first = f"; the first, {self.refused[0].frame}: {self.refused[0].reason}" if self.refused else ""
+            raise ValueError(f"{self.folder}: none of {len(self.refused)} frames can be used{first}")
+        return Dataset(
+            name, tuple(self.frames), metric, source, ground_truth, layout, tuple(self.refused), tuple(self.notes)
+        )
+
+
+def check_camera(camera: Camera) -> None:
+    """Raises ValueError if a camera's size or intrinsics cannot be any camera's."""
+    if not (1 <= camera.width_px <= MAX_SIDE_PX and 1 <= camera.height_px <= MAX_SIDE_PX):
+        raise ValueError(f"camera: {camera.width_px}x{camera.height_px} is no size")
+    numbers = [camera.focal_x_px, camera.focal_y_px, camera.principal_x_px, camera.principal_y_px]
+    if camera.distortion is not None:
+        numbers += list(vars(camera.distortion).values())
+    if not np.isfinite(numbers).all():
+        raise ValueError("camera: intrinsics are not finite")
+    if not (camera.focal_x_px > 0 and camera.focal_y_px > 0):
+        raise ValueError("camera: focal lengths must be above 0")
+
+
+def from_corner(camera: Camera) -> Camera:
+    """The camera whose principal point was counted from the corner of the top-left pixel, not from its centre.
+
+    So do COLMAP and what is made of its models, nerfstudio and ARKit.
+    """
+    return replace(camera, principal_x_px=camera.principal_x_px - 0.5, principal_y_px=camera.principal_y_px - 0.5)
+
+
+def from_opengl(world_from_camera: RigidTransform) -> RigidTransform:
+    """The pose of a camera that was given with OpenGL's axes: x right, y up, z back."""
+    return RigidTransform(world_from_camera.rotation @ OPENCV_FROM_OPENGL, world_from_camera.translation)
+
+
+def size_of(file: Path) -> tuple[int, int]:
+    """Width and height of an image file, of which little is read; ValueError if it is none."""
+    try:
+        with file.open("rb") as stream:
+            head = stream.read(_HEAD_BYTES)
+            try:
+                return image_size(head, ANY_SIZE)
+            except InvalidArgument as error:
+                if error.reason != "IMAGE_TRUNCATED":
+                    raise
+            return image_size(head + stream.read(), ANY_SIZE)
+    except InvalidArgument as error:
+        raise ValueError(f"image: {file}: {error}") from error
+    except OSError as error:
+        raise ValueError(f"image: {file} cannot be read: {error.strerror}") from error
+
+
+def read_text(file: Path) -> str:
+    """A text file; ValueError, naming it, if it cannot be read."""
+    try:
+        return file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ValueError(f"{file} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{file} is not text: {error}") from error
+
+
+def numbers(words: Sequence[str], count: int, what: str) -> Array:
+    """Finite numbers (count,) of their texts; ValueError, naming `what` they are."""
+    if len(words) != count:
+        raise ValueError(f"{what} must be {count} numbers, are {len(words)}")
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from error
+    if not np.isfinite(values).all():
+        raise ValueError(f"{what} is not finite")
+    return values
+
+
+def natural_order(name: str) -> list[tuple[int, int, str]]:
+    """Sorts "frame-9" before "frame-10"."""
+    key: list[tuple[int, int, str]] = []
+    for part in filter(None, re.split(r"(\d+)", name)):
+        digits = part.lstrip("0")  # not as a number: Python reads none of thousands of digits
+        key.append((0, len(digits), digits) if part.isdecimal() else (1, 0, part))
+    return key

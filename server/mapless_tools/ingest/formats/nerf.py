@@ -1,0 +1,194 @@
+"""transforms.json of nerfstudio and instant-ngp (and of Blender's data sets: transforms_train.json, ..._test.json).
+
+Read are `frames`, each with `file_path` (with or without ending) and `transform_matrix` (world_from_camera with
+OpenGL's camera axes); in a frame or for all, `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, `camera_angle_x`, `camera_angle_y`,
+`camera_model`, `is_fisheye`, k1 to k4, p1 and p2; and for all `applied_transform` and `applied_scale`, which are
+undone, and `train_filenames`, `val_filenames`, `test_filenames`.
+
+Pixels: nerfstudio shoots the ray of pixel (0, 0) through (0.5, 0.5), so principal points count from the corner.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential, RigidTransform, nearest_rotation
+from mapless_tools.dataset import Dataset, read_json
+
+from .collecting import Collector, from_corner, from_opengl, natural_order, size_of
+from .options import ReadOptions
+
+FILE_NAME = "transforms.json"
+SPLIT_FILES = {"transforms_train.json": "train", "transforms_val.json": "test", "transforms_test.json": "test"}
+_ENDINGS = ("", ".png", ".jpg", ".jpeg", ".webp")
+_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+
+
+def fits(path: Path) -> bool:
+    """Whether a folder has this layout."""
+    return any((path / name).is_file() for name in (FILE_NAME, *SPLIT_FILES))
+
+
+def read(path: Path, options: ReadOptions) -> Dataset:
+    """Reads it; see `read_dataset`."""
+    collector = Collector(path)
+    names = [FILE_NAME] if (path / FILE_NAME).is_file() else [n for n in SPLIT_FILES if (path / n).is_file()]
+    if not names:
+        raise ValueError(f"{path} holds no {FILE_NAME}")
+    for name in names:
+        _read_file(path / name, SPLIT_FILES.get(name, ""), collector)
+    collector.notes.append(
+        f"{names[0]} does not say its unit of length; it is taken for metres, which it is not if the poses were made "
+        "by COLMAP or scaled to fit a box"
+    )
+    return collector.dataset(path.resolve().name, "nerf", metric=False, source=", ".join(names))
+
+
+def _read_file(file: Path, split: str, collector: Collector) -> None:
+    content = read_json(file)
+    if not isinstance(content, dict) or not isinstance(content.get("frames"), list) or not content["frames"]:
+        raise ValueError(f"{file}: frames must be a list with at least one frame")
+    frames = content["frames"]
+    try:
+        scale, transform = _applied(content)
+        splits = _splits(content)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+    if scale != 1:
+        collector.notes.append(f"{file.name}: applied_scale {scale:g} is undone")
+    labels = [str(frame.get("file_path", "?")) if isinstance(frame, dict) else "?" for frame in frames]
+    for index in sorted(range(len(frames)), key=lambda i: natural_order(labels[i])):
+        frame = frames[index]
+        with collector.attempt(f"{file.name}: frames[{index}] ({labels[index]})"):
+            if not isinstance(frame, dict):
+                raise ValueError("must be an object")
+            image = _image(collector, frame)
+            pose = _world_from_camera(frame, scale, transform)
+            camera = _camera(collector, image, content | frame)
+            collector.add(image, camera, pose, splits.get(str(frame["file_path"]), split))
+
+
+def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
+    """Path of the image, with its ending."""
+    path = frame.get("file_path")
+    if not isinstance(path, str) or not path:
+        raise ValueError("file_path must be a path")
+    path = str(PurePosixPath(path))
+    named = (path + ending for ending in _ENDINGS)
+    # Not Path.is_file, which raises where a name is longer than any file's.
+    found = next((name for name in named if os.path.isfile(collector.folder / name)), path)
+    collector.image(found)
+    return found
+
+
+def _world_from_camera(frame: Mapping[str, Any], scale: float, world_from_original: RigidTransform) -> RigidTransform:
+    try:
+        pose = RigidTransform.from_matrix(_matrix(frame.get("transform_matrix")))
+    except ValueError as error:
+        raise ValueError(f"transform_matrix: {error}") from error
+    unscaled = RigidTransform(pose.rotation, pose.translation / scale)
+    return from_opengl(world_from_original.inverse().compose(unscaled))
+
+
+def _camera(collector: Collector, image: str, value: Mapping[str, Any]) -> Camera:
+    if "w" in value and "h" in value:
+        size = _whole(value, "w"), _whole(value, "h")
+    else:
+        size = size_of(collector.folder / image)
+    focal_x = _focal(value, "fl_x", "camera_angle_x", size[0])
+    focal_y = _focal(value, "fl_y", "camera_angle_y", size[1])
+    if focal_x is None and focal_y is None:
+        raise ValueError("fl_x and camera_angle_x are missing")
+    centre = _number(value, "cx", size[0] / 2), _number(value, "cy", size[1] / 2)
+    focal = focal_x or focal_y or 0.0, focal_y or focal_x or 0.0
+    return from_corner(Camera(*size, *focal, *centre, _distortion(value)))
+
+
+def _focal(value: Mapping[str, Any], length: str, angle: str, side_px: int) -> float | None:
+    if length in value:
+        return _number(value, length, 0.0)
+    if angle not in value:
+        return None
+    radians = _number(value, angle, 0.0)
+    if not 0 < radians < math.pi:
+        raise ValueError(f"{angle} must be between 0 and pi, is {radians:g}")
+    return side_px / 2 / math.tan(radians / 2)
+
+
+def _distortion(value: Mapping[str, Any]) -> Distortion | None:
+    model = "OPENCV_FISHEYE" if value.get("is_fisheye") else value.get("camera_model", "OPENCV")
+    k1, k2, k3, k4, p1, p2 = (_number(value, name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if model == "OPENCV_FISHEYE":
+        return Fisheye(k1, k2, k3, k4)
+    if model in _PINHOLES:
+        return None
+    if model not in ("OPENCV", "SIMPLE_RADIAL", "RADIAL"):
+        raise ValueError(f"camera_model {model!r} has no counterpart here; known: OPENCV, OPENCV_FISHEYE, PINHOLE")
+    if k4:
+        raise ValueError(f"k4 = {k4:g} has no counterpart here with camera_model {model}")
+    lens = RadialTangential(k1, k2, p1, p2, k3)
+    return None if lens == RadialTangential() else lens
+
+
+def _applied(content: Mapping[str, Any]) -> tuple[float, RigidTransform]:
+    """Scale and motion that were applied to the original poses, the motion first."""
+    scale = _number(content, "applied_scale", 1.0)
+    if not scale > 0:
+        raise ValueError(f"applied_scale must be above 0, is {scale:g}")
+    if "applied_transform" not in content:
+        return scale, RigidTransform.identity()
+    try:
+        matrix = _matrix(content["applied_transform"])
+        if matrix.shape not in ((3, 4), (4, 4)):
+            raise ValueError(f"must be 3x4, is {'x'.join(map(str, matrix.shape))}")
+        return scale, RigidTransform(nearest_rotation(matrix[:3, :3]), matrix[:3, 3])
+    except ValueError as error:
+        raise ValueError(f"applied_transform: {error}") from error
+
+
+def _splits(content: Mapping[str, Any]) -> dict[str, str]:
+    splits: dict[str, str] = {}
+    for field, split in (("train_filenames", "train"), ("val_filenames", "test"), ("test_filenames", "test")):
+        names = content.get(field, [])
+        if not isinstance(names, list):
+            raise ValueError(f"{field} must be a list")
+        for name in names:  # the same images are often both for validation and for testing
+            if splits.setdefault(str(name), split) != split:
+                raise ValueError(f"{field}: {name} is in both splits")
+    return splits
+
+
+def _matrix(value: Any) -> Array:
+    try:
+        matrix = np.array(value, dtype=float)
+    except (TypeError, ValueError, OverflowError) as error:  # JSON's integers have any number of digits
+        raise ValueError("must be numbers") from error
+    if not np.isfinite(matrix).all():
+        raise ValueError("is not finite")
+    return matrix
+
+
+def _number(value: Mapping[str, Any], field: str, default: float) -> float:
+    number = value.get(field, default)
+    if isinstance(number, bool) or not isinstance(number, int | float):
+        raise ValueError(f"{field} must be a number, is {number!r}")
+    try:
+        number = float(number)
+    except OverflowError as error:  # JSON's integers have any number of digits
+        raise ValueError(f"{field} is too large") from error
+    if not math.isfinite(number):
+        raise ValueError(f"{field} must be a number, is {number!r}")
+    return number
+
+
+def _whole(value: Mapping[str, Any], field: str) -> int:
+    number = _number(value, field, 0)
+    if number != int(number) or number < 1:
+        raise ValueError(f"{field} must be a whole number of pixels, is {number!r}")
+    return int(number)

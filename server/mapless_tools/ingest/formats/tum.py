@@ -1,0 +1,117 @@
+"""TUM RGB-D (Sturm et al. 2012): a sequence's folder with rgb.txt, groundtruth.txt and the images.
+
+Lines of rgb.txt are a time in seconds and an image's path; of groundtruth.txt a time and tx ty tz qx qy qz qw of
+world_from_camera, from motion capture at 100 Hz. A frame's pose is interpolated between the two before and after it.
+
+The layout has no intrinsics: they are those published for the camera of freiburg1, 2 or 3, which the folder's name
+tells, or given. Images of freiburg3 are undistorted already.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from mapless.geometry import Array, Camera, RadialTangential, RigidTransform
+from mapless_tools.dataset import Dataset
+
+from .collecting import Collector, numbers, read_text, size_of
+from .options import ReadOptions
+
+MAX_GAP_S = 0.02
+"""A frame without a pose this near, before and after, is refused: a hand moves centimetres meanwhile."""
+
+_LENSES = {
+    "1": ((517.306408, 516.469215, 318.643040, 255.313989), (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)),
+    "2": ((520.908620, 521.007327, 325.141442, 249.701764), (0.231222, -0.784899, -0.003257, -0.000105, 0.917205)),
+    "3": ((535.4, 539.2, 320.1, 247.6), None),
+}
+_SIZE = (640, 480)
+
+
+def fits(path: Path) -> bool:
+    """Whether a folder has this layout."""
+    return (path / "rgb.txt").is_file() and (path / "groundtruth.txt").is_file()
+
+
+def read(path: Path, options: ReadOptions) -> Dataset:
+    """Reads it; see `read_dataset`."""
+    collector = Collector(path)
+    lens = _lens(path) if options.intrinsics is None else None
+    trajectory = _Trajectory(path / "groundtruth.txt")
+    for number, words in _lines(path / "rgb.txt"):
+        with collector.attempt(f"rgb.txt:{number} ({words[-1]})"):
+            if len(words) != 2:
+                raise ValueError(f"expected a time and a path, found {len(words)} words")
+            time_s = float(numbers(words[:1], 1, "time")[0])
+            size = size_of(collector.image(words[1]))
+            if options.intrinsics is not None:
+                camera = options.intrinsics.camera(*size)
+            elif lens is not None and size == _SIZE:
+                camera = lens
+            else:
+                raise ValueError(f"image: is {size[0]}x{size[1]}, the known intrinsics are of 640x480")
+            collector.add(words[1], camera, trajectory.at(time_s), name=Path(words[1]).stem)
+    return collector.dataset(path.resolve().name, "tum", metric=True, source="TUM RGB-D", ground_truth="motion capture")
+
+
+def _lens(path: Path) -> Camera:
+    found = re.search(r"(?:freiburg|fr)([123])", path.resolve().name, re.IGNORECASE)
+    if found is None:
+        raise ValueError(
+            f"{path}: its name does not say which camera it is (freiburg1, 2 or 3); give the intrinsics with "
+            "--intrinsics"
+        )
+    k, distortion = _LENSES[found[1]]
+    return Camera(*_SIZE, *k, RadialTangential(*distortion) if distortion else None)
+
+
+def _lines(file: Path) -> list[tuple[int, list[str]]]:
+    numbered = enumerate(read_text(file).splitlines(), 1)
+    return [(number, line.split()) for number, line in numbered if line.strip() and not line.startswith("#")]
+
+
+def _row(file: Path, number: int, words: list[str]) -> Array:
+    try:
+        row = numbers(words, 8, "time, position and quaternion")
+        if not abs(np.linalg.norm(row[4:]) - 1) < 1e-2:
+            raise ValueError("the quaternion must have norm 1")
+    except ValueError as error:
+        raise ValueError(f"{file}:{number}: {error}") from error
+    return row
+
+
+class _Trajectory:
+    """Poses by time."""
+
+    def __init__(self, file: Path) -> None:
+        rows = [_row(file, number, words) for number, words in _lines(file)]
+        if len(rows) < 2:
+            raise ValueError(f"{file} holds fewer than two poses")
+        table: Array = np.array(rows)
+        _, order = np.unique(table[:, 0], return_index=True)
+        table = table[order]
+        self._time_s: NDArray[np.float64] = table[:, 0]
+        self._position = table[:, 1:4]
+        self._slerp = Slerp(self._time_s, Rotation.from_quat(table[:, 4:]))
+
+    def at(self, time_s: float) -> RigidTransform:
+        """The pose at a time; ValueError if none is near."""
+        after = int(np.searchsorted(self._time_s, time_s))
+        before = after if after < len(self._time_s) and self._time_s[after] == time_s else after - 1
+        if before < 0 or after >= len(self._time_s):
+            raise ValueError("pose: its time lies outside the ground truth's")
+        gap_s = max(time_s - self._time_s[before], self._time_s[after] - time_s)
+        if gap_s > MAX_GAP_S:
+            raise ValueError(f"pose: the ground truth has none within {1000 * MAX_GAP_S:g} ms, only {1000 * gap_s:.0f}")
+        position = [
+            float(np.interp(time_s, self._time_s[before : after + 1], axis)) for axis in self._between(before, after)
+        ]
+        return RigidTransform(self._slerp(time_s).as_matrix(), np.array(position))
+
+    def _between(self, before: int, after: int) -> Array:
+        return np.asarray(self._position[before : after + 1].T)

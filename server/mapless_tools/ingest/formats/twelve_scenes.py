@@ -1,0 +1,82 @@
+"""12-Scenes (Valentin et al. 2016): info.txt, split.txt and data/frame-000000.color.jpg, .pose.txt in a room's folder.
+
+`split.txt` has a line "sequence0 [frames=357]  [start=0 ; end=356]" for each sequence; the first is the queries', the
+rest the references'. `info.txt` has lines "key = value", among them m_colorWidth, m_colorHeight and
+m_calibrationColorIntrinsic (4x4, row by row). The pose is a 4x4 world_from_camera, not finite where tracking was lost.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from mapless_tools.dataset import Dataset
+
+from .collecting import Collector, check_camera, numbers, read_text, size_of
+from .options import Intrinsics, ReadOptions
+from .pseudo_ground_truth import GROUND_TRUTH, find_ground_truth
+from .seven_scenes import read_pose
+
+_LINE = re.compile(r"sequence\d+\s+\[frames=\d+\]\s+\[start=(\d+)\s*;\s*end=(\d+)\]")
+_IMAGE_END = ".color.jpg"
+
+
+def fits(path: Path) -> bool:
+    """Whether a folder has this layout."""
+    return (path / "info.txt").is_file() and (path / "data").is_dir()
+
+
+def read(path: Path, options: ReadOptions) -> Dataset:
+    """Reads it; see `read_dataset`."""
+    collector = Collector(path)
+    size, found = _intrinsics(path / "info.txt")
+    queries = _queries(path / "split.txt")
+    scene = "_".join(path.resolve().parts[-2:])
+    truth = find_ground_truth(options.ground_truth, scene) if options.ground_truth else None
+    for image in sorted((path / "data").glob(f"frame-*{_IMAGE_END}")):
+        relative = f"data/{image.name}"
+        with collector.attempt(relative):
+            number = re.fullmatch(rf"frame-(\d+){re.escape(_IMAGE_END)}", image.name)
+            if number is None:
+                raise ValueError("image: its name has no frame number")
+            if truth is not None:
+                # Sizes differ where somebody reduced the images; the focal length is that of the original's.
+                camera, pose = truth.camera_and_pose(relative, size, options.intrinsics)
+            else:
+                camera = (options.intrinsics or found).camera(*size)
+                pose = read_pose(image.with_name(image.name.removesuffix(_IMAGE_END) + ".pose.txt"))
+            check_camera(camera)  # before it is divided by its size
+            if size_of(image) != size:
+                camera = camera.resized(*size_of(image))
+            split = "test" if int(number[1]) in queries else "train"
+            collector.add(relative, camera, pose, split if queries else "", image.name.removesuffix(_IMAGE_END))
+    ground_truth = GROUND_TRUTH if truth is not None else "VoxelHashing (original)"
+    return collector.dataset(scene, "12scenes", metric=True, source="12-Scenes", ground_truth=ground_truth)
+
+
+def _intrinsics(file: Path) -> tuple[tuple[int, int], Intrinsics]:
+    """Size and intrinsics of the colour camera."""
+    lines = (line.partition("=") for line in read_text(file).splitlines())
+    values = {key.strip(): value for key, _, value in lines}
+    fields = ("m_colorWidth", "m_colorHeight", "m_calibrationColorIntrinsic")
+    for field in fields:
+        if field not in values:
+            raise ValueError(f"{file}: {field} is missing")
+    width, height, matrix = (values[field].split() for field in fields)
+    try:
+        k = numbers(matrix, 16, fields[2]).reshape(4, 4)
+        size = numbers(width, 1, fields[0]), numbers(height, 1, fields[1])
+        return (int(size[0][0]), int(size[1][0])), Intrinsics(*(float(k[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))))
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+
+
+def _queries(file: Path) -> range:
+    """Numbers of the frames of the first sequence; none if there is no split."""
+    if not file.is_file():
+        return range(0)
+    first = next((line for line in read_text(file).splitlines() if line.strip()), "")
+    found = _LINE.match(first.strip())
+    if found is None:
+        raise ValueError(f"{file}:1: expected sequence0 [frames=N] [start=A ; end=B], found {first.strip()[:80]!r}")
+    return range(int(found[1]), int(found[2]) + 1)

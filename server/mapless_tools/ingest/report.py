@@ -1,0 +1,170 @@
+"""What an import did, for a person and for a program."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from rich.console import Console
+
+from mapless_tools.dataset import Dataset, Frame, Refusal
+
+from .verdict import Verdict
+
+SHOWN = 20
+ALREADY_THERE = "already there"
+
+
+@dataclass
+class ImportReport:
+    """Counts and reasons; what is refused is named as its file names it, what is skipped by its id.
+
+    Attributes:
+        scene: id of the scene.
+        dataset: what was read.
+        chosen: frames of it that were to be imported.
+        verdict: of the epipolar check; None if there was none.
+        added: ids of references that this run stored.
+        skipped: references that are there already, and where.
+        refused: frames that are not in, each with the reason.
+        stopped: why the import ended before its end; empty if it did not.
+        seconds: that storing took.
+    """
+
+    scene: str
+    dataset: Dataset
+    chosen: Sequence[Frame]
+    verdict: Verdict | None = None
+    added: list[str] = field(default_factory=list)
+    skipped: list[Refusal] = field(default_factory=list)
+    refused: list[Refusal] = field(default_factory=list)
+    stopped: str = ""
+    seconds: float = 0.0
+    is_dry: bool = False
+
+    def __post_init__(self) -> None:
+        self.refused += self.dataset.refused
+
+    @property
+    def untried_count(self) -> int:
+        """Frames that the import did not come to."""
+        tried = len(self.added) + len(self.skipped) + len(self.refused) - len(self.dataset.refused)
+        return 0 if self.is_dry else len(self.chosen) - tried
+
+    @property
+    def went_well(self) -> bool:
+        """Whether all that was to be imported is in; of a dry run, whether all could be."""
+        wrong = self.verdict is not None and self.verdict.is_wrong
+        return not (self.refused or self.stopped or self.untried_count or (self.is_dry and wrong))
+
+
+def verdict_lines(verdict: Verdict, frames: Sequence[Frame]) -> list[str]:
+    """What the epipolar check found, a sentence a line."""
+    if not verdict.is_known:
+        return [
+            "warning: the poses could not be checked: none of the photographs that were compared have enough matches"
+        ]
+    compared = {index for error in verdict.pairs for index in error.pair}
+    errors = (
+        f"epipolar error of matched points under the given poses: median {verdict.median_px:.2f} px over "
+        f"{len(verdict.pairs)} pairs of neighbours among {len(compared)} of {len(frames)} photographs, "
+        f"{100 * verdict.bad_share:.0f} % of them above {verdict.threshold_px:.1f} px"
+    )
+    lines = [errors]
+    if verdict.is_wrong:
+        lines.append("warning: axes, intrinsics or poses are wrong: photographs of neighbours do not fit together")
+        if verdict.explanation:
+            lines.append(
+                f"warning: most likely {verdict.explanation}; the error would then be {verdict.explained_px:.2f} px"
+            )
+        else:
+            lines.append("warning: none of the usual mistakes explains it")
+    lines += [
+        f"warning: {frames[index].name} does not fit its neighbours: its pose or its image is wrong"
+        for index in verdict.suspects
+    ]
+    if verdict.unmatched_count > len(verdict.pairs):
+        lines.append(
+            f"warning: {verdict.unmatched_count} further pairs have too few matches: do positions and headings say who "
+            "is near?"
+        )
+    return lines
+
+
+def print_report(report: ImportReport, console: Console) -> None:
+    """The report, at most SHOWN reasons of a kind."""
+    _print_reasons("refused", report.refused, console)
+    if report.is_dry:
+        good = len(report.chosen) - (len(report.refused) - len(report.dataset.refused))
+        summary = f"{good} references could be imported, {len(report.refused)} are refused"
+        console.print(summary, markup=False, highlight=False)
+        return
+    _print_reasons("skipped as duplicates", [it for it in report.skipped if it.reason != ALREADY_THERE], console)
+    rate = f" ({len(report.added) / report.seconds:.1f} a second)" if report.added and report.seconds > 0 else ""
+    counts = [f"{len(report.added)} added{rate}", f"{len(report.skipped)} skipped as duplicates"]
+    counts.append(f"{len(report.refused)} refused")
+    if report.untried_count:
+        counts.append(f"{report.untried_count} not reached")
+    console.print(f"scene {report.scene}: {', '.join(counts)}", markup=False, highlight=False)
+    if report.stopped:
+        console.print(f"stopped: {report.stopped}", markup=False, highlight=False)
+        if report.added:
+            console.print("what is in stays in; the same command goes on from there", markup=False)
+
+
+def to_json(report: ImportReport) -> dict[str, Any]:
+    """All of the report."""
+    verdict = report.verdict
+    return {
+        "scene": report.scene,
+        "format": report.dataset.format,
+        "source": report.dataset.source,
+        "ground_truth": report.dataset.ground_truth,
+        "notes": list(report.dataset.notes),
+        "dry_run": report.is_dry,
+        "chosen": len(report.chosen),
+        "added": list(report.added),
+        "skipped": [vars(item) for item in report.skipped],
+        "refused": [vars(item) for item in report.refused],
+        "not_reached": report.untried_count,
+        "stopped": report.stopped,
+        "seconds": report.seconds,
+        "check": None if verdict is None else _verdict_json(verdict, report.chosen),
+    }
+
+
+def _verdict_json(verdict: Verdict, frames: Sequence[Frame]) -> dict[str, Any]:
+    return {
+        "median_px": _number(verdict.median_px),
+        "bad_share": _number(verdict.bad_share),
+        "threshold_px": verdict.threshold_px,
+        "pairs_without_matches": verdict.unmatched_count,
+        "wrong": verdict.is_wrong,
+        "explanation": verdict.explanation,
+        "explained_px": _number(verdict.explained_px),
+        "suspects": [frames[i].name for i in verdict.suspects],
+        "pairs": [
+            {
+                "references": [frames[i].name for i in pair.pair],
+                "error_px": pair.error_px,
+                "matches": pair.match_count,
+                "bad": pair.is_bad,
+            }
+            for pair in verdict.pairs
+        ],
+    }
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _print_reasons(title: str, items: Sequence[Refusal], console: Console) -> None:
+    if not items:
+        return
+    lines = [f"{title}:", *(f"  {item.frame}: {item.reason}" for item in items[:SHOWN])]
+    console.print("\n".join(lines), markup=False, highlight=False)
+    if len(items) > SHOWN:
+        console.print(f"... and {len(items) - SHOWN} more; --report writes them all")

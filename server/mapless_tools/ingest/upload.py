@@ -1,0 +1,214 @@
+"""Storing references through a server: several messages in flight, each whole or not at all.
+
+As many messages are read ahead as there are threads, and no more. What the server refuses is taken out of its message,
+and the rest is sent again; when it is busy or away it is waited for. A message whose answer was lost may have been
+stored all the same, so an id that is taken is looked at before it is called a duplicate.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+from mapless import (
+    AlreadyExists,
+    Client,
+    DeadlineExceeded,
+    Internal,
+    InvalidArgument,
+    MaplessError,
+    NotFound,
+    ResourceExhausted,
+    Unavailable,
+)
+from mapless_tools.dataset import Frame, Refusal
+from mapless_tools.progress import Progress
+
+from .existing import KnownReferences, Stored, difference, stored_of
+from .items import Item, batches_of, read_item
+from .report import ALREADY_THERE, ImportReport
+from .waiting import UploadOptions, Waiting
+
+STORE_FULL = "STORE_FULL"
+
+_REQUEST = re.compile(r"requests\[(\d+)\]")
+
+
+class _Stopped(Exception):
+    """The import ends; the report says why."""
+
+
+class Uploader:
+    """Stores frames and writes into a report what became of them."""
+
+    def __init__(
+        self,
+        client: Client,
+        known: KnownReferences,
+        report: ImportReport,
+        options: UploadOptions,
+        progress: Progress,
+    ) -> None:
+        self._client = client
+        self._known = known
+        self._report = report
+        self._options = options
+        self._progress = progress
+        self._stop = threading.Event()
+        self._lock = threading.Lock()
+
+    def run(self) -> None:
+        """Stores the report's chosen frames. An interruption stops it soon, and goes through."""
+        batches = batches_of(self._report.chosen)
+        total = len(self._report.chosen)
+        self._progress("storing references", 0, total)
+        start_s = time.monotonic()
+        threads = ThreadPoolExecutor(self._options.parallel, "import")
+        try:
+            workers = [threads.submit(self._work, batches) for _ in range(self._options.parallel)]
+            for worker in workers:
+                worker.result()
+        except BaseException:
+            self._stop.set()
+            self._client.close()  # ends the calls in flight
+            raise
+        finally:
+            threads.shutdown(wait=True)
+            self._report.seconds = time.monotonic() - start_s
+
+    def _work(self, batches: Iterator[Sequence[Frame]]) -> None:
+        try:
+            while not self._stop.is_set():
+                with self._lock:
+                    batch = next(batches, None)
+                if batch is None:
+                    return
+                items = [item for frame in batch if (item := self._load(frame)) is not None]
+                self._send(items)
+                with self._lock:
+                    report = self._report
+                    refused = len(report.refused) - len(report.dataset.refused)
+                    done = len(report.added) + len(report.skipped)
+                    self._progress("storing references", done, len(report.chosen) - refused)
+        except _Stopped:
+            pass
+        except BaseException:
+            self._stop.set()
+            raise
+
+    def _load(self, frame: Frame) -> Item | None:
+        """The frame with its image's bytes; None if it is not to be sent, which the report then says."""
+        try:
+            item = read_item(frame)
+        except ValueError as error:
+            self._refuse(frame, str(error))
+            return None
+        there = self._known.claim(item.stored)
+        if there is None:
+            return item
+        self._duplicate(frame, there, item.stored)
+        return None
+
+    def _send(self, items: Sequence[Item]) -> None:
+        """Stores items, in one message if it is taken."""
+        waiting = Waiting(self._options, self._stop)
+        left = list(items)
+        while left:
+            if self._stop.is_set():
+                raise _Stopped
+            try:
+                self._client.add_references(self._report.scene, [item.reference() for item in left])
+            except AlreadyExists as error:
+                left = self._reconcile(left, waiting, error)
+            except InvalidArgument as error:
+                left = self._without_guilty(left, error)
+            except ResourceExhausted as error:
+                if error.reason == STORE_FULL:
+                    self._end(f"the store is full: {error.message}")
+                if error.retry_after_s is None:
+                    left = self._halves(left, error)
+                elif not waiting.for_busy(error.retry_after_s):
+                    self._end(f"the server stays too busy: {error.message}")
+            except (Unavailable, DeadlineExceeded) as error:
+                waiting.lost_an_answer = True
+                if not waiting.for_return():
+                    self._end(f"the server cannot be reached: {error.message}")
+            except Internal as error:
+                left = self._halves(left, error)
+            except MaplessError as error:
+                self._end(str(error))
+            else:
+                self._add(left)
+                return
+
+    def _reconcile(self, items: Sequence[Item], waiting: Waiting, error: AlreadyExists) -> list[Item]:
+        """Items that are not there yet, after an id was taken."""
+        left = []
+        for item in items:
+            try:
+                there = stored_of(self._client.get_reference(self._report.scene, item.frame.name))
+            except NotFound:
+                left.append(item)
+                continue
+            except MaplessError as failure:
+                self._end(str(failure))
+            if waiting.lost_an_answer and not difference(there, item.stored):
+                self._add([item])
+            else:
+                self._duplicate(item.frame, there, item.stored)
+        if len(left) == len(items):  # it was there, and is not any longer: somebody else is at work
+            if waiting.for_return():
+                return left
+            self._end(str(error))
+        return left
+
+    def _without_guilty(self, items: Sequence[Item], error: InvalidArgument) -> list[Item]:
+        """Items without the one that the server names; those it does not name it are sent one by one."""
+        named = _REQUEST.match(error.field or "")
+        if named and int(named[1]) < len(items):
+            return self._without(items, int(named[1]), error)
+        return self._halves(items, error)
+
+    def _halves(self, items: Sequence[Item], error: MaplessError) -> list[Item]:
+        """Nothing: what was refused together is sent in parts, and what is refused alone is refused."""
+        if len(items) == 1:
+            return self._without(items, 0, error)
+        middle = len(items) // 2
+        self._send(items[:middle])
+        self._send(items[middle:])
+        return []
+
+    def _without(self, items: Sequence[Item], index: int, error: MaplessError) -> list[Item]:
+        field = _REQUEST.sub("", error.field or "").lstrip(".")
+        request = f" (request {error.request_id})" if isinstance(error, Internal) else ""
+        self._refuse(items[index].frame, f"{f'{field}: ' if field else ''}{error.message}{request}")
+        self._known.forget(items[index].stored)
+        return [*items[:index], *items[index + 1 :]]
+
+    def _duplicate(self, frame: Frame, there: Stored, new: Stored) -> None:
+        what = difference(there, new)
+        here = "" if there.reference_id == frame.name else f"the same image as {there.reference_id}"
+        if not what:
+            with self._lock:
+                self._report.skipped.append(Refusal(frame.name, here or ALREADY_THERE))
+        else:
+            self._refuse(frame, f"is there already{f' as {there.reference_id}' if here else ''}, but {what}")
+
+    def _refuse(self, frame: Frame, reason: str) -> None:
+        with self._lock:
+            self._report.refused.append(Refusal(frame.name, reason))
+
+    def _add(self, items: Sequence[Item]) -> None:
+        with self._lock:
+            self._report.added += [item.frame.name for item in items]
+
+    def _end(self, reason: str) -> None:
+        """Ends the import; whoever stops first says why."""
+        with self._lock:
+            if not self._stop.is_set():
+                self._report.stopped = reason
+            self._stop.set()
+        raise _Stopped

@@ -1,0 +1,258 @@
+"""What goes on at a server beside queries: scenes and references that come and go, watchers, callers who do it wrong.
+
+Each worker does one kind of thing again and again, at random moments, and notes how its calls end. What may go wrong by
+its own doing, a scene that another worker has just deleted, is expected; anything else is a failure.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from itertools import count, takewhile
+from typing import Any
+
+import grpc
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+from mapless import ConnectOptions, MaplessError, NewReference, aio
+from mapless.names import scene_name
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.v1 import localization_service_pb2_grpc as rpcs
+from mapless.v1 import reference_service_pb2 as reference_pb
+from mapless.v1 import reference_service_pb2_grpc as reference_rpcs
+from mapless_tools.demo.run import Photograph, Place
+
+from .requests import SCENE
+from .sender import MAX_MESSAGE_BYTES
+
+ONCE = ConnectOptions(max_attempts=1, timeout_s=20.0)
+"""What becomes of a call is what is noted, not what becomes of trying again."""
+EXTRA_REFERENCES = 4
+"""Of the scene that is queried, at a time: added in turn, the oldest deleted."""
+SCENES = 5
+"""Names that scenes are made under, again and again: a scene's generation is remembered for ever."""
+ENDING_S = 120.0
+"""For workers to be through with what they do: their calls have deadlines."""
+BUSY = frozenset({"RESOURCE_EXHAUSTED", "DEADLINE_EXCEEDED"})
+"""What a server may say to anybody at its limit."""
+UNCERTAIN = ("ALREADY_EXISTS", "NOT_FOUND")
+"""What may come of a call before that nobody knows the end of, because its time was over."""
+
+
+@dataclass
+class Outcomes:
+    """How calls ended.
+
+    Attributes:
+        counts: by worker and status.
+        failures: what none should have ended like; the first of each kind in full.
+        localize_codes: statuses of those that were Localize, for comparing with the server's account.
+    """
+
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
+    failures: dict[str, str] = field(default_factory=dict)
+    localize_codes: list[str] = field(default_factory=list)
+
+    async def note(self, worker: str, call: Awaitable[object], *expected: str) -> bool:
+        """Awaits a call; whether it went well. Statuses that are `expected` are no failures."""
+        code, text = "OK", ""
+        try:
+            await call
+        except MaplessError as error:
+            code, text = error.code, str(error)
+        except grpc.aio.AioRpcError as error:
+            code, text = error.code().name, error.details() or ""
+        self.counts[worker, code] += 1
+        if code != "OK" and code not in BUSY and code not in expected:
+            self.failures.setdefault(f"{worker}: {code}", text)
+        return code == "OK"
+
+
+WORK: Mapping[str, str] = {
+    "references": "add references to the scene that is asked, and delete the oldest",
+    "scenes": "make scenes, ask in them, and delete them",
+    "watch queries": "watch the queries for a while",
+    "watch health": "watch the health for a while",
+    "comers": "come on a new connection each time, ask a little and go, one in three in the middle of a call",
+    "wrong": "ask for what is to be refused",
+}
+"""What the workers do, by the names that their calls are counted under."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Everything the workers need.
+
+    Attributes:
+        address: of the server.
+        place: whose photographs are stored and asked with.
+        outcomes: where it is noted how calls end.
+        pace: times between what a worker does are divided by this.
+        stopping: set when they are to end, each when it is through with what it does.
+    """
+
+    address: str
+    place: Place
+    outcomes: Outcomes
+    pace: float = 1.0
+    stopping: asyncio.Event = field(default_factory=asyncio.Event)
+
+    async def references(self, chance: random.Random) -> None:
+        """Adds references to the scene that is queried, and deletes the oldest."""
+        stored: list[str] = []
+        async with aio.Client(self.address, ONCE) as client:
+            for number in self._rounds():
+                photo = chance.choice(self.place.references)
+                new = NewReference(f"extra-{number}", photo.data, photo.camera, photo.world_from_camera)
+                if await self.outcomes.note("references", client.add_reference(SCENE, new)):
+                    stored.append(new.reference_id)
+                # One whose answer came too late was perhaps stored all the same, and stays: no more than a few.
+                while len(stored) > EXTRA_REFERENCES:
+                    deleted = client.delete_reference(SCENE, stored.pop(0))
+                    await self.outcomes.note("references", deleted, "NOT_FOUND")
+                await self._pause(chance, 8.0)
+
+    async def scenes(self, chance: random.Random) -> None:
+        """Makes scenes, asks in them, and deletes them, sometimes while they are asked in."""
+        first, second = self.place.references[:2]
+        async with aio.Client(self.address, ONCE) as client:
+            for number in self._rounds():
+                scene = f"scene-{number % SCENES}"
+                await self.outcomes.note("scenes", client.create_scene(scene), *UNCERTAIN)
+                for photo in (first, second):
+                    new = NewReference(photo.name, photo.data, photo.camera, photo.world_from_camera)
+                    await self.outcomes.note("scenes", client.add_reference(scene, new), *UNCERTAIN)
+                asked = asyncio.create_task(self._ask(client, scene, self.place.queries[0]))
+                await asyncio.sleep(chance.choice([0.0, 0.05, 0.2, 3.0]))
+                await self.outcomes.note("scenes", client.delete_scene(scene), *UNCERTAIN)
+                await asked
+                await self._pause(chance, 20.0)
+
+    async def _ask(self, client: aio.Client, scene: str, photo: Photograph) -> None:
+        code = "OK"
+        try:
+            await client.localize(photo.data, photo.camera, scene)
+        except MaplessError as error:
+            code = error.code
+            if code not in ("NOT_FOUND", "UNAVAILABLE", *BUSY):
+                self.outcomes.failures.setdefault(f"scenes: {code}", str(error))
+        self.outcomes.counts["scenes", code] += 1
+        self.outcomes.localize_codes.append(code)
+
+    async def watchers(self, chance: random.Random) -> None:
+        """Watches the scene's queries, and the server's health, for a while each, and leaves without a word."""
+        async with _channel(self.address) as channel:
+            for _ in self._rounds():
+                watched = rpcs.LocalizationServiceStub(channel).WatchQueries(
+                    pb.WatchQueriesRequest(scene=scene_name(SCENE))
+                )
+                health = health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest())
+                leaving = asyncio.create_task(self._pause(chance, 10.0))
+                seen = await asyncio.gather(*(_seen_until(leaving, stream) for stream in (watched, health)))
+                for name, (messages, how) in zip(("watch queries", "watch health"), seen, strict=True):
+                    self.outcomes.counts[name, "messages"] += messages
+                    self.outcomes.counts[name, how] += 1
+                    # A connection has its age, after which the server ends it.
+                    if how not in ("left", "UNAVAILABLE", *BUSY):
+                        self.outcomes.failures.setdefault(f"{name}: {how}", "the server ended it")
+
+    async def comers(self, chance: random.Random) -> None:
+        """Comes on a new connection each time, asks a little, and goes; one in three in the middle of a call."""
+        for _ in self._rounds():
+            async with aio.Client(self.address, ONCE) as client:
+                await self.outcomes.note("comers", client.is_serving())
+                listing = asyncio.create_task(self.outcomes.note("comers", _listed(client), "CANCELLED"))
+                if chance.random() < 1 / 3:
+                    await asyncio.sleep(chance.uniform(0.0, 0.01))
+                    listing.cancel()
+                    with suppress(asyncio.CancelledError):
+                        await listing
+                else:
+                    await listing
+            host, _, port = self.address.rpartition(":")
+            _, writer = await asyncio.open_connection(host, int(port))
+            writer.write(chance.choice([b"", b"PRI * HTTP/2.0\r\n\r\n", b"GET / HTTP/1.1\r\n\r\n"]))
+            writer.transport.abort()
+            await self._pause(chance, 3.0)
+
+    async def wrong(self, chance: random.Random) -> None:
+        """Asks for what is not there, makes what is there, and sends what is no message."""
+        photo = self.place.queries[0]
+        async with aio.Client(self.address, ONCE) as client, _channel(self.address) as channel:
+            raw: Any = channel.unary_unary("/mapless.v1.ReferenceService/GetScene")
+            page = reference_pb.ListReferencesRequest(scene=scene_name(SCENE), page_token="of another list")
+            wrongs: Sequence[tuple[Callable[[], Awaitable[object]], str]] = (
+                (lambda: client.get_scene("there-is-none"), "NOT_FOUND"),
+                (lambda: client.create_scene(SCENE), "ALREADY_EXISTS"),
+                (lambda: client.delete_reference(SCENE, "there-is-none"), "NOT_FOUND"),
+                (lambda: client.retrieve_references(photo.data[:100], photo.camera, SCENE, 3), "INVALID_ARGUMENT"),
+                (lambda: raw(b"\xff\xff no message", timeout=20), "INVALID_ARGUMENT"),
+                (
+                    lambda: reference_rpcs.ReferenceServiceStub(channel).ListReferences(page, timeout=20),
+                    "INVALID_ARGUMENT",
+                ),
+            )
+            for _ in self._rounds():
+                call, code = chance.choice(wrongs)
+                await self.outcomes.note("wrong", call(), code)
+                await self._pause(chance, 2.0)
+
+    def _rounds(self) -> Iterator[int]:
+        return takewhile(lambda _: not self.stopping.is_set(), count())
+
+    async def _pause(self, chance: random.Random, mean_s: float) -> None:
+        with suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(self.stopping.wait(), chance.expovariate(self.pace / mean_s))
+
+
+@asynccontextmanager
+async def churning(workers: Workers, seed: int) -> AsyncIterator[Outcomes]:
+    """All workers at work until the block is left, which ends with RuntimeError if one has failed by itself."""
+    kinds = (workers.references, workers.scenes, workers.watchers, workers.comers, workers.wrong)
+    tasks = [asyncio.create_task(work(random.Random(seed + number))) for number, work in enumerate(kinds)]
+    try:
+        yield workers.outcomes
+        workers.stopping.set()
+        await asyncio.wait(tasks, timeout=ENDING_S)
+    finally:
+        for task in tasks:
+            task.cancel()
+        ended = await asyncio.gather(*tasks, return_exceptions=True)
+    for error in ended:
+        if isinstance(error, BaseException):
+            raise RuntimeError("a worker beside the queries failed, or does not end") from error
+
+
+def _channel(address: str) -> grpc.aio.Channel:
+    options = [
+        ("grpc.use_local_subchannel_pool", 1),
+        ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+    ]
+    return grpc.aio.insecure_channel(address, options)
+
+
+async def _listed(client: aio.Client) -> int:
+    return len([reference async for reference in client.list_references(SCENE)])
+
+
+async def _seen_until(leaving: asyncio.Task[None], stream: Any) -> tuple[int, str]:
+    """Messages until the watcher leaves, and "left"; or the status if the server ended it before."""
+    seen = 0
+
+    async def read() -> None:
+        nonlocal seen
+        async for _ in stream:
+            seen += 1
+
+    reading = asyncio.create_task(read())
+    try:
+        await asyncio.wait({reading, leaving}, return_when=asyncio.FIRST_COMPLETED)
+        ended = reading.done()
+    finally:
+        stream.cancel()
+        await asyncio.gather(reading, return_exceptions=True)
+    return seen, (await stream.code()).name if ended else "left"

@@ -1,0 +1,185 @@
+"""`mapless-server load ...`: arguments in; tables, a picture and JSON out."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from mapless_tools.progress import Progress
+
+    from .report import Check
+
+load_app = typer.Typer(
+    help="Measure what the server does under load. Figures go to load-output/load.json, pictures beside it: load.png "
+    "of the pipeline, soak.svg of the soak; and the server's log.",
+    no_args_is_help=True,
+)
+
+Data = Annotated[
+    Path | None, typer.Option(help="Folder with images/ and cameras.json; default: a room rendered on the spot.")
+]
+Output = Annotated[Path, typer.Option(help="Folder for the picture and the figures.")]
+Quick = Annotated[bool, typer.Option(help="Seconds instead of minutes: to see that it runs. Not for figures.")]
+Deadline = Annotated[float, typer.Option(help="Deadline of every call, seconds.")]
+Clients = Annotated[int, typer.Option(help="Clients that call independently of one another.")]
+Seed = Annotated[int, typer.Option(help="Of the arrivals.")]
+Minutes = Annotated[float, typer.Option(help="How long the soak takes.")]
+
+OUTPUT = Path("load-output")
+
+
+@load_app.command("overhead")
+def overhead_command(quick: Quick = False, output: Output = OUTPUT) -> None:
+    """What serving costs without computing, beside a bare grpc.aio server."""
+    _finish(_overhead(quick, output))
+
+
+@load_app.command("pipeline")
+def pipeline_command(
+    data: Data = None,
+    quick: Quick = False,
+    deadline_s: Deadline = 5.0,
+    step_s: Annotated[float, typer.Option(help="Seconds at each load.")] = 60.0,
+    clients: Clients = 8,
+    seed: Seed = 0,
+    output: Output = OUTPUT,
+) -> None:
+    """Latency, goodput and refusals of the real server from 30 to 300 % of what it can do; draws them."""
+    _finish(_pipeline(data, quick, output, deadline_s=deadline_s, step_s=step_s, clients=clients, seed=seed))
+
+
+@load_app.command("soak")
+def soak_command(
+    data: Data = None,
+    minutes: Minutes = 10.0,
+    quick: Quick = False,
+    rate_per_s: Annotated[
+        float | None, typer.Option(help="Queries a second; default: nine tenths of what the server can do.")
+    ] = None,
+    churn: Annotated[float, typer.Option(help="Pace of what goes on beside the queries; 0: nothing.")] = 1.0,
+    deadline_s: Deadline = 5.0,
+    clients: Clients = 8,
+    seed: Seed = 0,
+    output: Output = OUTPUT,
+) -> None:
+    """Everything that callers do, well and badly, for long: what grows, what is unaccounted for; draws it."""
+    given = {"minutes": minutes, "rate_per_s": rate_per_s, "churn": churn, "deadline_s": deadline_s}
+    _finish(_soak(data, quick, output, clients=clients, seed=seed, **given))
+
+
+@load_app.command("all")
+def all_command(data: Data = None, minutes: Minutes = 10.0, quick: Quick = False, output: Output = OUTPUT) -> None:
+    """All three, one after the other."""
+    checks = [*_overhead(quick, output), *_pipeline(data, quick, output)]
+    _finish(checks + _soak(data, quick, output, minutes=minutes))
+
+
+def _overhead(quick: bool, output: Path) -> list[Check]:
+    from .overhead import OverheadOptions, measure_overhead, overhead_checks, overhead_json, overhead_lines
+
+    options = OverheadOptions(rounds=2, unloaded_s=0.3, saturated_s=0.5) if quick else OverheadOptions()
+    with _measuring() as progress:
+        subjects = measure_overhead(options, progress)
+    checks = overhead_checks(subjects)
+    _report(output, "overhead", overhead_lines(subjects, options), checks, overhead_json(subjects, options))
+    return checks
+
+
+def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
+    from mapless_server.settings import available_cores
+    from mapless_tools.evaluate.command import usage_errors
+
+    from .chart import draw_load
+    from .pipeline import PipelineOptions, measure_pipeline, pipeline_checks, pipeline_json
+    from .report import machine_lines, step_lines
+    from .requests import place_of
+
+    brief = {"unloaded_s": 4.0, "ramp_s": 4.0, "step_s": 6.0, "settle_s": 1.0} if quick else {}
+    with _measuring() as progress:
+        with usage_errors():
+            options, place = PipelineOptions(**(given | brief)), place_of(data)
+        log = _new_log(output, "pipeline")
+        result = measure_pipeline(place, options, progress, log)
+        load = os.getloadavg()[0]
+    checks = pipeline_checks(result)
+    (output / "load.png").write_bytes(draw_load(result))
+    lines = [f"{result.scene}:", "", *step_lines(result.all_steps), *machine_lines(checks, load, available_cores())]
+    _report(output, "pipeline", lines, checks, pipeline_json(result), output / "load.png", log)
+    return checks
+
+
+def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
+    from mapless_server.settings import available_cores
+    from mapless_tools.evaluate.command import usage_errors
+
+    from .report import machine_lines, step_lines
+    from .requests import place_of
+    from .soak import SoakOptions, least_minutes, measure_soak, soak_checks, soak_json, soak_lines
+    from .soak_chart import draw_soak
+
+    brief = {"minutes": 0.25, "ramp_s": 4.0, "sample_every_s": 0.5, "churn": 4.0} if quick else {}
+    with _measuring() as progress:
+        with usage_errors():
+            options, place = SoakOptions(**(given | brief)), place_of(data)
+        least = least_minutes(options)
+        if options.minutes < least:
+            note = f"note: {options.minutes:g} minutes are too short to tell growth from settling; {least} are enough"
+            print(note, file=sys.stderr, flush=True)
+        log = _new_log(output, "soak")
+        result = measure_soak(place, options, progress, log)
+        load = os.getloadavg()[0]
+    checks = soak_checks(result)
+    steps = step_lines([*result.before, result.soak])
+    lines = [f"{result.scene}:", "", *steps, *soak_lines(result), *machine_lines(checks, load, available_cores())]
+    (output / "soak.svg").write_text(draw_soak(result.states, result.slopes), encoding="utf-8")
+    _report(output, "soak", lines, checks, soak_json(result), output / "soak.svg", log)
+    return checks
+
+
+def _new_log(output: Path, part: str) -> Path:
+    """An empty file for the log of the part's server, which would be in the way of progress and tables."""
+    output.mkdir(parents=True, exist_ok=True)
+    log = output / f"{part}-server.log"
+    log.write_bytes(b"")
+    return log
+
+
+def _report(
+    output: Path, part: str, lines: list[str], checks: list[Check], figures: dict[str, Any], *files: Path
+) -> None:
+    """Prints a part, puts it into the JSON file beside the others, and says where that and its other files are."""
+    from .report import check_lines, machine, update_json
+
+    print("\n".join([f"## {part}", "", machine(), "", *lines, *check_lines(checks)]), flush=True)
+    output.mkdir(parents=True, exist_ok=True)
+    update_json(output / "load.json", part, figures, checks)
+    print(f"Written: {', '.join(map(str, [output / 'load.json', *files]))}\n", flush=True)
+
+
+@contextmanager
+def _measuring() -> Iterator[Progress]:
+    """Progress bars; what goes wrong ends the command with one line."""
+    from mapless import MaplessError
+    from mapless_server.serve.signals import terminable
+    from mapless_tools.child import ServerFailed
+    from mapless_tools.evaluate.plan import UsageError
+    from mapless_tools.progress import progress_bars
+
+    try:
+        with terminable(), progress_bars() as progress:
+            yield progress
+    except (UsageError, ServerFailed, MaplessError) as error:
+        print(f"mapless-server: {error}", file=sys.stderr)
+        raise typer.Exit(2 if isinstance(error, UsageError) else 1) from None
+
+
+def _finish(checks: list[Check]) -> None:
+    """Exit code 1 if a bar was missed."""
+    raise typer.Exit(1 if any(check.met is False for check in checks) else 0)

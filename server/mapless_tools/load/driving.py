@@ -1,0 +1,150 @@
+"""The real server with a scene, and the ways it is called: side by side, as fast as it can, and at a rate."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+import tempfile
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapless import Client
+from mapless_tools.child import child_server
+from mapless_tools.demo.run import Place
+from mapless_tools.evaluate.run import CONNECT
+from mapless_tools.progress import Progress
+
+from .arrivals import Mix, Requests, plan_calls
+from .records import CallRecord, Fate
+from .requests import METHOD, read_answer, requests_for, store_references
+from .sender import Target, connected, send_closed_loop, send_open_loop
+from .step import ServerUnderLoad, Step, run_step
+from .watch import going_first
+
+CLOSED_SETTLE_SHARE = 0.2
+"""Of a step of calls side by side, what rates leave out: as many answers are missing at first as calls are begun."""
+_RAMP_GAIN = 1.03
+"""So much more has to come of twice as many calls side by side, or the server is saturated."""
+
+
+@dataclass(frozen=True)
+class LoadedServer:
+    """A server with a scene and what to ask of it.
+
+    Attributes:
+        address: of its services.
+        under_load: its process and metrics.
+        requests: that are ready to be sent.
+        data_dir: its store.
+    """
+
+    address: str
+    under_load: ServerUnderLoad
+    requests: Requests
+    data_dir: Path
+
+
+@contextmanager
+def server_with_scene(
+    place: Place, progress: Progress, environment: Mapping[str, str] | None = None, log: Path | None = None
+) -> Iterator[LoadedServer]:
+    """A server of its own with the references of a place stored, that has answered every query once.
+
+    Settings of the environment hold for it, and `environment` is added to it. Its log is added to the file `log`.
+
+    Raises:
+        ServerFailed: it did not start.
+        MaplessError: a call failed.
+    """
+    port = free_port()
+    with tempfile.TemporaryDirectory(prefix="mapless-load-") as data_dir:
+        flags = {"--metrics-port": str(port), "--metrics-host": "127.0.0.1"}
+        with child_server(Path(data_dir), flags, environment, log) as server:
+            with Client(server.address, CONNECT) as client:
+                progress("storing references", 0, len(place.references))
+                store_references(client, place.references)
+                progress("first answers", 0, len(place.queries))
+                requests = requests_for(client, place.queries)
+            with going_first(server.process_id):
+                under_load = ServerUnderLoad(server.process_id, f"127.0.0.1:{port}")
+                yield LoadedServer(server.address, under_load, requests, Path(data_dir))
+
+
+def free_port() -> int:
+    """A port of the loopback interface that nobody has at the moment."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+@asynccontextmanager
+async def calling(server: LoadedServer, clients: int, deadline_s: float) -> AsyncIterator[Target]:
+    """Connections to Localize."""
+    async with connected(server.address, METHOD, clients, deadline_s, read_answer) as target:
+        yield target
+
+
+async def find_saturation(
+    server: LoadedServer, target: Target, seconds: float, progress: Progress
+) -> tuple[list[Step], float]:
+    """Ever more calls side by side, until more of them bring no more answers; and the most answers a second."""
+    steps: list[Step] = []
+    best_per_s = 0.0
+    for power in itertools.count(1):
+        concurrency = 2**power
+        progress(f"saturation, {concurrency} calls side by side", 0, 1)
+        step = await closed_step(f"{concurrency} at a time", server, target, concurrency, seconds)
+        steps.append(step)
+        per_s = step.account.completed_per_s
+        if per_s < _RAMP_GAIN * best_per_s or step.account.count(Fate.REFUSED) or step.answers == 0:
+            best_per_s = max(best_per_s, per_s)
+            break
+        best_per_s = per_s
+    if best_per_s == 0:
+        raise RuntimeError(f"the server answered nothing: {dict(steps[-1].account.outcomes)}")
+    return steps, best_per_s
+
+
+async def closed_step(name: str, server: LoadedServer, target: Target, concurrency: int, seconds: float) -> Step:
+    """A step of so many calls side by side."""
+    return await run_step(
+        name,
+        server.under_load,
+        lambda: send_closed_loop(target, server.requests.good, concurrency, seconds),
+        seconds,
+        settle_s=CLOSED_SETTLE_SHARE * seconds,
+    )
+
+
+async def open_step(
+    name: str,
+    server: LoadedServer,
+    target: Target,
+    rate_per_s: float,
+    seconds: float,
+    *,
+    settle_s: float,
+    seed: int,
+    mix: Mix | None = None,
+    sample_every_s: float = 1.0,
+    requests: Requests | None = None,
+    beside: Callable[[], AbstractAsyncContextManager[object]] = nullcontext,
+) -> Step:
+    """A step of Poisson arrivals, of the server's requests or of others; `beside` goes on meanwhile."""
+    plan = plan_calls(rate_per_s, seconds, len(target.methods), requests or server.requests, mix or Mix(), seed)
+
+    async def send() -> list[CallRecord]:
+        async with beside():
+            return await send_open_loop(target, plan)
+
+    return await run_step(
+        name,
+        server.under_load,
+        send,
+        seconds,
+        asked_per_s=rate_per_s,
+        settle_s=settle_s,
+        sample_every_s=sample_every_s,
+    )

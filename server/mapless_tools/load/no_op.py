@@ -1,0 +1,97 @@
+"""A server that computes nothing, as a program: what is left is what serving itself costs.
+
+Everything is the real thing, from the sockets to the store, the queue and its threads; only the extractor finds no
+features in any photograph, and the method's three stages do nothing but pass the query on. `padded_photo` is what to
+send: as long as a photograph, and as small as one can be, so that decoding it costs nothing either.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Camera
+from mapless_server.engine.engine import Engine
+from mapless_server.engine.stages import Method
+from mapless_server.engine.tiers import Tier
+from mapless_server.method.localize import Answer, Coarse, Pipeline, Prepared
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.views import Features, View
+from mapless_server.observability.logs import configure_logging
+from mapless_server.observability.metrics import Metrics
+from mapless_server.security.rate import RateLimiter
+from mapless_server.serve.assembly import engine_options
+from mapless_server.serve.run import serve
+from mapless_server.settings import Settings, load_settings
+from mapless_server.store import Store
+
+SIDE_PX = 64
+CAMERA = Camera(SIDE_PX, SIDE_PX, 60.0, 60.0, 31.5, 31.5)
+_MAX_COMMENT_BYTES = 65_000  # a JPEG's segment has room for 65,533
+
+
+class BlindExtractor:
+    """Finds no features, whatever it is shown."""
+
+    name = "blind"
+
+    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+        """A view with nothing in it."""
+        nothing = Features(np.zeros((0, 2), np.float32), np.zeros((0, 4), np.float32), np.zeros(0, np.float32))
+        return View(camera.pinhole(), nothing)
+
+
+def padded_photo(size_bytes: int) -> bytes:
+    """A grey JPEG of 64 by 64 pixels with comments, about `size_bytes` long."""
+    jpeg = bytes(cv2.imencode(".jpg", np.full((SIDE_PX, SIDE_PX), 128, np.uint8))[1])
+    start_of_image, rest = jpeg[:2], jpeg[2:]
+    missing = max(0, size_bytes - len(jpeg))
+    lengths = [_MAX_COMMENT_BYTES] * (missing // _MAX_COMMENT_BYTES) + [missing % _MAX_COMMENT_BYTES]
+    comments = b"".join(b"\xff\xfe" + (length + 2).to_bytes(2, "big") + bytes(length) for length in lengths)
+    return start_of_image + comments + rest
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """What is known of a query of which nothing is computed; all such queries are of one bucket."""
+
+    bucket: str = "nothing"
+
+
+def no_op_method() -> Method:
+    """A method that goes through all stages, and rejects every photograph."""
+    rejected = Answer(Rejection(RejectionReason.LOW_TEXTURE, "nothing was computed"))
+    return Method(
+        prepare=lambda *_: cast(Prepared, Nothing()),
+        reconstruct=lambda batch, _: [cast(Coarse, part) for part in batch],
+        refine=lambda *_: rejected,
+        coarse_answer=lambda _: None,
+    )
+
+
+def make_no_op_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+    """An engine with the settings' queue and threads that computes nothing."""
+    tiers = [Tier(BlindExtractor(), Pipeline())]
+    return Engine(store, tiers, engine_options(settings), metrics, quota, no_op_method())
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Serves with the store in the folder given until SIGTERM; logs into it, as much as a server does by default."""
+    data_dir = Path(arguments[0])
+    flags = {"port": 0, "data_dir": data_dir, "metrics_port": 0, "warm_up": False}
+    settings = load_settings(flags).settings
+    with (data_dir / "log").open("w", encoding="utf-8") as stream:
+        configure_logging(settings, stream)
+        asyncio.run(serve(settings, make_no_op_engine))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,212 @@
+"""What serving costs without computing: calls a second at most, and the time that is ours beyond grpc's own."""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+from collections.abc import Sequence
+from contextlib import AsyncExitStack, ExitStack
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+from mapless import Client, RigidTransform
+from mapless_tools.child import ChildServer, child_module
+from mapless_tools.demo.run import Photograph
+from mapless_tools.progress import Progress
+
+from . import no_op
+from .driving import CLOSED_SETTLE_SHARE
+from .echo import ECHO_METHOD, SHORT_METHOD
+from .records import Fate
+from .report import Check
+from .requests import METHOD, photo_request, read_answer, store_references
+from .sender import Target, connected, send_closed_loop
+from .step import ServerUnderLoad, Step, run_step
+
+MIN_CALLS_PER_S = 300.0
+MAX_OVERHEAD_MS = 2.0
+BARE, ECHO, MAPLESS = "bare, short answer", "bare echo", "mapless, no-op"
+_EXPECTED = {MAPLESS: "rejected LOW_TEXTURE", BARE: "", ECHO: ""}
+
+
+@dataclass(frozen=True)
+class OverheadOptions:
+    """Options of the comparison.
+
+    Attributes:
+        message_bytes: size of the photograph; 0.3 MB is a phone's at 1024 px.
+        rounds: the servers take turns so often, so that what else the machine does hits all alike.
+        unloaded_s: calls one after the other, a round.
+        saturated_s: calls side by side, a round.
+        concurrency: of these; enough to keep a server busy, and no more than it has room for.
+        clients: connections they come from.
+    """
+
+    message_bytes: int = 300_000
+    rounds: int = 5
+    unloaded_s: float = 2.0
+    saturated_s: float = 3.0
+    concurrency: int = 16
+    clients: int = 4
+
+    def __post_init__(self) -> None:
+        if min(self.message_bytes, self.rounds, self.concurrency, self.clients) < 1:
+            raise ValueError("message_bytes, rounds, concurrency and clients must be at least 1")
+        if not min(self.unloaded_s, self.saturated_s) > 0:
+            raise ValueError("times must be above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A server that is compared: its steps, one a round."""
+
+    name: str
+    unloaded: Sequence[Step]
+    saturated: Sequence[Step]
+
+    @property
+    def p50_ms(self) -> float:
+        """The median round's median latency of one call at a time."""
+        return median(_p50_ms(step) for step in self.unloaded)
+
+    @property
+    def calls_per_s(self) -> float:
+        """The median round's rate at saturation."""
+        return median(step.account.completed_per_s for step in self.saturated)
+
+
+def measure_overhead(options: OverheadOptions, progress: Progress) -> list[Subject]:
+    """Starts the bare server and the one that computes nothing, and calls them by turns.
+
+    Raises:
+        ServerFailed: one did not start.
+        RuntimeError: a call did not end as it should.
+    """
+    with ExitStack() as stack:
+        data_dir = stack.enter_context(tempfile.TemporaryDirectory(prefix="mapless-load-"))
+        bare = stack.enter_context(child_module("mapless_tools.load.echo"))
+        ours = stack.enter_context(child_module("mapless_tools.load.no_op", data_dir))
+        request = _prepared(ours, options)
+        return asyncio.run(_compare(bare, ours, request, options, progress))
+
+
+def overhead_checks(subjects: Sequence[Subject]) -> list[Check]:
+    """The bars; the server is held against the bare one that answers as shortly, which is the harder comparison."""
+    by_name = {subject.name: subject for subject in subjects}
+    ours, bare = by_name[MAPLESS], by_name[BARE]
+    rounds = [_p50_ms(a) - _p50_ms(b) for a, b in zip(ours.unloaded, bare.unloaded, strict=True)]
+    overhead = median(rounds)
+    return [
+        Check(
+            "calls/s at saturation, no-op pipeline",
+            f"{ours.calls_per_s:.0f}",
+            f"at least {MIN_CALLS_PER_S:.0f}",
+            ours.calls_per_s >= MIN_CALLS_PER_S,
+        ),
+        Check(
+            "p50 overhead over a bare grpc.aio server, one call at a time",
+            f"{overhead:.2f} ms (rounds {min(rounds):.2f} to {max(rounds):.2f})",
+            f"at most {MAX_OVERHEAD_MS:g} ms",
+            overhead <= MAX_OVERHEAD_MS,
+        ),
+    ]
+
+
+def overhead_lines(subjects: Sequence[Subject], options: OverheadOptions) -> list[str]:
+    """A table with a row a server."""
+    lines = [
+        f"Messages of {options.message_bytes / 1e6:g} MB, {options.rounds} rounds by turns, "
+        f"{options.concurrency} calls side by side from {options.clients} connections:",
+        "",
+        "| server | p50 unloaded, ms | p99 unloaded, ms | calls/s | server CPU ms/call | generator's core |",
+        "|---|---|---|---|---|---|",
+    ]
+    for subject in subjects:
+        p99 = median(step.account.answers.p99_ms or 0.0 for step in subject.unloaded)
+        cpu_ms = median(1000 * step.cpu_s_per_answer for step in subject.saturated)
+        own = median(step.own_share for step in subject.saturated)
+        lines.append(
+            f"| {subject.name} | {subject.p50_ms:.2f} | {p99:.2f} | {subject.calls_per_s:.0f} | {cpu_ms:.2f} "
+            f"| {100 * own:.0f} % |"
+        )
+    return [*lines, ""]
+
+
+def overhead_json(subjects: Sequence[Subject], options: OverheadOptions) -> dict[str, Any]:
+    """For programs."""
+    return {
+        "options": vars(options),
+        "servers": [
+            {
+                "name": subject.name,
+                "p50_ms": subject.p50_ms,
+                "calls_per_s": subject.calls_per_s,
+                "unloaded": [step.as_json() for step in subject.unloaded],
+                "saturated": [step.as_json() for step in subject.saturated],
+            }
+            for subject in subjects
+        ],
+    }
+
+
+def _prepared(server: ChildServer, options: OverheadOptions) -> bytes:
+    """A request to a scene that now exists."""
+    photo = no_op.padded_photo(options.message_bytes)
+    references = [Photograph(f"r{i}", photo, no_op.CAMERA, RigidTransform.identity()) for i in range(2)]
+    with Client(server.address) as client:
+        store_references(client, references)
+    return photo_request(photo, no_op.CAMERA, [reference.name for reference in references])
+
+
+async def _compare(
+    bare: ChildServer, ours: ChildServer, request: bytes, options: OverheadOptions, progress: Progress
+) -> list[Subject]:
+    unloaded: dict[str, list[Step]] = {BARE: [], ECHO: [], MAPLESS: []}
+    saturated: dict[str, list[Step]] = {BARE: [], ECHO: [], MAPLESS: []}
+    places = {BARE: (bare, SHORT_METHOD), ECHO: (bare, ECHO_METHOD), MAPLESS: (ours, METHOD)}
+    async with AsyncExitStack() as stack:
+        targets: dict[str, Target] = {}
+        for name, (server, method) in places.items():
+            reader = read_answer if name == MAPLESS else _nothing
+            targets[name] = await stack.enter_async_context(
+                connected(server.address, method, options.clients, 30.0, reader)
+            )
+            await _step(name, server, targets[name], request, 4, 0.5)  # what happens once, happens now
+        for done in range(options.rounds):
+            progress("overhead, rounds", done, options.rounds)
+            for name, (server, _) in places.items():
+                unloaded[name].append(await _step(name, server, targets[name], request, 1, options.unloaded_s))
+            for name, (server, _) in places.items():
+                saturated[name].append(
+                    await _step(name, server, targets[name], request, options.concurrency, options.saturated_s)
+                )
+        progress("overhead, rounds", options.rounds, options.rounds)
+    return [Subject(name, unloaded[name], saturated[name]) for name in places]
+
+
+async def _step(
+    name: str, server: ChildServer, target: Target, request: bytes, concurrency: int, duration_s: float
+) -> Step:
+    step = await run_step(
+        f"{name}, {concurrency} at a time",
+        ServerUnderLoad(server.process_id),
+        lambda: send_closed_loop(target, [request], concurrency, duration_s),
+        duration_s,
+        settle_s=CLOSED_SETTLE_SHARE * duration_s,
+    )
+    if set(step.account.outcomes) != {f"OK {_EXPECTED[name]}".strip()}:
+        raise RuntimeError(f"{step.name}: calls ended as {dict(step.account.outcomes)}")
+    if step.account.count(Fate.ANSWERED) != step.account.sent:
+        raise RuntimeError(f"{step.name}: calls came too late: {dict(step.account.fates)}")
+    return step
+
+
+def _nothing(_: bytes) -> str:
+    return ""
+
+
+def _p50_ms(step: Step) -> float:
+    p50_ms = step.account.answers.p50_ms
+    assert p50_ms is not None
+    return p50_ms

@@ -1,0 +1,205 @@
+"""The real server with a real scene under less and more than it can do: latency, goodput and refusals against load."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mapless_server.settings import available_cores
+from mapless_tools.demo.run import Place
+from mapless_tools.progress import Progress
+
+from .driving import LoadedServer, calling, closed_step, find_saturation, open_step, server_with_scene
+from .records import Fate
+from .report import Check, loop_lag_check, trend_check
+from .step import Step
+
+MIN_SHARE_OF_IDEAL = 0.9
+MAX_P99_OVER_UNLOADED_P50 = 3.0
+MIN_SHARE_OF_PEAK = 0.9
+MAX_REFUSAL_MS = 50.0
+COMFORTABLE, EXCESSIVE = 0.7, 3.0
+"""Shares of saturation that have bars of their own."""
+COMFORTABLE_STEPS = 3
+"""The step whose p99 has a bar takes so many times as long as the others."""
+
+
+@dataclass(frozen=True)
+class PipelineOptions:
+    """Options of the measurement.
+
+    Attributes:
+        clients: that call independently, each on a connection of its own.
+        deadline_s: of every call: what a robot that calls once a second still has a use for.
+        unloaded_s: calls one after the other.
+        ramp_s: with each number of calls side by side, until more of them bring less than 3 % more answers.
+        step_s: at each share of saturation; a p99 wants some hundred calls.
+        settle_s: of each step, what its rates leave out: the queue fills meanwhile.
+        shares: of saturation that are offered.
+        seed: of the arrivals.
+    """
+
+    clients: int = 8
+    deadline_s: float = 5.0
+    unloaded_s: float = 30.0
+    ramp_s: float = 15.0
+    step_s: float = 60.0
+    settle_s: float = 10.0
+    shares: tuple[float, ...] = (0.3, 0.5, COMFORTABLE, 0.9, 1.0, 1.5, 2.0, EXCESSIVE)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.clients < 1 or not self.shares or min(self.shares) <= 0:
+            raise ValueError("clients must be at least 1, shares above 0 and at least one")
+        if not min(self.deadline_s, self.unloaded_s, self.ramp_s) > 0 or not 0 <= self.settle_s < self.step_s:
+            raise ValueError("times must be above 0, settle_s at least 0 and below step_s")
+
+
+@dataclass(frozen=True, eq=False)
+class PipelineResult:
+    """What was measured.
+
+    Attributes:
+        scene: in words.
+        options: of the measurement.
+        unloaded: one call at a time.
+        ramp: so many calls side by side: 2, 4, ...
+        saturation_per_s: the most answers a second of these.
+        steps: at the options' shares of it.
+    """
+
+    scene: str
+    options: PipelineOptions
+    unloaded: Step
+    ramp: Sequence[Step]
+    saturation_per_s: float
+    steps: Sequence[Step]
+
+    @property
+    def all_steps(self) -> list[Step]:
+        """In order."""
+        return [self.unloaded, *self.ramp, *self.steps]
+
+    def at(self, share: float) -> Step | None:
+        """The step at a share of saturation; None if it was not asked for."""
+        return dict(zip(self.options.shares, self.steps, strict=True)).get(share)
+
+
+def measure_pipeline(
+    place: Place, options: PipelineOptions, progress: Progress, log: Path | None = None
+) -> PipelineResult:
+    """Starts a server, finds what it can do at most, and offers it shares of that.
+
+    Raises:
+        ServerFailed: it did not start.
+        MaplessError: a call before the measurement failed.
+        RuntimeError: it answered nothing.
+    """
+    with server_with_scene(place, progress, log=log) as server:
+        return asyncio.run(_measure(place, server, options, progress))
+
+
+def pipeline_checks(result: PipelineResult) -> list[Check]:
+    """The bars."""
+    cores = available_cores()
+    best = max(result.ramp, key=lambda step: step.account.completed_per_s)
+    checks = [
+        _ideal_check("unloaded", result.saturation_per_s, result.unloaded.cpu_s_per_answer, cores),
+        _ideal_check("at saturation", result.saturation_per_s, best.cpu_s_per_answer, cores),
+        _comfort_check(result),
+        *_overload_checks(result),
+    ]
+    overdue = sum(step.account.count(Fate.OVERDUE) for step in result.all_steps)
+    failed = sum(step.account.count(Fate.FAILED) for step in result.all_steps)
+    return [
+        *checks,
+        Check("accepted calls that ended after their deadline, all steps", str(overdue), "0", overdue == 0),
+        Check("calls that failed, all steps", str(failed), "0", failed == 0),
+        loop_lag_check(result.all_steps),
+    ]
+
+
+def pipeline_json(result: PipelineResult) -> dict[str, Any]:
+    """For programs."""
+    return {
+        "scene": result.scene,
+        "options": vars(result.options),
+        "saturation_per_s": result.saturation_per_s,
+        "unloaded": result.unloaded.as_json(),
+        "ramp": [step.as_json() for step in result.ramp],
+        "steps": [
+            {"share_of_saturation": share, **step.as_json()}
+            for share, step in zip(result.options.shares, result.steps, strict=True)
+        ],
+    }
+
+
+async def _measure(place: Place, server: LoadedServer, options: PipelineOptions, progress: Progress) -> PipelineResult:
+    async with calling(server, options.clients, options.deadline_s) as target:
+        progress("unloaded", 0, 1)
+        unloaded = await closed_step("unloaded", server, target, 1, options.unloaded_s)
+        ramp, saturation_per_s = await find_saturation(server, target, options.ramp_s, progress)
+        steps = []
+        for number, share in enumerate(options.shares):
+            progress(f"load {100 * share:.0f} %", 0, 1)
+            steps.append(
+                await open_step(
+                    f"{100 * share:.0f} %",
+                    server,
+                    target,
+                    share * saturation_per_s,
+                    options.step_s * (COMFORTABLE_STEPS if share == COMFORTABLE else 1),
+                    settle_s=options.settle_s,
+                    seed=options.seed + number,
+                )
+            )
+    return PipelineResult(place.title, options, unloaded, ramp, saturation_per_s, steps)
+
+
+def _ideal_check(where: str, saturation_per_s: float, cpu_s: float, cores: int) -> Check:
+    ideal = cores / cpu_s
+    return Check(
+        f"answers/s at saturation, of cores / CPU seconds an answer ({where})",
+        f"{saturation_per_s:.2f} of {cores} / {cpu_s:.3f} = {ideal:.2f}: {100 * saturation_per_s / ideal:.0f} %",
+        f"at least {100 * MIN_SHARE_OF_IDEAL:.0f} %",
+        saturation_per_s >= MIN_SHARE_OF_IDEAL * ideal,
+    )
+
+
+def _comfort_check(result: PipelineResult) -> Check:
+    figure = f"p99 at {100 * COMFORTABLE:.0f} % load"
+    bar = f"at most {MAX_P99_OVER_UNLOADED_P50:g} times the unloaded p50"
+    step, p50_ms = result.at(COMFORTABLE), result.unloaded.account.answers.p50_ms
+    if step is None or p50_ms is None or step.account.answers.p99_ms is None:
+        return Check(figure, "-", bar, None)
+    p99_ms, count = step.account.answers.p99_ms, step.account.answers.count
+    value = f"{p99_ms:.0f} ms of {count} answers, {p99_ms / p50_ms:.1f} times {p50_ms:.0f} ms"
+    return Check(figure, value, bar, p99_ms <= MAX_P99_OVER_UNLOADED_P50 * p50_ms)
+
+
+def _overload_checks(result: PipelineResult) -> list[Check]:
+    step = result.at(EXCESSIVE)
+    where = f"at {EXCESSIVE:g} times saturation"
+    if step is None:
+        return [Check(f"goodput, refusals and memory {where}", "-", "", None)]
+    peak_per_s = max([result.saturation_per_s, *(it.account.goodput_per_s for it in result.steps)])
+    goodput_per_s, refusals = step.account.goodput_per_s, step.account.refusals
+    slowest_ms = refusals.max_ms
+    return [
+        Check(
+            f"goodput {where}",
+            f"{goodput_per_s:.2f}/s, {100 * goodput_per_s / peak_per_s:.0f} % of the peak of {peak_per_s:.2f}/s",
+            f"at least {100 * MIN_SHARE_OF_PEAK:.0f} %",
+            goodput_per_s >= MIN_SHARE_OF_PEAK * peak_per_s,
+        ),
+        Check(
+            f"slowest of {refusals.count} refusals {where}",
+            "-" if slowest_ms is None else f"{slowest_ms:.1f} ms (p99 {refusals.p99_ms:.1f} ms)",
+            f"below {MAX_REFUSAL_MS:g} ms",
+            None if slowest_ms is None else slowest_ms < MAX_REFUSAL_MS,
+        ),
+        trend_check(f"memory {where}", step.trend_of("resident_mib"), "MiB"),
+    ]

@@ -1,0 +1,130 @@
+"""Figures against their bars, and steps as a table: Markdown, as the project's other reports."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mapless_server import __version__
+from mapless_server.observability.provenance import cpu_model
+from mapless_server.settings import available_cores
+from mapless_tools.output_files import write_json
+
+from .records import Fate
+from .step import Step
+from .watch import Trend
+
+
+@dataclass(frozen=True)
+class Check:
+    """A figure and what is asked of it.
+
+    Attributes:
+        figure: what was measured.
+        value: in words.
+        bar: what it should be.
+        met: whether it is; None where it was not measured.
+    """
+
+    figure: str
+    value: str
+    bar: str
+    met: bool | None
+
+
+def machine() -> str:
+    """What the figures were measured with and on."""
+    return f"mapless {__version__}; {cpu_model()}, {available_cores()} cores, load generator on the same"
+
+
+def check_lines(checks: Sequence[Check]) -> list[str]:
+    """A table of figure, value, bar and verdict."""
+    verdict = {True: "yes", False: "**no**", None: "not measured"}
+    rows = [f"| {check.figure} | {check.value} | {check.bar} | {verdict[check.met]} |" for check in checks]
+    return ["| figure | measured | bar | met |", "|---|---|---|---|", *rows, ""]
+
+
+def step_lines(steps: Sequence[Step]) -> list[str]:
+    """A table with a row a step, and below it how every call ended."""
+    lines = [
+        "| step | offered/s | sent | goodput/s | refused/s | answers p50 / p95 / p99 ms | refusals p50 / p99 / max ms "
+        "| overdue | server CPU s/answer | RSS MiB, before > after | threads | fds | generator's core |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for step in steps:
+        account, first, last = step.account, step.samples[0], step.samples[-1]
+        answers, refusals = account.answers, account.refusals
+        cells = [
+            step.name,
+            f"{account.offered_per_s:.2f}",
+            str(account.sent),
+            f"{account.goodput_per_s:.2f}",
+            f"{account.refused_per_s:.2f}",
+            " / ".join(map(_ms, (answers.p50_ms, answers.p95_ms, answers.p99_ms))),
+            " / ".join(map(_ms, (refusals.p50_ms, refusals.p99_ms, refusals.max_ms))),
+            str(account.count(Fate.OVERDUE)),
+            f"{step.cpu_s_per_answer:.4f}" if step.answers else "-",
+            f"{first.resident_mib:.0f} > {last.resident_mib:.0f}",
+            f"{first.threads} > {last.threads}",
+            f"{first.descriptors} > {last.descriptors}",
+            f"{100 * step.own_share:.0f} %",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    lines.append("")
+    for step in steps:
+        outcomes = ", ".join(f"{count} {outcome}" for outcome, count in step.account.outcomes.items())
+        lag = step.account.send_lag
+        lines.append(f"- {step.name}: {outcomes or 'no calls'}; sent late by {_ms(lag.p99_ms)} ms (p99).")
+    return [*lines, ""]
+
+
+def loop_lag_check(steps: Sequence[Step], bar_s: float = 0.02) -> Check:
+    """Whether the server's event loop was never held up for longer."""
+    told = [step.told.longest_lag_s for step in steps if step.told is not None]
+    longest = max((lag for lag in told if lag is not None), default=None)
+    value = (
+        "-" if longest is None else "beyond the widest bucket" if math.isinf(longest) else f"< {1000 * longest:g} ms"
+    )
+    met = None if longest is None else longest <= bar_s
+    return Check("longest the event loop was held up", value, f"{1000 * bar_s:g} ms", met)
+
+
+def machine_lines(checks: Sequence[Check], load: float, cores: int) -> list[str]:
+    """A hint where bars are missed and more wanted to run than there are cores for.
+
+    Args:
+        checks: the bars.
+        load: how many threads ran or waited for a core, on average (the system's load average of a minute).
+        cores: that there are.
+    """
+    if load <= cores or all(check.met is not False for check in checks):
+        return []
+    return [
+        f"Some {load:.1f} threads wanted to run on {cores} cores, load generator and whatever else runs here among "
+        "them. Bars that depend on time (deadlines, the event loop) then say as much of the machine as of the server: "
+        "measure with more cores, nothing else running, or a lower rate.",
+        "",
+    ]
+
+
+def trend_check(figure: str, line: Trend | None, unit: str) -> Check:
+    """Whether something does not grow."""
+    if line is None:
+        return Check(figure, "-", "no growth", None)
+    value = f"{line.per_minute:+.3f} ({line.low:+.3f} to {line.high:+.3f}) {unit}/min around {line.mean:.1f}"
+    return Check(figure, value, "no growth (95 %)", not line.grows)
+
+
+def update_json(file: Path, part: str, figures: Mapping[str, Any], checks: Sequence[Check]) -> None:
+    """Writes a part's figures and verdicts into a file that may hold other parts."""
+    content = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    measured = {"machine": machine(), "checks": [vars(check) for check in checks], **figures}
+    write_json(file, content | {part: measured})
+
+
+def _ms(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}" if value >= 10 else f"{value:.1f}"

@@ -1,0 +1,255 @@
+"""A server in use for an hour: what it holds at the end it should have held after its first minutes.
+
+Queries of all kinds come as a Poisson process, some hung up on, some in too great a hurry, some with images that are
+none; beside them go the workers of `churn`. Nine tenths of what the server can do is asked of it, or a rate that a
+machine with other work can bear.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mapless_tools.demo.run import Place
+from mapless_tools.progress import Progress
+
+from .arrivals import Mix
+from .churn import WORK, Outcomes, Workers, churning
+from .driving import LoadedServer, calling, closed_step, find_saturation, open_step, server_with_scene
+from .records import Fate
+from .report import Check, loop_lag_check
+from .requests import mixed_requests
+from .scrape import Reconciliation, reconcile
+from .slopes import CONFIDENCE, MIN_SAMPLES, Slope, slope
+from .state import FIELDS, ServerState, Watched, column, states
+from .step import Step
+
+UNITS: Mapping[str, str] = {
+    "resident_mib": "MiB",
+    "unique_mib": "MiB",
+    "python_blocks": "blocks",
+    "threads": "",
+    "descriptors": "",
+    "sockets": "",
+    "data_mib": "MiB",
+    "waiting_jobs": "",
+    "loop_lag_ms": "ms",
+}
+"""Of what slopes are taken of."""
+BOUND = ("resident_mib", "unique_mib", "python_blocks", "threads", "descriptors", "sockets")
+"""What must not grow. The others are told: the data folder grows by what is remembered of the deleted."""
+
+MIN_SETTLED_S = 300.0
+"""In less nothing that takes minutes, as allocators and caches do, can be told from growth."""
+
+
+@dataclass(frozen=True)
+class SoakOptions:
+    """Options of the soak.
+
+    Attributes:
+        minutes: how long.
+        rate_per_s: of calls of Localize; None for `share` of saturation, which is then looked for.
+        share: of saturation that is offered in good queries, those that are cancelled among them.
+        cancelled_share, hurried_share, bad_share: of all calls; bad images come on top of the good ones.
+        clients: that call independently.
+        deadline_s: of every call.
+        churn: how fast the workers beside the queries are; 0 for none.
+        ramp_s: with each number of calls side by side, to find saturation.
+        settle_share: of the time, what slopes leave out: memory is still being filled.
+        sample_every_s: between looks at the server.
+        seed: of the arrivals.
+    """
+
+    minutes: float = 10.0
+    rate_per_s: float | None = None
+    share: float = 0.9
+    cancelled_share: float = 0.1
+    hurried_share: float = 0.05
+    bad_share: float = 0.1
+    clients: int = 8
+    deadline_s: float = 5.0
+    churn: float = 1.0
+    ramp_s: float = 15.0
+    settle_share: float = 1 / 3
+    sample_every_s: float = 10.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        times = (self.minutes, self.share, self.deadline_s, self.ramp_s, self.sample_every_s)
+        if not min(times) > 0 or self.clients < 1 or self.churn < 0:
+            raise ValueError("times, share and clients must be above 0, churn at least 0")
+        if self.rate_per_s is not None and not self.rate_per_s > 0:
+            raise ValueError("rate_per_s must be above 0")
+        if not (0 <= self.settle_share < 1 and 0 <= self.bad_share < 1):
+            raise ValueError("settle_share and bad_share must be at least 0 and below 1")
+
+
+@dataclass(frozen=True, eq=False)
+class SoakResult:
+    """What was measured.
+
+    Attributes:
+        scene: in words.
+        options: of the soak.
+        before: one call at a time, then more of them until the server was saturated, if that was looked for.
+        rate_per_s: of calls of Localize that was asked for.
+        soak: the soak's own step.
+        states: of the server meanwhile.
+        slopes: of the states after the settling, by field; none if there are too few.
+        outcomes: of the calls beside the queries.
+        account: the client's account against the server's; None if the server serves no metrics.
+    """
+
+    scene: str
+    options: SoakOptions
+    before: Sequence[Step]
+    rate_per_s: float
+    soak: Step
+    states: Sequence[ServerState]
+    slopes: Mapping[str, Slope]
+    outcomes: Outcomes
+    account: Reconciliation | None
+
+
+def measure_soak(place: Place, options: SoakOptions, progress: Progress, log: Path | None = None) -> SoakResult:
+    """Starts a server, finds what it can do unless a rate is given, and keeps it busy; its log is added to `log`.
+
+    Raises:
+        ServerFailed: it did not start.
+        MaplessError: a call before the measurement failed.
+        RuntimeError: it answered nothing, or ended.
+    """
+    with server_with_scene(place, progress, {"MAPLESS_ALLOW_WATCHING": "true"}, log) as server:
+        return asyncio.run(_measure(place, server, options, progress))
+
+
+def slopes_of(found: Sequence[ServerState], settle_s: float) -> dict[str, Slope]:
+    """Slopes of what was seen after the settling; none if that is too little."""
+    settled = [state for state in found if state.at_s >= found[0].at_s + settle_s]
+    if len(settled) < MIN_SAMPLES or settled[-1].at_s - settled[0].at_s < MIN_SETTLED_S:
+        return {}
+    return {field: slope(column(settled, "at_s"), column(settled, field)) for field in UNITS}
+
+
+def least_minutes(options: SoakOptions) -> int:
+    """How long a soak has to be for slopes."""
+    # The first look after the settling and the last one before the end each come up to one interval off.
+    settled_s = max(MIN_SETTLED_S, (MIN_SAMPLES - 1) * options.sample_every_s) + 2 * options.sample_every_s
+    return math.ceil(settled_s / (1 - options.settle_share) / 60 - 1e-9)
+
+
+def soak_checks(result: SoakResult) -> list[Check]:
+    """The bars."""
+    step = result.soak
+    overdue, failed = step.account.count(Fate.OVERDUE), step.account.count(Fate.FAILED)
+    failures = "; ".join(f"{what} ({text})" for what, text in result.outcomes.failures.items())
+    return [
+        *(_slope_check(field, result.slopes.get(field), field in BOUND, result.options) for field in UNITS),
+        _account_check(result),
+        Check("accepted calls that ended after their deadline", str(overdue), "0", overdue == 0),
+        Check("calls that failed", str(failed), "0", failed == 0),
+        Check("calls beside the queries that failed", failures or "0", "0", not failures),
+        loop_lag_check([step]),
+    ]
+
+
+def soak_lines(result: SoakResult) -> list[str]:
+    """What went on beside the queries."""
+    told: dict[str, list[str]] = {}
+    for (worker, code), count in sorted(result.outcomes.counts.items()):
+        told.setdefault(worker, []).append(f"{count} {code}")
+    lines = [f"- {worker}, who {WORK[worker]}: {', '.join(counts)}" for worker, counts in told.items()]
+    return ["Beside the queries, by how calls ended:", "", *(lines or ["- nothing"]), ""]
+
+
+def soak_json(result: SoakResult) -> dict[str, Any]:
+    """For programs."""
+    return {
+        "scene": result.scene,
+        "options": vars(result.options),
+        "rate_per_s": result.rate_per_s,
+        "before": [step.as_json() for step in result.before],
+        "soak": result.soak.as_json(),
+        "slopes": {field: {**vars(it), "verdict": it.verdict} for field, it in result.slopes.items()},
+        "states": {field: column(result.states, field) for field in ("at_s", *FIELDS)},
+        "beside": {f"{worker} {code}": count for (worker, code), count in sorted(result.outcomes.counts.items())},
+        "account": None if result.account is None else vars(result.account),
+    }
+
+
+async def _measure(place: Place, server: LoadedServer, options: SoakOptions, progress: Progress) -> SoakResult:
+    seconds = 60 * options.minutes
+    watched = Watched(server.under_load.process_id, str(server.under_load.metrics_address), server.data_dir)
+    workers = Workers(server.address, place, Outcomes(), options.churn)
+    async with calling(server, options.clients, options.deadline_s) as target:
+        progress("unloaded", 0, 1)
+        before = [await closed_step("unloaded", server, target, 1, options.ramp_s)]
+        p50_ms = before[0].account.answers.p50_ms or 1000.0
+        rate_per_s = options.rate_per_s
+        if rate_per_s is None:
+            ramp, saturation_per_s = await find_saturation(server, target, options.ramp_s, progress)
+            before += ramp
+            rate_per_s = options.share * saturation_per_s / (1 - options.bad_share)
+        progress(f"soak, {options.minutes:g} minutes", 0, 1)
+        async with states(watched, options.sample_every_s) as found:
+            step = await open_step(
+                "soak",
+                server,
+                target,
+                rate_per_s,
+                seconds,
+                settle_s=options.settle_share * seconds,
+                seed=options.seed,
+                mix=_mix(options, p50_ms),
+                requests=mixed_requests(server.requests, place.queries),
+                beside=lambda: churning(workers, options.seed) if options.churn else nullcontext(),
+            )
+    account = None
+    if step.told is not None:
+        account = reconcile([*step.codes, *workers.outcomes.localize_codes], step.told)
+    slopes = slopes_of(found, options.settle_share * seconds)
+    return SoakResult(place.title, options, before, rate_per_s, step, found, slopes, workers.outcomes, account)
+
+
+def _mix(options: SoakOptions, p50_ms: float) -> Mix:
+    """Those who hang up and those in a hurry do so before about half of the answers."""
+    return Mix(
+        options.cancelled_share,
+        options.bad_share,
+        cancel_within_s=2 * p50_ms / 1000,
+        hurried_share=options.hurried_share,
+        hurry_s=2 * p50_ms / 1000,
+    )
+
+
+def _slope_check(field: str, found: Slope | None, is_bound: bool, options: SoakOptions) -> Check:
+    figure, bar = f"slope of {field}", f"0 within {100 * CONFIDENCE:.0f} %" if is_bound else "told"
+    if found is None:
+        return Check(figure, f"{options.minutes:g} minutes are too short, {least_minutes(options)} are not", bar, None)
+    unit = f" {UNITS[field]}".rstrip()
+    value = (
+        f"{found.per_hour:+.3g} ({found.low:+.3g} to {found.high:+.3g}){unit}/h around {found.level:.6g}: "
+        f"{found.verdict}"
+    )
+    return Check(figure, value, bar, not found.grows if is_bound else None)
+
+
+def _account_check(result: SoakResult) -> Check:
+    account = result.account
+    figure, bar = "Localize calls of the soak in the server's metrics", "every one accounted for"
+    if account is None:
+        return Check(figure, "-", bar, None)
+    value = (
+        f"{account.sent} sent ({result.soak.account.sent} queries, {account.sent - result.soak.account.sent} of those "
+        f"beside them; the steps before are not among them), {account.handled} counted; {account.unseen} given up "
+        "before the server began with them"
+    )
+    if account.missing or account.surplus or account.running:
+        value += f"; missing {dict(account.missing)}, surplus {account.surplus}, still running {account.running}"
+    return Check(figure, value, bar, account.complete)

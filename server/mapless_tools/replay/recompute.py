@@ -1,0 +1,167 @@
+"""Computing the answer of a captured call anew: the services and the method themselves, on what was captured.
+
+In place of the engine and its queue stands one computation after another, without limits of time. Where time decided
+then, it decides the same: features that were not tried to their end are not tried, and a pose that was not refined is
+not refined.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TypeVar, cast
+
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.engine.engine import Engine, EngineOptions
+from mapless_server.engine.query import UNFINISHED, Caller, Query, Result
+from mapless_server.engine.stages import COARSE, PREPARE, REFINE, Method, QueryStages, Work
+from mapless_server.engine.tiers import Tier
+from mapless_server.engine.views import QueryViews
+from mapless_server.method.localize import Answer, Coarse, coarse_answer, refine
+from mapless_server.observability.metrics import Metrics
+from mapless_server.rpc.call import Call
+from mapless_server.scheduling.fair import Flow
+from mapless_server.scheduling.jobs import Done, Job, Visit
+from mapless_server.security.principal import Principal
+from mapless_server.security.tenancy import SceneKey
+from mapless_server.services.capture.calls import CapturedCall
+from mapless_server.services.capture.errors import CaptureError
+from mapless_server.services.capture.messages import Response, diagnostics_of
+from mapless_server.services.localization import LocalizationService
+from mapless_server.services.watching import Watchers
+from mapless_server.store import SceneAttributes, Store
+
+from .stand_ins import RETRIEVAL, Blobs, RecordedChooser, RecordedSource
+
+Joined = TypeVar("Joined")
+
+MESSAGES: dict[str, tuple[Any, Any]] = {
+    "Localize": (pb.LocalizeRequest, pb.LocalizeResponse),
+    "LocalizeRig": (pb.LocalizeRigRequest, pb.LocalizeRigResponse),
+    "LocalizeSequence": (pb.LocalizeSequenceRequest, pb.LocalizeSequenceResponse),
+}
+"""Of each method that is captured."""
+
+
+def response_of(call: CapturedCall) -> Response:
+    """What was answered; CaptureError if it is of a method that this program does not know."""
+    if call.method not in MESSAGES:
+        raise CaptureError(f"this program knows no method {call.method}")
+    return cast(Response, MESSAGES[call.method][1].FromString(call.response))
+
+
+def recompute(call: CapturedCall, blobs: Blobs, tiers: Sequence[Tier], options: EngineOptions) -> Response:
+    """What is answered to a captured call now.
+
+    Args:
+        call: that was answered then.
+        blobs: of the references.
+        tiers: what computes now.
+        options: limits and defaults of now.
+
+    Raises:
+        CaptureError: a part of what was captured is gone, or its method is not known.
+        RequestError, FieldError: the call is refused now.
+    """
+    then = response_of(call)
+    request = MESSAGES[call.method][0].FromString(call.request)
+    engine = cast(Engine, _Recomputing(call, request, then, blobs, tiers, options))
+    service = LocalizationService(lambda: engine, Metrics(), cast(Store, _Attributes(call)), Watchers(False))
+    now = Call(call.request_id, time.monotonic(), math.inf, Principal(tenant=call.tenant))
+    return cast(Response, asyncio.run(getattr(service, call.method)(request, now)))
+
+
+class _Attributes:
+    """Of the store, what services ask themselves."""
+
+    def __init__(self, call: CapturedCall) -> None:
+        self._attributes = call.attributes
+
+    def get_attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        return self._attributes
+
+
+class _Recomputing:
+    """Of the engine, what services ask; a photograph is known by its field in the request."""
+
+    parallel_queries = 1
+
+    def __init__(
+        self,
+        call: CapturedCall,
+        request: Any,
+        then: Response,
+        blobs: Blobs,
+        tiers: Sequence[Tier],
+        options: EngineOptions,
+    ) -> None:
+        self.options = options
+        self._call = call
+        self._blobs = blobs
+        self._tiers = tiers
+        self._parts = {part.field: part for part in call.parts}
+        described = zip(self._parts, diagnostics_of(then), strict=True)
+        stages = {field: [it.stage for it in about.stages] for field, about in described}
+        self._unfinished = {field: _unfinished(names) for field, names in stages.items()}
+        self._looked_at = {field for field, names in stages.items() if RETRIEVAL in names}
+        self._method = _unrefined() if _is_cut_short(request, then) else Method()
+
+    async def localize(
+        self,
+        query: Query,
+        caller: Caller,
+        source: object = None,
+        visits: list[Visit] | None = None,
+        tell_coarse: object = None,
+    ) -> tuple[Result, Sequence[Visit]]:
+        part = self._parts[query.photo.field]
+        given_up = self._unfinished[query.photo.field]
+        tried = [tier for tier in self._tiers if tier.extractor.name not in given_up]
+        chooser = RecordedChooser(part.choice, self._tiers[0].extractor, query.photo.field in self._looked_at)
+        stages = QueryStages(tried or self._tiers, chooser, self.options.escalation, self._method)
+        views = QueryViews(query.photo, self.options.image_limits)
+        work = Work(query, RecordedSource(self._call, part, self._blobs), views, math.inf)
+        return await asyncio.to_thread(_compute, stages, work), ()
+
+    @contextmanager
+    def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
+        yield
+
+    async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
+        return await asyncio.to_thread(compute)
+
+
+def _compute(stages: QueryStages, work: Work) -> Result:
+    """The way through the stages, without a queue."""
+    of_name = {PREPARE: stages.prepare, COARSE: stages.coarse, REFINE: stages.refine}
+    step = stages.first_step(work)
+    while True:
+        (verdict,) = of_name[step.stage]([Job(Flow("", ""), step, math.inf, 0, lambda *_: None)])
+        if isinstance(verdict, Done):
+            return cast(Result, verdict.value)
+        if isinstance(verdict, Exception):
+            raise verdict
+        step = verdict.step
+
+
+def _unfinished(stages: Sequence[str]) -> frozenset[str]:
+    """Extractors that there was no time for."""
+    return frozenset(it.removesuffix(UNFINISHED) for it in stages if it.endswith(UNFINISHED))
+
+
+def _is_cut_short(request: Any, then: Response) -> bool:
+    """Whether the coarse pose was answered since there was no time to refine it."""
+    if not isinstance(then, pb.LocalizeResponse) or not request.options.allow_coarse:
+        return False
+    is_coarse = then.localization.pose_stage == pb.POSE_STAGE_COARSE
+    return is_coarse and request.options.variant != pb.VARIANT_COARSE
+
+
+def _unrefined() -> Method:
+    def answer(coarse: Coarse, check: Callable[[], None]) -> Answer:
+        return coarse_answer(coarse) or refine(coarse, check)
+
+    return Method(refine=answer)

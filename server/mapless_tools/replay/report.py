@@ -1,0 +1,217 @@
+"""A folder of captured calls, computed anew: which, by what, and what has changed since."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+from mapless_server.engine.engine import EngineOptions
+from mapless_server.engine.tiers import Tier
+from mapless_server.networks.weights import WeightsError, WeightsMissing
+from mapless_server.serve.assembly import engine_options, make_tiers, what_is_missing
+from mapless_server.services.capture.calls import CapturedCall, decode_call
+from mapless_server.services.capture.circumstances import circumstances_of
+from mapless_server.services.capture.errors import CaptureError
+from mapless_server.services.capture.files import calls_of, check_format
+from mapless_server.settings import Settings
+
+from .comparing import Change, changed, compare, outcome_of, stage_seconds
+from .recompute import recompute, response_of
+from .stand_ins import Blobs
+
+IDENTICAL, CHANGED, NOT_COMPUTED = "identical", "changed", "not computed"
+"""Verdicts on a call; the last says nothing of its answer: a part of what was captured is damaged, or unknown here."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which calls; what is empty or None selects all.
+
+    Attributes:
+        request_ids: of these calls.
+        last: so many, the latest.
+        tenant: of this tenant.
+        scene_id: in its scenes of this id.
+    """
+
+    request_ids: frozenset[str] = frozenset()
+    last: int | None = None
+    tenant: str = ""
+    scene_id: str = ""
+
+    def files(self, folder: Path) -> list[Path]:
+        """Files of the tenant and the scene, the latest first; CaptureError if a folder cannot be read."""
+        try:
+            found = [it for it in calls_of(folder) if self._takes(*it.relative_to(folder).parts)]
+        except OSError as error:
+            raise CaptureError(f"{error.filename} cannot be read: {error.strerror}") from error
+        return sorted(found, key=lambda it: it.name, reverse=True)
+
+    def _takes(self, _tenants: str, tenant: str, _calls: str, scene_id: str, _name: str) -> bool:
+        return self.tenant in ("", tenant) and self.scene_id in ("", scene_id)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """A captured call and its answer computed anew.
+
+    Attributes:
+        request_id, time, method, tenant, scene_id: of the call; the time is UTC.
+        verdict: see `IDENTICAL`.
+        outcome_then, outcome_now: "localized", or why not; empty where there is no answer.
+        seconds_then, seconds_now: computing time of its stages.
+        stages_then, stages_now: of each stage.
+        apart_cm, apart_deg: how far the poses are apart; None where there are no two, or the answers are identical.
+        changes: what is different; the first of it.
+        error: why there is no answer now.
+        found_anew: references whose captured features this version cannot read, so that it found them anew.
+    """
+
+    request_id: str
+    time: str
+    method: str
+    tenant: str
+    scene_id: str
+    verdict: str
+    outcome_then: str = ""
+    outcome_now: str = ""
+    seconds_then: float = 0.0
+    seconds_now: float = 0.0
+    stages_then: dict[str, float] | None = None
+    stages_now: dict[str, float] | None = None
+    apart_cm: float | None = None
+    apart_deg: float | None = None
+    changes: tuple[Change, ...] = ()
+    error: str = ""
+    found_anew: int = 0
+
+
+@dataclass(frozen=True)
+class Report:
+    """What became of the calls, the oldest first.
+
+    Attributes:
+        calls: each of them.
+        circumstances: what else is different between then and now, of any of the calls.
+        unreadable: files that are damaged, and why.
+    """
+
+    calls: tuple[Replayed, ...]
+    circumstances: tuple[Change, ...]
+    unreadable: tuple[str, ...]
+
+    @property
+    def is_identical(self) -> bool:
+        """Whether every answer is the same, to the last bit."""
+        return not self.unreadable and all(it.verdict == IDENTICAL for it in self.calls)
+
+
+def replay(folder: Path, selection: Selection, settings: Settings) -> Report:
+    """Computes captured answers anew.
+
+    Args:
+        folder: a capture folder, whether a server uses it or not; nothing in it is changed.
+        selection: which calls.
+        settings: by which features, backend and so on; where they listen and store does not matter.
+
+    Raises:
+        CaptureError: it is no capture folder, holds no such calls, or the settings ask for what is not there.
+    """
+    check_format(folder)
+    unreadable: list[str] = []
+    found = select(folder, selection, unreadable)
+    calls, circumstances = [], dict[Change, None]()
+    with ExitStack() as stack:
+        tiers, options = _tiers(settings), engine_options(settings)
+        for tier in tiers:
+            stack.callback(tier.pipeline.matcher.close)
+        now, blobs = circumstances_of(settings, tiers), Blobs(folder)
+        for path in found:
+            call = _call_in(path, folder, unreadable)
+            if call is None:
+                continue
+            replayed = _replayed(call, blobs, tiers, options)
+            if replayed.error and not path.exists():  # its server deleted it, or a part of it, meanwhile
+                continue
+            circumstances |= dict.fromkeys(changed(call.circumstances, now))
+            calls.append(replayed)
+    return Report(tuple(calls), tuple(circumstances), tuple(unreadable))
+
+
+def select(folder: Path, selection: Selection, unreadable: list[str]) -> list[Path]:
+    """Files of the calls, the oldest first; of files that cannot be read nobody knows whether they were meant."""
+    found: list[Path] = []
+    ids: set[str] = set()
+    for path, call in _read(selection.files(folder), folder, unreadable):
+        if not selection.request_ids or call.request_id in selection.request_ids:
+            found.append(path)
+            ids.add(call.request_id)
+        if len(found) == selection.last:
+            break
+    missing = selection.request_ids - ids if selection.last is None or len(found) < selection.last else frozenset()
+    if missing or not (found or unreadable):
+        which = f"call of id {', '.join(sorted(missing))}" if missing else "such calls"
+        faults = f"; {len(unreadable)} files cannot be read" if unreadable else ""
+        raise CaptureError(f"{folder} holds no {which}{faults}")
+    if selection.request_ids:
+        unreadable.clear()  # all that were asked for are there
+    return found[::-1]
+
+
+def _read(paths: list[Path], folder: Path, unreadable: list[str]) -> Iterator[tuple[Path, CapturedCall]]:
+    for path in paths:
+        call = _call_in(path, folder, unreadable)
+        if call is not None:
+            yield path, call
+
+
+def _call_in(path: Path, folder: Path, unreadable: list[str]) -> CapturedCall | None:
+    try:
+        return decode_call(path.read_bytes())
+    except FileNotFoundError:  # its server has deleted it since
+        return None
+    except OSError as error:
+        unreadable.append(f"{path.relative_to(folder)}: {error.strerror}")
+    except CaptureError as error:
+        unreadable.append(f"{path.relative_to(folder)}: {error}")
+    return None
+
+
+def _tiers(settings: Settings) -> tuple[Tier, ...]:
+    try:
+        return make_tiers(settings)
+    except (ImportError, WeightsMissing) as error:
+        raise CaptureError(what_is_missing(error)) from error
+    except (ValueError, WeightsError) as error:
+        raise CaptureError(str(error)) from error
+
+
+def _replayed(call: CapturedCall, blobs: Blobs, tiers: tuple[Tier, ...], options: EngineOptions) -> Replayed:
+    time = datetime.fromtimestamp(call.time_s, timezone.utc).isoformat(timespec="milliseconds")
+    about = (call.request_id, time, call.method, call.tenant, call.scene_id)
+    outcome_then, stages_then = "", dict[str, float]()
+    try:
+        then = response_of(call)
+        outcome_then, stages_then = outcome_of(then), stage_seconds(then)
+        now = recompute(call, blobs, tiers, options)
+        comparison, stages_now = compare(then, now), stage_seconds(now)
+    except Exception as error:  # whatever this version cannot do with one call is said of it, and the others are told
+        name = "" if isinstance(error, CaptureError) else f"{type(error).__name__}: "
+        return Replayed(*about, NOT_COMPUTED, outcome_then, stages_then=stages_then, error=f"error: {name}{error}")
+    return Replayed(
+        *about,
+        IDENTICAL if comparison.is_identical else CHANGED,
+        outcome_then,
+        outcome_of(now),
+        sum(stages_then.values()),
+        sum(stages_now.values()),
+        stages_then,
+        stages_now,
+        comparison.apart_cm,
+        comparison.apart_deg,
+        comparison.changes,
+        found_anew=len(blobs.found_anew & {key for _, key in call.keys}),
+    )

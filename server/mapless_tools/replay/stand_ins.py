@@ -1,0 +1,158 @@
+"""References and choices as a captured call has them, in place of the store's and the server's own."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.names import reference_name
+from mapless_server.engine.views import QueryViews
+from mapless_server.errors import DataLoss
+from mapless_server.images.decode import decode_image
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.turns import Turn
+from mapless_server.method.views import Photograph, PosedView, View
+from mapless_server.scenes.library import STORED_IMAGES, Loaded
+from mapless_server.scenes.retrieval.chosen import Choice
+from mapless_server.scenes.retrieval.narrowing import Narrowing
+from mapless_server.scenes.retrieval.ranking import RankOptions
+from mapless_server.security.tenancy import SceneKey, scene_id_of
+from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CapturedReference
+from mapless_server.services.capture.errors import DamagedCapture
+from mapless_server.services.capture.files import blob_path
+from mapless_server.store import SceneAttributes, codec
+from mapless_server.store.cache import LruCache
+
+RETRIEVAL = "retrieval"
+"""The stage in which references are chosen."""
+
+_REMEMBERED_BYTES = 512 * 2**20
+
+
+class Blobs:
+    """Photographs and features of references in a capture folder; what was read is remembered for the next call.
+
+    Attributes:
+        found_anew: keys of the references whose features this program could not read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.found_anew: set[str] = set()
+        self._folder = folder
+        self._views: LruCache[View] = LruCache(_REMEMBERED_BYTES)
+
+    def view(self, tenant: str, reference: CapturedReference, extractor: FeatureExtractor) -> View:
+        """What an extractor found in a reference: as it was captured, or found anew.
+
+        That is so if the extractor finds other features than those that were captured, or if another version wrote them
+        in a form that this one cannot read; the latter is noted.
+
+        Raises:
+            DamagedCapture: it is not there, or not what was written.
+        """
+        known = (reference.key, extractor.name)
+        view = self._views.get(known)
+        if view is None:
+            view = self._read_view(tenant, reference, extractor)
+            features = view.features
+            size_bytes = features.keypoints.nbytes + features.descriptors.nbytes + features.sizes_px.nbytes
+            self._views.put(known, view, size_bytes)
+        return view
+
+    def pixels(self, tenant: str, reference: CapturedReference) -> NDArray[np.uint8]:
+        """A reference's photograph, (H, W, 3) RGB; DamagedCapture if it is not there, or not what was written."""
+        return decode_image(self._read(tenant, reference.image_sha256), STORED_IMAGES)
+
+    def _read_view(self, tenant: str, reference: CapturedReference, extractor: FeatureExtractor) -> View:
+        if extractor.name in reference.views:
+            data = self._read(tenant, reference.views[extractor.name])
+            try:
+                return codec.decode_view("", data, codec.sha256_for("", data))
+            except codec.Damaged:  # its bytes are what was written, so it is its form that is unknown
+                self.found_anew.add(reference.key)
+        return extractor.extract(self.pixels(tenant, reference), reference.camera)
+
+    def _read(self, tenant: str, sha256: str) -> bytes:
+        try:
+            data = blob_path(self._folder, tenant, sha256).read_bytes()
+        except OSError as error:
+            raise DamagedCapture(f"blob {sha256}: {error.strerror}") from error
+        if hashlib.sha256(data).hexdigest() != sha256:
+            raise DamagedCapture(f"blob {sha256} is not what was written")
+        return data
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSource:
+    """Where references come from; see `ReferenceSource`."""
+
+    call: CapturedCall
+    part: CapturedPart
+    blobs: Blobs
+
+    def load(
+        self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: FeatureExtractor, turn: Turn, waits: bool
+    ) -> Loaded:
+        """Implements ReferenceSource: those that were captured; one that was not could not be read then either."""
+        by_id = {it.reference_id: it for it in self.part.references}
+        for index, reference_id in enumerate(reference_ids):
+            if reference_id not in by_id:
+                raise DataLoss(f"reference {reference_id!r} was not captured", field=f"references[{index}]")
+        wanted = [by_id[reference_id] for reference_id in reference_ids]
+        return self.part.generation, tuple(self._posed_view(it, extractor, scene_key) for it in wanted)
+
+    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        """Implements ReferenceSource."""
+        return self.call.attributes
+
+    def _posed_view(self, reference: CapturedReference, extractor: FeatureExtractor, scene_key: SceneKey) -> PosedView:
+        tenant = self.call.tenant
+        view = self.blobs.view(tenant, reference, extractor)
+        read = partial(self.blobs.pixels, tenant, reference)
+        photograph = Photograph(reference.image_sha256, reference.camera, read)
+        name = reference_name(scene_id_of(scene_key), reference.reference_id)
+        return PosedView(reference.key, name, replace(view, photograph=photograph), reference.world_from_camera)
+
+
+class RecordedChooser:
+    """Chooses what was chosen, whatever is asked; see `query_stages.Chooser`."""
+
+    def __init__(self, choice: Choice | None, extractor: FeatureExtractor, has_looked: bool) -> None:
+        """A chooser for one photograph.
+
+        Args:
+            choice: that was captured.
+            extractor: whose features photographs are compared by.
+            has_looked: whether the photograph was looked at for it, which takes a reference to compare it with.
+        """
+        self._choice = choice
+        self._extractor = extractor
+        self._has_looked = has_looked
+
+    def choose(
+        self,
+        scene_key: SceneKey,
+        views: QueryViews,
+        count: int,
+        narrowing: Narrowing,
+        among: Sequence[str],
+        turn: Turn,
+        options: RankOptions | None = None,
+    ) -> Choice:
+        """The choice that was captured; DamagedCapture if there is none."""
+        if self._choice is None:
+            raise DamagedCapture("no choice of references was captured")
+        if self._has_looked:
+            views.view(self._extractor, turn)
+            with turn.stage(RETRIEVAL):  # it is over, but the answer lists it
+                pass
+        return self._choice
+
+    def tell_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
+        """It was left out then, too."""

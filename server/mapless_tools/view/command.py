@@ -1,0 +1,86 @@
+"""`mapless-server view`: a scene in the browser."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from typing import Annotated, NoReturn
+
+import typer
+
+from mapless_tools.ingest.command import Address, Ca, Cert, ClientId, Key, Scene, Tls, TokenFile
+
+_ALLOW_WATCHING = {"MAPLESS_ALLOW_WATCHING": "true"}
+
+
+def view_command(
+    scene: Scene,
+    host: Annotated[str, typer.Option(help="Loopback address that the page is served on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port of the page; 0 takes any free one.")] = 8080,
+    no_open: Annotated[bool, typer.Option("--no-open", help="Do not open a browser.")] = False,
+    max_pictured: Annotated[int, typer.Option(help="References drawn with their photographs; others are dots.")] = 300,
+    seeds: Annotated[
+        int, typer.Option(help="References localized against their neighbours, to have points to show; 0.5 s each.")
+    ] = 8,
+    address: Address = "",
+    tls: Tls = False,
+    ca: Ca = None,
+    cert: Cert = None,
+    key: Key = None,
+    token_file: TokenFile = None,
+    client_id: ClientId = "",
+) -> None:
+    """Show a scene in the browser: references, matched points, and queries as they are answered.
+
+    Live queries take a server with the setting allow_watching, and a token of the role write.
+    """
+    from mapless import MaplessError
+    from mapless_server.extras import install_hint
+    from mapless_server.security.binding import is_loopback
+    from mapless_server.serve.signals import terminable
+    from mapless_server.settings import ConfigError, load_settings
+    from mapless_tools.child import ServerFailed
+    from mapless_tools.ingest.connection import Connection, reachable
+
+    if not is_loopback(host):
+        _fail(
+            f"--host {host} is not a loopback address: the page asks nobody who they are, and shows the scene's "
+            f"photographs; from another machine, use a tunnel: ssh -L {port}:127.0.0.1:{port} THIS-MACHINE"
+        )
+    try:
+        from .viewer import ViewOptions, viewer
+    except ImportError as error:
+        _fail(install_hint(error))
+    try:
+        options = ViewOptions(host, port, max_pictured, seeds)
+        settings = load_settings({}).settings
+        connection = Connection(address, tls, ca, cert, key, token_file, client_id)
+        with (
+            terminable(),
+            reachable(connection, settings, _ALLOW_WATCHING) as (server, connect),
+            viewer(server, connect, scene, options) as page,
+        ):
+            _tell(page, "" if address else server, no_open)
+            threading.Event().wait()
+    except (ValueError, ConfigError) as error:
+        _fail(str(error))
+    except (MaplessError, ServerFailed, RuntimeError) as error:
+        _fail(str(error), code=1)
+    except KeyboardInterrupt:
+        raise typer.Exit(130) from None
+
+
+def _tell(page: str, own_server: str, no_open: bool) -> None:
+    if own_server:
+        print(f"queries sent to {own_server} are shown", file=sys.stderr)
+    # Read by programs that take any port: keep its form.
+    print(f"mapless-server view is on {page}", flush=True)
+    if not no_open:
+        import webbrowser
+
+        webbrowser.open(page)
+
+
+def _fail(message: str, code: int = 2) -> NoReturn:
+    print(f"mapless-server: {message}", file=sys.stderr)
+    raise typer.Exit(code)

@@ -1,0 +1,155 @@
+"""The viewer put together: what is asked of the server, by whom, and where it goes."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from mapless import Client, ConnectOptions, MaplessError, Reference, ResourceExhausted
+from mapless_server.errors import InvalidArgument
+
+from .feed import Feed
+from .guarded import GuardedViser
+from .pictures import THUMBNAIL_PX, Picture, colours_at, read_picture
+from .queries import Query
+from .scenery import Scenery, lay_out
+from .stage import Stage
+
+log = logging.getLogger(__name__)
+
+_TRIES, _BUSY_S = 20, 1.0
+"""How often a busy server is asked, and how long to wait where it does not say."""
+_FIRST = 40
+"""Photographs that are loaded before points are asked for."""
+SEED_NEIGHBOURS = 8
+"""References that one is localized against to show points."""
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """What to show and where.
+
+    Attributes:
+        host: a loopback address: there is no authentication.
+        port: 0 takes any free one.
+        max_pictured: references drawn with their photographs, spread over the scene; more make browsers slow. The
+            others are dots.
+        seeds: references that are localized against their neighbours, so that there are points to begin with; half a
+            second of the server's computing each.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    max_pictured: int = 300
+    seeds: int = 8
+
+    def __post_init__(self) -> None:
+        if not (self.max_pictured >= 1 and self.seeds >= 0 and 0 <= self.port <= 65535):
+            raise ValueError(f"senseless options: {self}")
+
+
+@contextmanager
+def viewer(address: str, connect: ConnectOptions, scene: str, options: ViewOptions) -> Iterator[str]:
+    """Shows a scene until the block is left; gives the page's address.
+
+    Args:
+        address: of the server, "host:port".
+        connect: how to connect to it.
+        scene: its id.
+        options: see there.
+
+    Raises:
+        MaplessError: the server cannot be reached, or will not tell.
+        ValueError: the scene has no references.
+        RuntimeError: viser cannot be guarded.
+    """
+    with ExitStack() as stack:
+        client = stack.enter_context(Client(address, connect))
+        scenery = lay_out(client.get_scene(scene), list(client.list_references(scene)), options.max_pictured)
+
+        def open_photo(reference_id: str) -> bytes:
+            return client.get_reference(scene, reference_id, include_image=True).image or b""
+
+        server = GuardedViser(options.host, options.port, f"mapless: {scene}")
+        stack.callback(server.stop)
+        stage = Stage(server, scenery, scene, open_photo)
+        work = _Background(client, scene, scenery, stage)
+        stack.callback(work.close)
+        feed = Feed(address, connect, scene, work.show_query, stage.say)
+        stack.callback(feed.close)
+        work.begin(feed, options.seeds)
+        yield f"http://{options.host}:{server.get_port()}"
+
+
+class _Background:
+    """What is done while people look already: photographs onto frustums, points, and live queries."""
+
+    def __init__(self, client: Client, scene: str, scenery: Scenery, stage: Stage) -> None:
+        self._client, self._scene, self._scenery, self._stage = client, scene, scenery, stage
+        # One call at a time: the server has others to serve.
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="view")
+        self._closing = threading.Event()
+
+    def begin(self, feed: Feed, seeds: int) -> None:
+        """The first photographs, then points, then the other photographs, of which there may be many."""
+        loads = [partial(self._load, self._scenery.references[index]) for index in self._scenery.pictured]
+        points = [partial(self._seed, feed, int(index)) for index in self._scenery.pictured[:seeds]]
+        for work in (*loads[:_FIRST], *points, *loads[_FIRST:]):
+            self._pool.submit(self._do, work)
+
+    def close(self) -> None:
+        """Ends after what it is at."""
+        self._closing.set()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def show_query(self, query: Query) -> None:
+        """A query that was answered."""
+        try:
+            self._stage.show_query(query)
+            self._show_points(query)
+        except InvalidArgument as error:
+            log.warning("query %d cannot be shown: %s", query.number, error)
+
+    def _do(self, work: Callable[[], None]) -> None:
+        """Does it, later if the server is busy, unless it is over; what fails is told, and the rest goes on without."""
+        for _ in range(_TRIES):
+            if self._closing.is_set():
+                return
+            try:
+                work()
+                return
+            except ResourceExhausted as error:
+                self._closing.wait(error.retry_after_s or _BUSY_S)
+            except (MaplessError, InvalidArgument) as error:
+                if not self._closing.is_set():
+                    log.warning("%s", error)
+                return
+
+    def _load(self, reference: Reference) -> None:
+        image = self._client.get_reference(self._scene, reference.reference_id, include_image=True).image or b""
+        self._stage.show_picture(reference.reference_id, read_picture(image, THUMBNAIL_PX))
+
+    def _seed(self, feed: Feed, index: int) -> None:
+        """Localizes a reference against its neighbours, for the points that they have in common."""
+        reference = self._scenery.references[index]
+        near = [it.reference_id for it in self._scenery.neighbours(index, SEED_NEIGHBOURS)]
+        if len(near) < 2:
+            return
+        image = self._client.get_reference(self._scene, reference.reference_id, include_image=True).image or b""
+        answer = feed.localize(image, reference.camera, near)
+        self._show_points(Query(0, image, reference.camera, answer))
+
+    def _show_points(self, query: Query) -> None:
+        debug = query.answer.debug
+        if query.pose is None or debug is None or not debug.is_inlier.any():
+            return
+        picture: Picture = read_picture(query.image, 4 * THUMBNAIL_PX)
+        good = np.flatnonzero(debug.is_inlier)
+        self._stage.show_points(debug.x_in_world[good], colours_at(picture, query.camera, debug.query_px[good]))

@@ -1,0 +1,30 @@
+"""What is said of a scene as a whole, as messages: what the proto says is ignored may be anything."""
+
+from __future__ import annotations
+
+import pytest
+
+from mapless.scenes import Calibration
+from mapless.v1 import localization_service_pb2 as localization_pb
+from mapless.v1 import reference_service_pb2 as pb
+from mapless_server.services.messages.scenes import changes_from_message
+
+
+@pytest.mark.parametrize("seconds", [0, 1, 10**15, -(10**15)])
+def test_when_a_calibration_was_stored_is_not_the_caller_s_to_say_whatever_it_says(seconds: int) -> None:
+    calibration = pb.SceneCalibration(
+        position_factor_68=1.0,
+        position_factor_95=1.5,
+        rotation_factor_68=1.0,
+        rotation_factor_95=2.0,
+        query_count=7,
+        variant=localization_pb.VARIANT_BEST,
+    )
+    calibration.create_time.seconds = seconds
+    request = pb.UpdateSceneRequest(scene=pb.Scene(name="scenes/hall", calibration=calibration))
+    request.update_mask.paths.append("calibration")
+    changes = changes_from_message(request)
+    stored = changes["calibration"]
+    assert isinstance(stored, Calibration)
+    assert (stored.create_time, stored.query_count, stored.rotation_factor_95) == (None, 7, 2.0)
+    assert request.scene.calibration.create_time.seconds == seconds  # the request itself is left alone

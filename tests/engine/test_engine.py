@@ -1,0 +1,416 @@
+"""What a query costs and what it is answered: one tier where that is enough, the better of two where it is not."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from images import encode, textured
+from servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
+
+from mapless.geometry import RigidTransform
+from mapless_server.engine.describing import Description
+from mapless_server.engine.engine import Engine, EngineOptions
+from mapless_server.engine.query import Caller, Photo, Query, Result
+from mapless_server.engine.stages import MAX_LISTINGS, Work
+from mapless_server.engine.tiers import EscalationOptions, Tier
+from mapless_server.engine.views import QueryViews
+from mapless_server.errors import DeadlineExceeded, InvalidArgument, Unavailable
+from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline
+from mapless_server.method.pnp import PoseStage
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.views import Features, PosedView, View
+from mapless_server.scenes.retrieval.narrowing import Narrowing, Sphere
+from mapless_server.scheduling.costs import Costs
+from mapless_server.scheduling.fair import Flow
+from mapless_server.scheduling.jobs import Job, Over
+from mapless_server.scheduling.observer import Ending
+from mapless_server.security.tenancy import SceneKey
+from mapless_server.store import NewReference, Store
+
+SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
+ESCALATION = EscalationOptions(doubtful_trust=0.1, doubtful_radius_m=0.2)
+SCENE = SceneKey("s")
+DESCRIPTOR = StandInDescriptor()
+PIXELS = decode_image(PHOTO, ImageLimits())
+FEATURES = Features(np.zeros((1, 2), np.float32), np.full((1, 4), 0.5, np.float32), np.ones(1, np.float32))
+
+
+def localized(inliers: int, at: RigidTransform | None = None) -> Answer:
+    covariance, trust = np.diag([1e-4] * 3 + [1e-6] * 3), 0.5 if inliers == SURE_INLIERS else 0.01
+    found = Localization(at or pose(0.0), covariance, PoseStage.REFINED, inliers, 2 * inliers, 0.7, trust=trust)
+    return Answer(found, None, {"coarse": 0.25}, (1, 2), (3, 4))
+
+
+def rejected(reason: RejectionReason = RejectionReason.TOO_FEW_MATCHES) -> Answer:
+    return Answer(Rejection(reason, "planted"), None, {"correspond": 0.125})
+
+
+Reply = Answer | Callable[[View, Sequence[PosedView], Callable[[], None]], Answer]
+
+
+def caller(deadline_s: float = 60.0) -> Caller:
+    return Caller(Flow("tenant", "client"), time.monotonic() + deadline_s)
+
+
+@dataclass
+class Setting:
+    """An engine of two tiers whose method answers what is planted, and who was asked."""
+
+    store: Store
+    replies: dict[str, Reply] = field(default_factory=dict)
+    asked: list[str] = field(default_factory=list)
+    seen: list[tuple[View, Sequence[PosedView]]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.extractors = {name: StandInExtractor(name) for name in ("cheap", "strong")}
+        pipelines = {name: Pipeline(cast(Any, StandInReconstructor())) for name in self.extractors}
+
+        def method(
+            query: View, references: Sequence[PosedView], pipeline: Pipeline, _: Any, check: Callable[[], None]
+        ) -> Answer:
+            (name,) = (name for name, it in pipelines.items() if it is pipeline)
+            self.asked.append(name)
+            self.seen.append((query, references))
+            reply = self.replies[name]
+            return reply(query, references, check) if callable(reply) else reply
+
+        tiers = [Tier(extractor, pipelines[name]) for name, extractor in self.extractors.items()]
+        self.engine = Engine(
+            self.store, tiers, EngineOptions(escalation=ESCALATION), None, None, whole(method), DESCRIPTOR
+        )
+        self.loop = asyncio.new_event_loop()
+
+    def describe(self, photos: Sequence[Photo]) -> list[Description]:
+        return self.loop.run_until_complete(self.engine.describe(photos, caller()))
+
+    def close(self) -> None:
+        self.loop.run_until_complete(self.engine.close())
+        self.loop.close()
+
+    def localize(self, deadline_s: float = 60.0, **changes: Any) -> Result:
+        named: dict[str, Any] = {"reference_ids": ("r0", "r1"), "narrowing": Narrowing(), "reference_count": 2}
+        values = named | changes
+        query = Query(SCENE, photo=Photo(PHOTO, CAMERA, "image"), options=LocalizeOptions(), **values)
+        result, _ = self.loop.run_until_complete(self.engine.localize(query, caller(deadline_s)))
+        return result
+
+
+@pytest.fixture
+def setting(tmp_path: Path) -> Iterator[Setting]:
+    with Store.open(tmp_path) as store:
+        setting = Setting(store)
+        store.create_scene(SCENE)
+        photos = [Photo(encode(".png", textured(seed=i)), CAMERA, "image") for i in range(3)]
+        described = setting.describe(photos)
+        store.add_references(
+            SCENE,
+            [
+                NewReference(f"r{i}", photo.image, CAMERA, pose(float(i)), found.views, found.descriptors)
+                for i, (photo, found) in enumerate(zip(photos, described, strict=True))
+            ],
+        )
+        for extractor in setting.extractors.values():
+            extractor.seen.clear()
+        yield setting
+        setting.close()
+
+
+def is_outcome(result: Result, planted: Answer) -> bool:
+    """Whether an answer's outcome is given, to a rejection of which a hint is added."""
+    given = result.attempt.answer.outcome
+    if isinstance(given, Rejection):
+        return replace(given, hint=None) == planted.outcome
+    return given is planted.outcome
+
+
+class TestTiers:
+    @pytest.mark.parametrize(
+        "sure", [localized(SURE_INLIERS), rejected(RejectionReason.DEGENERATE_REFERENCES)], ids=["pose", "rejection"]
+    )
+    def test_an_answer_beyond_doubt_costs_one_tier(self, setting: Setting, sure: Answer) -> None:
+        setting.replies["cheap"] = sure
+        result = setting.localize()
+        assert setting.asked == ["cheap"]
+        assert not setting.extractors["strong"].seen
+        assert is_outcome(result, sure)
+        assert result.attempt.tier.extractor.name == "cheap"
+        assert list(result.stage_seconds) == ["decode", "features", *sure.stage_seconds]
+
+    @pytest.mark.parametrize(
+        ("first", "second", "answered"),
+        [
+            (rejected(), localized(SURE_INLIERS), "strong"),
+            (rejected(), rejected(RejectionReason.GATE), "strong"),
+            (localized(DOUBTFUL_INLIERS), localized(SURE_INLIERS), "strong"),
+            (localized(DOUBTFUL_INLIERS), rejected(), "cheap"),
+        ],
+    )
+    def test_a_doubtful_answer_is_tried_again_and_the_better_one_given(
+        self, setting: Setting, first: Answer, second: Answer, answered: str
+    ) -> None:
+        setting.replies = {"cheap": first, "strong": second}
+        result = setting.localize()
+        assert setting.asked == ["cheap", "strong"]
+        assert result.attempt.tier.extractor.name == answered
+        assert is_outcome(result, {"cheap": first, "strong": second}[answered])
+
+    def test_the_time_of_both_is_told_apart(self, setting: Setting) -> None:
+        setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
+        seconds = setting.localize().stage_seconds
+        assert list(seconds) == [
+            *("decode", "features", "correspond"),
+            *("strong/features", "strong/coarse"),
+        ]
+        assert (seconds["correspond"], seconds["strong/coarse"]) == (0.125, 0.25)
+
+    def test_contradicting_poses_are_rejected_by_name(self, setting: Setting) -> None:
+        near, far = localized(DOUBTFUL_INLIERS), localized(DOUBTFUL_INLIERS, at=pose(3.0))
+        setting.replies = {"cheap": near, "strong": far}
+        outcome = setting.localize().attempt.answer.outcome
+        assert isinstance(outcome, Rejection)
+        assert outcome.reason is RejectionReason.GATE
+        assert outcome.message.startswith("the features disagree: the pose of cheap (5 inliers) and that of strong (5)")
+
+    def test_a_pose_outside_the_prior_is_doubtful_too(self, setting: Setting) -> None:
+        setting.replies = {"cheap": localized(SURE_INLIERS, at=pose(3.0)), "strong": localized(SURE_INLIERS)}
+        near = Narrowing(Sphere(pose(0.0).translation, 0.5))
+        result = setting.localize(narrowing=near)
+        assert isinstance(result.attempt.answer.outcome, Localization)
+        assert setting.asked == ["cheap", "strong"]
+
+    def test_each_tier_works_with_its_own_features_on_one_photograph(self, setting: Setting) -> None:
+        """The photograph is decoded once; the references are those of each tier, the same ones."""
+        setting.replies = {"cheap": rejected(), "strong": rejected()}
+        setting.localize()
+        (first, first_references), (second, second_references) = setting.seen
+        assert first.photograph is second.photograph
+        assert len(setting.extractors["cheap"].seen) == len(setting.extractors["strong"].seen) == 1
+        assert setting.extractors["cheap"].seen[0] is setting.extractors["strong"].seen[0]
+        assert [it.key for it in first_references] == [it.key for it in second_references]
+
+    def test_where_the_server_chooses_each_tier_chooses(self, setting: Setting) -> None:
+        setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
+        seconds = setting.localize(reference_ids=()).stage_seconds
+        assert {"retrieval", "strong/retrieval"} <= set(seconds)
+
+    @pytest.mark.parametrize("steps", ["long", "short"])
+    def test_no_answer_is_lost_because_a_better_one_comes_too_late(self, setting: Setting, steps: str) -> None:
+        """The stronger features are given up before the deadline, even in the middle of a step."""
+        answered = threading.Event()
+
+        def endless(_: View, __: Sequence[PosedView], check: Callable[[], None]) -> Answer:
+            if steps == "long":
+                assert answered.wait(20)
+            while True:
+                check()
+                time.sleep(0.01)
+
+        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": endless}
+        result = setting.localize(deadline_s=0.8)
+        answered.set()
+        assert result.attempt.tier.extractor.name == "cheap"
+        assert isinstance(result.attempt.answer.outcome, Localization)
+        assert list(result.stage_seconds) == ["decode", "features", "coarse", "strong/unfinished"]
+
+    def test_no_answer_is_lost_because_a_better_one_fails(
+        self, setting: Setting, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        def failing(*_: object) -> Answer:
+            raise RuntimeError("out of memory, say")
+
+        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": failing}
+        result = setting.localize()
+        assert result.attempt.tier.extractor.name == "cheap"
+        assert list(result.stage_seconds)[-1] == "strong/unfinished"
+        assert "strong failed" in caplog.text
+        assert "out of memory, say" in caplog.text
+
+    def test_nobody_waits_until_references_are_described_for_a_better_answer(self, setting: Setting) -> None:
+        """It is done after the call, once, and the next doubtful query has the better answer."""
+        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": localized(SURE_INLIERS)}
+        photo = encode(".png", textured(seed=7))
+        of_cheap = View(CAMERA, setting.extractors["cheap"].extract(textured(seed=7), CAMERA).features)
+        new = NewReference("late", photo, CAMERA, pose(9.0), {"cheap": of_cheap})
+        setting.store.add_references(SCENE, [new])
+        names = []
+        for _ in range(200):
+            result = setting.localize(reference_ids=("r0", "late"))
+            names.append(result.attempt.tier.extractor.name)
+            if names[-1] == "strong":
+                break
+            assert list(result.stage_seconds)[-1] == "strong/unfinished"
+            time.sleep(0.02)
+        assert names[0] == "cheap"
+        assert names[-1] == "strong"
+        seen = setting.extractors["strong"].seen
+        assert sum(np.array_equal(image, textured(seed=7)) for image in seen) == 1
+
+    def test_a_deadline_that_passes_in_the_first_tier_is_no_answer(self, setting: Setting) -> None:
+        def slow(_: View, __: Sequence[PosedView], check: Callable[[], None]) -> Answer:
+            time.sleep(0.3)
+            check()
+            return localized(SURE_INLIERS)
+
+        setting.replies = {"cheap": slow}
+        with pytest.raises(DeadlineExceeded):
+            setting.localize(deadline_s=0.2)
+
+    def test_tiers_share_neither_names_nor_what_remembers_matches(self, setting: Setting) -> None:
+        cheap, strong = setting.engine.tiers
+        same_name = Tier(StandInExtractor("cheap"), strong.pipeline)
+        same_matcher = Tier(strong.extractor, cheap.pipeline)
+        for tiers in ([], [cheap, same_name], [cheap, same_matcher]):
+            with pytest.raises(ValueError, match="each with an extractor and a matcher of its own"):
+                Engine(setting.store, tiers, EngineOptions())
+
+
+class TestMemory:
+    def test_a_photograph_of_a_group_is_counted_once_with_its_group_and_a_single_one_by_itself(
+        self, setting: Setting, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        setting.replies["cheap"] = localized(SURE_INLIERS)
+        submit, sizes = setting.engine.queue.submit, list[int]()
+
+        def noted(flow: Flow, step: Any, deadline_s: float, size_bytes: int, *others: Any) -> Any:
+            sizes.append(size_bytes)
+            return submit(flow, step, deadline_s, size_bytes, *others)
+
+        monkeypatch.setattr(setting.engine.queue, "submit", noted)
+        setting.localize()
+        setting.localize(is_part=True)
+        assert sizes == [len(PHOTO), 0]
+
+
+class TestPhotograph:
+    def test_reaches_the_method_with_the_query_and_every_reference(self, setting: Setting) -> None:
+        setting.replies["cheap"] = localized(SURE_INLIERS)
+        setting.localize()
+        ((query, references),) = setting.seen
+        assert query.photograph is not None
+        assert query.photograph.sha256 == hashlib.sha256(PHOTO).hexdigest()
+        assert query.photograph.camera == CAMERA
+        np.testing.assert_array_equal(query.photograph.read(), PIXELS)
+        for i, reference in enumerate(references):
+            assert reference.view.photograph is not None
+            np.testing.assert_array_equal(reference.view.photograph.read(), textured(seed=i))
+
+    def test_one_that_goes_while_a_network_looks_is_no_candidate_any_more(self, setting: Setting) -> None:
+        """The server chose it, so the caller must not hear of it."""
+
+        def look(_: View, references: Sequence[PosedView], __: Any) -> Answer:
+            if len(setting.asked) == 1:
+                setting.store.delete_reference(SCENE, references[0].name.rpartition("/")[2])
+            for reference in references:
+                assert reference.view.photograph is not None
+                reference.view.photograph.read()
+            return localized(SURE_INLIERS)
+
+        setting.replies["cheap"] = look
+        result = setting.localize(reference_ids=(), reference_count=3)
+        assert setting.asked == ["cheap", "cheap"]
+        assert len(result.attempt.references) == 2
+        assert len(setting.extractors["cheap"].seen) == 1, "the photograph is described once"
+
+    @pytest.mark.parametrize("tier", ["cheap", "strong"])
+    def test_a_scene_that_is_being_emptied_costs_no_answer_at_hand(self, setting: Setting, tier: str) -> None:
+        """Whatever the scene was listed for, it is listed again only so often."""
+
+        def look(_: View, references: Sequence[PosedView], __: Any) -> Answer:
+            (photograph,) = {it.view.photograph for it in references[:1]}
+            assert photograph is not None
+            setting.store.delete_reference(SCENE, references[0].name.rpartition("/")[2])
+            photograph.read()
+            raise AssertionError("it was deleted")
+
+        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": localized(SURE_INLIERS)} | {tier: look}
+        if tier == "cheap":
+            with pytest.raises(Unavailable) as caught:
+                setting.localize(reference_ids=())
+            assert caught.value.reason == "SCENE_CHANGED"
+        else:
+            result = setting.localize(reference_ids=())
+            assert result.attempt.tier.extractor.name == "cheap"
+            assert list(result.stage_seconds)[-1] == "strong/unfinished"
+        assert setting.asked.count(tier) == MAX_LISTINGS
+
+
+class TestDescribingReferences:
+    """A store that was filled under other features: the first call that needs a reference describes it."""
+
+    STEP_S = 0.2
+
+    def test_teaches_the_queue_nothing_of_the_queries_to_come(
+        self, setting: Setting, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        seen: list[tuple[str, float]] = []
+        monkeypatch.setattr(Costs, "observe", lambda _, stage, __, seconds: seen.append((stage, seconds)))
+        setting.replies["cheap"] = localized(SURE_INLIERS)
+        add_undescribed(setting, 2)
+        extract = setting.extractors["cheap"].extract
+
+        def slow(*arguments: Any) -> View:
+            time.sleep(self.STEP_S)
+            return extract(*arguments)
+
+        monkeypatch.setattr(setting.extractors["cheap"], "extract", slow)
+        query = query_of(("new0", "new1"))
+        _, visits = setting.loop.run_until_complete(setting.engine.localize(query, caller()))
+        (seconds,) = (it for stage, it in seen if stage == "prepare")
+        (took_s,) = (visit.end_s - visit.start_s for visit in visits if visit.stage == "prepare")
+        assert took_s - seconds >= 2 * self.STEP_S
+        assert seconds >= self.STEP_S, "the photograph's own description is part of it"
+
+    def test_nor_does_one_that_is_given_up(self, setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
+        add_undescribed(setting, 2)
+        stages = setting.engine._stages
+        views = QueryViews(Photo(PHOTO, CAMERA, "image"), ImageLimits())
+        work = Work(query_of(("new0", "new1")), setting.engine._library, views, time.monotonic() + 60)
+        job = Job(Flow("t", "c"), stages.first_step(work), time.monotonic() + 60, 1, lambda *_: None)
+
+        def extract(*_: Any) -> View:
+            time.sleep(self.STEP_S)
+            job.end(Ending.CANCELLED, None)
+            return View(CAMERA, FEATURES)
+
+        monkeypatch.setattr(setting.extractors["cheap"], "extract", extract)
+        (verdict,) = stages.prepare([job])
+        assert isinstance(verdict, Over)
+        assert job.unusual_s >= self.STEP_S
+
+
+def query_of(reference_ids: tuple[str, ...]) -> Query:
+    photo = Photo(PHOTO, CAMERA, "image")
+    return Query(SCENE, reference_ids, photo, Narrowing(), reference_count=2, options=LocalizeOptions())
+
+
+def add_undescribed(setting: Setting, count: int) -> None:
+    """References new0, new1, ... with features that no tier has."""
+    of_others = {"others": View(CAMERA, FEATURES)}
+    photos = [encode(".png", textured(seed=20 + i)) for i in range(count)]
+    news = [NewReference(f"new{i}", photo, CAMERA, pose(9.0 + i), of_others) for i, photo in enumerate(photos)]
+    setting.store.add_references(SCENE, news)
+
+
+class TestDescribe:
+    def test_every_tier_once_and_without_pixels(self, setting: Setting) -> None:
+        photos = [Photo(encode(".png", textured(seed=i)), CAMERA, "image") for i in range(5)]
+        described = setting.describe(photos)
+        assert [list(found.views) for found in described] == [["cheap", "strong"]] * 5
+        assert all(view.photograph is None for found in described for view in found.views.values())
+        assert [len(it.seen) for it in setting.extractors.values()] == [5, 5]
+
+    def test_a_bad_image_names_its_field(self, setting: Setting) -> None:
+        photos = [Photo(PHOTO, CAMERA, "requests[0].image"), Photo(PHOTO[:-50], CAMERA, "requests[1].image")]
+        with pytest.raises(InvalidArgument) as caught:
+            setting.describe(photos)
+        assert caught.value.field == "requests[1].image"

@@ -1,0 +1,230 @@
+"""Groups in a busy server: what they hold is counted, what they have computed is not thrown away, and all is told."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import threading
+import time
+from collections import Counter
+from collections.abc import Coroutine, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from servers import CAMERA
+
+from mapless_server.engine.engine import JOIN, Engine, EngineOptions
+from mapless_server.engine.groups import localize_each
+from mapless_server.engine.query import Caller, Photo, Query, Result
+from mapless_server.engine.stages import PREPARE
+from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError
+from mapless_server.method.localize import LocalizeOptions
+from mapless_server.rpc.call import Call
+from mapless_server.scenes.retrieval.narrowing import Narrowing
+from mapless_server.scheduling.admission import ScheduleOptions
+from mapless_server.scheduling.fair import Flow
+from mapless_server.scheduling.items import Items, work_off
+from mapless_server.scheduling.jobs import Stage, Step, Visit
+from mapless_server.scheduling.observer import Observer
+from mapless_server.scheduling.work_queue import Lane, WorkQueue, WorkQueueOptions
+from mapless_server.security.tenancy import SceneKey
+from mapless_server.services.groups import _localize_each
+
+LIMIT_S = 30.0
+MAX_BYTES = 1000
+PART = Query(
+    SceneKey("s"), (), Photo(bytes(100), CAMERA, "image"), Narrowing(), 2, LocalizeOptions(), is_part=True
+)  # fmt: skip
+
+
+class Toy(Engine):
+    """The engine's queue, with photographs that take a moment each."""
+
+    def __init__(self, seconds: float = 0.002, max_queued_s: float = 2.0) -> None:
+        self.options = EngineOptions(workers=2, max_batch=1)
+        self.seconds, self.fails_at, self._numbers = seconds, -1, itertools.count(1)
+        schedule = ScheduleOptions(max_queued_s=max_queued_s, max_bytes=MAX_BYTES)
+        stages = {Stage(PREPARE, "host"): work_off, Stage(JOIN, "host"): work_off}
+        self.queue = WorkQueue(stages, [Lane("host", 2)], WorkQueueOptions(schedule), Observer())
+
+    async def localize(
+        self,
+        query: Query,
+        caller: Caller,
+        source: object = None,
+        visits: list[Visit] | None = None,
+        tell_coarse: object = None,
+    ) -> tuple[Result, Sequence[Visit]]:
+        def compute(_: None, check: object) -> None:
+            number = next(self._numbers)
+            time.sleep(self.seconds)
+            if number == self.fails_at:
+                raise RuntimeError("planted")
+
+        step = Step(PREPARE, "p", "p", Items([None], compute))
+        size_bytes = 0 if query.is_part else len(query.photo.image)
+        try:
+            await self.queue.submit(caller.flow, step, caller.deadline_s, size_bytes, visits)
+        except Exception as error:
+            raise error if str(error) == "planted" else Overloaded(str(error), retry_after_s=0.05) from error
+        return cast(Result, SimpleNamespace()), visits or []
+
+    async def close(self) -> None:
+        await self.queue.close()
+
+
+def caller(name: str, lasts_s: float = LIMIT_S) -> Caller:
+    return Caller(Flow("tenant", name), time.monotonic() + lasts_s)
+
+
+def run(engine: Toy, work: Coroutine[Any, Any, None]) -> None:
+    async def all_of_it() -> None:
+        try:
+            await asyncio.wait_for(work, LIMIT_S)
+        finally:
+            await engine.close()
+
+    asyncio.run(all_of_it())
+
+
+def test_groups_in_progress_hold_no_more_than_is_allowed_and_the_others_are_refused_as_single_calls_are() -> None:
+    engine, held, most = Toy(), 0, 0
+    outcomes: Counter[str] = Counter()
+
+    async def one(number: int) -> None:
+        nonlocal held, most
+        queries, who = [PART] * 3, caller(f"c{number}")
+        try:
+            with engine.hold(queries, who):
+                held += 300
+                most = max(most, held)
+                try:
+                    await localize_each(engine, queries, who, "images")
+                    await engine.join(lambda: None, who)
+                finally:
+                    held -= 300
+            outcomes["answered"] += 1
+        except Overloaded as refused:
+            outcomes[refused.reason] += 1
+
+    async def work() -> None:
+        await asyncio.gather(*(one(i) for i in range(50)))
+        assert 300 <= most <= MAX_BYTES
+        assert outcomes["TOO_MUCH_MEMORY"] > 0
+        assert outcomes["answered"] > 0
+        assert set(outcomes) == {"answered", "TOO_MUCH_MEMORY"}
+        await one(99)  # what was held is free again
+        assert outcomes["answered"] + outcomes["TOO_MUCH_MEMORY"] == 51
+
+    run(engine, work())
+
+
+def test_what_a_group_holds_is_missing_to_single_calls_until_it_ends_whether_well_or_not() -> None:
+    engine = Toy()
+    single = replace(PART, photo=Photo(bytes(500), CAMERA, "image"), is_part=False)
+
+    async def work() -> None:
+        for error in (None, ValueError("planted")):
+            try:
+                with engine.hold([PART] * 6, caller("rig")):
+                    with pytest.raises(Overloaded, match="memory"):
+                        await engine.localize(single, caller("other"))
+                    if error is not None:
+                        raise error
+            except ValueError:
+                pass
+            await engine.localize(single, caller("other"))
+
+    run(engine, work())
+
+
+def test_one_caller_s_groups_leave_room_for_another_s() -> None:
+    engine = Toy()
+
+    async def work() -> None:
+        with engine.hold([PART] * 5, caller("loud")):
+            with pytest.raises(Overloaded, match="memory"), engine.hold([PART] * 4, caller("loud")):
+                pass
+            with engine.hold([PART] * 3, caller("quiet")):
+                pass
+
+    run(engine, work())
+
+
+def test_a_group_that_no_server_of_this_setting_could_hold_is_told_not_to_come_again() -> None:
+    engine = Toy()
+
+    async def work() -> None:
+        with pytest.raises(Overloaded) as refused, engine.hold([PART] * 11, caller("rig")):
+            pass
+        assert (refused.value.reason, refused.value.retry_after_s) == ("TOO_LARGE", None)
+
+    run(engine, work())
+
+
+def test_photographs_that_were_computed_are_posed_together_however_full_the_queue_is() -> None:
+    engine = Toy(max_queued_s=0.3)
+    is_released = threading.Event()
+
+    def held(_: None, check: object) -> None:
+        assert is_released.wait(LIMIT_S)
+
+    async def work() -> None:
+        rig = caller("rig")
+        for _ in range(3):  # the queue learns what a joint pose costs: two of them fill it
+            await engine.join(lambda: time.sleep(0.25), rig)
+        await localize_each(engine, [PART] * 4, rig, "images")
+        others = [asyncio.ensure_future(engine._each(JOIN, [None], held, caller(name), 0)) for name in "abcd"]
+        try:
+            await asyncio.sleep(0.05)
+            with pytest.raises(Overloaded) as refused:  # as the joint pose would be, did it not continue what is done
+                await engine._each(JOIN, [None], held, rig, 0)
+            assert refused.value.reason == "QUEUE_FULL"
+            joint = asyncio.ensure_future(engine.join(lambda: "pose", rig))
+            await asyncio.sleep(0.05)
+        finally:
+            is_released.set()
+            await asyncio.gather(*others, return_exceptions=True)
+        assert await joint == "pose"
+
+    run(engine, work())
+
+
+def test_and_while_the_server_drains_but_not_after_its_end() -> None:
+    engine = Toy()
+
+    async def work() -> None:
+        await localize_each(engine, [PART] * 2, caller("rig"), "images")
+        engine.queue.drain()
+        assert await engine.join(lambda: "pose", caller("rig")) == "pose"
+        with pytest.raises(DeadlineExceeded):
+            await engine.join(lambda: "pose", caller("rig", -1.0))
+        await engine.close()
+        with pytest.raises(RequestError) as over:
+            await engine.join(lambda: "pose", caller("rig"))
+        assert over.value.code == "UNAVAILABLE"
+
+    run(engine, work())
+
+
+def test_the_stages_of_a_group_that_fails_are_told_too() -> None:
+    engine = Toy()
+    engine.fails_at = 3
+
+    async def work() -> None:
+        visits: list[list[Visit]] = [[] for _ in range(4)]
+        with pytest.raises(RuntimeError, match="planted"):
+            await localize_each(engine, [PART] * 4, caller("rig"), "images", visits)
+        seen = [len(it) for it in visits]
+        assert sum(seen) >= 2  # the one that failed, and the one that had to be through before it began
+        assert all(it.stage == PREPARE for of_one in visits for it in of_one)
+        engine.fails_at = next(engine._numbers) + 3
+        call = Call("id", time.monotonic(), time.monotonic() + LIMIT_S)
+        with pytest.raises(RuntimeError, match="planted"):
+            await _localize_each(engine, [PART] * 4, call, "images")
+        assert call.trail.queue_s is not None
+        assert call.trail.stage_seconds[PREPARE] >= engine.seconds
+
+    run(engine, work())

@@ -1,0 +1,133 @@
+"""A coarse answer comes before the final one, once, whatever is told; and whoever stops reading ends what computes."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine, Sequence
+from typing import Any, cast
+
+import pytest
+
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.engine.query import Result
+from mapless_server.services.progressive import TellCoarse, coarse_then_final
+
+LIMIT_S = 10.0
+FINAL = pb.LocalizeResponse(localization=pb.Localization(inlier_count=100))
+
+
+def coarse(number: int) -> Result:
+    """The stand-in for a result; its message has the number."""
+    return cast(Result, number)
+
+
+def message(result: Result) -> pb.LocalizeResponse:
+    return pb.LocalizeResponse(localization=pb.Localization(inlier_count=cast(int, result)))
+
+
+class Planted:
+    """An answer that is there when it is let, with what it tells before."""
+
+    def __init__(self, tells: Sequence[int] = (), end: Exception | None = None) -> None:
+        self._tells, self._end = tells, end
+        self.may_end = asyncio.Event()
+        self.is_cancelled = False
+
+    async def answer(self, tell: TellCoarse) -> pb.LocalizeResponse:
+        for number in self._tells:
+            tell(coarse(number))
+        try:
+            await self.may_end.wait()
+        except asyncio.CancelledError:
+            self.is_cancelled = True
+            raise
+        if self._end is not None:
+            raise self._end
+        return FINAL
+
+    def messages(self) -> Any:
+        return coarse_then_final(self.answer, message)
+
+
+def run(test: Coroutine[Any, Any, None]) -> None:
+    asyncio.run(asyncio.wait_for(test, LIMIT_S))
+
+
+def seen(response: pb.LocalizeProgressivelyResponse) -> tuple[int, bool]:
+    return response.answer.localization.inlier_count, response.is_final
+
+
+def test_the_coarse_answer_does_not_wait_for_the_final_one() -> None:
+    async def test() -> None:
+        planted = Planted([1])
+        messages = planted.messages()
+        assert seen(await anext(messages)) == (1, False)
+        planted.may_end.set()
+        assert [seen(it) async for it in messages] == [(100, True)]
+
+    run(test())
+
+
+@pytest.mark.parametrize(("tells", "expected"), [((), []), ((1,), [(1, False)]), ((1, 2, 3), [(1, False)])])
+def test_there_are_two_messages_at_most_and_the_order_is_kept(
+    tells: Sequence[int], expected: list[tuple[int, bool]]
+) -> None:
+    """Even where the final answer is there before anybody looks."""
+
+    async def test() -> None:
+        planted = Planted(tells)
+        planted.may_end.set()
+        assert [seen(it) async for it in planted.messages()] == [*expected, (100, True)]
+
+    run(test())
+
+
+@pytest.mark.parametrize("tells", [(), (1,)])
+def test_an_error_comes_in_the_place_of_the_final_answer(tells: Sequence[int]) -> None:
+    async def test() -> None:
+        planted = Planted(tells, KeyError("planted"))
+        planted.may_end.set()
+        messages = planted.messages()
+        for number in tells:
+            assert seen(await anext(messages)) == (number, False)
+        with pytest.raises(KeyError, match="planted"):
+            await anext(messages)
+
+    run(test())
+
+
+def test_whoever_stops_reading_ends_it() -> None:
+    async def test() -> None:
+        planted = Planted([1])
+        messages = planted.messages()
+        await anext(messages)
+        await messages.aclose()
+        assert planted.is_cancelled
+
+    run(test())
+
+
+def test_whoever_is_cancelled_while_waiting_ends_it() -> None:
+    async def test() -> None:
+        planted = Planted()
+        waits = asyncio.ensure_future(anext(planted.messages()))
+        await asyncio.sleep(0)
+        waits.cancel()
+        await asyncio.gather(waits, return_exceptions=True)
+        assert waits.cancelled()
+        assert planted.is_cancelled
+
+    run(test())
+
+
+def test_an_error_that_nobody_waits_for_any_more_is_not_reported(caplog: pytest.LogCaptureFixture) -> None:
+    async def test() -> None:
+        planted = Planted([1], KeyError("planted"))
+        planted.may_end.set()
+        messages = planted.messages()
+        await anext(messages)
+        await asyncio.sleep(0.01)
+        await messages.aclose()
+
+    run(test())
+    assert not caplog.records

@@ -1,0 +1,125 @@
+"""When stronger features are tried, and which of two answers is the better one: a rule, case by case."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless_server.engine.tiers import UNMENDABLE, Attempt, EscalationOptions, Tier, better_of, is_doubtful
+from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless_server.method.pnp import PoseStage
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance, error_radius
+
+OPTIONS = EscalationOptions()
+CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
+
+
+class Named:
+    """An extractor that is only asked for its name."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def extract(self, *_: Any) -> Any:
+        raise NotImplementedError
+
+
+CHEAP, STRONG = (Tier(Named(name), Pipeline()) for name in ("cheap", "strong"))
+
+
+def localized(
+    x_m: float = 0.0, sigma_m: float = 0.01, inliers: int = 100, turn_deg: float = 0.0, trust: float = 0.5
+) -> Answer:
+    """A pose at x with equal errors along all axes, and of so many degrees a metre of error."""
+    pose = RigidTransform(rotation_from_vector([0.0, np.radians(turn_deg), 0.0]), np.array([x_m, 0.0, 0.0]))
+    covariance = np.diag([sigma_m**2] * 3 + [np.radians(0.1) ** 2] * 3)
+    return Answer(Localization(pose, covariance, PoseStage.REFINED, inliers, 2 * inliers, 0.7, (), trust))
+
+
+def rejected(reason: RejectionReason = RejectionReason.TOO_FEW_MATCHES) -> Answer:
+    return Answer(Rejection(reason, "planted"))
+
+
+def better(cheap: Answer, strong: Answer) -> Attempt:
+    return better_of(Attempt(CHEAP, cheap, (), 1, CAMERA), Attempt(STRONG, strong, (), 1, CAMERA), OPTIONS)
+
+
+class TestDoubt:
+    @pytest.mark.parametrize("reason", RejectionReason)
+    def test_a_rejection_is_doubtful_unless_the_references_are_to_blame(self, reason: RejectionReason) -> None:
+        assert is_doubtful(rejected(reason), OPTIONS) is (reason not in UNMENDABLE)
+        assert {it.name for it in UNMENDABLE} == {"NO_USABLE_REFERENCES", "DEGENERATE_REFERENCES"}
+
+    @given(trust=st.floats(0, 1), sigma_m=st.floats(1e-4, 1.0))
+    def test_a_pose_is_doubtful_with_little_trust_or_a_large_radius_and_no_other_is(
+        self, trust: float, sigma_m: float
+    ) -> None:
+        radius_m = error_radius(np.eye(3) * sigma_m**2, 0.68)
+        expected = trust < OPTIONS.doubtful_trust or radius_m > OPTIONS.doubtful_radius_m
+        assert is_doubtful(localized(sigma_m=sigma_m, trust=trust), OPTIONS) is expected
+
+    def test_a_pose_that_claims_nothing_is_not_doubtful(self) -> None:
+        coarse = Localization(RigidTransform.identity(), None, PoseStage.INITIAL, 0, 0, 0.0)
+        assert not is_doubtful(Answer(coarse), OPTIONS)
+
+
+class TestBetter:
+    def test_a_localization_is_better_than_a_rejection(self) -> None:
+        assert better(rejected(), localized()).tier is STRONG
+        assert better(localized(), rejected()).tier is CHEAP
+
+    def test_of_two_rejections_the_stronger_features_are_heard(self) -> None:
+        answer = better(rejected(RejectionReason.LOW_TEXTURE), rejected(RejectionReason.LOW_OVERLAP))
+        assert answer.tier is STRONG
+        assert isinstance(answer.answer.outcome, Rejection)
+        assert answer.answer.outcome.reason is RejectionReason.LOW_OVERLAP
+
+    @pytest.mark.parametrize(
+        ("sigmas", "tier"), [((0.02, 0.01), STRONG), ((0.01, 0.02), CHEAP), ((0.02, 0.02), STRONG)]
+    )
+    def test_of_two_that_agree_the_smaller_claim_is_better(self, sigmas: tuple[float, float], tier: Tier) -> None:
+        first, second = (localized(0.01 * i, sigma, inliers=30) for i, sigma in enumerate(sigmas))
+        assert better(first, second).tier is tier
+
+    @pytest.mark.parametrize(("inliers", "tier"), [(30, None), (44, None), (45, STRONG), (300, STRONG)])
+    @pytest.mark.parametrize("far", [{"x_m": 3.0}, {"turn_deg": 20.0}], ids=["far", "turned"])
+    def test_of_two_that_disagree_only_the_clearly_better_supported_is_believed(
+        self, far: dict[str, float], inliers: int, tier: Tier | None
+    ) -> None:
+        chosen = better(localized(inliers=30), localized(inliers=inliers, **far))
+        assert chosen.tier is STRONG, "the doubtful pose of the cheap features is contradicted either way"
+        outcome = chosen.answer.outcome
+        if tier is None:
+            assert isinstance(outcome, Rejection)
+            assert outcome.reason is RejectionReason.GATE
+            apart = "3.00 m and 0.0 degrees" if "x_m" in far else "0.00 m and 20.0 degrees"
+            told = f"the pose of cheap (30 inliers) and that of strong ({inliers}) are {apart} apart"
+            assert outcome.message == f"the features disagree: {told}"
+        else:
+            assert isinstance(outcome, Localization)
+
+    @given(apart_m=st.floats(0, 3), sigma_m=st.floats(1e-3, 0.5))
+    def test_poses_agree_within_the_sum_of_their_95_radii_or_the_stated_distance(
+        self, apart_m: float, sigma_m: float
+    ) -> None:
+        chosen = better(localized(0.0, sigma_m, inliers=40), localized(apart_m, 0.01, inliers=40))
+        reach_m = sum(accuracy_from_covariance(np.eye(6) * it**2).position_95_m for it in (sigma_m, 0.01))
+        if abs(apart_m - max(reach_m, OPTIONS.same_position_m)) > 1e-9:
+            agree = apart_m < max(reach_m, OPTIONS.same_position_m)
+            assert isinstance(chosen.answer.outcome, Localization if agree else Rejection)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"doubtful_trust": -1.0}, {"doubtful_radius_m": -1.0}, {"clearly_more": 0.5}, {"time_share": 0.0}]
+    + [{"time_share": 1.5}, {"same_position_m": float("nan")}, {"same_rotation_deg": -1.0}],
+)
+def test_options_check_themselves(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="senseless"):
+        EscalationOptions(**wrong)

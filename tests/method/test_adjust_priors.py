@@ -1,0 +1,124 @@
+"""The final adjustment with priors: their derivatives, that they help where they know more, and hurt nowhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from compare import assert_pose_close, pose_error
+from jacobians import assert_jacobian
+from planted import NOISE, true_structure
+from scenes import SceneOptions, SyntheticScene, make_scene, random_for
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.method.adjust import AdjustOptions, _pose_problem, _State, adjust_pose
+from mapless_server.method.match import PointMatches
+from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
+from mapless_server.method.priors.known import NO_PRIORS, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
+from mapless_server.method.priors.pose_only import moved
+from mapless_server.method.structure import Structure
+
+DOWN = np.array([0.0, 1.0, 0.0])
+
+
+def scene_of(case: object) -> tuple[SyntheticScene, Structure, PointMatches]:
+    scene = make_scene(random_for("adjust priors", case), SceneOptions(point_count=60, reference_count=3))
+    return scene, *true_structure(scene, NOISE)
+
+
+def gravity_at(pose: RigidTransform, sigma_deg: float, tilt_deg: float = 0.0) -> GravityPrior:
+    down = rotation_from_vector([np.radians(tilt_deg), 0, 0]) @ pose.rotation.T @ DOWN
+    return GravityPrior(down / np.linalg.norm(down), DOWN, sigma_deg)
+
+
+def all_priors(pose: RigidTransform, off: float) -> Priors:
+    """Of all kinds, a little off."""
+    there = moved(pose, off * np.array([1.0, -1, 2, 0.5, 0.3, -0.4]))
+    return Priors(
+        PositionPrior(there.translation, np.diag([0.02, 0.03, 0.04]) ** 2),
+        HeadingPrior.looking(there.rotation[:, 2], 1.0),
+        gravity_at(there, 0.5),
+        PosePrior(there, np.diag([0.03] * 3 + [0.02] * 3) ** 2),
+    )
+
+
+def adjusted(
+    scene: SyntheticScene, structure: Structure, matches: PointMatches, priors: Priors = NO_PRIORS
+) -> PoseEstimate:
+    """Solved without priors, adjusted with them."""
+    solved = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
+    assert isinstance(solved, PoseEstimate)
+    return adjust_pose(scene.query, scene.references, structure, matches, solved, AdjustOptions(), priors)
+
+
+def test_the_gradient_with_priors_is_that_of_the_cost() -> None:
+    scene, structure, matches = scene_of("gradient")
+    used = np.arange(len(matches))
+    problem, state = _pose_problem(
+        scene.query, scene.references, structure, matches, used, scene.world_from_query, AdjustOptions()
+    )
+    problem = problem.with_priors(all_priors(scene.world_from_query, 0.01))
+    gradient = problem.linearize(state).pose_gradient[-6:]
+
+    def cost(motion: Array) -> float:
+        motions = np.zeros((len(state.rotation), 6))
+        motions[-1] = motion
+        there: _State = state.moved(motions, np.zeros_like(state.points))
+        return problem.cost(there)
+
+    assert_jacobian(2 * gradient, cost, np.zeros(6), tolerance=1e-5)
+
+
+def test_right_priors_pull_a_weak_answer_right_and_sharpen_it() -> None:
+    """Seven matches among the points and a position to a millimetre."""
+    alone, helped = [], []
+    for seed in range(8):
+        scene, structure, matches = scene_of(seed)
+        rows = np.linspace(0, len(matches) - 1, 7).astype(int)
+        few = PointMatches(matches.point[rows], matches.keypoint[rows], matches.guided[rows], 0.0)
+        rng = random_for("weak", seed)
+        position = PositionPrior(scene.world_from_query.translation + rng.normal(0, 0.001, 3), 0.001**2 * np.eye(3))
+        without, estimate = adjusted(scene, structure, few), adjusted(scene, structure, few, Priors(position))
+        assert [check.used for check in estimate.prior_checks] == [True]
+        assert np.trace(estimate.covariance[:3, :3]) < np.trace(without.covariance[:3, :3])
+        alone.append(pose_error(without.world_from_camera, scene.world_from_query))
+        helped.append(pose_error(estimate.world_from_camera, scene.world_from_query))
+    assert np.median(helped, axis=0)[0] < 0.5 * np.median(alone, axis=0)[0]
+
+
+@pytest.mark.parametrize("kind", ["position", "heading", "gravity", "pose"])
+def test_a_wrong_prior_is_reported_and_changes_not_a_bit(kind: str) -> None:
+    scene, structure, matches = scene_of("wrong")
+    wrong = getattr(all_priors(scene.world_from_query, 1.0), kind)
+    without = adjusted(scene, structure, matches)
+    estimate = adjusted(scene, structure, matches, Priors(**{kind: wrong}))
+    (check,) = estimate.prior_checks
+    assert (check.kind.value, check.conflict, check.used) == (kind, True, False)
+    assert estimate.world_from_camera.matrix().tobytes() == without.world_from_camera.matrix().tobytes()
+    assert estimate.covariance.tobytes() == without.covariance.tobytes()
+
+
+def test_gravity_that_knows_less_than_the_photograph_changes_nothing() -> None:
+    scene, structure, matches = scene_of("less")
+    estimate = adjusted(scene, structure, matches, Priors(gravity=gravity_at(scene.world_from_query, 3.0, 2.0)))
+    (check,) = estimate.prior_checks
+    assert (check.conflict, check.used) == (False, False)
+    assert check.mahalanobis == pytest.approx(2 / 3, abs=0.2)
+    assert_pose_close(
+        estimate.world_from_camera, adjusted(scene, structure, matches).world_from_camera, metres=0, degrees=1e-9
+    )
+
+
+def test_what_priors_pulled_before_they_turned_out_to_know_too_little_is_undone() -> None:
+    """The pose solver, to whom points are fixed, knew less: its pull must not be seen in the answer."""
+    scene, structure, matches = scene_of("undone")
+    solved = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
+    assert isinstance(solved, PoseEstimate)
+    pulled_to = moved(solved.world_from_camera, np.array([0.01, 0, 0, 0.002, 0, 0]))
+    pulled = replace(solved, world_from_camera=pulled_to, errors_px=solved.errors_px + 1, unpulled=solved)
+    priors = Priors(gravity=gravity_at(scene.world_from_query, 3.0))
+    given = scene.query, scene.references, structure, matches
+    answer, alone = adjust_pose(*given, pulled, AdjustOptions(), priors), adjust_pose(*given, solved, AdjustOptions())
+    assert [check.used for check in answer.prior_checks] == [False]
+    assert answer.world_from_camera.matrix().tobytes() == alone.world_from_camera.matrix().tobytes()

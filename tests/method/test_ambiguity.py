@@ -1,0 +1,136 @@
+"""Two places that look the same are both told; one that is clearly better supported is answered."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from compare import assert_pose_close
+from scenes import make_scene, random_for
+
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless_server.method.correspond import Matcher
+from mapless_server.method.features import make_extractor
+from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline, localize
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.trust import ambiguity
+from mapless_server.method.trust.ambiguity import AmbiguityOptions
+from mapless_server.method.views import PosedView, View
+from mapless_tools.demo.raycast import Quad, Surface
+from mapless_tools.demo.room import Station, look_at, take
+from mapless_tools.demo.textures import painting
+
+ELSEWHERE = RigidTransform(rotation_from_vector([0.0, 0.7, 0.0]), np.array([20.0, -3.0, 8.0]))
+"""Where the copy stands: another room, turned."""
+
+SCENE = make_scene(random_for("ambiguity"))
+PIPELINE = Pipeline(matcher=Matcher())
+
+
+def copied(references: Sequence[PosedView], which: Sequence[int], where: RigidTransform) -> tuple[PosedView, ...]:
+    """The references, some of which (by index) stand in the copy."""
+    return tuple(
+        replace(r, key=f"{r.key}-copy", world_from_camera=where.compose(r.world_from_camera)) if i in which else r
+        for i, r in enumerate(references)
+    )
+
+
+def answer_of(references: Sequence[PosedView], query: View = SCENE.query) -> Answer:
+    return localize(query, references, PIPELINE, LocalizeOptions())
+
+
+def rejected(answer: Answer) -> Rejection:
+    assert isinstance(answer.outcome, Rejection), answer.outcome
+    return answer.outcome
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 1e6])
+def test_two_like_places_are_both_told(offset_m: float) -> None:
+    """Every second reference stands in the copy: nothing decides."""
+    far = RigidTransform(np.eye(3), np.array([offset_m, -offset_m, 0.0]))
+    references = [replace(r, world_from_camera=far.compose(r.world_from_camera)) for r in SCENE.references]
+    rejection = rejected(answer_of(copied(references, (1, 3, 5), ELSEWHERE)))
+    assert rejection.reason is RejectionReason.AMBIGUOUS
+    truth = far.compose(SCENE.world_from_query)
+    here, there = sorted(rejection.hypotheses, key=lambda it: it.references)
+    assert_pose_close(here.world_from_camera, truth, metres=0.02, degrees=0.3)
+    assert_pose_close(there.world_from_camera, ELSEWHERE.compose(truth), metres=0.02, degrees=0.3)
+    assert set(here.references) == {references[i].name for i in (0, 2, 4)}
+    assert set(there.references) == {references[i].name for i in (1, 3, 5)}
+    assert rejection.hypotheses[0].inlier_count >= rejection.hypotheses[1].inlier_count > 50
+    assert "m apart" in rejection.message
+
+
+@pytest.mark.parametrize("which", [(), (5,)], ids=["no copy", "one reference in the copy"])
+def test_a_place_is_not_its_own_rival(which: Sequence[int]) -> None:
+    """One reference alone has no points, so it proposes no place."""
+    outcome = answer_of(copied(SCENE.references, which, ELSEWHERE)).outcome
+    assert isinstance(outcome, Localization), outcome
+    assert_pose_close(outcome.world_from_camera, SCENE.world_from_query, metres=0.02, degrees=0.3)
+
+
+def test_the_clearly_better_supported_place_is_answered() -> None:
+    """The copy lost most of what there is to see."""
+    random = random_for("weak copy")
+
+    def worn(view: PosedView) -> PosedView:
+        f = view.view.features
+        kept = random.random(len(f)) < 0.3
+        features = replace(f, keypoints=f.keypoints[kept], descriptors=f.descriptors[kept], sizes_px=f.sizes_px[kept])
+        return replace(view, key=f"{view.key}-worn", view=replace(view.view, features=features))
+
+    copies = [worn(r) if i % 2 else r for i, r in enumerate(SCENE.references)]
+    outcome = answer_of(copied(copies, (1, 3, 5), ELSEWHERE)).outcome
+    assert isinstance(outcome, Localization), outcome
+    assert_pose_close(outcome.world_from_camera, SCENE.world_from_query, metres=0.02, degrees=0.3)
+
+
+def test_poses_within_the_bounds_are_one_place() -> None:
+    """The second half is posed 5 cm off: bad references, but no second place."""
+    nearby = RigidTransform(np.eye(3), np.array([0.05, 0.0, 0.0]))
+    outcome = answer_of(copied(SCENE.references, (1, 3, 5), nearby)).outcome
+    assert not (isinstance(outcome, Rejection) and outcome.reason is RejectionReason.AMBIGUOUS)
+
+
+def test_where_nearly_all_agree_no_second_pose_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """That is what makes it cheap for the usual query."""
+    monkeypatch.setattr(ambiguity, "ransac", None)
+    assert isinstance(answer_of(SCENE.references).outcome, Localization)
+
+
+def test_a_photograph_of_what_is_in_both_of_two_like_rooms() -> None:
+    """Rendered photographs of a corner between painted walls, which stands twice in the world."""
+    random = np.random.default_rng(5)
+    edges = ([2.0, 0, 0], [0.0, -2, 0])
+    walls = [Quad(np.array([x, 2.0, 2]), np.array(e), np.array([0, 0, -2.0]), painting(random, (700, 700)))
+             for x, e in zip((0.0, 2.0), edges, strict=True)]  # fmt: skip
+    surfaces = [Surface.of(wall, wall.texture) for wall in walls]
+    camera = Camera(320, 240, 280.0, 280.0, 160.3, 118.9)
+    poses = [look_at([0.2 + 0.12 * i, 0.1, 1 + 0.08 * (i % 3)], [1.5, 1.6, 1]) for i in range(9)]
+    extractor = make_extractor("sift")
+    views = [
+        extractor.extract(take(surfaces, Station(f"p{i}", camera, pose)).image, camera) for i, pose in enumerate(poses)
+    ]
+    references = [
+        PosedView(f"p{i}", f"scenes/corner/references/p{i}", view, pose)
+        for i, (view, pose) in enumerate(zip(views, poses, strict=True))
+    ]
+    query, truth, others = views[4], poses[4], references[:4] + references[5:]
+    alone = answer_of(others, query).outcome
+    assert isinstance(alone, Localization), alone
+    assert_pose_close(alone.world_from_camera, truth, metres=0.02, degrees=0.3)
+    rejection = rejected(answer_of(copied(others, range(1, 8, 2), ELSEWHERE), query))
+    assert rejection.reason is RejectionReason.AMBIGUOUS, rejection
+    here, there = sorted(rejection.hypotheses, key=lambda it: others[0].name not in it.references)
+    assert_pose_close(here.world_from_camera, truth, metres=0.03, degrees=0.5)
+    assert_pose_close(there.world_from_camera, ELSEWHERE.compose(truth), metres=0.03, degrees=0.5)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"min_share": 0.0}, {"min_own_share": 1.5}, {"min_keypoints": 3}, {"agreeing_px": 1.0}]
+)
+def test_options_check_themselves(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="senseless"):
+        AmbiguityOptions(**wrong)  # type: ignore[arg-type]

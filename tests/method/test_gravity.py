@@ -1,0 +1,260 @@
+"""Poses from two matches and gravity: the library's conventions by planted poses, and what priors do to an answer.
+
+A weak query must be pulled right, a wrong prior must change nothing, to the last bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from compare import assert_pose_close, pose_error
+from scenes import CAMERA, random_for
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.method.match import PointMatches
+from mapless_server.method.observations import ONE_PIXEL
+from mapless_server.method.pnp import PnpOptions, PoseEstimate, PoseStage, solve_pose
+from mapless_server.method.priors.gravity import GravityOptions, ransac_with_gravity, solve_pairs
+from mapless_server.method.priors.known import NO_PRIORS, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
+from mapless_server.method.priors.pose_only import PoseOnlyOptions, moved, refine_pose
+from mapless_server.method.structure import Structure
+from mapless_server.method.tracks import Tracks
+from mapless_server.method.views import Features, View
+
+POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
+DOWNS = {"y down": [0, 1, 0], "y up": [0, -1, 0], "z up": [0, 0, -1], "x up": [-1, 0, 0], "askew": [0.6, 0.0, 0.8]}
+
+
+def gravity(
+    down: Array | None = None, noise_deg: float = 0.0, sigma_deg: float = 1.0, pose: RigidTransform = POSE
+) -> GravityPrior:
+    """What an accelerometer in the camera at the pose says, tilted about one axis."""
+    down = np.array([0.0, 0.0, -1.0]) if down is None else np.asarray(down, float)
+    tilted = rotation_from_vector([np.radians(noise_deg), 0, 0]) @ pose.rotation.T @ down
+    return GravityPrior(tilted / np.linalg.norm(tilted), down, sigma_deg)
+
+
+def seen(rng: np.random.Generator, count: int, noise_px: float = 0.5, wrong: int = 0) -> tuple[Array, Array]:
+    """Points all over the image of a camera at POSE and their pixels; the first ones are seen elsewhere."""
+    pixels = rng.uniform([0, 0], [959, 719], (count, 2))
+    x_in_world = POSE.apply(CAMERA.rays(pixels) * rng.uniform(3, 6, (count, 1)))
+    pixels = pixels + rng.normal(0, noise_px, pixels.shape)
+    pixels[:wrong] = rng.uniform([0, 0], [959, 719], (wrong, 2))
+    return x_in_world, pixels
+
+
+def problem_of(x_in_world: Array, pixels: Array) -> tuple[View, Structure, PointMatches]:
+    """Point i matched with keypoint i."""
+    n = len(x_in_world)
+    index = np.arange(n)
+    features = Features(pixels.astype(np.float32), np.ones((n, 1), np.float32), np.ones(n, np.float32))
+    structure = Structure(x_in_world, Tracks(index[:0], index[:0], index[:0]), ONE_PIXEL)
+    return View(CAMERA, features), structure, PointMatches(index, index, np.zeros(n, bool), 0.0)
+
+
+def solved(
+    x_in_world: Array, pixels: Array, priors: Priors = NO_PRIORS, initial: RigidTransform = POSE
+) -> PoseEstimate:
+    estimate = solve_pose(*problem_of(x_in_world, pixels), initial, PnpOptions(), priors)
+    assert isinstance(estimate, PoseEstimate), estimate
+    return estimate
+
+
+# The solver and its conventions
+
+
+@pytest.mark.parametrize("down", DOWNS.values(), ids=DOWNS)
+def test_two_matches_and_gravity_give_the_planted_pose_whatever_axis_is_down(down: list[float]) -> None:
+    for seed in range(5):
+        x_in_world, pixels = seen(random_for("pairs", seed), 2, noise_px=0)
+        rays = CAMERA.rays(pixels)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        prior = gravity(np.array(down, float))
+        rotations, translations = solve_pairs(prior, rays, x_in_world, np.array([[0, 1]]))
+        poses = [RigidTransform(r, t).inverse() for r, t in zip(rotations, translations, strict=True)]
+        assert 1 <= len(poses) <= 2
+        for pose in poses:
+            np.testing.assert_allclose(pose.rotation @ prior.in_camera, prior.in_world, atol=1e-9)
+        best = min(poses, key=lambda it: sum(pose_error(it, POSE)))
+        assert_pose_close(best, POSE, metres=1e-6, degrees=1e-5)
+
+
+def test_gravity_of_the_wrong_sign_gives_other_poses() -> None:
+    x_in_world, pixels = seen(random_for("sign"), 2, noise_px=0)
+    rays = CAMERA.rays(pixels) / np.linalg.norm(CAMERA.rays(pixels), axis=1, keepdims=True)
+    right = gravity()
+    flipped = GravityPrior(-right.in_camera, right.in_world, 1.0)
+    rotations, translations = solve_pairs(flipped, rays, x_in_world, np.array([[0, 1]]))
+    poses = [RigidTransform(r, t).inverse() for r, t in zip(rotations, translations, strict=True)]
+    assert all(pose_error(pose, POSE)[1] > 30 for pose in poses)
+
+
+def test_no_pose_for_two_matches_of_one_point() -> None:
+    point = np.array([[0.0, 0, 1], [0, 0, 1]])
+    rotations, translations = solve_pairs(gravity(), point, np.ones((2, 3)), np.array([[0, 1]]))
+    assert np.isfinite(rotations).all()
+    assert np.isfinite(translations).all()
+
+
+@pytest.mark.parametrize("wrong", [0, 40, 80])
+def test_the_planted_pose_is_found_with_gravity_a_degree_off(wrong: int) -> None:
+    for seed in range(4):
+        x_in_world, pixels = seen(random_for("ransac", wrong, seed), 100, wrong=wrong)
+        poses = ransac_with_gravity(CAMERA, x_in_world, pixels, Priors(gravity=gravity(noise_deg=1)), 4.0)
+        assert_pose_close(poses[0], POSE, metres=0.05, degrees=0.6)
+
+
+def test_the_same_matches_give_the_same_bits() -> None:
+    x_in_world, pixels = seen(random_for("bits"), 60, wrong=40)
+    priors = Priors(gravity=gravity(noise_deg=1))
+    first, second = (ransac_with_gravity(CAMERA, x_in_world, pixels, priors, 4.0)[0] for _ in range(2))
+    assert first.matrix().tobytes() == second.matrix().tobytes()
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_fewer_than_two_matches_give_nothing(count: int) -> None:
+    x_in_world, pixels = seen(random_for("few"), count)
+    assert ransac_with_gravity(CAMERA, x_in_world, pixels, Priors(gravity=gravity()), 4.0) == []
+
+
+def test_without_gravity_there_is_nothing_to_do() -> None:
+    with pytest.raises(ValueError, match="no gravity"):
+        ransac_with_gravity(CAMERA, np.zeros((3, 3)), np.zeros((3, 2)), Priors(), 4.0)
+
+
+@pytest.mark.parametrize("change", [{"batch": 0}, {"max_samples": 0}, {"confidence": 1.0}, {"refined": 0}])
+def test_senseless_options_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="senseless"):
+        GravityOptions(**change)  # type: ignore[arg-type]
+
+
+# Refinement
+
+
+def test_the_refinement_is_at_a_minimum_of_matches_and_priors() -> None:
+    """No small motion lowers the cost, written down here a second time."""
+    rng = random_for("minimum")
+    x_in_world, pixels = seen(rng, 12)
+    options = PoseOnlyOptions(iterations=40, min_decrease=1e-12)
+    priors = Priors(
+        PositionPrior(POSE.translation + 0.05, 0.02**2 * np.eye(3)),
+        HeadingPrior.looking(POSE.rotation[:, 2], 2.0),
+        gravity(noise_deg=2),
+        PosePrior(moved(POSE, np.full(6, 0.03)), 0.05**2 * np.eye(6)),
+    )
+
+    def cost(pose: RigidTransform) -> float:
+        errors = CAMERA.project(pose.inverse().apply(x_in_world)) - pixels
+        squared = (errors**2).sum(axis=1) / options.sigma_px**2
+        scale = options.loss_scale_sigma**2
+        return float((scale * np.log1p(squared / scale)).sum()) + options.prior_weight * priors.cost(pose)
+
+    found = refine_pose(CAMERA, x_in_world, pixels, POSE, priors, options)
+    for axis in np.eye(6):
+        for step in (-1e-4, 1e-4):
+            assert cost(moved(found, step * axis)) > cost(found)
+
+
+def test_two_matches_and_a_pose_prior_are_enough_to_refine() -> None:
+    x_in_world, pixels = seen(random_for("two"), 2, noise_px=0)
+    start = moved(POSE, np.array([0.02, 0, 0, 0, 0.01, 0]))
+    prior = PosePrior(start, np.diag([0.05] * 3 + [0.02] * 3) ** 2)
+    found = refine_pose(CAMERA, x_in_world, pixels, start, Priors(pose=prior), PoseOnlyOptions())
+    assert sum(pose_error(found, POSE)) < sum(pose_error(start, POSE))
+    assert (np.linalg.norm(CAMERA.project(found.inverse().apply(x_in_world)) - pixels, axis=1) < 1).all()
+
+
+# Answers
+
+
+def hardly_seen(rng: np.random.Generator) -> tuple[Array, Array]:
+    """Six points far away in a small corner of the image: their pose is known along one line and in one tilt only."""
+    pixels = rng.uniform([440, 320], [520, 400], (6, 2))
+    x_in_world = POSE.apply(CAMERA.rays(pixels) * rng.uniform(8, 9, (6, 1)))
+    return x_in_world, pixels + rng.normal(0, 0.5, pixels.shape)
+
+
+def test_a_weak_query_is_pulled_right() -> None:
+    """What six points in a corner leave open, gravity a half degree off and a position to 2 cm close."""
+    alone, helped = [], []
+    for seed in range(12):
+        rng = random_for("weak", seed)
+        x_in_world, pixels = hardly_seen(rng)
+        priors = Priors(
+            PositionPrior(POSE.translation + rng.normal(0, 0.02, 3), 0.02**2 * np.eye(3)),
+            gravity=gravity(noise_deg=0.5),
+        )
+        alone.append(pose_error(solved(x_in_world, pixels).world_from_camera, POSE))
+        estimate = solved(x_in_world, pixels, priors)
+        assert all(check.used and not check.conflict for check in estimate.prior_checks)
+        helped.append(pose_error(estimate.world_from_camera, POSE))
+    assert np.median(helped, axis=0)[0] < 0.5 * np.median(alone, axis=0)[0]
+    assert np.median(helped, axis=0)[0] < 0.1
+
+
+def test_priors_that_took_part_sharpen_the_covariance() -> None:
+    x_in_world, pixels = hardly_seen(random_for("sharper"))
+    before = solved(x_in_world, pixels).covariance
+    prior = PositionPrior(POSE.translation, 0.02**2 * np.eye(3))
+    after = solved(x_in_world, pixels, Priors(prior)).covariance
+    assert np.linalg.eigvalsh(after[:3, :3])[-1] < 0.02**2 < np.linalg.eigvalsh(before[:3, :3])[-1]
+
+
+def wrong_priors() -> dict[str, Priors]:
+    flipped = GravityPrior(-gravity().in_camera, gravity().in_world, 1.0)
+    return {
+        "gravity upside down": Priors(gravity=flipped),
+        "gravity tilted": Priors(gravity=gravity(noise_deg=20)),
+        "heading": Priors(heading=HeadingPrior.looking(-POSE.rotation[:, 2], 5.0)),
+        "position": Priors(PositionPrior(POSE.translation + 3.0, 0.1**2 * np.eye(3))),
+        "pose": Priors(pose=PosePrior(moved(POSE, np.full(6, 0.5)), 0.05**2 * np.eye(6))),
+    }
+
+
+@pytest.mark.parametrize("name", wrong_priors())
+@pytest.mark.parametrize("count", [20, 200], ids=["few matches", "many"])
+def test_a_wrong_prior_is_a_conflict_and_changes_not_a_bit(name: str, count: int) -> None:
+    x_in_world, pixels = seen(random_for("wrong", name), count, wrong=count // 4)
+    without = solved(x_in_world, pixels)
+    estimate = solved(x_in_world, pixels, wrong_priors()[name])
+    (check,) = estimate.prior_checks
+    assert (check.conflict, check.used) == (True, False)
+    assert estimate.world_from_camera.matrix().tobytes() == without.world_from_camera.matrix().tobytes()
+    assert estimate.covariance.tobytes() == without.covariance.tobytes()
+
+
+def test_one_wrong_prior_does_not_keep_the_right_one_out() -> None:
+    x_in_world, pixels = hardly_seen(random_for("one of two"))
+    position = PositionPrior(POSE.translation, 0.02**2 * np.eye(3))
+    flipped = GravityPrior(-gravity().in_camera, gravity().in_world, 1.0)
+    estimate = solved(x_in_world, pixels, Priors(position, gravity=flipped))
+    assert [(check.kind.value, check.conflict, check.used) for check in estimate.prior_checks] == [
+        ("position", False, True),
+        ("gravity", True, False),
+    ]
+
+
+def test_gravity_finds_what_three_matches_do_not() -> None:
+    """Nine right ones of 240: three are drawn in one of 20 000 samples, PoseLib's most; two in one of 700."""
+    found_alone = found_with = 0
+    options = PnpOptions(max_iterations=512)
+    for seed in range(6):
+        x_in_world, pixels = seen(random_for("needle", seed), 240, wrong=222)
+        nowhere = POSE.shifted(np.array([50.0, 0, 0]))
+        problem = problem_of(x_in_world, pixels)
+        for priors in (Priors(), Priors(gravity=gravity(noise_deg=0.3, sigma_deg=0.5))):
+            estimate = solve_pose(*problem, nowhere, options, priors)
+            right = isinstance(estimate, PoseEstimate) and pose_error(estimate.world_from_camera, POSE)[0] < 0.1
+            found_alone, found_with = found_alone + (right and not priors), found_with + (right and bool(priors))
+    assert found_with > found_alone
+    assert found_with >= 4
+
+
+def test_a_pose_prior_stands_in_for_an_initial_pose_that_is_lost() -> None:
+    """Among so many wrong matches only a search near the right pose finds the right ones."""
+    x_in_world, pixels = seen(random_for("lost"), 300, wrong=292)
+    prior = PosePrior(moved(POSE, np.full(6, 0.002)), np.diag([0.01] * 3 + [0.005] * 3) ** 2)
+    estimate = solved(x_in_world, pixels, Priors(pose=prior), POSE.shifted(np.array([50.0, 0, 0])))
+    assert_pose_close(estimate.world_from_camera, POSE, metres=0.02, degrees=0.3)
+    assert estimate.stage is PoseStage.REFINED
+    assert estimate.prior_checks[0].used

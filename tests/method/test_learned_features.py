@@ -1,0 +1,257 @@
+"""Learned extractors: planted score maps give keypoints where they are, through reduction and lens; random weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from images import textured
+from numpy.typing import NDArray
+from scenes import random_for
+
+from mapless.geometry import Array, Camera, RadialTangential
+from mapless_server.method.features import FeatureExtractor, make_extractor
+from mapless_server.method.views import Features
+
+torch = pytest.importorskip("torch", reason="the learned features' extra is not installed")
+pytest.importorskip("kornia", reason="the learned features' extra is not installed")
+
+from kornia.feature import ALIKED, XFeat  # noqa: E402
+from safetensors.torch import save_file  # noqa: E402
+from torch import Tensor, nn  # noqa: E402
+
+from mapless_server.method.features.aliked import AlikedExtractor  # noqa: E402
+from mapless_server.method.features.network import LearnedOptions, image_tensor  # noqa: E402
+from mapless_server.method.features.xfeat import SHIFT_PX, XfeatExtractor, peak_offsets, strict_maxima  # noqa: E402
+from mapless_server.networks.weights import CheckpointError  # noqa: E402
+
+CAMERA = Camera(320, 256, 300.0, 300.0, 159.5, 127.5)
+LENS = RadialTangential(-0.25, 0.07, 0.001, -0.0015, -0.005)
+
+
+def saved(network: nn.Module, file: Path, without: tuple[str, ...] = ()) -> Path:
+    state = {k: v.contiguous().clone() for k, v in network.state_dict().items() if k not in without}
+    save_file(state, file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Random ones, in files as the authors' are."""
+    folder = tmp_path_factory.mktemp("weights")
+    torch.manual_seed(0)
+    return {
+        "aliked": saved(ALIKED("aliked-n16"), folder / "aliked.safetensors", without=("dkd.hw_grid",)),
+        "xfeat": saved(XFeat().net, folder / "xfeat.safetensors"),
+    }
+
+
+@pytest.fixture(scope="module")
+def aliked(weights: dict[str, Path]) -> AlikedExtractor:
+    return AlikedExtractor(weights["aliked"], options=LearnedOptions(max_keypoints=300, min_score=0.0))
+
+
+@pytest.fixture(scope="module")
+def xfeat(weights: dict[str, Path]) -> XfeatExtractor:
+    return XfeatExtractor(weights["xfeat"], options=LearnedOptions(max_keypoints=300, min_score=0.001))
+
+
+def assert_is_well_formed(features: Features, dimension: int) -> None:
+    assert features.keypoints.dtype == features.descriptors.dtype == features.sizes_px.dtype == np.float32
+    assert features.descriptors.shape == (len(features), dimension)
+    assert np.isfinite(features.keypoints).all()
+    assert (features.sizes_px > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1e-5)
+
+
+def peaks(random: np.random.Generator, width: int, height: int, step_px: int = 20) -> Array:
+    """Places between pixels, one in each square of a grid."""
+    grid = np.meshgrid(np.arange(step_px, width - step_px, step_px), np.arange(step_px, height - step_px, step_px))
+    centres = np.stack(grid, axis=-1).reshape(-1, 2)
+    return np.asarray(centres + random.uniform(-4, 4, centres.shape))
+
+
+def bumps(centres: Array, width: int, height: int, sigma_px: float) -> Tensor:
+    """(1, 1, H, W): Gaussians of height 0.9; pixel (0, 0) is the centre of the top-left one."""
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    image = np.zeros((height, width))
+    for cx, cy in centres:
+        image = np.maximum(image, 0.9 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * sigma_px**2)))
+    planted: Tensor = torch.from_numpy(image[None, None].astype(np.float32))
+    return planted
+
+
+def largest_miss_px(keypoints: NDArray[np.floating], centres: Array) -> float:
+    distance = np.linalg.norm(keypoints[None].astype(float) - centres[:, None], axis=2)
+    assert len(keypoints) == len(centres)
+    return float(distance.min(axis=1).max())
+
+
+@pytest.mark.parametrize("max_side_px", [320, 256])
+@pytest.mark.parametrize("lens", [None, LENS], ids=["pinhole", "lens"])
+def test_aliked_keypoints_are_where_the_score_map_has_its_peaks(
+    aliked: AlikedExtractor, monkeypatch: pytest.MonkeyPatch, lens: RadialTangential | None, max_side_px: int
+) -> None:
+    """The planted truth is in the reduced, distorted image; back to it through nothing but the two cameras."""
+    camera = replace(CAMERA, distortion=lens)
+    reduced = camera if max_side_px == 320 else camera.resized(256, 205)
+    centres = peaks(random_for("aliked", lens, max_side_px), reduced.width_px, reduced.height_px)
+    score_map = bumps(centres, reduced.width_px, reduced.height_px, sigma_px=1.5)
+    feature_map = torch.ones(1, 128, reduced.height_px, reduced.width_px)
+    monkeypatch.setattr(aliked._network, "extract_dense_map", lambda _: (feature_map, score_map))
+    monkeypatch.setattr(aliked, "options", replace(aliked.options, max_side_px=max_side_px, min_score=0.3))
+    view = aliked.extract(np.zeros((256, 320, 3), np.uint8), camera)
+    assert view.camera == reduced.pinhole()
+    # The soft maximum over five pixels is drawn to the middle one by up to a fifth of a pixel; a bias it has not.
+    seen = reduced.project(view.camera.rays(view.features.keypoints))
+    assert largest_miss_px(seen, centres) < 0.35
+    nearest = centres[np.linalg.norm(seen[:, None] - centres, axis=2).argmin(axis=1)]
+    assert np.abs((seen - nearest).mean(axis=0)).max() < 0.05
+
+
+def test_a_wide_peak_is_a_large_keypoint(aliked: AlikedExtractor, monkeypatch: pytest.MonkeyPatch) -> None:
+    centres = np.rint(peaks(random_for("wide"), 320, 256))
+    feature_map = torch.ones(1, 128, 256, 320)
+    sizes = []
+    for sigma_px in (0.5, 1.0, 3.0):
+        score_map = bumps(centres, 320, 256, sigma_px)
+        monkeypatch.setattr(aliked._network, "extract_dense_map", lambda _, s=score_map: (feature_map, s))
+        sizes.append(np.median(aliked.extract(np.zeros((256, 320, 3), np.uint8), CAMERA).features.sizes_px))
+    assert 0 < sizes[0] < sizes[1] < sizes[2] <= 4 * np.sqrt(8)  # all weight in the corners of five by five pixels
+
+
+def test_xfeat_keypoints_are_where_the_map_has_its_peaks(
+    xfeat: XfeatExtractor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Gaussians are parabolas once their logarithm is taken, so the peaks come out exact."""
+    centres = peaks(random_for("xfeat"), 320, 256)
+    heat = bumps(centres, 320, 256, sigma_px=1.5) + 1e-6
+    cells = torch.nn.functional.pixel_unshuffle(heat, 8)
+    # 65 logits whose softmax is a hundredth of the map: the rest of a cell is "no keypoint".
+    logits = torch.cat([cells, 100 - cells.sum(dim=1, keepdim=True)], dim=1).log()
+    maps = (torch.ones(1, 64, 32, 40), logits, torch.ones(1, 1, 32, 40))
+    monkeypatch.setattr(xfeat, "_network", lambda _: maps)
+    view = xfeat.extract(np.zeros((256, 320, 3), np.uint8), CAMERA)
+    assert view.camera == CAMERA
+    assert largest_miss_px(view.features.keypoints, centres + SHIFT_PX) < 0.05
+
+
+def test_xfeat_finds_what_kornia_finds(xfeat: XfeatExtractor) -> None:
+    image = textured(320, 256, seed=3)
+    twin = XFeat(top_k=300, detection_threshold=0.001)
+    twin.net = xfeat._network
+    theirs = twin.eval().detectAndCompute(image_tensor(image, torch.device("cpu")))[0]
+    ours = xfeat.extract(image, CAMERA).features
+    assert len(ours) > 50
+    order = np.lexsort(theirs["keypoints"].numpy().T)
+    ours_pixels = np.rint(ours.keypoints - SHIFT_PX)
+    ours_order = np.lexsort(ours_pixels.T)
+    np.testing.assert_array_equal(ours_pixels[ours_order], theirs["keypoints"].numpy()[order])
+    np.testing.assert_allclose(ours.descriptors[ours_order], theirs["descriptors"].numpy()[order], atol=1e-5)
+
+
+def test_strict_maxima_are_those_of_loops() -> None:
+    scores = torch.from_numpy(random_for("maxima").integers(0, 40, (24, 31))).float()
+    expected = []
+    for y in range(2, 22):
+        for x in range(2, 29):
+            others = scores[y - 2 : y + 3, x - 2 : x + 3].flatten().tolist()
+            others.remove(scores[y, x])
+            if scores[y, x] > max(others) and scores[y, x] > 10:
+                expected.append([x, y])
+    assert strict_maxima(scores, 5, 10.0).tolist() == expected
+    assert 3 < len(expected) < 40
+
+
+def test_offsets_find_the_top_of_a_parabola() -> None:
+    x, y = torch.meshgrid(torch.arange(9.0), torch.arange(7.0), indexing="xy")
+    heights = 5 - 0.3 * (x - 4.3) ** 2 - 0.7 * (y - 2.6) ** 2
+    torch.testing.assert_close(peak_offsets(heights, torch.tensor([[4, 3]])), torch.tensor([[0.3, -0.4]]))
+
+
+@pytest.mark.parametrize("name", ["aliked", "xfeat"])
+def test_a_shifted_photograph_has_shifted_keypoints(name: str, request: pytest.FixtureRequest) -> None:
+    """By 32 px, a step of the networks' coarsest grid, and far from borders: all else is the same to rounding."""
+    extractor: FeatureExtractor = request.getfixturevalue(name)
+    wide = textured(480, 384, seed=5)
+    first, second = (
+        extractor.extract(np.ascontiguousarray(wide[s : s + 256, s : s + 320]), CAMERA).features.keypoints
+        for s in (32, 64)
+    )
+    back = second + 32
+    inside = (np.abs(first - [176, 144]) < [70, 50]).all(axis=1)
+    distance = np.linalg.norm(first[inside][:, None] - back, axis=2).min(axis=1)
+    assert inside.sum() > 5
+    assert (distance < 0.05).mean() > 0.5
+
+
+@pytest.mark.parametrize(("name", "dimension"), [("aliked", 128), ("xfeat", 64)])
+def test_any_photograph_gives_well_formed_features(name: str, dimension: int, request: pytest.FixtureRequest) -> None:
+    extractor: FeatureExtractor = request.getfixturevalue(name)
+    for image in (textured(200, 150, seed=1), np.full((64, 300, 3), 127, np.uint8), textured(40, 33, seed=2)):
+        height, width = image.shape[:2]
+        camera = Camera(width, height, 300.0, 300.0, (width - 1) / 2, (height - 1) / 2, LENS)
+        view = extractor.extract(image, camera)
+        assert view.camera.distortion is None
+        assert_is_well_formed(view.features, dimension)
+        assert len(view.features) <= 300
+
+
+@pytest.mark.parametrize("extractor", [AlikedExtractor, XfeatExtractor])
+def test_the_name_tells_what_changes_the_features(
+    extractor: Callable[..., FeatureExtractor], weights: dict[str, Path], tmp_path: Path
+) -> None:
+    name = "aliked" if extractor is AlikedExtractor else "xfeat"
+    changed = (LearnedOptions(), LearnedOptions(1000), LearnedOptions(max_side_px=800), LearnedOptions(min_score=0.2))
+    names = {extractor(weights[name], options=options).name for options in changed}
+    torch.manual_seed(1)
+    network = ALIKED("aliked-n16") if name == "aliked" else XFeat().net
+    other = saved(network, tmp_path / "other.safetensors", without=("dkd.hw_grid",))
+    names.add(extractor(other, options=LearnedOptions()).name)
+    assert len(names) == 5
+    assert make_extractor(name, weights[name]).name == make_extractor(name, weights[name]).name
+    assert all(n.startswith(name) for n in names)
+
+
+def test_weights_that_do_not_fit_are_refused(weights: dict[str, Path], tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="does not fit"):
+        make_extractor("aliked", weights["xfeat"])
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes(weights["xfeat"].read_bytes()[:-100])
+    with pytest.raises(CheckpointError):
+        make_extractor("xfeat", cut)
+    with pytest.raises(ValueError, match="weights"):
+        make_extractor("aliked")
+
+
+def test_superpoint_keypoints_are_pixels(tmp_path: Path) -> None:
+    """A random network, against transformers' own output; relative coordinates are whole pixels again."""
+    transformers = pytest.importorskip("transformers", reason="the superpoint extra is not installed")
+    from mapless_server.method.features.superpoint import SuperPointExtractor
+
+    def config() -> object:
+        return transformers.SuperPointConfig(
+            encoder_hidden_sizes=[4, 4, 8, 8], decoder_hidden_size=8, descriptor_decoder_dim=16
+        )
+
+    torch.manual_seed(0)
+    network = transformers.SuperPointForKeypointDetection(config())
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.normal_(0, 0.3)
+    file = saved(network, tmp_path / "superpoint.safetensors")
+    extractor = SuperPointExtractor(file, options=LearnedOptions(200, 512, 0.0), config=config())
+    view = extractor.extract(textured(320, 256, seed=4), CAMERA)
+    assert view.camera == CAMERA
+    assert 20 < len(view.features) <= 200
+    assert_is_well_formed(view.features, 16)
+    np.testing.assert_array_equal(view.features.keypoints, np.rint(view.features.keypoints))
+
+
+def test_senseless_options_are_refused() -> None:
+    for options in ({"max_keypoints": 0}, {"max_side_px": 8}, {"min_score": 1.0}, {"min_score": float("nan")}):
+        with pytest.raises(ValueError, match="senseless"):
+            LearnedOptions(**options)

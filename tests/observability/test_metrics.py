@@ -1,0 +1,574 @@
+"""Metrics have the names that dashboards know, count each event once, and never grow with what callers send."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import re
+import socket
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import pytest
+from prometheus_client import generate_latest
+from prometheus_client.parser import text_string_to_metric_families
+
+from mapless_server.method.rejection import RejectionReason
+from mapless_server.observability import exporter
+from mapless_server.observability.event_loop import LoopObserver, watch_event_loop
+from mapless_server.observability.exporter import MAX_CONNECTIONS, MetricsServer
+from mapless_server.observability.metrics import LOCALIZED, STAGES, Metrics
+from mapless_server.rpc.guard import CallObserver
+from mapless_server.scheduling.observer import Ending, Observer, Refusal
+
+LOCALIZE = "/mapless.v1.LocalizationService/Localize"
+
+COUNTERS = {
+    "mapless_captured_total": set(),
+    "mapless_capture_dropped_total": {"reason"},
+    "grpc_server_started_total": {"grpc_service", "grpc_method"},
+    "grpc_server_handled_total": {"grpc_service", "grpc_method", "grpc_code"},
+    "mapless_admitted_total": set(),
+    "mapless_admitted_cost_seconds_total": set(),
+    "mapless_admission_rejected_total": {"reason"},
+    "mapless_jobs_terminated_total": {"stage", "outcome"},
+    "mapless_batches_total": {"stage", "bucket"},
+    "mapless_busy_seconds_total": {"stage"},
+    "mapless_reference_cache_hits_total": set(),
+    "mapless_reference_cache_misses_total": set(),
+    "mapless_reference_cache_evictions_total": set(),
+    "mapless_token_cache_hits_total": {"tier"},
+    "mapless_token_cache_misses_total": set(),
+    "mapless_token_cache_evictions_total": set(),
+    "mapless_answers_total": {"outcome"},
+    "mapless_gpu_oom_total": set(),
+    "mapless_fatal_total": set(),
+    "mapless_store_errors_total": set(),
+}
+GAUGES = {
+    "mapless_capture_bytes": set(),
+    "mapless_capture_enabled": set(),
+    "mapless_python_allocated_blocks": set(),
+    "mapless_queue_depth": {"stage"},
+    "mapless_queue_cost_seconds": {"stage"},
+    "mapless_inflight": {"stage"},
+    "mapless_reference_cache_bytes": set(),
+    "mapless_retrieval_index_bytes": set(),
+    "mapless_token_cache_bytes": {"tier"},
+    "mapless_scheduler_heartbeat_timestamp_seconds": set(),
+    "mapless_gpu_memory_bytes": {"kind"},
+    "mapless_health_serving": set(),
+    "mapless_tls_certificate_expiry_timestamp_seconds": set(),
+    "mapless_build_info": {"version", "backend", "features", "weights_sha256"},
+    "mapless_warmup_seconds": set(),
+}
+HISTOGRAMS = {
+    "grpc_server_handling_seconds": {"grpc_service", "grpc_method"},
+    "mapless_queue_wait_seconds": {"stage"},
+    "mapless_stage_seconds": {"stage", "tier"},
+    "mapless_batch_size": {"stage"},
+    "mapless_batch_seconds": {"stage"},
+    "mapless_coarse_answer_seconds": set(),
+    "mapless_inliers": set(),
+    "mapless_inlier_ratio": set(),
+    "mapless_reprojection_error_px": set(),
+    "mapless_scale_deviation": set(),
+    "mapless_accuracy_radius_m": set(),
+    "mapless_event_loop_lag_seconds": set(),
+    "mapless_store_op_seconds": {"op"},
+}
+
+Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Both kinds of cache."""
+
+    hits: int = 1
+    device_hits: int = 2
+    host_hits: int = 3
+    misses: int = 4
+    evictions: int = 5
+    used_bytes: int = 6
+    device_bytes: int = 7
+    host_bytes: int = 8
+
+
+def samples_of(metrics: Metrics) -> Samples:
+    """What a scrape says, by name and labels."""
+    return {
+        (sample.name, frozenset(sample.labels.items())): sample.value
+        for family in text_string_to_metric_families(generate_latest(metrics.registry).decode())
+        for sample in family.samples
+    }
+
+
+def changed(before: Samples, after: Samples) -> Samples:
+    """By how much, where it did."""
+    changes = {
+        key: value - before.get(key, 0.0)
+        for key, value in after.items()
+        if key[0].startswith(("mapless", "grpc"))
+        and key[0] != "mapless_python_allocated_blocks"  # it changes by itself
+    }
+    return {key: change for key, change in changes.items() if change}
+
+
+def tell_everything(metrics: Metrics) -> None:
+    metrics.call_started(LOCALIZE)
+    metrics.call_handled(LOCALIZE, "OK", 0.2)
+    metrics.admitted(0.5)
+    metrics.refused(Refusal.QUEUE_FULL)
+    metrics.queued("coarse", 3, 1.5)
+    metrics.running("coarse", 2)
+    metrics.waited("coarse", 0.1)
+    metrics.computed("coarse", "392x518x10", 2, 0.3)
+    metrics.ended("refine", Ending.OK)
+    metrics.beat()
+    metrics.stages({"decode": 0.01})
+    metrics.answered(
+        LOCALIZED,
+        inlier_count=80,
+        match_count=100,
+        reprojection_error_px=0.6,
+        scale_deviation=0.01,
+        accuracy_radius_m=0.02,
+    )
+    metrics.loop_lagged(0.001)
+    metrics.stored("load_references", 0.002)
+    metrics.store_failed()
+    metrics.ran_out_of_memory()
+    metrics.failed_fatally()
+    metrics.set_serving(True)
+    metrics.warmed_up(3.0)
+    metrics.built("1.2.3", "pi3x", "aliked", "ab" * 32)
+    metrics.watch_reference_cache(Counts)
+    metrics.watch_token_cache(Counts)
+    metrics.watch_gpu_memory(lambda: {"allocated": 10.0, "reserved": 20.0})
+    metrics.watch_certificate(lambda: 2e9)
+
+
+@pytest.fixture
+def metrics() -> Metrics:
+    return Metrics()
+
+
+def test_names_types_and_labels_are_those_that_dashboards_know(metrics: Metrics) -> None:
+    tell_everything(metrics)
+    families = {f.name: f for f in text_string_to_metric_families(generate_latest(metrics.registry).decode())}
+    ours = {name: family for name, family in families.items() if name.startswith(("mapless", "grpc"))}
+    found = {
+        f"{name}_total" if family.type == "counter" else name: (
+            family.type,
+            {label for sample in family.samples for label in sample.labels} - {"le"},
+        )
+        for name, family in ours.items()
+    }
+    expected = {
+        **{name: ("counter", labels) for name, labels in COUNTERS.items()},
+        **{name: ("gauge", labels) for name, labels in GAUGES.items()},
+        **{name: ("histogram", labels) for name, labels in HISTOGRAMS.items()},
+    }
+    assert found == expected
+    assert {"process_cpu_seconds", "process_resident_memory_bytes", "process_open_fds"} <= set(families)
+    assert "python_gc_collections" in families
+    assert all(family.documentation for family in ours.values())
+
+
+def test_metrics_that_nobody_moved_yet_are_described(metrics: Metrics) -> None:
+    families = {f.name for f in text_string_to_metric_families(generate_latest(metrics.registry).decode())}
+    assert families >= {name.removesuffix("_total") for name in COUNTERS} | set(GAUGES) | set(HISTOGRAMS)
+
+
+@pytest.mark.parametrize("reason", Refusal)
+def test_a_refusal_is_counted_once_and_was_zero_before(metrics: Metrics, reason: Refusal) -> None:
+    before = samples_of(metrics)
+    key = ("mapless_admission_rejected_total", frozenset({("reason", reason.value)}))
+    assert before[key] == 0
+    metrics.refused(reason)
+    assert changed(before, samples_of(metrics)) == {key: 1}
+
+
+@pytest.mark.parametrize("ending", Ending)
+@pytest.mark.parametrize("stage", STAGES)
+def test_an_ending_is_counted_once_and_was_zero_before(metrics: Metrics, stage: str, ending: Ending) -> None:
+    before = samples_of(metrics)
+    key = ("mapless_jobs_terminated_total", frozenset({("stage", stage), ("outcome", ending.value)}))
+    assert before[key] == 0
+    metrics.ended(stage, ending)
+    assert changed(before, samples_of(metrics)) == {key: 1}
+
+
+@pytest.mark.parametrize("outcome", [LOCALIZED, *(reason.value for reason in RejectionReason)])
+def test_an_answer_is_counted_under_its_outcome(metrics: Metrics, outcome: str) -> None:
+    before = samples_of(metrics)
+    key = ("mapless_answers_total", frozenset({("outcome", outcome)}))
+    assert before[key] == 0
+    metrics.answered(outcome)
+    assert changed(before, samples_of(metrics)) == {key: 1}
+
+
+def test_how_long_somebody_watches_is_counted_as_a_call_and_as_no_latency(metrics: Metrics) -> None:
+    before, watch = samples_of(metrics), "/mapless.v1.LocalizationService/WatchQueries"
+    metrics.call_started(watch)
+    metrics.call_handled(watch, "CANCELLED", 3600.0, "ab" * 16)
+    after = changed(before, samples_of(metrics))
+    assert {name for name, _ in after} == {"grpc_server_started_total", "grpc_server_handled_total"}
+    watched = {
+        name
+        for name, labels in samples_of(metrics)
+        if name.startswith("grpc_server_handling") and ("grpc_method", "WatchQueries") in labels
+    }
+    assert not watched
+
+
+def test_a_stream_that_ends_by_itself_has_a_latency_and_its_first_answer_another(metrics: Metrics) -> None:
+    before, method = samples_of(metrics), "/mapless.v1.LocalizationService/LocalizeProgressively"
+    metrics.answered_coarsely(0.25)
+    metrics.call_handled(method, "OK", 0.5, "")
+    sums = {name: value for (name, _), value in changed(before, samples_of(metrics)).items() if name.endswith("_sum")}
+    assert sums == {"mapless_coarse_answer_seconds_sum": 0.25, "grpc_server_handling_seconds_sum": 0.5}
+
+
+def test_a_batch_adds_to_size_time_and_business(metrics: Metrics) -> None:
+    before = samples_of(metrics)
+    metrics.computed("coarse", "392x518x10", 3, 0.25)
+    changes = changed(before, samples_of(metrics))
+    stage = ("stage", "coarse")
+    assert changes["mapless_batch_size_sum", frozenset({stage})] == 3
+    assert changes["mapless_batch_seconds_sum", frozenset({stage})] == 0.25
+    assert changes["mapless_busy_seconds_total", frozenset({stage})] == 0.25
+    assert changes["mapless_batches_total", frozenset({stage, ("bucket", "392x518x10")})] == 1
+
+
+def test_stages_of_stronger_features_are_a_tier_not_a_name(metrics: Metrics) -> None:
+    before = samples_of(metrics)
+    metrics.stages({"features": 0.1, "aliked-n16-2048-1024px-0.01-c2ab3d81/features": 2.0})
+    changes = changed(before, samples_of(metrics))
+    sums = {dict(labels)["tier"]: value for (name, labels), value in changes.items() if name.endswith("_sum")}
+    assert sums == {"0": 0.1, "1": 2.0}
+    assert "aliked" not in generate_latest(metrics.registry).decode()
+
+
+@pytest.mark.parametrize(
+    ("histogram", "edge"),
+    [
+        ("grpc_server_handling_seconds", 0.3),
+        ("grpc_server_handling_seconds", 30.0),
+        ("mapless_queue_wait_seconds", 1.0),
+        ("mapless_event_loop_lag_seconds", 0.02),
+        ("mapless_scale_deviation", 0.05),
+        ("mapless_accuracy_radius_m", 0.2),
+        ("mapless_inliers", 50.0),
+    ],
+)
+def test_there_is_an_edge_where_something_is_promised(metrics: Metrics, histogram: str, edge: float) -> None:
+    edges = {
+        float(dict(labels)["le"])
+        for name, labels in samples_of(metrics)
+        if name == f"{histogram}_bucket" and "le" in dict(labels)
+    }
+    assert edge in edges
+    assert math.inf in edges
+
+
+def test_series_do_not_grow_with_what_is_told(metrics: Metrics) -> None:
+    tell_everything(metrics)
+    for i in range(100):
+        metrics.computed(f"stage-{i}", f"bucket-{i}", 1, 0.1)
+        metrics.stages({f"stage-{i}": 0.1})
+        metrics.stored(f"op-{i}", 0.1)
+        metrics.call_handled(f"/mapless.v1.Service-{i}/M", f"CODE_{i}", 0.1)
+        metrics.answered(f"outcome-{i}")
+    count = len(samples_of(metrics))
+    for i in range(100, 2000):
+        metrics.computed(f"stage-{i}", f"bucket-{i}", 1, 0.1)
+        metrics.stages({f"stage-{i}": 0.1})
+        metrics.stored(f"op-{i}", 0.1)
+        metrics.call_started(f"/mapless.v1.Service-{i}/M")
+        metrics.call_handled(f"/mapless.v1.Service-{i}/M", f"CODE_{i}", 0.1)
+        metrics.answered(f"outcome-{i}")
+    after = samples_of(metrics)
+    assert len(after) <= count + 1  # "other" calls that started
+    assert after["mapless_answers_total", frozenset({("outcome", "other")})] == 2000
+    other = frozenset({("stage", "other"), ("bucket", "other")})
+    batches = {labels: value for (name, labels), value in after.items() if name == "mapless_batches_total"}
+    assert sum(batches.values()) == 2001
+    assert batches[other] > 1900
+
+
+def test_quality_that_is_not_known_or_not_a_number_is_left_out(metrics: Metrics) -> None:
+    metrics.answered(
+        LOCALIZED, inlier_count=10, match_count=0, reprojection_error_px=math.nan, scale_deviation=math.inf
+    )
+    metrics.answered(LOCALIZED, inlier_count=30, match_count=40, reprojection_error_px=0.5)
+    samples = samples_of(metrics)
+    assert samples["mapless_inliers_sum", frozenset()] == 40
+    assert (samples["mapless_inlier_ratio_count", frozenset()], samples["mapless_inlier_ratio_sum", frozenset()]) == (
+        1,
+        0.75,
+    )
+    assert samples["mapless_reprojection_error_px_sum", frozenset()] == 0.5
+    assert samples["mapless_scale_deviation_count", frozenset()] == 0
+
+
+def test_metrics_are_what_the_others_tell(metrics: Metrics) -> None:
+    def hears(queue: Observer, calls: CallObserver, loop: LoopObserver) -> None:
+        queue.ended("refine", Ending.OK)
+        calls.call_started(LOCALIZE)
+        loop.beat()
+
+    before = samples_of(metrics)
+    hears(metrics, metrics, metrics)  # the types are checked by mypy
+    assert len(changed(before, samples_of(metrics))) == 3
+
+
+def test_two_servers_in_one_process_count_for_themselves() -> None:
+    first, second = Metrics(), Metrics()
+    first.failed_fatally()
+    assert samples_of(first)["mapless_fatal_total", frozenset()] == 1
+    assert samples_of(second)["mapless_fatal_total", frozenset()] == 0
+
+
+def test_caches_are_read_when_somebody_asks(metrics: Metrics) -> None:
+    tell_everything(metrics)
+    samples = samples_of(metrics)
+    assert samples["mapless_reference_cache_hits_total", frozenset()] == 1
+    assert samples["mapless_reference_cache_bytes", frozenset()] == 6
+    assert samples["mapless_token_cache_hits_total", frozenset({("tier", "device")})] == 2
+    assert samples["mapless_token_cache_hits_total", frozenset({("tier", "host")})] == 3
+    assert samples["mapless_token_cache_bytes", frozenset({("tier", "host")})] == 8
+    assert samples["mapless_gpu_memory_bytes", frozenset({("kind", "reserved")})] == 20
+    metrics.watch_reference_cache(lambda: Counts(hits=17))
+    assert samples_of(metrics)["mapless_reference_cache_hits_total", frozenset()] == 17
+
+
+def test_one_that_cannot_be_read_blinds_nobody_to_the_others(
+    metrics: Metrics, caplog: pytest.LogCaptureFixture
+) -> None:
+    tell_everything(metrics)
+
+    def broken() -> Counts:
+        raise RuntimeError("the cache is gone")
+
+    metrics.watch_reference_cache(broken)
+    samples = samples_of(metrics)
+    assert ("mapless_reference_cache_hits_total", frozenset()) not in samples
+    assert samples["mapless_token_cache_misses_total", frozenset()] == 4
+    assert samples["mapless_fatal_total", frozenset()] == 1
+    assert "mapless_reference_cache_hits" in caplog.text
+    assert "the cache is gone" in caplog.text
+
+
+# The port
+
+
+@pytest.fixture
+def server(metrics: Metrics) -> Iterator[MetricsServer]:
+    running = MetricsServer(metrics.registry, "127.0.0.1", 0, metrics)
+    yield running
+    running.close()
+
+
+def scrape(port: int, host: str = "127.0.0.1") -> str:
+    with urllib.request.urlopen(f"http://{host}:{port}/metrics", timeout=30) as response:
+        return str(response.read().decode())
+
+
+def metrics_threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "metrics" or "process_request" in thread.name]
+
+
+def test_the_port_serves_what_the_registry_has(metrics: Metrics, server: MetricsServer) -> None:
+    metrics.failed_fatally()
+    assert "\nmapless_fatal_total 1.0\n" in scrape(server.port)
+
+
+def ask(port: int, path: str) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=30) as response:
+            return response.status, response.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def test_the_port_is_ready_while_health_says_serving_and_at_no_other_time(
+    metrics: Metrics, server: MetricsServer
+) -> None:
+    assert ask(server.port, "/ready") == (503, "not serving\n")  # starting
+    metrics.set_serving(True)
+    assert ask(server.port, "/ready") == (200, "serving\n")
+    assert ask(server.port, "/ready?from=probe") == (200, "serving\n")
+    metrics.set_serving(False)
+    assert ask(server.port, "/ready") == (503, "not serving\n")  # draining
+    assert ask(server.port, "/metrics")[0] == 200
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "ready", "live"), [(None, 200, 200), (0, 200, 200), (6, 503, 200), (50, 503, 200), (61, 503, 503)]
+)
+def test_a_server_whose_heart_stands_still_is_not_ready_and_after_a_minute_not_alive(
+    metrics: Metrics, server: MetricsServer, silent_s: float | None, ready: int, live: int
+) -> None:
+    metrics.set_serving(True)
+    if silent_s is not None:
+        metrics.beat()
+        assert metrics.beaten_s is not None
+        metrics.beaten_s -= silent_s
+    assert (ask(server.port, "/ready")[0], ask(server.port, "/live")[0]) == (ready, live)
+    metrics.beat()
+    assert (ask(server.port, "/ready")[0], ask(server.port, "/live")[0]) == (200, 200)
+    metrics.set_serving(False)
+    assert ask(server.port, "/live") == (200, "alive\n")  # draining kills nobody
+
+
+@pytest.mark.parametrize("path", ["/", "/favicon.ico", "/ready/", "/metrics/", "/metrics/../etc/passwd", "/live/"])
+def test_nothing_else_is_on_the_port(metrics: Metrics, server: MetricsServer, path: str) -> None:
+    metrics.set_serving(True)
+    assert ask(server.port, path) == (404, "there are /metrics, /ready and /live\n")
+
+
+def test_the_port_serves_exemplars_to_who_asks_for_open_metrics(metrics: Metrics, server: MetricsServer) -> None:
+    metrics.call_handled(LOCALIZE, "OK", 0.25, "0af7651916cd43dd8448eb211c80319c")
+    request = urllib.request.Request(
+        f"http://127.0.0.1:{server.port}/metrics", headers={"Accept": "application/openmetrics-text; version=1.0.0"}
+    )
+    with urllib.request.urlopen(request, timeout=30) as response:
+        text = response.read().decode()
+    assert '# {trace_id="0af7651916cd43dd8448eb211c80319c"} 0.25' in text
+    assert text.endswith("# EOF\n")
+
+
+def test_a_port_that_is_taken_is_an_error(metrics: Metrics, server: MetricsServer) -> None:
+    with pytest.raises(OSError, match="in use"):
+        MetricsServer(metrics.registry, "127.0.0.1", server.port, metrics)
+    with pytest.raises(OSError):  # noqa: PT011  the resolver's words differ
+        MetricsServer(metrics.registry, "no-such-host.invalid", 0, metrics)
+
+
+def test_closing_frees_the_port_and_ends_the_threads_even_of_open_connections(metrics: Metrics) -> None:
+    before = set(threading.enumerate())
+    server = MetricsServer(metrics.registry, "127.0.0.1", 0, metrics)
+    with socket.create_connection(("127.0.0.1", server.port), 10) as idle:
+        scrape(server.port)
+        server.close()
+        assert set(threading.enumerate()) <= before
+        assert idle.recv(1) == b""
+    again = MetricsServer(metrics.registry, "127.0.0.1", server.port, metrics)
+    again.close()
+
+
+def test_idle_connections_take_few_threads_and_keep_nobody_out(server: MetricsServer) -> None:
+    idle = [socket.create_connection(("127.0.0.1", server.port), 10) for _ in range(10 * MAX_CONNECTIONS)]
+    try:
+        for connection in idle:
+            connection.sendall(b"GET /metrics HTTP/1.1\r\nX-Slow: ")  # and never the rest
+        assert "mapless_fatal_total" in scrape(server.port)
+        deadline_s = time.monotonic() + 20
+        while len(metrics_threads()) > MAX_CONNECTIONS + 1:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+    finally:
+        for connection in idle:
+            connection.close()
+
+
+def test_a_silent_connection_is_closed(metrics: Metrics, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exporter._Handler, "timeout", 0.05)
+    server = MetricsServer(metrics.registry, "127.0.0.1", 0, metrics)
+    try:
+        with socket.create_connection(("127.0.0.1", server.port), 30) as silent:
+            assert silent.recv(1) == b""
+    finally:
+        server.close()
+
+
+@pytest.mark.parametrize(
+    "nonsense", [b"\x00\xff\xfe\r\n\r\n", b"POST /metrics HTTP/1.1\r\n\r\n", b"GET " + b"a" * 70000]
+)
+def test_nonsense_is_refused_and_the_next_is_served(server: MetricsServer, nonsense: bytes) -> None:
+    with socket.create_connection(("127.0.0.1", server.port), 30) as connection:
+        connection.sendall(nonsense)
+        connection.shutdown(socket.SHUT_WR)
+        answer = connection.recv(1000)
+    assert re.search(rb"\b4\d\d\b", answer)
+    assert "mapless_fatal_total" in scrape(server.port)
+
+
+def test_the_port_answers_while_the_event_loop_is_blocked(server: MetricsServer) -> None:
+    async def block() -> str:
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(scrape, server.port).result(30)  # waited for on the loop's own thread
+
+    assert "mapless_fatal_total" in asyncio.run(block())
+
+
+def test_the_port_listens_on_ipv6(metrics: Metrics) -> None:
+    if not socket.has_ipv6:
+        pytest.skip("no IPv6 on this machine")
+    try:
+        server = MetricsServer(metrics.registry, "::1", 0, metrics)
+    except OSError:
+        pytest.skip("no IPv6 on this machine")
+    assert "mapless_fatal_total" in scrape(server.port, "[::1]")
+    server.close()
+
+
+# The event loop
+
+
+class Heard:
+    def __init__(self) -> None:
+        self.lags_s: list[float] = []
+        self.beats = 0
+
+    def loop_lagged(self, seconds: float) -> None:
+        self.lags_s.append(seconds)
+
+    def beat(self) -> None:
+        self.beats += 1
+
+
+def test_a_blocked_loop_is_measured_and_logged(caplog: pytest.LogCaptureFixture) -> None:
+    heard = Heard()
+
+    async def run() -> None:
+        watching = asyncio.create_task(watch_event_loop(heard))
+        while not heard.lags_s:
+            await asyncio.sleep(0.001)
+        time.sleep(0.3)
+        count = len(heard.lags_s)
+        while len(heard.lags_s) == count:
+            await asyncio.sleep(0.001)
+        watching.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await watching
+
+    caplog.set_level(logging.WARNING)
+    asyncio.run(run())
+    assert max(heard.lags_s) >= 0.28
+    assert min(heard.lags_s) >= 0
+    assert heard.beats == len(heard.lags_s)
+    record = next(r for r in caplog.records if r.getMessage() == "the event loop was blocked")
+    assert vars(record)["lag_ms"] >= 280
+
+
+def test_a_dead_scheduler_does_not_beat() -> None:
+    heard = Heard()
+
+    async def run() -> None:
+        watching = asyncio.create_task(watch_event_loop(heard, is_alive=lambda: len(heard.lags_s) <= 2))
+        while len(heard.lags_s) < 5:
+            await asyncio.sleep(0.001)
+        watching.cancel()
+
+    asyncio.run(run())
+    assert heard.beats == 2

@@ -1,0 +1,475 @@
+"""Calls that are answered by a stream: counted once however they end, and closed behind them.
+
+Those that could last for ever are waited for by nobody; those that come to an end are calls like all others.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import time
+import warnings
+import weakref
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import grpc
+import pytest
+
+from mapless.errors import from_rpc_error
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.wire import FieldError
+from mapless_server.errors import FailedPrecondition, Unauthenticated
+from mapless_server.rpc import guard as rpc
+from mapless_server.rpc import sending
+from mapless_server.rpc.call import Call
+from mapless_server.rpc.guard import CallGuard
+from mapless_server.security.principal import Principal
+
+METHOD = "/mapless.v1.LocalizationService/WatchQueries"
+FINITE = "/mapless.v1.LocalizationService/LocalizeProgressively"
+LIMIT_S = 30.0
+
+
+@dataclass
+class Counted:
+    """Calls as they were counted."""
+
+    started: int = 0
+    handled: list[str] = field(default_factory=list)
+
+    def call_started(self, method: str) -> None:
+        assert method in {METHOD, FINITE}
+        self.started += 1
+
+    def call_handled(self, method: str, code: str, seconds: float, trace_id: str) -> None:
+        self.handled.append(code)
+
+
+class Numbers:
+    """Messages that count up to `last`; then it ends, or raises what it was given, or waits for ever."""
+
+    def __init__(self, last: int, then: Exception | str = "end") -> None:
+        self._last, self._then, self._count = last, then, 0
+        self.is_closed = False
+
+    def __aiter__(self) -> Numbers:
+        return self
+
+    async def __anext__(self) -> pb.WatchQueriesResponse:
+        if self._count == self._last:
+            if isinstance(self._then, Exception):
+                raise self._then
+            if self._then == "end":
+                raise StopAsyncIteration
+            await asyncio.Event().wait()
+        self._count += 1
+        return pb.WatchQueriesResponse(missed_count=self._count)
+
+    async def aclose(self) -> None:
+        self.is_closed = True
+
+
+@asynccontextmanager
+async def serving(
+    numbers: Numbers | Exception,
+    counted: Counted,
+    understand: Callable[[bytes], pb.WatchQueriesRequest] = pb.WatchQueriesRequest.FromString,
+    **options: Any,
+) -> AsyncIterator[tuple[Any, CallGuard]]:
+    """A channel to a server whose streams are answered so; of a message that nobody reads it takes 64 KiB."""
+
+    async def watch(request: pb.WatchQueriesRequest, call: Call) -> Numbers:
+        if isinstance(numbers, Exception):
+            raise numbers
+        assert request.scene == "scenes/hall"
+        return numbers
+
+    guard = CallGuard(observer=counted, **options)
+    server = grpc.aio.server()
+    method = grpc.unary_stream_rpc_method_handler(watch, understand, pb.WatchQueriesResponse.SerializeToString)
+    service = {name.rpartition("/")[2]: guard.guarded(name, method) for name in (METHOD, FINITE)}
+    server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("mapless.v1.LocalizationService", service)])
+    port = server.add_insecure_port("127.0.0.1:0")
+    await server.start()
+    try:
+        as_by_default = [("grpc.http2.bdp_probe", 0)]  # or the window would grow with what was read before
+        async with grpc.aio.insecure_channel(f"127.0.0.1:{port}", as_by_default) as channel:
+            yield channel, guard
+    finally:
+        await server.stop(5)
+
+
+def watching(channel: Any, timeout: float | None = LIMIT_S, method: str = METHOD) -> Any:
+    request = pb.WatchQueriesRequest(scene="scenes/hall").SerializeToString()
+    return channel.unary_stream(method)(request, timeout=timeout)
+
+
+async def read(call: Any, seen: list[int] | None = None) -> list[int]:
+    """The messages' numbers; `seen` has them if it fails, too."""
+    seen = [] if seen is None else seen
+    async for data in call:
+        seen += [pb.WatchQueriesResponse.FromString(data).missed_count]
+    return seen
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async def wait() -> None:
+        while not condition():
+            await asyncio.sleep(0.002)
+
+    await asyncio.wait_for(wait(), LIMIT_S)
+
+
+def test_a_stream_that_ends_by_itself() -> None:
+    async def run() -> None:
+        counted, numbers = Counted(), Numbers(5)
+        async with serving(numbers, counted) as (channel, _):
+            call = watching(channel)
+            assert await read(call) == [1, 2, 3, 4, 5]
+            assert "x-request-id" in dict(await call.trailing_metadata())
+        assert (counted.started, counted.handled, numbers.is_closed) == (1, ["OK"], True)
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (FailedPrecondition("not now"), "FAILED_PRECONDITION"),
+        (FieldError("scene", "is none"), "INVALID_ARGUMENT"),
+        (RuntimeError("secret"), "INTERNAL"),
+    ],
+)
+@pytest.mark.parametrize("when", ["at once", "later"])
+def test_a_stream_that_fails(error: Exception, code: str, when: str) -> None:
+    async def run() -> None:
+        counted, numbers = Counted(), Numbers(2, error)
+        async with serving(error if when == "at once" else numbers, counted) as (channel, _):
+            with pytest.raises(grpc.RpcError) as caught:
+                await read(watching(channel))
+            failure = from_rpc_error(caught.value)
+        assert failure.code == code
+        assert failure.request_id
+        assert "secret" not in str(failure)
+        assert counted.handled == [code]
+        assert numbers.is_closed == (when == "later")
+
+    asyncio.run(run())
+
+
+def test_a_caller_who_goes_ends_it() -> None:
+    async def run() -> None:
+        counted, numbers = Counted(), Numbers(1, "wait")
+        async with serving(numbers, counted) as (channel, _):
+            call = watching(channel)
+            await call.initial_metadata()
+            await call.read()
+            call.cancel()
+            await until(lambda: numbers.is_closed)
+            await until(lambda: counted.handled == ["CANCELLED"])
+
+    asyncio.run(run())
+
+
+def test_a_caller_who_reads_nothing_and_goes_ends_it() -> None:
+    async def run() -> None:
+        counted, numbers = Counted(), Numbers(10**9, "wait")
+        async with serving(numbers, counted) as (channel, _):
+            call = watching(channel)
+            await call.initial_metadata()
+            await asyncio.sleep(0.1)  # until what is under way fills all there is room for
+            call.cancel()
+            await until(lambda: numbers.is_closed)
+
+    asyncio.run(run())
+
+
+class Photographs(Numbers):
+    """Messages that are larger than what a connection takes before somebody reads."""
+
+    async def __anext__(self) -> pb.WatchQueriesResponse:
+        await asyncio.sleep(0.001)
+        message = await super().__anext__()
+        message.image = bytes(2**20)
+        return message
+
+
+@pytest.mark.parametrize("how", ["cancels", "closes its channel", "reaches its deadline"])
+def test_a_watcher_who_leaves_while_a_photograph_is_sent_is_no_fault_of_the_server(
+    how: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def run() -> None:
+        counted, numbers = Counted(), Photographs(10**9)
+        async with serving(numbers, counted) as (channel, _):
+            call = watching(channel, 1.0 if how == "reaches its deadline" else LIMIT_S)
+            await call.initial_metadata()
+            await asyncio.sleep(0.3)  # nobody reads: the server waits in the middle of a message
+            if how == "cancels":
+                call.cancel()
+            elif how == "closes its channel":
+                await channel.close()
+            await until(lambda: len(counted.handled) == 1)
+        assert numbers.is_closed
+        assert counted.handled == ["DEADLINE_EXCEEDED" if how == "reaches its deadline" else "CANCELLED"]
+
+    with caplog.at_level("WARNING"):
+        asyncio.run(run())
+    assert not caplog.records
+
+
+def test_it_lasts_beyond_the_deadline_of_other_calls_and_ends_at_its_own() -> None:
+    async def run() -> None:
+        counted, numbers = Counted(), Numbers(0, "wait")
+        async with serving(numbers, counted, default_deadline_s=0.2, max_deadline_s=0.3) as (channel, _):
+            call = watching(channel, timeout=None)
+            await call.initial_metadata()
+            await asyncio.sleep(0.5)
+            assert not numbers.is_closed
+            call.cancel()
+            await until(lambda: numbers.is_closed)
+            with pytest.raises(grpc.RpcError) as caught:
+                await read(watching(channel, timeout=0.4))
+            assert from_rpc_error(caught.value).code == "DEADLINE_EXCEEDED"
+            await until(lambda: len(counted.handled) == 2)
+
+    asyncio.run(run())
+
+
+def test_whose_message_does_not_come_is_told_so_without_a_deadline_too() -> None:
+    async def run() -> None:
+        counted = Counted()
+        async with serving(Numbers(0), counted, default_deadline_s=0.2) as (channel, _):
+            call = channel.stream_stream(METHOD)()
+            with pytest.raises(grpc.RpcError) as caught:
+                await call.read()
+            assert from_rpc_error(caught.value).reason == "MESSAGE_LATE"
+        assert counted.handled == ["DEADLINE_EXCEEDED"]
+
+    asyncio.run(run())
+
+
+def test_nobody_waits_for_its_end() -> None:
+    async def run() -> None:
+        async with serving(Numbers(0, "wait"), Counted()) as (channel, guard):
+            call = watching(channel)
+            await call.initial_metadata()
+            start_s = time.monotonic()
+            await guard.wait_until_idle(LIMIT_S)
+            assert time.monotonic() - start_s < LIMIT_S / 2
+            call.cancel()
+
+    asyncio.run(run())
+
+
+def test_a_caller_who_may_not_any_more_sees_nothing_more() -> None:
+    allowed = [True, True, True, True, False]  # at the door, with the message, and before each that is sent
+
+    def authenticate(*_: Any) -> Principal:
+        if not allowed.pop(0):
+            raise Unauthenticated("it has been revoked", reason="TOKEN_INVALID")
+        return Principal()
+
+    async def run() -> None:
+        counted, numbers, seen = Counted(), Numbers(9), list[int]()
+        async with serving(numbers, counted, authenticate=authenticate) as (channel, _):
+            with pytest.raises(grpc.RpcError) as caught:
+                await read(watching(channel), seen)
+            assert from_rpc_error(caught.value).reason == "TOKEN_INVALID"
+        assert seen == [1, 2]
+        assert (counted.handled, numbers.is_closed) == (["UNAUTHENTICATED"], True)
+
+    asyncio.run(run())
+
+
+class Large(Numbers):
+    """Messages that are more together than a connection takes before somebody reads."""
+
+    async def __anext__(self) -> pb.WatchQueriesResponse:
+        message = await super().__anext__()
+        message.image = bytes(3_000_000)
+        return message
+
+
+class Asked:
+    """What a message is understood as."""
+
+    scene = "scenes/hall"
+
+
+class TestStreamsThatComeToAnEnd:
+    def test_all_that_is_sent_comes_and_they_are_counted(self) -> None:
+        async def run() -> None:
+            counted, numbers = Counted(), Numbers(2)
+            async with serving(numbers, counted) as (channel, _):
+                call = watching(channel, method=FINITE)
+                assert await read(call) == [1, 2]
+                assert "x-request-id" in dict(await call.trailing_metadata())
+            assert (counted.started, counted.handled, numbers.is_closed) == (1, ["OK"], True)
+
+        asyncio.run(run())
+
+    @pytest.mark.parametrize("options", [{"default_deadline_s": 0.3}, {"max_deadline_s": 0.3}])
+    def test_their_deadline_is_that_of_unary_calls(self, options: dict[str, Any]) -> None:
+        async def run() -> None:
+            counted, numbers, seen = Counted(), Numbers(1, "wait"), list[int]()
+            async with serving(numbers, counted, **options) as (channel, _):
+                with pytest.raises(grpc.RpcError) as caught:
+                    await read(watching(channel, LIMIT_S if "max_deadline_s" in options else None, FINITE), seen)
+                failure = from_rpc_error(caught.value)
+                await until(lambda: numbers.is_closed)
+            assert (failure.code, failure.reason, seen) == ("DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED", [1])
+            assert failure.request_id
+            assert counted.handled == ["DEADLINE_EXCEEDED"]
+
+        asyncio.run(run())
+
+    def test_the_server_waits_for_their_end(self) -> None:
+        async def run() -> None:
+            numbers = Numbers(1, "wait")
+            async with serving(numbers, Counted()) as (channel, guard):
+                call = watching(channel, method=FINITE)
+                await call.read()
+                idle = asyncio.ensure_future(guard.wait_until_idle(LIMIT_S))
+                await asyncio.sleep(0.05)
+                assert not idle.done()
+                call.cancel()
+                await asyncio.wait_for(idle, LIMIT_S)
+                assert numbers.is_closed
+
+        asyncio.run(run())
+
+    def test_an_error_after_a_message_is_told_with_details(self) -> None:
+        async def run() -> None:
+            counted, seen = Counted(), list[int]()
+            async with serving(Numbers(1, FailedPrecondition("not now")), counted) as (channel, _):
+                with pytest.raises(grpc.RpcError) as caught:
+                    await read(watching(channel, method=FINITE), seen)
+            assert (from_rpc_error(caught.value).reason, seen) == ("FAILED_PRECONDITION", [1])
+
+        asyncio.run(run())
+
+    def test_what_was_made_in_time_waits_for_a_reader_who_takes_longer(self, caplog: pytest.LogCaptureFixture) -> None:
+        """The servicer is through with it long before, and the caller is told no other end later."""
+
+        async def run() -> None:
+            counted, numbers = Counted(), Large(8)
+            async with serving(numbers, counted, default_deadline_s=0.2) as (channel, _):
+                call = watching(channel, None, FINITE)
+                await call.initial_metadata()
+                await until(lambda: numbers.is_closed)
+                await asyncio.sleep(0.4)
+                assert not counted.handled
+                assert await read(call) == [*range(1, 9)]
+            assert counted.handled == ["OK"]
+
+        with caplog.at_level("WARNING"):
+            asyncio.run(run())
+        assert not caplog.records
+
+    def test_the_request_does_not_wait_for_who_reads_slowly(self) -> None:
+        """It is a photograph."""
+        requests: list[weakref.ref[Asked]] = []
+
+        def understand(data: bytes) -> Any:
+            asked = Asked()
+            requests.append(weakref.ref(asked))
+            return asked
+
+        async def run() -> None:
+            counted, numbers = Counted(), Large(8)
+            async with serving(numbers, counted, understand) as (channel, _):
+                call = watching(channel, method=FINITE)
+                await until(lambda: numbers.is_closed)
+                assert [it() for it in requests] == [None]
+                assert not counted.handled
+                assert await read(call) == [*range(1, 9)]
+
+        asyncio.run(run())
+
+    def test_one_whose_time_is_over_before_it_begins_leaves_nothing_behind(self) -> None:
+        def authenticate(*_: Any) -> Principal:
+            time.sleep(0.15)  # at the door, and with the message
+            return Principal()
+
+        async def run() -> None:
+            late = serving(Numbers(1), Counted(), default_deadline_s=0.2, authenticate=authenticate)
+            async with late as (channel, _):
+                with pytest.raises(grpc.RpcError) as caught:
+                    await read(watching(channel, None, FINITE))
+            assert from_rpc_error(caught.value).reason == "DEADLINE_EXCEEDED"
+
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            asyncio.run(run())
+            gc.collect()
+        assert not told
+
+    def test_who_was_let_in_is_answered(self) -> None:
+        asked = []
+
+        def authenticate(*_: Any) -> Principal:
+            asked.append(1)
+            return Principal()
+
+        async def run() -> None:
+            async with serving(Numbers(2), Counted(), authenticate=authenticate) as (channel, _):
+                assert await read(watching(channel, method=FINITE)) == [1, 2]
+            assert len(asked) == 2  # at the door, and with the message
+
+        asyncio.run(run())
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> Iterator[None]:
+    """A server that waits for no reader, and has nothing to complain of."""
+    for limit in ("SEND_LIMIT_S", "ENDLESS_SEND_LIMIT_S"):
+        monkeypatch.setattr(rpc, limit, 0.1)
+    monkeypatch.setattr(sending, "_STATUS_LIMIT_S", 0.1)
+    with caplog.at_level("WARNING"):
+        yield
+    assert not caplog.records
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("method", [METHOD, FINITE])
+class TestWhoReadsTooSlowly:
+    """No deadline ends it: its messages were made in time, and the caller gave none."""
+
+    @pytest.mark.parametrize("read_before", [0, 1])
+    def test_is_told_so_when_it_reads_again_and_has_no_call_meanwhile(self, method: str, read_before: int) -> None:
+        async def run() -> None:
+            counted, numbers = Counted(), Large(8)
+            async with serving(numbers, counted) as (channel, guard):
+                before = len(asyncio.all_tasks())
+                call, seen = watching(channel, None, method), list[int]()
+                for _ in range(read_before):
+                    await anext(aiter(call))
+                await until(lambda: len(counted.handled) == 1)
+                await guard.wait_until_idle(LIMIT_S)
+                assert numbers.is_closed
+                with pytest.raises(grpc.RpcError) as caught:
+                    await asyncio.wait_for(read(call, seen), LIMIT_S)
+                failure = from_rpc_error(caught.value)
+                await until(lambda: len(asyncio.all_tasks()) == before + 1)  # the one that asks
+            assert (failure.code, failure.reason) == ("DEADLINE_EXCEEDED", "READ_LATE")
+            assert failure.request_id
+            assert seen == [read_before + 1]
+            assert counted.handled == ["DEADLINE_EXCEEDED"]
+
+        asyncio.run(run())
+
+    def test_leaves_nothing_behind_when_it_never_reads_and_goes(self, method: str) -> None:
+        async def run() -> None:
+            counted = Counted()
+            async with serving(Large(8), counted) as (channel, _):
+                before = len(asyncio.all_tasks())
+                call = watching(channel, None, method)
+                await until(lambda: len(counted.handled) == 1)
+                call.cancel()
+                await until(lambda: len(asyncio.all_tasks()) == before + 1)  # the one that asks
+            assert counted.handled == ["DEADLINE_EXCEEDED"]
+
+        asyncio.run(run())

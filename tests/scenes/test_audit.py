@@ -1,0 +1,237 @@
+"""The audit names the planted fault, with its kind and amount, and leaves the others in peace."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import SceneOptions, make_scene
+
+from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless_server.method.views import Features, PosedView
+from mapless_server.scenes.audit import AuditOptions, PairMatches, Verdict, audit_references, surroundings_of
+from mapless_server.scenes.audit.auditor import Auditor
+from mapless_server.scenes.audit.resection import with_focal
+from mapless_server.scenes.audit.surroundings import Gone, PosedName, Surroundings, places_of
+from mapless_server.scenes.audit.verdict import ReferenceAudit
+
+SCENE = SceneOptions(point_count=250, reference_count=6, baseline_m=0.4, noise_px=0.3, distractor_count=40)
+VICTIM = 2
+
+
+@pytest.fixture(scope="module")
+def references() -> list[PosedView]:
+    return list(make_scene(np.random.default_rng(7), SCENE).references)
+
+
+@pytest.fixture(scope="module")
+def pairs() -> PairMatches:
+    """Shared, because matches depend on the photographs alone and no test alters these under the same key."""
+    return PairMatches()
+
+
+def audit(references: list[PosedView], pairs: PairMatches) -> list[ReferenceAudit]:
+    return audit_references([r.name for r in references], surroundings_of(references), pairs=pairs)
+
+
+def altered(references: list[PosedView], index: int, reference: PosedView) -> list[PosedView]:
+    return [reference if i == index else r for i, r in enumerate(references)]
+
+
+def moved(reference: PosedView, by_m: tuple[float, float, float]) -> PosedView:
+    pose = reference.world_from_camera
+    return replace(reference, world_from_camera=RigidTransform(pose.rotation, pose.translation + by_m))
+
+
+def only_fault(audits: list[ReferenceAudit], index: int) -> ReferenceAudit:
+    """The audit of the only reference that is not consistent."""
+    assert [a.verdict for i, a in enumerate(audits) if i != index] == [Verdict.CONSISTENT] * (len(audits) - 1)
+    return audits[index]
+
+
+def test_nothing_is_found_where_nothing_is_wrong(references: list[PosedView], pairs: PairMatches) -> None:
+    audits = audit(references, pairs)
+    assert {a.verdict for a in audits} == {Verdict.CONSISTENT}
+    assert max(a.position_offset_m or 0 for a in audits) < 0.01
+    assert max(a.error_px or 0 for a in audits) < 1.0
+
+
+@pytest.mark.parametrize("by_m", [(0.05, 0.0, 0.0), (0.0, 0.0, -0.05), (0.4, -0.3, 0.2)])
+def test_a_moved_pose_is_named_with_its_distance(
+    references: list[PosedView], pairs: PairMatches, by_m: tuple[float, float, float]
+) -> None:
+    found = only_fault(audit(altered(references, VICTIM, moved(references[VICTIM], by_m)), pairs), VICTIM)
+    assert found.verdict is Verdict.WRONG_POSE
+    assert found.position_offset_m == pytest.approx(np.linalg.norm(by_m), abs=0.01)
+    assert found.rotation_offset_deg is not None
+    assert found.rotation_offset_deg < 0.2
+
+
+@pytest.mark.parametrize("axis", [(0.6, 0.8, 0.0), (0.0, 0.0, 1.0)])
+def test_a_turned_pose_is_named_with_its_angle(
+    references: list[PosedView], pairs: PairMatches, axis: tuple[float, float, float]
+) -> None:
+    pose = references[VICTIM].world_from_camera
+    turned = RigidTransform(rotation_from_vector(np.radians(2) * np.array(axis)) @ pose.rotation, pose.translation)
+    victim = replace(references[VICTIM], world_from_camera=turned)
+    found = only_fault(audit(altered(references, VICTIM, victim), pairs), VICTIM)
+    assert found.verdict is Verdict.WRONG_POSE
+    assert found.rotation_offset_deg == pytest.approx(2, abs=0.1)
+
+
+@pytest.mark.parametrize("ratio", [0.95, 1.05])
+def test_a_wrong_focal_length_is_named_with_what_puts_it_right(
+    references: list[PosedView], pairs: PairMatches, ratio: float
+) -> None:
+    view = references[VICTIM].view
+    victim = replace(references[VICTIM], view=replace(view, camera=with_focal(view.camera, ratio)))
+    found = only_fault(audit(altered(references, VICTIM, victim), pairs), VICTIM)
+    assert found.verdict is Verdict.WRONG_INTRINSICS
+    assert found.focal_ratio == pytest.approx(1 / ratio, abs=0.005)
+    assert f"{100 * (ratio - 1):+.1f} %" in found.message
+
+
+def test_wrong_pose_and_focal_length_together_are_told_apart(references: list[PosedView], pairs: PairMatches) -> None:
+    view = references[VICTIM].view
+    victim = replace(
+        moved(references[VICTIM], (0.0, 0.3, 0.0)), view=replace(view, camera=with_focal(view.camera, 1.1))
+    )
+    found = only_fault(audit(altered(references, VICTIM, victim), pairs), VICTIM)
+    assert found.verdict is Verdict.WRONG_POSE_AND_INTRINSICS
+    assert found.position_offset_m == pytest.approx(0.3, abs=0.03)
+    assert found.focal_ratio == pytest.approx(1 / 1.1, abs=0.01)
+
+
+def test_swapped_photographs_name_each_other(references: list[PosedView], pairs: PairMatches) -> None:
+    a, b = references[1], references[4]
+    swapped = altered(references, 1, replace(a, view=b.view, key=b.key))
+    swapped = altered(swapped, 4, replace(b, view=a.view, key=a.key))
+    audits = audit(swapped, pairs)
+    assert [x.verdict for i, x in enumerate(audits) if i not in (1, 4)] == [Verdict.CONSISTENT] * 4
+    assert (audits[1].verdict, audits[1].other) == (Verdict.SWAPPED_IMAGE, b.name)
+    assert (audits[4].verdict, audits[4].other) == (Verdict.SWAPPED_IMAGE, a.name)
+
+
+def test_a_photograph_stored_twice_is_a_duplicate(references: list[PosedView], pairs: PairMatches) -> None:
+    copy = replace(references[VICTIM], key="copy", name="scenes/synthetic/references/copy")
+    audits = audit([*references, copy], pairs)
+    assert [a.verdict.is_alarm for a in audits] == [False] * 7
+    assert (audits[VICTIM].verdict, audits[VICTIM].other) == (Verdict.DUPLICATE, copy.name)
+    assert (audits[6].verdict, audits[6].other) == (Verdict.DUPLICATE, references[VICTIM].name)
+
+
+def test_a_copy_at_a_wrong_pose_bears_no_witness(references: list[PosedView], pairs: PairMatches) -> None:
+    """Two copies at the same wrong pose would confirm each other."""
+    wrong = moved(references[VICTIM], (0.1, 0.0, 0.0))
+    copy = replace(wrong, key="copy", name="scenes/synthetic/references/copy")
+    audits = audit([*altered(references, VICTIM, wrong), copy], pairs)
+    assert [a.verdict.is_alarm for a in audits] == [i in (VICTIM, 6) for i in range(7)]
+    assert (audits[6].verdict, audits[6].other) == (Verdict.WRONG_POSE, wrong.name)
+    assert audits[6].position_offset_m == pytest.approx(0.1, abs=0.01)
+
+
+def test_where_half_of_a_photograph_shows_something_else_the_scene_has_changed(references: list[PosedView]) -> None:
+    random = np.random.default_rng(1)
+    features = references[VICTIM].view.features
+    left = features.keypoints[:, 0] < references[VICTIM].view.camera.width_px / 2
+    strange = random.standard_normal(features.descriptors.shape).astype(np.float32)
+    strange /= np.linalg.norm(strange, axis=1, keepdims=True)
+    descriptors = np.where(left[:, None], strange, features.descriptors)
+    view = replace(references[VICTIM].view, features=Features(features.keypoints, descriptors, features.sizes_px))
+    victim = replace(references[VICTIM], key="changed", view=view)
+    found = only_fault(audit(altered(references, VICTIM, victim), PairMatches()), VICTIM)
+    assert found.verdict is Verdict.SCENE_CHANGED
+    assert found.changed_share is not None
+    assert 0.35 < found.changed_share < 0.65
+
+
+def test_what_nobody_else_sees_is_unverifiable_and_no_alarm(references: list[PosedView], pairs: PairMatches) -> None:
+    elsewhere = make_scene(np.random.default_rng(99), replace(SCENE, reference_count=2)).references[0]
+    alone = moved(replace(elsewhere, key="alone", name="alone"), (50.0, 0.0, 0.0))
+    audits = audit([*references, alone], pairs)
+    assert [a.verdict for a in audits] == [Verdict.CONSISTENT] * 6 + [Verdict.UNVERIFIABLE]
+    assert not audits[-1].verdict.is_alarm
+    assert audits[-1].position_offset_m is None
+
+
+def test_one_reference_alone_is_unverifiable(references: list[PosedView], pairs: PairMatches) -> None:
+    assert [a.verdict for a in audit(references[:1], pairs)] == [Verdict.UNVERIFIABLE]
+
+
+def test_the_verdict_does_not_depend_on_who_else_is_asked(references: list[PosedView], pairs: PairMatches) -> None:
+    scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
+    together = audit(scene, pairs)
+    neighbour = VICTIM + 1
+    alone = audit_references([scene[neighbour].name], surroundings_of(scene), pairs=pairs)
+    assert alone == [together[neighbour]]
+
+
+def test_the_verdict_does_not_depend_on_where_the_world_begins(references: list[PosedView], pairs: PairMatches) -> None:
+    """UTM coordinates are millions of metres."""
+    scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
+    far = [replace(r, world_from_camera=r.world_from_camera.shifted([4.5e5, 5.4e6, 300.0])) for r in scene]
+    for near, there in zip(audit(scene, pairs), audit(far, pairs), strict=True):
+        assert near.verdict is there.verdict
+        assert near.position_offset_m == pytest.approx(there.position_offset_m, abs=1e-4)
+
+
+def test_references_are_loaded_as_they_are_needed(references: list[PosedView], pairs: PairMatches) -> None:
+    """Of a scene with a far part only the near part is read."""
+    far = [moved(replace(r, name=f"far-{i}"), (1000.0 + i, 0.0, 0.0)) for i, r in enumerate(references)]
+    by_name = {r.name: r for r in [*references, *far]}
+    loaded: list[str] = []
+
+    def load(names: object) -> list[PosedView]:
+        loaded.extend(names)  # type: ignore[arg-type]
+        return [by_name[name] for name in names]  # type: ignore[attr-defined]
+
+    around = Surroundings(places_of([PosedName(r.name, r.world_from_camera) for r in by_name.values()]), load)
+    options = AuditOptions(candidate_count=4, neighbour_count=4)
+    assert audit_references([references[0].name], around, options, pairs)[0].verdict is Verdict.CONSISTENT
+    assert set(loaded) <= {r.name for r in references}
+    assert len(loaded) == len(set(loaded)) == 5
+
+
+def test_a_neighbour_that_cannot_be_loaded_is_no_witness(references: list[PosedView], pairs: PairMatches) -> None:
+    """The verdict is the same as if it had never been there, and it is asked for once."""
+    lost = references[VICTIM + 1].name
+    scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
+    left = {r.name: r for r in scene if r.name != lost}
+    asked: list[str] = []
+
+    def load(names: Sequence[str]) -> list[PosedView]:
+        asked.extend(names)
+        return [left[name] for name in names if name in left]
+
+    around = Surroundings(places_of([PosedName(r.name, r.world_from_camera) for r in scene]), load)
+    names = [r.name for r in scene if r.name != lost]
+    audits = audit_references(names, around, pairs=pairs)
+    assert [a.verdict for a in audits] == [a.verdict for a in audit(list(left.values()), pairs)]
+    assert asked.count(lost) == 1
+    with pytest.raises(Gone):
+        audit_references([lost], around, pairs=pairs)
+
+
+def test_what_is_remembered_of_neighbours_changes_no_verdict(references: list[PosedView], pairs: PairMatches) -> None:
+    scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
+    names = [r.name for r in scene]
+    forgetful = Auditor(surroundings_of(scene), AuditOptions(), pairs, remembered_findings=1)
+    assert [forgetful.audit(name) for name in names] == audit(scene, pairs)
+    assert len(forgetful._findings) == 1
+
+
+def test_senseless_options_are_refused() -> None:
+    with pytest.raises(ValueError, match="senseless"):
+        AuditOptions(position_tolerance_m=0.0)
+
+
+def test_one_among_many_faulty_ones_is_in_doubt_and_never_called_consistent(
+    references: list[PosedView], pairs: PairMatches
+) -> None:
+    """Every second pose is wrong by as much: who is right cannot be told, and that is what is said."""
+    many = [moved(r, (0.1 * (i - 2), 0.15, 0.0)) if i % 2 else r for i, r in enumerate(references)]
+    audits = audit(many, pairs)
+    assert all(a.verdict is not Verdict.CONSISTENT for i, a in enumerate(audits) if i % 2)
+    assert all((a.error_px or 0) < 3 for a in audits if a.verdict is Verdict.CONSISTENT)

@@ -1,0 +1,234 @@
+"""The index of a scene: equal to a brute-force twin under any changes, and consistent for readers while it changes."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import random_for, unit_rows
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.scenes.retrieval.index import SceneIndex
+from mapless_server.store.records import IndexedReference, SceneChanges
+
+DIMENSION = 24
+SIMILARITY_TOLERANCE = 5e-3
+"""Of whole numbers of 8 bits, with as few numbers as here."""
+
+POOL = unit_rows(random_for("index").standard_normal((64, DIMENSION))).astype(np.float32)
+QUERY = POOL[0]
+
+
+def pose(number: int) -> RigidTransform:
+    return RigidTransform(rotation_from_vector([0.01 * number, 0.3, 0.0]), np.array([number, 2.0, -number]))
+
+
+def reference(number: int, described: bool = True, name: str | None = None) -> IndexedReference:
+    vector = POOL[number % len(POOL)] if described else None
+    return IndexedReference(name or f"id-{number}", f"key-{number}", pose(number), vector)
+
+
+def whole(*references: IndexedReference, generation: int = 1) -> SceneChanges:
+    return SceneChanges(generation, references, frozenset(), True)
+
+
+def change(
+    generation: int, added: tuple[IndexedReference, ...] = (), removed: frozenset[str] = frozenset()
+) -> SceneChanges:
+    return SceneChanges(generation, added, removed, False)
+
+
+@dataclass
+class SlowIndex:
+    """The same in words."""
+
+    by_key: dict[str, IndexedReference] = field(default_factory=dict)
+
+    def apply(self, changes: SceneChanges) -> None:
+        if changes.is_whole:
+            self.by_key = {}
+        for key in changes.removed:
+            self.by_key.pop(key, None)
+        for it in changes.added:
+            self.by_key[it.key] = it
+
+
+def content(index: SceneIndex) -> dict[str, tuple[str, float | None, Array]]:
+    """By key: id, similarity with the query, pose."""
+    entries = index.entries()
+    rows = entries.rows()
+    found = {}
+    for row, similarity in zip(rows.tolist(), entries.similarities(QUERY, rows).tolist(), strict=True):
+        reference_id, key, world_from_camera = entries.reference(row)
+        found[key] = (reference_id, None if np.isnan(similarity) else similarity, world_from_camera.matrix())
+    assert len(found) == len(rows) == len(entries)
+    return found
+
+
+def assert_same(index: SceneIndex, slow: SlowIndex) -> None:
+    found = content(index)
+    assert found.keys() == slow.by_key.keys()
+    for key, (reference_id, similarity, matrix) in found.items():
+        expected = slow.by_key[key]
+        assert reference_id == expected.reference_id
+        assert reference_id in index.entries()
+        np.testing.assert_array_equal(matrix, expected.world_from_camera.matrix())
+        if expected.descriptor is None:
+            assert similarity is None
+        else:
+            assert similarity == pytest.approx(float(expected.descriptor @ QUERY), abs=SIMILARITY_TOLERANCE)
+    undescribed = {(it.reference_id, it.key) for it in slow.by_key.values() if it.descriptor is None}
+    assert set(index.entries().undescribed()) == undescribed
+
+
+STEPS = st.lists(
+    st.tuples(
+        st.lists(st.tuples(st.integers(0, 400), st.booleans()), max_size=30, unique_by=lambda it: it[0]),
+        st.sets(st.integers(0, 400), max_size=60),
+        st.integers(0, 9),
+    ),
+    max_size=12,
+)
+
+
+@settings(deadline=None, max_examples=40)
+@given(STEPS)
+def test_any_changes_leave_what_they_leave_in_a_dictionary(
+    steps: list[tuple[list[tuple[int, bool]], set[int], int]],
+) -> None:
+    """Adds (some without descriptor), removals (some of what never was), descriptors that come later, scenes anew."""
+    index, slow = SceneIndex(DIMENSION), SlowIndex()
+    gone: set[int] = set()
+    for generation, (adds, removes, kind) in enumerate(steps):
+        present = {int(key.removeprefix("key-")): it for key, it in slow.by_key.items()}
+        fresh = tuple(reference(n, described) for n, described in adds if n not in present and n not in gone)
+        late = tuple(reference(n) for n, it in present.items() if it.descriptor is None and n not in removes)
+        added = fresh + (late if kind < 5 else ())
+        changes = SceneChanges(generation, added, frozenset(f"key-{n}" for n in removes if n in present), kind == 0)
+        gone |= removes | (set(present) if kind == 0 else set())
+        index.apply(changes)
+        slow.apply(changes)
+        assert index.generation == generation
+        assert_same(index, slow)
+
+
+def test_many_adds_and_removals_in_blocks() -> None:
+    """Enough for the arrays to grow several times and to be compacted."""
+    index, slow = SceneIndex(DIMENSION), SlowIndex()
+    for generation in range(10):
+        added = tuple(reference(100 * generation + i) for i in range(100))
+        removed = frozenset(list(slow.by_key)[:90])
+        for target in (index, slow):
+            target.apply(change(generation, added, removed))
+        assert_same(index, slow)
+    assert len(index.entries()) == 1000 - 9 * 90
+    for target in (index, slow):
+        target.apply(change(10, removed=frozenset(list(slow.by_key)[:-5])))
+    assert_same(index, slow)
+
+
+def test_entries_stay_as_they_were() -> None:
+    index = SceneIndex(DIMENSION)
+    index.apply(whole(*(reference(i, described=i > 0) for i in range(300))))
+    before = index.entries()
+    rows, similarities = before.rows(), before.similarities(QUERY, before.rows())
+    index.describe({"key-0": POOL[5]})
+    index.apply(change(2, (reference(1000, name="id-7"),), frozenset(f"key-{i}" for i in range(250))))
+    np.testing.assert_array_equal(before.rows(), rows)
+    np.testing.assert_array_equal(before.similarities(QUERY, rows), similarities)
+    assert before.generation == 1
+    assert before.undescribed() == [("id-0", "key-0")]
+    assert before.reference(before.rows({"id-7"})[0])[1] == "key-7"
+    now = index.entries()
+    assert now.generation == 2
+    assert "id-3" not in now
+    assert now.reference(now.rows({"id-7"})[0])[1] == "key-1000"
+
+
+def test_an_id_that_is_used_again_is_the_new_reference_now_and_the_old_one_in_older_entries() -> None:
+    index = SceneIndex(DIMENSION)
+    index.apply(whole(*(reference(i) for i in range(10))))
+    before = index.entries()
+    index.apply(change(2, (reference(50, name="id-3"),), frozenset({"key-3"})))
+    assert before.reference(before.rows({"id-3"})[0])[1] == "key-3"
+    assert index.entries().reference(index.entries().rows({"id-3"})[0])[1] == "key-50"
+    assert len(index.entries()) == 10
+
+
+def test_readers_see_one_generation_whole_while_changes_are_applied() -> None:
+    """Of every generation there are ten references that stand at x = generation; never some of them."""
+    index = SceneIndex(DIMENSION)
+    torn: list[str] = []
+    done = threading.Event()
+
+    def references(generation: int) -> tuple[IndexedReference, ...]:
+        at = RigidTransform(np.eye(3), np.array([generation, 0.0, 0.0]))
+        vector = POOL[generation % len(POOL)]
+        return tuple(IndexedReference(f"{i}", f"{generation}-{i}", at, vector) for i in range(10))
+
+    def read() -> None:
+        while not done.is_set():
+            entries = index.entries()
+            rows = entries.rows()
+            expected = float(POOL[entries.generation % len(POOL)] @ QUERY)
+            similar = np.allclose(entries.similarities(QUERY, rows), expected, atol=SIMILARITY_TOLERANCE)
+            here = (entries.centres(rows)[:, 0] == entries.generation).all()
+            if not (len(rows) == 10 and len(entries.rows([str(i) for i in range(10)])) == 10 and similar and here):
+                torn.append(f"generation {entries.generation}: {len(rows)} rows")
+
+    index.apply(whole(*references(0), generation=0))
+    readers = [threading.Thread(target=read) for _ in range(3)]
+    for reader in readers:
+        reader.start()
+    for generation in range(1, 600):
+        index.apply(change(generation, references(generation), frozenset(f"{generation - 1}-{i}" for i in range(10))))
+    done.set()
+    for reader in readers:
+        reader.join()
+    assert not torn
+
+
+def test_similarities_are_the_same_gathered_or_in_one_go() -> None:
+    index = SceneIndex(DIMENSION)
+    index.apply(whole(*(reference(i) for i in range(64))))
+    entries = index.entries()
+    rows = entries.rows()
+    every = entries.similarities(QUERY, rows)
+    for few in (rows[::7], rows[:1], rows[5:20], rows[:0]):
+        np.testing.assert_allclose(entries.similarities(QUERY, few), every[few], rtol=1e-6, atol=1e-7)
+
+
+def test_a_blank_photograph_resembles_nothing_and_is_described() -> None:
+    index = SceneIndex(DIMENSION)
+    blank = IndexedReference("blank", "blank", pose(1), np.zeros(DIMENSION, np.float32))
+    index.apply(whole(blank, reference(0)))
+    entries = index.entries()
+    assert entries.similarities(QUERY, entries.rows()).tolist() == pytest.approx([0.0, 1.0], abs=SIMILARITY_TOLERANCE)
+    assert entries.undescribed() == []
+
+
+def test_a_descriptor_of_another_length_is_refused_and_changes_nothing() -> None:
+    index = SceneIndex(DIMENSION)
+    index.apply(whole(reference(0, described=False)))
+    wrong = IndexedReference("b", "b", pose(1), np.ones(3, np.float32))
+    with pytest.raises(ValueError, match=r"\(3,\)"):
+        index.apply(change(2, (reference(5), wrong)))
+    with pytest.raises(ValueError, match=r"\(3,\)"):
+        index.describe({"key-0": np.ones(3, np.float32)})
+    assert index.generation == 1
+    assert index.entries().undescribed() == [("id-0", "key-0")]
+
+
+def test_memory_follows_what_is_held() -> None:
+    index = SceneIndex(512)
+    vector = np.full(512, 512**-0.5, np.float32)
+    many = tuple(IndexedReference(f"reference-{i:06d}", f"{i:032x}", pose(0), vector) for i in range(4000))
+    index.apply(whole(*many))
+    per_reference = index.size_bytes / len(many)
+    assert 512 + 96 < per_reference < 512 + 600
+    index.apply(change(2, removed=frozenset(it.key for it in many[:-10])))
+    assert index.size_bytes < 0.1 * per_reference * len(many)

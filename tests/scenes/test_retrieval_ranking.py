@@ -1,0 +1,254 @@
+"""The ranking of references: its laws on planted similarities, places and headings, against a slow twin."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scenes import random_for, unit_rows
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.scenes.retrieval.index import Entries, SceneIndex
+from mapless_server.scenes.retrieval.narrowing import Cone, Narrowing, Sphere
+from mapless_server.scenes.retrieval.ranking import RankedReference, RankOptions, rank_references, spread
+from mapless_server.store.records import IndexedReference, SceneChanges
+
+DIMENSION = 16
+QUERY = np.eye(DIMENSION, dtype=np.float32)[0]
+AHEAD = np.array([0.0, 0.0, 1.0])
+UNTHINNED = RankOptions(nearby_weight=1.0, same_place_m=0.0)
+
+
+def with_similarity(similarity: float) -> NDArray[np.float32]:
+    """A unit vector of that cosine with the query's."""
+    vector = np.zeros(DIMENSION, np.float32)
+    vector[:2] = similarity, math.sqrt(1 - similarity**2)
+    return vector
+
+
+def planted(
+    similarities: list[float | None], x_m: list[float] | None = None, turned_deg: list[float] | None = None
+) -> Entries:
+    """References "0", "1", ... on a line, looking along z, turned about y."""
+    n = len(similarities)
+    places, turns = x_m or [10.0 * i for i in range(n)], turned_deg or [0.0] * n
+    references = [
+        IndexedReference(
+            str(i),
+            f"key-{i}",
+            RigidTransform(rotation_from_vector([0.0, math.radians(turn), 0.0]), np.array([x, 0.0, 0.0])),
+            None if similarity is None else with_similarity(similarity),
+        )
+        for i, (similarity, x, turn) in enumerate(zip(similarities, places, turns, strict=True))
+    ]
+    index = SceneIndex(DIMENSION)
+    index.apply(SceneChanges(1, tuple(references), frozenset(), True))
+    return index.entries()
+
+
+def ids(ranked: list[RankedReference]) -> str:
+    return " ".join(it.reference_id for it in ranked)
+
+
+class TestOrder:
+    def test_the_most_similar_comes_first(self) -> None:
+        ranked = rank_references(planted([0.2, 0.9, -0.1, 0.5]), QUERY, 10)
+        assert ids(ranked) == "1 3 0 2"
+        assert [it.similarity for it in ranked] == pytest.approx([0.9, 0.5, 0.2, -0.1], abs=0.01)
+        assert ranked[0].key == "key-1"
+        assert ranked[0].world_from_camera.translation.tolist() == [10.0, 0.0, 0.0]
+
+    @pytest.mark.parametrize("count", [0, 1, 3, 4, 100])
+    def test_never_more_than_there_are(self, count: int) -> None:
+        assert len(rank_references(planted([0.1, 0.2, 0.3, 0.4]), QUERY, count)) == min(count, 4)
+
+    def test_an_empty_scene_has_none(self) -> None:
+        assert rank_references(planted([]), QUERY, 10) == []
+
+    def test_those_without_descriptor_come_last_the_nearest_to_the_prior_first(self) -> None:
+        entries = planted([None, -0.9, None, None], x_m=[9.0, 0.0, 1.0, 4.0])
+        near = Narrowing(Sphere(np.zeros(3), 1.0))
+        ranked = rank_references(entries, QUERY, 4, near)
+        assert ids(ranked) == "1 2 3 0"
+        assert [math.isnan(it.similarity) for it in ranked] == [False, True, True, True]
+
+    def test_a_photograph_without_descriptor_ranks_by_place(self) -> None:
+        entries = planted([0.9, 0.8, 0.7], x_m=[5.0, 1.0, 3.0])
+        assert ids(rank_references(entries, None, 3, Narrowing(Sphere(np.zeros(3), 1.0)))) == "1 2 0"
+        assert ids(rank_references(entries, None, 3)) == "0 1 2"
+
+    def test_only_named_references_are_ranked_and_unknown_names_passed_over(self) -> None:
+        entries = planted([0.2, 0.9, -0.1, 0.5])
+        assert ids(rank_references(entries, QUERY, 10, among=["0", "3", "elsewhere"])) == "3 0"
+        assert rank_references(entries, QUERY, 10, among=[]) == []
+
+    def test_a_large_scene_is_ranked_as_by_sorting(self) -> None:
+        """Only a pool is looked at; without thinning that must not show."""
+        similarity = np.round(random_for("large").uniform(-1, 1, 3000), 2)
+        entries = planted(similarity.tolist(), x_m=[0.0] * 3000)
+        exact = entries.similarities(QUERY, entries.rows())
+        expected = np.argsort(-exact, kind="stable")[:7].tolist()
+        options = replace(UNTHINNED, pool=1, smallest_pool=1)
+        assert [int(it.reference_id) for it in rank_references(entries, QUERY, 7, options=options)] == expected
+
+
+class TestNarrowing:
+    def test_a_position_prior_keeps_what_is_within_radius_and_margin(self) -> None:
+        entries = planted([0.1, 0.2, 0.3, 0.4], x_m=[0.0, 11.9, 12.1, 50.0])
+        prior = Narrowing(Sphere(np.zeros(3), 2.0), margin_m=10.0)
+        assert ids(rank_references(entries, QUERY, 10, prior)) == "1 0"
+
+    def test_a_heading_keeps_what_looks_the_same_way(self) -> None:
+        entries = planted([0.1, 0.2, 0.3, 0.4], turned_deg=[0.0, 29.0, -31.0, 180.0])
+        heading = Narrowing(heading=Cone(AHEAD, 30.0), margin_deg=0.0)
+        assert ids(rank_references(entries, QUERY, 10, heading)) == "1 0"
+
+    def test_both_must_hold(self) -> None:
+        entries = planted([0.1, 0.2, 0.3], x_m=[0.0, 0.0, 99.0], turned_deg=[0.0, 90.0, 0.0])
+        both = Narrowing(Sphere(np.zeros(3), 1.0), Cone(AHEAD, 20.0), margin_m=0.0, margin_deg=0.0)
+        assert ids(rank_references(entries, QUERY, 10, both)) == "0"
+
+    def test_half_a_turn_keeps_all(self) -> None:
+        entries = planted([0.1, 0.2, 0.3], turned_deg=[0.0, 90.0, 180.0])
+        assert len(rank_references(entries, QUERY, 10, Narrowing(heading=Cone(AHEAD, 180.0)))) == 3
+
+    def test_nothing_left_is_an_empty_answer(self) -> None:
+        far = Narrowing(Sphere(np.array([1e6, 0.0, 0.0]), 1.0))
+        assert rank_references(planted([0.9]), QUERY, 10, far) == []
+
+
+class TestThinning:
+    def test_a_neighbour_loses_half_of_its_lead(self) -> None:
+        """With a typical 0.2, of 0.8 beside 0.9 there is left 0.5: less than 0.55, more than 0.45."""
+        options = RankOptions(apart_m=0.3, nearby_weight=0.5)
+        for elsewhere, expected in ((0.55, [0, 2, 1]), (0.45, [0, 1, 2])):
+            axes = np.tile(AHEAD, (3, 1))
+            centres = np.array([[0.0, 0, 0], [0.2, 0, 0], [5, 0, 0]])
+            assert spread([0.9, 0.8, elsewhere], centres, axes, 3, 0.2, options) == expected
+
+    def test_one_that_looks_elsewhere_is_no_neighbour(self) -> None:
+        options = RankOptions(apart_deg=30.0, nearby_weight=0.0)
+        centres = np.zeros((3, 3))
+        turned = np.array([[0, 0, 1.0], [0, 0, 1.0], [1.0, 0, 0]])
+        assert spread([0.9, 0.8, 0.7], centres, turned, 2, 0.0, options) == [0, 2]
+
+    def test_what_is_below_typical_is_not_raised(self) -> None:
+        centres, axes = np.array([[0.0, 0, 0], [0.1, 0, 0], [5, 0, 0]]), np.tile(AHEAD, (3, 1))
+        assert spread([0.9, 0.1, 0.2], centres, axes, 3, 0.5, RankOptions(nearby_weight=0.0)) == [0, 2, 1]
+
+    def test_neighbours_are_thinned_in_the_ranking_too(self) -> None:
+        entries = planted([0.9, 0.89, 0.8, 0.1, 0.1, 0.1, 0.1], x_m=[0.0, 0.1, 5.0, 20.0, 30.0, 40.0, 50.0])
+        assert ids(rank_references(entries, QUERY, 2)) == "0 2"
+        assert ids(rank_references(entries, QUERY, 2, options=UNTHINNED)) == "0 1"
+
+    def test_of_a_camera_that_stood_still_few_are_chosen_before_others(self) -> None:
+        """Three hundred alike, more than are looked at first; then those that are less so, the better first."""
+        similarities: list[float | None] = [*[0.99] * 300, 0.5, 0.7, 0.6, *[0.1] * 400]
+        places = [0.0001 * i for i in range(300)] + [1.0, 2.0, 3.0] + [10.0 + i for i in range(400)]
+        ranked = rank_references(planted(similarities, places), QUERY, 6)
+        assert ids(ranked) == "0 1 2 301 302 300"
+        assert ids(rank_references(planted([0.9, 0.8, 0.7], [0.0, 0.01, 0.02]), QUERY, 2)) == "0 1"
+
+    @settings(deadline=None)
+    @given(
+        st.lists(
+            st.tuples(st.integers(-10, 10), st.integers(0, 9), st.sampled_from([0, 20, 90])), min_size=1, max_size=8
+        ),
+        st.integers(0, 9),
+        st.sampled_from([0.0, 0.5, 1.0]),
+        st.sampled_from([-0.5, 0.2]),
+        st.sampled_from([0.0, 0.15]),
+        st.integers(1, 3),
+    )
+    def test_the_choice_is_that_of_loops(
+        self,
+        candidates: list[tuple[int, int, int]],
+        count: int,
+        weight: float,
+        typical: float,
+        same_m: float,
+        most: int,
+    ) -> None:
+        scores = [0.1 * score for score, _, _ in candidates]
+        centres = np.array([[0.1 * place, 0.0, 0.0] for _, place, _ in candidates])
+        angles = np.radians([turn for _, _, turn in candidates])
+        axes = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
+        options = RankOptions(0.25, 30.0, weight, same_m, most)
+        expected = slow_spread(scores, centres, axes, count, typical, options)
+        assert spread(scores, centres, axes, count, typical, options) == expected
+
+
+def slow_spread(
+    scores: list[float], centres: Array, axes: Array, count: int, typical: float, options: RankOptions
+) -> list[int]:
+    """The rule in words."""
+    chosen: list[int] = []
+
+    def sees_what_is_seen(i: int) -> bool:
+        return any(
+            np.linalg.norm(centres[i] - centres[c]) < options.apart_m
+            and math.degrees(math.acos(min(1.0, axes[i] @ axes[c]))) <= options.apart_deg
+            for c in chosen
+        )
+
+    def is_passed_over(i: int) -> bool:
+        there = [
+            c
+            for c in chosen
+            if np.linalg.norm(centres[i] - centres[c]) < options.same_place_m
+            and math.degrees(math.acos(min(1.0, axes[i] @ axes[c]))) <= options.apart_deg
+        ]
+        return len(there) >= max(1, min(options.per_place, count // 2))
+
+    def worth(i: int) -> float:
+        lead = max(scores[i] - typical, 0.0)
+        return scores[i] - (1 - options.nearby_weight) * lead if sees_what_is_seen(i) else scores[i]
+
+    while len(chosen) < count:
+        left = [i for i in range(len(scores)) if i not in chosen and not is_passed_over(i)]
+        if not left:
+            break
+        chosen.append(max(left, key=lambda i: (worth(i), -i)))
+    return chosen
+
+
+def test_a_removed_reference_is_never_ranked() -> None:
+    random = random_for("removed")
+    vectors = unit_rows(random.standard_normal((200, DIMENSION))).astype(np.float32)
+    pose = RigidTransform.identity()
+    index = SceneIndex(DIMENSION)
+    added = tuple(IndexedReference(str(i), str(i), pose, vector) for i, vector in enumerate(vectors))
+    index.apply(SceneChanges(1, added, frozenset(), True))
+    left = set(map(str, range(200)))
+    while left:
+        best = rank_references(index.entries(), vectors[0], 20)
+        assert {it.reference_id for it in best} <= left
+        assert len(best) == min(20, len(left))
+        gone = frozenset(it.reference_id for it in best)
+        left -= gone
+        index.apply(SceneChanges(index.generation + 1, (), gone, False))
+    assert rank_references(index.entries(), vectors[0], 20) == []
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: RankOptions(apart_m=-1.0),
+        lambda: RankOptions(apart_deg=181.0),
+        lambda: RankOptions(nearby_weight=1.5),
+        lambda: RankOptions(nearby_weight=math.nan),
+        lambda: RankOptions(same_place_m=-1.0),
+        lambda: RankOptions(per_place=0),
+        lambda: RankOptions(pool=0),
+        lambda: RankOptions(smallest_pool=0),
+    ],
+)
+def test_senseless_options_are_refused(make: Callable[[], RankOptions]) -> None:
+    with pytest.raises(ValueError, match="senseless"):
+        make()

@@ -1,0 +1,152 @@
+"""Scenes in memory: one damaged reference costs itself and no other, and memory is kept count of."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from images import encode, textured
+from planted_damage import damage
+from servers import CAMERA, StandInDescriptor, StandInExtractor, pose
+
+from mapless_server.errors import DataLoss, NotFound
+from mapless_server.method.turns import Turn
+from mapless_server.scenes.indexes import SceneIndexes
+from mapless_server.scenes.library import ReferenceLibrary
+from mapless_server.security.tenancy import SceneKey
+from mapless_server.store import NewReference, SceneChanges, Store
+
+SCENE = SceneKey("s")
+EXTRACTOR, DESCRIPTOR = StandInExtractor(), StandInDescriptor()
+IMAGES = [textured(seed=i) for i in range(3)]
+
+
+def new(i: int, is_described: bool) -> NewReference:
+    descriptors = {DESCRIPTOR.name: np.eye(16, dtype=np.float32)[i]} if is_described else {}
+    views = {EXTRACTOR.name: EXTRACTOR.extract(IMAGES[i], CAMERA)}
+    return NewReference(f"r{i}", encode(".png", IMAGES[i]), CAMERA, pose(float(i)), views, descriptors)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    with Store.open(tmp_path) as store:
+        store.create_scene(SCENE)
+        yield store
+
+
+def indexes_of(store: Store, capacity_bytes: int = 2**30) -> SceneIndexes:
+    return SceneIndexes(store, ReferenceLibrary(store), DESCRIPTOR, EXTRACTOR, capacity_bytes)
+
+
+def turn() -> Turn:
+    return Turn(lambda: None)
+
+
+class TestDamage:
+    def test_one_that_cannot_be_described_is_tried_and_told_once(
+        self, store: Store, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        store.add_references(SCENE, [new(i, is_described=False) for i in range(3)])
+        damage(store, SCENE, "r1", "features")
+        indexes = indexes_of(store)
+        with caplog.at_level(logging.INFO):
+            entries = [indexes.entries(SCENE, turn()) for _ in range(3)][-1]
+        assert len(entries) == 3
+        assert [reference_id for reference_id, _ in entries.undescribed()] == ["r1"]
+        assert [it.getMessage() for it in caplog.records if it.levelno >= logging.ERROR] == [
+            "reference r1 of scene s is not used: reference 'r1' is damaged in the store (features); delete it and "
+            "add it again"
+        ]
+        assert sum("describing" in it.getMessage() for it in caplog.records) == 1
+
+    @pytest.mark.parametrize("what", ["descriptor", "pose"])
+    def test_one_that_is_left_out_is_told_from_one_that_is_not_there(self, store: Store, what: str) -> None:
+        store.add_references(SCENE, [new(i, is_described=True) for i in range(3)])
+        damage(store, SCENE, "r1", what)
+        indexes = indexes_of(store)
+        entries = indexes.entries(SCENE, turn())
+        assert [it in entries for it in ("r0", "r1", "r2")] == [True, False, True]
+        assert [indexes.is_damaged(SCENE, it) for it in ("r0", "r1", "r2", "nobody")] == [False, True, False, False]
+
+    def test_one_that_is_deleted_is_not_damaged_any_more_and_may_be_added_again(self, store: Store) -> None:
+        store.add_references(SCENE, [new(i, is_described=True) for i in range(3)])
+        damage(store, SCENE, "r1", "descriptor")
+        indexes = indexes_of(store)
+        indexes.entries(SCENE, turn())
+        store.delete_reference(SCENE, "r1")
+        assert not indexes.is_damaged(SCENE, "r1")
+        store.add_references(SCENE, [new(1, is_described=True)])
+        assert "r1" in indexes.entries(SCENE, turn())
+        assert not indexes.is_damaged(SCENE, "r1")
+
+
+class TestMemory:
+    def test_what_is_held_is_what_the_scenes_take_whatever_became_of_them(self, store: Store) -> None:
+        """The running total is the sum, after scenes grew, were forgotten and were deleted."""
+        keys = [SceneKey(f"many-{i}") for i in range(4)]
+        indexes = indexes_of(store)
+        for key in keys:
+            store.create_scene(key)
+            indexes.entries(key, turn())
+        store.add_references(keys[0], [new(i, is_described=True) for i in range(3)])
+        indexes.entries(keys[0], turn())
+        store.delete_scene(keys[1])
+        with pytest.raises(NotFound):
+            indexes.entries(keys[1], turn())
+        assert set(indexes._held) == {keys[0], keys[2], keys[3]}
+        assert indexes.size_bytes == sum(held.index.size_bytes for held in indexes._held.values())
+
+    def test_one_that_was_deleted_takes_none(self, store: Store) -> None:
+        store.add_references(SCENE, [new(0, is_described=True)])
+        indexes = indexes_of(store)
+        indexes.entries(SCENE, turn())
+        assert indexes.size_bytes > 0
+        for _ in range(2):  # a second time there is nothing to forget
+            indexes.forget(SCENE)
+            assert indexes.size_bytes == 0
+        assert "r0" in indexes.entries(SCENE, turn())  # as if it were asked for the first time
+
+    @pytest.mark.parametrize("is_described", [True, False])
+    def test_one_that_is_deleted_while_it_is_asked_takes_none(
+        self, store: Store, is_described: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Neither what has been read of it by then, nor what was found out after."""
+        store.add_references(SCENE, [new(i, is_described) for i in range(3)])
+        indexes = indexes_of(store)
+        real = store.list_changes
+
+        def read_then_delete(*arguments: Any) -> SceneChanges:
+            changes = real(*arguments)
+            store.delete_scene(SCENE)
+            indexes.forget(SCENE)
+            return changes
+
+        monkeypatch.setattr(store, "list_changes", read_then_delete)
+        if is_described:
+            assert len(indexes.entries(SCENE, turn())) == 3
+        else:
+            with pytest.raises(NotFound):
+                indexes.entries(SCENE, turn())
+        assert not indexes.is_damaged(SCENE, "r0")
+        indexes.tell_damaged(SCENE, "r0", DataLoss("lost"))
+        assert (indexes.size_bytes, dict(indexes._held)) == (0, {})
+
+    def test_scenes_used_longest_ago_make_room_and_the_last_one_stays(self, store: Store) -> None:
+        keys = [SceneKey(f"many-{i}") for i in range(4)]
+        for key in keys:
+            store.create_scene(key)
+        one = indexes_of(store)
+        one.entries(keys[0], turn())
+        two = indexes_of(store, capacity_bytes=2 * one.size_bytes)
+        for key in (*keys, keys[2]):
+            two.entries(key, turn())
+        assert list(two._held) == [keys[3], keys[2]]
+        assert two.size_bytes == 2 * one.size_bytes
+        none = indexes_of(store, capacity_bytes=0)
+        for key in keys:
+            none.entries(key, turn())
+        assert list(none._held) == [keys[3]]

@@ -1,0 +1,363 @@
+"""A tenant sees what it would on a server of its own: nothing of the others, in any answer, list, error or cache."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from images import encode, textured
+
+from mapless import wire
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless.v1 import reference_service_pb2 as pb
+from mapless.v1.geometry_pb2 import Vector3
+from mapless.wire import FieldError
+from mapless_server.engine.describing import Description
+from mapless_server.errors import NotFound, RequestError
+from mapless_server.images.decode import ImageLimits
+from mapless_server.method.views import Features, View
+from mapless_server.rpc.call import Call
+from mapless_server.scenes.audit.coverage import Coverage, CoverageVerdict
+from mapless_server.scenes.retrieval.chosen import Choice
+from mapless_server.security.principal import DEFAULT_TENANT, Principal
+from mapless_server.security.tenancy import SceneKey, check_tenant, end_of_keys, key_of, scene_id_of, tenant_of
+from mapless_server.services.references import ReferenceService
+from mapless_server.store import Store
+
+CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
+PHOTO, OTHER_PHOTO = encode(".png", textured(seed=1)), encode(".png", textured(seed=2))
+# Names that a careless comparison would mix up: by case, by prefix, as patterns, and what comes before and after "/".
+TENANTS = [DEFAULT_TENANT, "acme", "ACME", "acme0", "acme-", "acm_", "a"]
+
+ids = st.from_regex(r"\A[A-Za-z0-9_]([A-Za-z0-9_-]{0,6}[A-Za-z0-9_])?\Z")
+
+
+class TestKeys:
+    @given(first=st.tuples(ids | st.just(DEFAULT_TENANT), ids), second=st.tuples(ids | st.just(DEFAULT_TENANT), ids))
+    def test_no_two_scenes_share_a_key(self, first: tuple[str, str], second: tuple[str, str]) -> None:
+        assert (key_of(*first) == key_of(*second)) == (first == second)
+
+    @given(tenant=ids | st.just(DEFAULT_TENANT), scene_id=ids)
+    def test_a_key_tells_whose_scene_it_is_and_what_they_call_it(self, tenant: str, scene_id: str) -> None:
+        key = key_of(check_tenant(tenant), wire.checked_id(scene_id, "scene_id"))
+        assert (tenant_of(key), scene_id_of(key)) == (tenant, scene_id)
+
+    @given(ids)
+    def test_stores_of_one_tenant_are_as_they_always_were(self, scene_id: str) -> None:
+        assert key_of(DEFAULT_TENANT, scene_id) == scene_id
+
+    @given(tenant=ids, other=ids, scene_id=ids)
+    def test_between_a_tenants_first_and_last_key_is_nobody_else(self, tenant: str, other: str, scene_id: str) -> None:
+        key = key_of(other, scene_id)
+        assert (key_of(tenant, "") < key < end_of_keys(tenant)) == (other == tenant) or tenant == DEFAULT_TENANT
+
+    @pytest.mark.parametrize("name", ["", "a/b", "a b", ".", "a" * 129, "a\n", "ä"])
+    def test_what_is_no_id_is_no_tenant(self, name: str) -> None:
+        with pytest.raises(ValueError, match="an id is"):
+            check_tenant(name)
+
+
+@dataclass
+class StandInEngine:
+    """Finds one feature in every photograph."""
+
+    store: Store
+    options: Any = field(default_factory=lambda: SimpleNamespace(image_limits=ImageLimits()))
+
+    def forget_scene(self, _: SceneKey) -> None:
+        pass
+
+    def forget_references(self, _: Collection[str]) -> None:
+        pass
+
+    async def describe(self, photos: Sequence[Any], *_: Any, **__: Any) -> list[Description]:
+        features = Features(np.zeros((1, 2), np.float32), np.ones((1, 4), np.float32), np.ones(1, np.float32))
+        return [Description({"stand-in": View(photo.camera.pinhole(), features)}, {}) for photo in photos]
+
+    async def retrieve(self, scene_key: SceneKey, *_: Any) -> Choice:
+        self.store.get_scene(scene_key)
+        return Choice((), "stand-in", 1)
+
+    async def audit(self, scene_key: SceneKey, reference_ids: Sequence[str], _: Any) -> Any:
+        return self.store.get_scene(scene_key).generation, []
+
+    async def check_coverage(self, scene_key: SceneKey, *_: Any) -> Any:
+        nowhere = Coverage(CoverageVerdict.NOT_LOCALIZABLE, "nothing is looked at", 0, 0.0, None, ())
+        return self.store.get_scene(scene_key).generation, nowhere
+
+
+@dataclass
+class Server:
+    """The service on a store, called as the interceptor would."""
+
+    service: ReferenceService
+    store: Store
+
+    def call(self, tenant: str, method: str, request: Any) -> Any:
+        """The answer, or the error: code, text, field and reason."""
+        call = Call("request", time.monotonic(), time.monotonic() + 60, Principal(tenant))
+        try:
+            return asyncio.run(getattr(self.service, method)(request, call))
+        except RequestError as error:
+            return (error.code, str(error), error.field, error.reason)
+        except FieldError as error:
+            return ("INVALID_ARGUMENT", str(error), error.field, "")
+
+    def listed(self, tenant: str, method: str, request: Any, page_size: int) -> Any:
+        """All pages."""
+        found: list[Any] = []
+        request.page_size = page_size
+        while True:
+            page = self.call(tenant, method, request)
+            if isinstance(page, tuple):
+                return page
+            found += page.scenes if method == "ListScenes" else page.references
+            if not page.next_page_token:
+                return found
+            request.page_token = page.next_page_token
+
+
+@contextmanager
+def serving(folder: Path) -> Iterator[Server]:
+    with Store.open(folder) as store:
+        engine = cast(Any, StandInEngine(store))
+        service = ReferenceService(lambda: engine, store)
+        try:
+            yield Server(service, store)
+        finally:
+            service.close()
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    with serving(tmp_path) as server:
+        yield server
+
+
+def create_request(scene_id: str, reference_id: str, photo: bytes = PHOTO) -> pb.CreateReferenceRequest:
+    pose = RigidTransform(rotation_from_vector([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]))
+    return pb.CreateReferenceRequest(
+        scene=f"scenes/{scene_id}",
+        reference_id=reference_id,
+        reference=pb.Reference(
+            image=photo,
+            intrinsics=wire.camera_to_message(CAMERA),
+            world_from_camera=wire.transform_to_message(pose),
+        ),
+    )
+
+
+def requests_for(scene_id: str, reference_id: str) -> dict[str, Any]:
+    """A good request of every RPC but CreateScene and ListScenes, which name no scene that must exist."""
+    scene = f"scenes/{scene_id}"
+    reference = f"{scene}/references/{reference_id}"
+    new = create_request(scene_id, "new")
+    return {
+        "GetScene": pb.GetSceneRequest(name=scene),
+        "ListReferences": pb.ListReferencesRequest(scene=scene),
+        "GetReference": pb.GetReferenceRequest(name=reference, include_image=True),
+        "CreateReference": new,
+        "BatchCreateReferences": pb.BatchCreateReferencesRequest(scene=scene, requests=[new]),
+        "DeleteReference": pb.DeleteReferenceRequest(name=reference),
+        "RetrieveReferences": pb.RetrieveReferencesRequest(
+            scene=scene, image=PHOTO, intrinsics=wire.camera_to_message(CAMERA)
+        ),
+        "AuditScene": pb.AuditSceneRequest(scene=scene),
+        "CheckCoverage": pb.CheckCoverageRequest(
+            scene=scene,
+            world_from_camera=new.reference.world_from_camera,
+            intrinsics=wire.camera_to_message(CAMERA),
+        ),
+        "UpdateScene": pb.UpdateSceneRequest(
+            scene=pb.Scene(name=scene, down_in_world=Vector3(z=-1)), update_mask={"paths": ["down_in_world"]}
+        ),
+        "DeleteScene": pb.DeleteSceneRequest(name=scene),
+    }
+
+
+def seen(server: Server, tenant: str) -> Any:
+    """Everything that a tenant can see."""
+    scenes = server.listed(tenant, "ListScenes", pb.ListScenesRequest(), 2)
+    return [
+        (scene, server.listed(tenant, "ListReferences", pb.ListReferencesRequest(scene=scene.name), 2))
+        for scene in scenes
+    ]
+
+
+def test_every_rpc_is_looked_at() -> None:
+    (service,) = pb.DESCRIPTOR.services_by_name.values()
+    assert {method.name for method in service.methods} == {"CreateScene", "ListScenes", *requests_for("s", "r")}
+
+
+@pytest.mark.parametrize("stranger", [tenant for tenant in TENANTS if tenant != "acme"])
+@pytest.mark.parametrize("method", list(requests_for("s", "r")))
+def test_a_scene_of_another_tenant_is_answered_as_one_that_is_not_there(
+    server: Server, method: str, stranger: str
+) -> None:
+    assert server.call("acme", "CreateScene", pb.CreateSceneRequest(scene_id="s")).scene.name == "scenes/s"
+    assert server.call("acme", "CreateReference", create_request("s", "r")).reference.name == "scenes/s/references/r"
+    before = seen(server, "acme")
+    answer = server.call(stranger, method, requests_for("s", "r")[method])
+    absent = server.call("nobody", method, requests_for("s", "r")[method])
+    assert answer == absent
+    assert answer[0] == "NOT_FOUND"
+    assert "acme" not in str(answer)
+    assert server.call(stranger, "ListScenes", pb.ListScenesRequest()) == pb.ListScenesResponse()
+    assert seen(server, "acme") == before
+
+
+@pytest.mark.parametrize("stranger", [tenant for tenant in TENANTS if tenant != "acme"])
+def test_the_same_ids_of_two_tenants_are_two_things(server: Server, stranger: str) -> None:
+    photos = {"acme": PHOTO, stranger: OTHER_PHOTO}
+    for tenant, photo in photos.items():
+        assert server.call(tenant, "CreateScene", pb.CreateSceneRequest(scene_id="s")).scene.name == "scenes/s"
+        server.call(tenant, "CreateReference", create_request("s", "r", photo))
+    get = requests_for("s", "r")["GetReference"]
+    for tenant, photo in photos.items():
+        assert server.call(tenant, "GetReference", get).reference.image == photo
+    theirs = seen(server, "acme")
+    server.call(stranger, "DeleteScene", pb.DeleteSceneRequest(name="scenes/s"))
+    assert server.call(stranger, "GetReference", get)[0] == "NOT_FOUND"
+    assert seen(server, "acme") == theirs
+    assert server.call("acme", "GetReference", get).reference.image == PHOTO
+
+
+@pytest.mark.parametrize("method", ["ListScenes", "ListReferences"])
+def test_a_page_token_of_another_tenant_is_refused(server: Server, method: str) -> None:
+    for tenant in TENANTS:
+        for scene_id in ("s", "t"):
+            server.call(tenant, "CreateScene", pb.CreateSceneRequest(scene_id=scene_id))
+        for reference_id in ("a", "b"):
+            server.call(tenant, "CreateReference", create_request("s", reference_id))
+
+    def request(**page: Any) -> Any:
+        if method == "ListScenes":
+            return pb.ListScenesRequest(**page)
+        return pb.ListReferencesRequest(scene="scenes/s", **page)
+
+    tokens = {tenant: server.call(tenant, method, request(page_size=1)).next_page_token for tenant in TENANTS}
+    for tenant in TENANTS:
+        for giver, token in tokens.items():
+            answer = server.call(tenant, method, request(page_size=1, page_token=token))
+            assert isinstance(answer, tuple) == (giver != tenant)
+            if giver != tenant:
+                assert (answer[0], answer[2]) == ("INVALID_ARGUMENT", "page_token")
+
+
+def test_tokens_of_scenes_are_not_those_of_references_whatever_the_names(server: Server) -> None:
+    for tenant in (DEFAULT_TENANT, "scenes"):
+        for scene_id in ("scenes", "t"):
+            server.call(tenant, "CreateScene", pb.CreateSceneRequest(scene_id=scene_id))
+        for reference_id in ("a", "b"):
+            server.call(tenant, "CreateReference", create_request("scenes", reference_id))
+    token = server.call(
+        DEFAULT_TENANT, "ListReferences", pb.ListReferencesRequest(scene="scenes/scenes", page_size=1)
+    ).next_page_token
+    for tenant in (DEFAULT_TENANT, "scenes"):
+        assert server.call(tenant, "ListScenes", pb.ListScenesRequest(page_token=token))[2] == "page_token"
+
+
+def test_what_is_taken_already_is_told_without_the_tenant(server: Server) -> None:
+    taken = [
+        ("CreateScene", pb.CreateSceneRequest(scene_id="s")),
+        ("CreateReference", create_request("s", "r")),
+        (
+            "BatchCreateReferences",
+            pb.BatchCreateReferencesRequest(scene="scenes/s", requests=[create_request("s", "r")]),
+        ),
+    ]
+    answers = {}
+    for tenant in TENANTS:
+        for method, request in taken[:2]:
+            server.call(tenant, method, request)
+        answers[tenant] = [server.call(tenant, method, request) for method, request in taken]
+    assert [code for code, *_ in answers["acme"]] == ["ALREADY_EXISTS"] * 3
+    assert "acme" not in str(answers["acme"])
+    assert all(answer == answers["acme"] for answer in answers.values())
+
+
+def test_what_one_tenant_loaded_is_not_in_anothers_cache(server: Server) -> None:
+    server.call("acme", "CreateScene", pb.CreateSceneRequest(scene_id="s"))
+    server.call("acme", "CreateReference", create_request("s", "r"))
+    mine = key_of("acme", "s")
+    assert len(server.store.load_references(mine, ["r"], "stand-in").references) == 1
+    assert len(server.store.list_changes(mine, None, "").added) == 1
+    look_ups: list[Callable[[SceneKey], Any]] = [
+        lambda key: server.store.load_references(key, ["r"], "stand-in"),
+        lambda key: server.store.load_references(key, None, "stand-in"),
+        lambda key: server.store.list_changes(key, None, ""),
+    ]
+    for tenant in TENANTS:
+        for look_up in look_ups if tenant != "acme" else []:
+            with pytest.raises(NotFound, match="no scene 's'"):
+                look_up(key_of(tenant, "s"))
+        if tenant != "acme":
+            # The same id and the same generation, and yet other references.
+            server.call(tenant, "CreateScene", pb.CreateSceneRequest(scene_id="s"))
+            server.call(tenant, "CreateReference", create_request("s", f"of.{tenant}.own"))
+            theirs = server.store.list_changes(key_of(tenant, "s"), None, "")
+            assert [it.reference_id for it in theirs.added] == [f"of.{tenant}.own"]
+            assert theirs.generation == server.store.get_scene(mine).generation
+
+
+ENTANGLED = [DEFAULT_TENANT, "acme", "ACME", "acme0"]
+operations = st.lists(
+    st.tuples(
+        st.sampled_from(ENTANGLED),
+        st.sampled_from(["CreateScene", "CreateScene", "list", *requests_for("s", "r")]),
+        st.sampled_from(["s", "acme"]),
+        st.sampled_from(["r", "new"]),
+        st.integers(1, 3),
+    ),
+    max_size=30,
+)
+
+
+@settings(max_examples=15, deadline=None)
+@given(operations)
+def test_each_tenant_sees_what_it_would_on_a_server_of_its_own(
+    tmp_path_factory: pytest.TempPathFactory, operations: list[tuple[str, str, str, str, int]]
+) -> None:
+    folder = tmp_path_factory.mktemp("tenants")
+    with serving(folder / "shared") as shared:
+        said: dict[str, list[Any]] = {tenant: [] for tenant in ENTANGLED}
+        for operation in operations:
+            said[operation[0]].append(perform(shared, operation[0], operation))
+        for number, tenant in enumerate(ENTANGLED):
+            with serving(folder / f"own-{number}") as own:
+                own_said = [perform(own, DEFAULT_TENANT, it) for it in operations if it[0] == tenant]
+                assert said[tenant] == own_said
+                assert shown(seen(shared, tenant)) == shown(seen(own, DEFAULT_TENANT))
+
+
+def perform(server: Server, tenant: str, operation: tuple[str, str, str, str, int]) -> str:
+    """What a tenant is answered, as text, times apart."""
+    _, method, scene_id, reference_id, page_size = operation
+    if method == "list":
+        return shown(server.listed(tenant, "ListScenes", pb.ListScenesRequest(), page_size))
+    if method == "CreateScene":
+        return shown(server.call(tenant, method, pb.CreateSceneRequest(scene_id=scene_id)))
+    return shown(server.call(tenant, method, requests_for(scene_id, reference_id)[method]))
+
+
+def shown(answer: Any) -> str:
+    if isinstance(answer, list | tuple):
+        return "\n".join(map(shown, answer))
+    if hasattr(answer, "DESCRIPTOR"):
+        return without_times(str(answer))
+    return str(answer)
+
+
+def without_times(text: str) -> str:
+    """Drops the numbers of a create_time."""
+    return "\n".join(line for line in text.splitlines() if not line.strip().startswith(("seconds:", "nanos:")))

@@ -1,0 +1,427 @@
+"""Encryption with real handshakes on loopback: who gets in, who does not, and what changes when the files do."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from certificates import DAY, Pair, authority, signed
+from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, PrivateFormat
+
+from mapless import Client, ConnectOptions, MaplessError, Unavailable
+from mapless.__main__ import main
+from mapless.errors import from_rpc_error
+from mapless_server.security.access import Authenticator
+from mapless_server.security.errors import SecurityError
+from mapless_server.security.principal import Role
+from mapless_server.security.tls import Tls, TlsFiles, read_material
+
+METHOD = "/mapless.v1.ReferenceService/GetScene"
+CALL = "/test.Who/Am"
+AUTHORITY, STRANGER = authority(), authority("stranger")
+PASSWORD = BestAvailableEncryption(b"password")
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> TlsFiles:
+    """A good pair, and no client authority."""
+    files = TlsFiles(tmp_path / "server.pem", tmp_path / "server-key.pem")
+    signed(AUTHORITY, "first").write(files.certificate, files.key)
+    return files
+
+
+@pytest.fixture
+def mutual(files: TlsFiles, tmp_path: Path) -> TlsFiles:
+    """The same for a server that asks clients for a certificate."""
+    (tmp_path / "clients.pem").write_bytes(AUTHORITY.certificate_pem)
+    return TlsFiles(files.certificate, files.key, tmp_path / "clients.pem")
+
+
+@dataclass
+class Serving:
+    """A bare server that answers whom it believes the caller to be, and health.
+
+    Attributes:
+        health_metadata: of the last question after its health.
+    """
+
+    port: int
+    tls: Tls
+    health_metadata: dict[str, str]
+
+    def options(self, client: Pair | None = None, root: Pair | None = AUTHORITY, **more: Any) -> ConnectOptions:
+        return ConnectOptions(
+            timeout_s=10,
+            max_attempts=1,
+            tls=True,
+            root_certificates=root.certificate_pem if root else None,
+            client_certificate=client.certificate_pem if client else None,
+            client_key=client.key_pem if client else None,
+            **more,
+        )
+
+    def who_am_i(self, options: ConnectOptions) -> str:
+        with options.channel(f"localhost:{self.port}") as channel:
+            answer: bytes = channel.unary_unary(CALL)(b"", timeout=10, metadata=options.metadata())
+            return answer.decode()
+
+    def is_serving(self, options: ConnectOptions) -> bool:
+        with Client(f"127.0.0.1:{self.port}", options) as client:
+            return client.is_serving()
+
+    def shown_certificate(self, client: Pair | None = None, folder: Path | None = None) -> str:
+        """The common name of the certificate that a new connection sees, by another implementation of TLS."""
+        context = ssl.create_default_context(cadata=AUTHORITY.certificate_pem.decode())
+        context.set_alpn_protocols(["h2"])
+        if client and folder:
+            client.write(folder / "own.pem", folder / "own-key.pem")
+            context.load_cert_chain(folder / "own.pem", folder / "own-key.pem")
+        with (
+            socket.create_connection(("127.0.0.1", self.port), 10) as plain,
+            context.wrap_socket(plain, server_hostname="localhost") as encrypted,
+        ):
+            subject: Any = (encrypted.getpeercert() or {})["subject"]
+            return str(dict(pair for part in subject for pair in part)["commonName"])
+
+
+@contextmanager
+def serving(files: TlsFiles) -> Iterator[Serving]:
+    """A server with these files, in a thread of its own."""
+    tls = Tls(files)
+    loop = asyncio.new_event_loop()
+    server: Any = None
+    health_metadata: dict[str, str] = {}
+
+    async def answer(request: bytes, context: Any) -> bytes:
+        principal = Authenticator(None).authenticate(context.invocation_metadata(), METHOD, context.auth_context())
+        assert principal.role is Role.WRITE
+        return principal.name.encode()
+
+    async def healthy(request: bytes, context: Any) -> bytes:
+        health_metadata.clear()
+        health_metadata.update(context.invocation_metadata())
+        return b"\x08\x01"
+
+    async def start() -> int:
+        nonlocal server
+        server = grpc.aio.server()
+        for service, method, handler in (("test.Who", "Am", answer), ("grpc.health.v1.Health", "Check", healthy)):
+            handlers = {method: grpc.unary_unary_rpc_method_handler(handler)}
+            server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(service, handlers),))
+        port: int = server.add_secure_port("127.0.0.1:0", tls.server_credentials())
+        await server.start()
+        return port
+
+    port = loop.run_until_complete(start())
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+    try:
+        yield Serving(port, tls, health_metadata)
+    finally:
+        asyncio.run_coroutine_threadsafe(server.stop(0), loop).result(30)
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join(30)
+        assert not thread.is_alive()
+        loop.close()
+
+
+def refused(call: Callable[[], object]) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        call()
+    assert from_rpc_error(caught.value).code == "UNAVAILABLE"
+
+
+class TestWhoGetsIn:
+    def test_a_client_that_knows_the_authority(self, files: TlsFiles) -> None:
+        with serving(files) as server:
+            assert server.is_serving(server.options())
+            assert server.who_am_i(server.options()) == ""
+
+    def test_not_one_that_trusts_another_authority(self, files: TlsFiles) -> None:
+        with serving(files) as server:
+            refused(lambda: server.who_am_i(server.options(root=STRANGER)))
+            with pytest.raises(Unavailable):
+                server.is_serving(server.options(root=STRANGER))
+
+    def test_not_one_that_does_not_encrypt(self, files: TlsFiles) -> None:
+        plain = ConnectOptions(max_attempts=1, timeout_s=5)
+        with serving(files) as server, pytest.raises(MaplessError):
+            server.is_serving(plain)
+
+    def test_clients_refuse_a_server_whose_certificate_has_expired(
+        self, files: TlsFiles, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        # It was good when the server started: that is what the check is made to believe.
+        signed(AUTHORITY, "old", ends=-timedelta(hours=1)).write(files.certificate, files.key)
+        with pytest.raises(SecurityError, match="expired"):
+            Tls(files)
+        monkeypatch.setattr("mapless_server.security.tls._check_time", lambda *_: None)
+        with serving(files) as server:
+            refused(lambda: server.who_am_i(server.options()))
+
+    def test_with_client_certificates_those_of_the_authority_and_by_their_name(self, mutual: TlsFiles) -> None:
+        with serving(mutual) as server:
+            assert server.who_am_i(server.options(signed(AUTHORITY, "robot-7"))) == "robot-7"
+            assert server.is_serving(server.options(signed(AUTHORITY, "robot-7")))
+
+    @pytest.mark.parametrize(
+        "client",
+        [
+            None,
+            signed(STRANGER, "robot-7"),
+            signed(AUTHORITY, "late", ends=-timedelta(hours=1)),
+            signed(AUTHORITY, "early", begins=timedelta(hours=1)),
+        ],
+        ids=["none", "a stranger's", "expired", "not yet valid"],
+    )
+    def test_with_client_certificates_nobody_else(self, mutual: TlsFiles, client: Pair | None) -> None:
+        with serving(mutual) as server:
+            refused(lambda: server.who_am_i(server.options(client)))
+
+
+class TestChanges:
+    def test_new_connections_see_the_new_certificate_and_old_ones_go_on(self, files: TlsFiles) -> None:
+        with serving(files) as server, server.options().channel(f"localhost:{server.port}") as channel:
+            states: list[grpc.ChannelConnectivity] = []
+            call = channel.unary_unary(CALL)
+            assert call(b"", timeout=10) == b""
+            channel.subscribe(states.append)
+            assert server.shown_certificate() == "first"
+            expiry_s = server.tls.expiry_s
+            signed(AUTHORITY, "second", ends=3 * DAY).write(files.certificate, files.key)
+            assert server.shown_certificate() == "first"
+            assert server.tls.refresh()
+            assert [server.shown_certificate() for _ in range(2)] == ["second"] * 2
+            assert server.tls.expiry_s - expiry_s == pytest.approx(2 * 86400, abs=120)
+            assert call(b"", timeout=10) == b""
+            assert set(states) <= {grpc.ChannelConnectivity.READY}, "the old connection was cut"
+            assert server.who_am_i(server.options()) == ""
+
+    def test_whose_clients_get_in_changes_too(self, mutual: TlsFiles) -> None:
+        assert mutual.client_ca
+        with serving(mutual) as server:
+            ours, theirs = signed(AUTHORITY, "ours"), signed(STRANGER, "theirs")
+            assert server.who_am_i(server.options(ours)) == "ours"
+            mutual.client_ca.write_bytes(STRANGER.certificate_pem)
+            assert server.tls.refresh()
+            assert server.who_am_i(server.options(theirs)) == "theirs"
+            refused(lambda: server.who_am_i(server.options(ours)))
+
+    @pytest.mark.parametrize("broken", ["key of another", "no PEM", "gone", "expired"])
+    def test_files_that_cannot_be_used_leave_the_old_ones_in_use(
+        self, files: TlsFiles, broken: str, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        with serving(files) as server:
+            if broken == "key of another":
+                files.certificate.write_bytes(signed(AUTHORITY, "second").certificate_pem)
+            elif broken == "no PEM":
+                files.certificate.write_bytes(b"x")
+            elif broken == "gone":
+                files.key.unlink()
+            else:
+                signed(AUTHORITY, "old", ends=-timedelta(hours=1)).write(files.certificate, files.key)
+            assert [server.tls.refresh() for _ in range(3)] == [False] * 3
+            errors = [record for record in caplog.records if record.levelno == logging.ERROR]
+            assert len(errors) == 1
+            assert "stay in use" in errors[0].getMessage()
+            assert server.shown_certificate() == "first"
+            assert server.who_am_i(server.options()) == ""
+            signed(AUTHORITY, "third").write(files.certificate, files.key)
+            assert server.tls.refresh()
+            assert server.shown_certificate() == "third"
+
+    def test_a_link_that_is_turned_to_another_folder_is_a_change(self, tmp_path: Path) -> None:
+        # As Kubernetes replaces a mounted secret.
+        for name in ("one", "two"):
+            (tmp_path / name).mkdir()
+            signed(AUTHORITY, name).write(tmp_path / name / "tls.crt", tmp_path / name / "tls.key")
+        (tmp_path / "data").symlink_to("one")
+        with serving(TlsFiles(tmp_path / "data" / "tls.crt", tmp_path / "data" / "tls.key")) as server:
+            assert server.shown_certificate() == "one"
+            (tmp_path / "new").symlink_to("two")
+            (tmp_path / "new").replace(tmp_path / "data")
+            assert server.tls.refresh()
+            assert server.shown_certificate() == "two"
+
+    def test_a_new_certificate_in_the_middle_of_many_handshakes(self, mutual: TlsFiles, tmp_path: Path) -> None:
+        with serving(mutual) as server:
+            client = server.options(signed(AUTHORITY, "robot"))
+            names: list[str] = []
+            stop = threading.Event()
+
+            def connect() -> None:
+                while not stop.is_set():
+                    names.append(server.who_am_i(client))
+
+            threads = [threading.Thread(target=connect) for _ in range(3)]
+            for thread in threads:
+                thread.start()
+            for i in range(10):
+                signed(AUTHORITY, f"server-{i}").write(mutual.certificate, mutual.key)
+                server.tls.refresh()
+            stop.set()
+            for thread in threads:
+                thread.join(30)
+                assert not thread.is_alive()
+            assert len(names) >= 3
+            assert set(names) == {"robot"}
+            own = signed(AUTHORITY, "robot")
+            assert server.shown_certificate(own, tmp_path) == "server-9"
+
+
+class TestFilesAtTheStart:
+    def test_good_ones_are_read_and_the_key_is_never_shown(self, mutual: TlsFiles) -> None:
+        material = read_material(mutual)
+        assert material.certificate == mutual.certificate.read_bytes()
+        assert material.client_ca == AUTHORITY.certificate_pem
+        assert "PRIVATE" not in repr(material)
+
+    def test_a_chain_begins_with_the_servers_own(self, files: TlsFiles) -> None:
+        own = files.certificate.read_bytes()
+        files.certificate.write_bytes(own + AUTHORITY.certificate_pem)
+        assert read_material(files).certificate == own + AUTHORITY.certificate_pem
+        files.certificate.write_bytes(AUTHORITY.certificate_pem + own)
+        with pytest.raises(SecurityError, match="not that of the first certificate"):
+            read_material(files)
+
+    @pytest.mark.parametrize(
+        ("which", "content", "complaint"),
+        [
+            ("certificate", None, "No such file"),
+            ("key", None, "No such file"),
+            ("client_ca", None, "No such file"),
+            ("certificate", b"", "holds no certificate in PEM form"),
+            ("certificate", b"\x30\x82\x00", "holds no certificate in PEM form"),
+            ("key", b"-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----\n", "no private key in PEM form"),
+            ("key", AUTHORITY.certificate_pem, "no private key in PEM form"),
+            ("key", AUTHORITY.key_pem, "is not that of the first certificate"),
+            (
+                "key",
+                AUTHORITY.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, PASSWORD),
+                "encrypted",
+            ),
+            ("client_ca", AUTHORITY.key_pem, "holds no certificate in PEM form"),
+        ],
+    )
+    def test_wrong_ones_are_one_sentence_that_names_the_file(
+        self, mutual: TlsFiles, which: str, content: bytes | None, complaint: str
+    ) -> None:
+        path: Path = getattr(mutual, which)
+        if content is None:
+            path.unlink()
+        else:
+            path.write_bytes(content)
+        with pytest.raises(SecurityError, match=complaint) as caught:
+            Tls(mutual)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+    @pytest.mark.parametrize(("begins", "ends", "what"), [(-3, -1, "expired at"), (1, 3, "not valid before")])
+    def test_a_time_that_is_not_now_is_an_error(self, files: TlsFiles, begins: int, ends: int, what: str) -> None:
+        signed(AUTHORITY, "x", begins * DAY, ends * DAY).write(files.certificate, files.key)
+        with pytest.raises(SecurityError, match=what):
+            Tls(files)
+
+
+class TestConnectOptions:
+    def test_neither_token_nor_key_is_shown(self) -> None:
+        options = ConnectOptions(tls=True, client_certificate=b"cert", client_key=b"SECRET", token="SECRET")
+        assert "SECRET" not in repr(options)
+        assert options.metadata() == (("authorization", "Bearer SECRET"),)
+
+    def test_without_token_and_client_id_nothing_is_sent(self) -> None:
+        assert ConnectOptions().metadata() == ()
+        assert ConnectOptions(client_id="r7").metadata() == (("x-client-id", "r7"),)
+
+    @pytest.mark.parametrize(
+        ("wrong", "complaint"),
+        [
+            ({"client_certificate": b"x"}, "go together"),
+            ({"client_key": b"x", "tls": True}, "go together"),
+            ({"client_certificate": b"x", "client_key": b"x"}, "needs tls"),
+            ({"token": "SECRET\n"}, "token must be"),
+            ({"token": ""}, "token must be"),
+            ({"token": "SECRET\N{BULLET}"}, "token must be"),
+            ({"client_id": "a b"}, "client_id must be"),
+            ({"client_id": "a\n"}, "client_id must be"),
+        ],
+    )
+    def test_what_cannot_be_sent_is_refused_without_being_shown(self, wrong: dict[str, Any], complaint: str) -> None:
+        with pytest.raises(ValueError, match=complaint) as caught:
+            ConnectOptions(**wrong)
+        assert "SECRET" not in str(caught.value)
+
+
+class TestCommand:
+    @pytest.fixture
+    def server(self, mutual: TlsFiles) -> Iterator[Serving]:
+        with serving(mutual) as server:
+            yield server
+
+    @pytest.fixture
+    def flags(self, tmp_path: Path) -> dict[str, str]:
+        signed(AUTHORITY, "robot-7").write(tmp_path / "own.pem", tmp_path / "own-key.pem")
+        (tmp_path / "ca.pem").write_bytes(AUTHORITY.certificate_pem)
+        (tmp_path / "token").write_text("mapless_x\n")
+        files = {"--ca": "ca.pem", "--cert": "own.pem", "--key": "own-key.pem", "--token-file": "token"}
+        return {flag: str(tmp_path / name) for flag, name in files.items()}
+
+    def health(self, server: Serving, flags: dict[str, str]) -> int:
+        arguments = [part for flag in flags.items() for part in flag]
+        with pytest.raises(SystemExit) as caught:
+            main(["--address", f"localhost:{server.port}", "--timeout", "5", *arguments, "health"])
+        return int(caught.value.code or 0)
+
+    def test_it_connects_with_certificates_and_sends_the_token(
+        self, server: Serving, flags: dict[str, str], capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert self.health(server, flags | {"--client-id": "r7"}) == 0
+        assert capsys.readouterr().out.splitlines()[0] == "SERVING"
+        assert server.health_metadata["authorization"] == "Bearer mapless_x"
+        assert server.health_metadata["x-client-id"] == "r7"
+
+    def test_the_token_may_come_from_the_environment_and_a_file_wins(
+        self, server: Serving, flags: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("MAPLESS_TOKEN", "mapless_environment")
+        file = flags.pop("--token-file")
+        assert self.health(server, flags) == 0
+        assert server.health_metadata["authorization"] == "Bearer mapless_environment"
+        assert self.health(server, flags | {"--token-file": file}) == 0
+        assert server.health_metadata["authorization"] == "Bearer mapless_x"
+
+    @pytest.mark.parametrize(
+        ("changes", "code", "complaint"),
+        [
+            ({"--key": None}, 2, "go together"),
+            ({"--cert": None}, 2, "go together"),
+            ({"--token-file": "absent"}, 2, "absent"),
+            ({"--ca": "absent"}, 2, "absent"),
+            ({"--cert": None, "--key": None}, 1, "UNAVAILABLE"),
+        ],
+    )
+    def test_complaints(
+        self,
+        server: Serving,
+        flags: dict[str, str],
+        capsys: pytest.CaptureFixture[str],
+        changes: dict[str, str | None],
+        code: int,
+        complaint: str,
+    ) -> None:
+        given = {flag: value for flag, value in (flags | changes).items() if value is not None}
+        assert self.health(server, given) == code
+        said = capsys.readouterr().err
+        assert complaint in said
+        assert "mapless_x" not in said

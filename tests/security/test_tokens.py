@@ -1,0 +1,417 @@
+"""Tokens: what the file keeps, what it refuses, that changes are taken over while serving, and who may call what."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import re
+import stat
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime, timedelta, timezone
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+from grpc_health.v1 import health_pb2
+from grpc_reflection.v1alpha import reflection_pb2
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from mapless.v1 import localization_service_pb2, reference_service_pb2
+from mapless_server.errors import PermissionDenied, RequestError, Unauthenticated
+from mapless_server.security.access import METHOD_ROLES, OPEN_METHODS, Authenticator, certificate_name
+from mapless_server.security.errors import SecurityError
+from mapless_server.security.principal import DEFAULT_TENANT, Principal, Role
+from mapless_server.security.reloading import Reloading, keep_fresh
+from mapless_server.security.tokens import Tokens, create_token, read_tokens, revoke_token, sha256_of
+from mapless_tools.cli import tokens as command
+
+NOW = datetime(2030, 1, 1, tzinfo=timezone.utc)
+READ = "/mapless.v1.ReferenceService/GetScene"
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "tokens.json"
+
+
+def entry(**changes: Any) -> dict[str, Any]:
+    return {"name": "robot", "tenant": "acme", "role": "read", "sha256": sha256_of("secret")} | changes
+
+
+def authenticator(*entries: dict[str, Any], now: Callable[[], datetime] = lambda: NOW) -> Authenticator:
+    tokens = Tokens.model_validate_json(json.dumps({"tokens": entries}))
+    return Authenticator(lambda: tokens, now)
+
+
+def bearer(token: str) -> tuple[tuple[str, str], ...]:
+    return (("user-agent", "x"), ("authorization", f"Bearer {token}"))
+
+
+class TestFile:
+    def test_a_new_token_is_known_and_only_its_hash_is_on_disk(self, path: Path) -> None:
+        token = create_token(path, "robot-7", "acme", "localize", NOW)
+        assert re.fullmatch(r"mapless_[A-Za-z0-9_-]{43}", token)
+        assert token.removeprefix("mapless_") not in path.read_text()
+        known = read_tokens(path).find(token)
+        assert known is not None
+        assert (known.name, known.tenant, known.allows, known.expires) == ("robot-7", "acme", Role.LOCALIZE, NOW)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert os.listdir(path.parent) == [path.name]
+
+    def test_tokens_differ_and_a_revoked_one_is_gone_while_the_others_stay(self, path: Path) -> None:
+        made = {name: create_token(path, name, DEFAULT_TENANT, "read", None) for name in "abc"}
+        revoke_token(path, "b")
+        found = {name: read_tokens(path).find(token) for name, token in made.items()}
+        assert [name for name, token in found.items() if token] == ["a", "c"]
+
+    def test_what_a_person_wrote_about_tenants_survives_a_change(self, path: Path) -> None:
+        path.write_text('{"tokens": [], "tenants": {"acme": {"rate_ms": 250}, "other": {}}}')
+        create_token(path, "a", "acme", "read", None)
+        tokens = read_tokens(path)
+        assert [tokens.rate_ms(tenant) for tenant in ("acme", "other", "unknown")] == [250, None, None]
+
+    def test_a_taken_name_is_refused_and_nothing_changes(self, path: Path) -> None:
+        create_token(path, "a", "acme", "read", None)
+        before = path.read_bytes()
+        with pytest.raises(SecurityError, match="'a' already"):
+            create_token(path, "a", "other", "write", None)
+        assert path.read_bytes() == before
+
+    @pytest.mark.parametrize(
+        ("name", "tenant", "role", "what"),
+        [
+            ("a/b", "t", "read", "name"),
+            ("a", "t/u", "read", "tenant"),
+            ("a", "", "read", "tenant"),
+            ("a", "t", "admin", "role"),
+        ],
+    )
+    def test_names_and_roles_that_are_none_are_refused(
+        self, path: Path, name: str, tenant: str, role: str, what: str
+    ) -> None:
+        with pytest.raises(SecurityError, match=f"^{what}: "):
+            create_token(path, name, tenant, role, None)
+        assert not path.exists()
+
+    def test_revoking_what_is_not_there_is_an_error(self, path: Path) -> None:
+        with pytest.raises(SecurityError, match="No such file"):
+            revoke_token(path, "a")
+        create_token(path, "a", "t", "read", None)
+        with pytest.raises(SecurityError, match="no token of the name 'b'"):
+            revoke_token(path, "b")
+
+    def test_commands_at_the_same_time_lose_no_token(self, path: Path) -> None:
+        with ThreadPoolExecutor(8) as pool:
+            made = list(pool.map(lambda i: create_token(path, f"t{i}", "acme", "read", None), range(24)))
+        tokens = read_tokens(path)
+        assert [tokens.find(token) is None for token in made] == [False] * 24
+
+    def test_a_link_stays_a_link(self, path: Path, tmp_path: Path) -> None:
+        target = tmp_path / "elsewhere" / "real.json"
+        target.parent.mkdir()
+        path.symlink_to(target)
+        token = create_token(path, "a", "t", "read", None)
+        assert path.is_symlink()
+        assert read_tokens(target).find(token) == read_tokens(path).tokens[0]
+
+    def test_a_folder_that_is_not_there_is_one_sentence(self, tmp_path: Path) -> None:
+        with pytest.raises(SecurityError, match="absent: No such file"):
+            create_token(tmp_path / "absent" / "tokens.json", "a", "t", "read", None)
+
+    @pytest.mark.parametrize(
+        ("content", "complaint"),
+        [
+            ("", "Invalid JSON"),
+            ("[]", "valid dictionary|object"),
+            ('{"token": []}', "token: Extra inputs"),
+            (json.dumps({"tokens": [entry(sha256="mapless_oops-this-is-a-secret")]}), "tokens.0.sha256: .*pattern"),
+            (json.dumps({"tokens": [entry(role="root")]}), "tokens.0.role"),
+            (json.dumps({"tokens": [entry(expires="tomorrow")]}), "tokens.0.expires"),
+            (json.dumps({"tokens": [entry(expires="2030-01-01T00:00:00")]}), "tokens.0.expires: .*timezone"),
+            (json.dumps({"tokens": [entry(), entry(sha256=sha256_of("b"))]}), "name 'robot' stands twice"),
+            (json.dumps({"tokens": [entry(), entry(name="b")]}), "stands twice"),
+            ('{"tenants": {"a": {"rate_ms": -1}}}', "tenants.a.rate_ms"),
+            ('{"tenants": {"a/b": {}}}', "tenants.a/b"),
+        ],
+    )
+    def test_a_wrong_file_is_one_sentence_that_shows_no_secret(self, path: Path, content: str, complaint: str) -> None:
+        path.write_text(content)
+        with pytest.raises(SecurityError, match=complaint) as caught:
+            read_tokens(path)
+        assert str(caught.value).startswith(str(path))
+        assert "\n" not in str(caught.value)
+        assert "oops" not in str(caught.value)
+
+
+class TestReloading:
+    def make(self, path: Path) -> Reloading[Tokens]:
+        return Reloading([path], lambda: read_tokens(path), "tokens")
+
+    def test_a_missing_file_is_an_error_at_the_start(self, path: Path) -> None:
+        with pytest.raises(SecurityError, match="No such file"):
+            self.make(path)
+
+    def test_changes_are_taken_over_and_nothing_is_read_without_one(self, path: Path) -> None:
+        token = create_token(path, "a", "t", "read", None)
+        source = self.make(path)
+        first = source.value
+        assert not source.refresh()
+        assert source.value is first
+        revoke_token(path, "a")
+        assert source.refresh()
+        assert (first.find(token) is not None, source.value.find(token)) == (True, None)
+
+    def test_a_change_in_place_of_the_same_length_is_noticed(self, path: Path) -> None:
+        path.write_text(json.dumps({"tokens": [entry(role="read ".strip())]}))
+        source = self.make(path)
+        old = path.stat()
+        path.write_text(path.read_text().replace(sha256_of("secret"), sha256_of("sesame")))
+        os.utime(path, ns=(old.st_atime_ns, old.st_mtime_ns + 1))
+        assert path.stat().st_size == old.st_size
+        assert source.refresh()
+        assert source.value.find("secret") is None
+
+    def test_a_change_while_the_file_is_read_is_noticed_afterwards(self, path: Path) -> None:
+        path.write_text("{}")
+
+        def read() -> Tokens:
+            tokens = read_tokens(path)
+            if not tokens.tokens:
+                create_token(path, "a", "t", "read", None)
+            return tokens
+
+        source = Reloading([path], read, "tokens")
+        assert not source.value.tokens
+        assert source.refresh()
+        assert [it.name for it in source.value.tokens] == ["a"]
+
+    @pytest.mark.parametrize("broken", ["{", None])
+    def test_a_file_that_breaks_or_goes_leaves_the_old_tokens_and_is_logged_once(
+        self, path: Path, broken: str | None, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        token = create_token(path, "a", "t", "read", None)
+        good = path.read_bytes()
+        source = self.make(path)
+        if broken is None:
+            path.unlink()
+        else:
+            path.write_text(broken)
+        with caplog.at_level(logging.INFO):
+            assert [source.refresh() for _ in range(3)] == [False] * 3
+        assert [record.levelname for record in caplog.records] == ["ERROR"]
+        assert source.value.find(token) == source.value.tokens[0]
+        path.write_bytes(good)
+        assert source.refresh()
+        assert source.value.find(token) == source.value.tokens[0]
+
+    def test_a_file_that_could_not_be_read_for_a_moment_is_tried_again(self, path: Path) -> None:
+        path.write_text("{}")
+        failing = [False]
+
+        def read() -> Tokens:
+            if failing[0]:
+                raise SecurityError("too many open files")
+            return read_tokens(path)
+
+        source = Reloading([path], read, "tokens")
+        token = create_token(path, "a", "t", "read", None)
+        failing[0] = True
+        assert not source.refresh()
+        failing[0] = False
+        assert source.refresh()
+        assert source.value.find(token) == source.value.tokens[0]
+
+    def test_the_event_loop_does_not_read_files(self) -> None:
+        threads: list[threading.Thread] = []
+
+        class Source:
+            def refresh(self) -> bool:
+                threads.append(threading.current_thread())
+                return False
+
+        async def watch() -> None:
+            task = asyncio.create_task(keep_fresh([Source(), Source()], interval_s=0.001))
+            while len(threads) < 4:
+                await asyncio.sleep(0.001)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+
+        asyncio.run(watch())
+        assert threading.main_thread() not in threads
+
+
+class TestWhoMayCallWhat:
+    def test_the_table_names_every_method_there_is_and_no_other(self) -> None:
+        services = [
+            service
+            for file in (localization_service_pb2, reference_service_pb2)
+            for service in file.DESCRIPTOR.services_by_name.values()
+        ]
+        methods = {f"/{service.full_name}/{method.name}" for service in services for method in service.methods}
+        assert len(methods) >= 10
+        assert set(METHOD_ROLES) == methods
+
+    def test_the_open_methods_are_those_of_health_and_reflection(self) -> None:
+        services = [
+            *health_pb2.DESCRIPTOR.services_by_name.values(),
+            *reflection_pb2.DESCRIPTOR.services_by_name.values(),
+        ]
+        methods = {f"/{service.full_name}/{method.name}" for service in services for method in service.methods}
+        methods |= {method.replace("v1alpha", "v1") for method in methods}
+        assert methods == OPEN_METHODS
+        assert not OPEN_METHODS & set(METHOD_ROLES)
+
+    def test_what_changes_something_computes_for_long_or_shows_what_others_ask_takes_the_role_write(self) -> None:
+        for method, role in METHOD_ROLES.items():
+            name = method.rpartition("/")[2]
+            takes_much = re.match(r"Create|BatchCreate|Delete|Update|AuditScene|WatchQueries", name) is not None
+            assert (role is Role.WRITE) == takes_much, method
+
+    @pytest.mark.parametrize(("method", "role"), list(product(METHOD_ROLES, ("read", "localize", "write"))))
+    def test_each_role_may_do_what_it_is_for_and_nothing_above(self, method: str, role: str) -> None:
+        caller = authenticator(entry(role=role))
+        if Role[role.upper()] >= METHOD_ROLES[method]:
+            assert caller.authenticate(bearer("secret"), method) == Principal("acme", Role[role.upper()], "robot")
+        else:
+            with pytest.raises(PermissionDenied, match=METHOD_ROLES[method].name.lower()) as caught:
+                caller.authenticate(bearer("secret"), method)
+            assert caught.value.reason == "ROLE_TOO_LOW"
+
+    @pytest.mark.parametrize("asks", [True, False])
+    @pytest.mark.parametrize(
+        "method", ["/mapless.v1.ReferenceService/New", "/other.Service/Do", "", *sorted(OPEN_METHODS)]
+    )
+    def test_a_method_that_is_not_in_the_table_is_refused(self, method: str, asks: bool) -> None:
+        caller = authenticator(entry(role="write")) if asks else Authenticator(None)
+        with pytest.raises(PermissionDenied):
+            caller.authenticate(bearer("secret"), method)
+
+    @pytest.mark.parametrize(
+        ("metadata", "reason"),
+        [
+            ((), "TOKEN_MISSING"),
+            ((("authorisation", "Bearer secret"),), "TOKEN_MISSING"),
+            ((("authorization", "secret"),), "TOKEN_INVALID"),
+            ((("authorization", "Basic secret"),), "TOKEN_INVALID"),
+            ((("authorization", "Bearer "),), "TOKEN_INVALID"),
+            ((("authorization", ""),), "TOKEN_INVALID"),
+            ((("authorization", "Bearer secret, Bearer secret"),), "TOKEN_INVALID"),
+            (bearer("secret") * 2, "TOKEN_INVALID"),
+            (bearer("Secret"), "TOKEN_INVALID"),
+            (bearer(sha256_of("secret")), "TOKEN_INVALID"),
+            (bearer("late"), "TOKEN_EXPIRED"),
+        ],
+    )
+    def test_callers_without_a_good_token_are_told_why(self, metadata: Any, reason: str) -> None:
+        late = entry(name="late", sha256=sha256_of("late"), expires=NOW.isoformat())
+        with pytest.raises(Unauthenticated) as caught:
+            authenticator(entry(), late).authenticate(metadata, READ)
+        assert (caught.value.reason, caught.value.code) == (reason, "UNAUTHENTICATED")
+        assert "secret" not in str(caught.value).lower()
+
+    def test_a_revoked_token_and_one_that_never_was_get_the_same_answer(self, path: Path) -> None:
+        revoked = create_token(path, "a", "t", "read", None)
+        revoke_token(path, "a")
+        caller = Authenticator(lambda: read_tokens(path))
+        answers = set()
+        for token in (revoked, revoked.swapcase()):
+            with pytest.raises(RequestError) as caught:
+                caller.authenticate(bearer(token), READ)
+            answers.add((type(caught.value), str(caught.value), caught.value.reason))
+        assert len(answers) == 1
+
+    def test_a_token_is_good_until_the_moment_it_expires(self) -> None:
+        now = [NOW - timedelta(microseconds=1)]
+        caller = authenticator(entry(expires=NOW.isoformat()), now=lambda: now[0])
+        assert caller.authenticate(bearer("secret"), READ).name == "robot"
+        now[0] = NOW
+        with pytest.raises(Unauthenticated) as caught:
+            caller.authenticate(bearer("secret"), READ)
+        assert caught.value.reason == "TOKEN_EXPIRED"
+
+    @given(st.text(st.characters(codec="utf-8"), max_size=30))
+    def test_no_other_text_opens_the_door(self, text: str) -> None:
+        with pytest.raises(Unauthenticated):
+            authenticator(entry(sha256=sha256_of("secret" * 3))).authenticate((("authorization", text),), READ)
+
+    def test_the_scheme_is_read_in_any_case(self) -> None:
+        caller = authenticator(entry())
+        assert caller.authenticate((("authorization", "bEaReR secret"),), READ).tenant == "acme"
+
+    def test_without_tokens_everybody_is_the_default_tenant_named_by_the_certificate(self) -> None:
+        caller = Authenticator(None)
+        assert caller.authenticate((), READ) == Principal(DEFAULT_TENANT, Role.WRITE, "")
+        context = {"x509_common_name": [b"robot-7"], "x509_subject_alternative_name": [b"r7.example"]}
+        assert caller.authenticate(bearer("whatever"), READ, context).name == "robot-7"
+
+    def test_a_certificate_cannot_write_lines_into_the_log(self) -> None:
+        assert certificate_name({"x509_common_name": [b"a\nb\x1b[0m\xff"]}) == "a?b?[0m\ufffd"
+        assert certificate_name({"x509_subject_alternative_name": [b"x" * 999]}) == "x" * 128
+        assert certificate_name({"x509_common_name": []}) == ""
+
+
+class TestCommand:
+    def run(self, *arguments: str, path: Path) -> tuple[int, str, str]:
+        result = CliRunner().invoke(command.token_app, [*arguments, "--tokens-file", str(path)])
+        return result.exit_code, result.stdout, result.stderr
+
+    def test_create_prints_the_token_alone_then_list_and_revoke(self, path: Path) -> None:
+        create = ("create", "--name", "robot-7", "--tenant", "acme", "--role", "localize")
+        code, token, said = self.run(*create, "--expires", "2099-01-01T00:00:00Z", path=path)
+        assert (code, token.count("\n")) == (0, 1)
+        assert token.strip() not in said
+        known = read_tokens(path).find(token.strip())
+        assert known is not None
+        assert (known.name, known.role, known.expires) == (
+            "robot-7",
+            "localize",
+            datetime(2099, 1, 1, tzinfo=timezone.utc),
+        )
+        code, listed, _ = self.run("list", path=path)
+        assert code == 0
+        assert listed == "robot-7  localize  tenant acme  expires 2099-01-01T00:00:00+00:00\n"
+        assert self.run("revoke", "robot-7", path=path) == (0, "", "")
+        assert self.run("list", path=path) == (0, "", "")
+
+    @pytest.mark.parametrize(
+        ("arguments", "code", "complaint"),
+        [
+            (("create", "--name", "a", "--role", "king"), 1, "role"),
+            (("create", "--name", "a", "--role", "read", "--expires", "soon"), 2, "--expires"),
+            (("create", "--name", "a", "--role", "read", "--expires", "2099-01-01T00:00:00"), 2, "--expires"),
+            (("create", "--name", "a", "--role", "read", "--expires", "2001-01-01T00:00:00Z"), 2, "over already"),
+            (("create", "--name", "old", "--role", "read"), 1, "already"),
+            (("revoke", "a"), 1, "no token"),
+        ],
+    )
+    def test_complaints_are_one_line(self, path: Path, arguments: tuple[str, ...], code: int, complaint: str) -> None:
+        create_token(path, "old", "t", "read", None)
+        found_code, printed, said = self.run(*arguments, path=path)
+        assert (found_code, printed, said.count("\n")) == (code, "", 1)
+        assert complaint in said
+
+    def test_the_clients_token_in_the_environment_is_not_the_servers_business(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("MAPLESS_TOKEN", "mapless_x")
+        create_token(path, "a", "t", "read", None)
+        assert self.run("list", path=path)[0] == 0
+
+    def test_without_a_file_it_says_how_to_name_one(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.delenv("MAPLESS_TOKENS_FILE", raising=False)
+        result = CliRunner().invoke(command.token_app, ["list"])
+        assert (result.exit_code, "MAPLESS_TOKENS_FILE" in result.stderr) == (2, True)
+
+    def test_the_servers_setting_names_the_file(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        create_token(path, "a", "t", "read", None)
+        monkeypatch.setenv("MAPLESS_TOKENS_FILE", str(path))
+        result = CliRunner().invoke(command.token_app, ["list"])
+        assert result.stdout == "a  read      tenant t  never expires\n"

@@ -1,0 +1,114 @@
+"""Settings to tiers: what serves, and what is said where something is missing."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mapless_server.method.features import make_extractor
+from mapless_server.networks.weights import WeightsMissing
+from mapless_server.observability.metrics import Metrics
+from mapless_server.serve import assembly
+from mapless_server.serve.assembly import (
+    StartupError,
+    choose_device,
+    feature_names,
+    make_engine,
+    make_first_features,
+    make_tiers,
+)
+from mapless_server.settings import Settings
+from mapless_server.store import Store
+
+
+def settings(tmp_path: Path, **values: str) -> Settings:
+    return Settings(data_dir=tmp_path / "data", weights_dir=tmp_path / "weights", **values)  # type: ignore[arg-type]
+
+
+def test_one_kind_of_features_is_one_tier(tmp_path: Path) -> None:
+    (tier,) = make_tiers(settings(tmp_path, features="sift"))
+    assert tier.extractor.name == make_first_features(settings(tmp_path, features="sift"))[1].name
+    assert feature_names("sift", "cpu") == ("sift",)
+
+
+def test_auto_begins_with_features_that_need_nothing(tmp_path: Path) -> None:
+    assert feature_names("auto", "cpu")[0] == "sift"
+    _, extractor = make_first_features(settings(tmp_path, features="auto"))
+    assert extractor.name == make_first_features(settings(tmp_path, features="sift"))[1].name
+
+
+@pytest.mark.parametrize(
+    ("missing", "told"),
+    [("weights", "weights fetch aliked"), ("package", "mapless-absent is not installed: pip install")],
+)
+def test_auto_serves_with_what_is_there_and_says_so_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, missing: str, told: str
+) -> None:
+    def without_package(name: str, *arguments: object) -> object:
+        if name != "sift":
+            raise ModuleNotFoundError("No module named 'mapless-absent'", name="mapless-absent")
+        return make_extractor(name)
+
+    if missing == "package":
+        monkeypatch.setattr(assembly, "find_weights", lambda name, weights_dir: weights_dir / name)
+        monkeypatch.setattr(assembly, "make_extractor", without_package)
+    with caplog.at_level(logging.WARNING):
+        (tier,) = make_tiers(settings(tmp_path, features="auto"))
+    assert tier.extractor.name.startswith("sift")
+    (record,) = caplog.records
+    assert told in record.getMessage()
+    assert "\n" not in record.getMessage()
+    assert record.getMessage().startswith("features auto: sift serves without aliked: ")
+
+
+def test_what_is_asked_for_by_name_is_never_replaced(tmp_path: Path) -> None:
+    with Store.open(tmp_path / "data") as store:
+        for features, told in (("aliked", "weights fetch aliked"), ("nonesuch", "nonesuch")):
+            with pytest.raises(StartupError, match=told):
+                make_engine(settings(tmp_path, features=features), store, Metrics(), None)
+
+
+def test_a_server_without_networks_does_not_load_torch(tmp_path: Path) -> None:
+    program = (
+        "import sys; from pathlib import Path; from mapless_server.serve.assembly import make_tiers\n"
+        "from mapless_server.settings import Settings\n"
+        "make_tiers(Settings(data_dir=Path(sys.argv[1]), weights_dir=Path(sys.argv[1])))\n"
+        "print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program, tmp_path], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_features_without_a_network_need_no_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    assert len(make_tiers(settings(tmp_path, features="sift"))) == 1
+    assert len(make_tiers(settings(tmp_path, features="auto"))) == 1
+
+
+def test_on_a_gpu_the_strong_features_answer_alone() -> None:
+    assert feature_names("auto", "cuda") == ("aliked",)
+
+
+def test_a_device_that_is_not_there_is_said(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    absent = f"cuda:{torch.cuda.device_count()}"
+    with Store.open(tmp_path / "data") as store, pytest.raises(StartupError, match=f"no device {absent}"):
+        make_engine(settings(tmp_path, device=absent), store, Metrics(), None)
+    assert choose_device("cpu") == "cpu"
+
+
+def test_light_glue_is_for_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_for: list[str] = []
+
+    def find(name: str, weights_dir: Path) -> Path:
+        looked_for.append(name)
+        raise WeightsMissing(name, weights_dir)
+
+    monkeypatch.setattr(assembly, "find_weights", find)
+    for device in ("cpu", "cuda"):
+        assembly._make_matcher("aliked", settings(tmp_path), device).close()
+        assert looked_for == [] if device == "cpu" else ["aliked-lightglue"]

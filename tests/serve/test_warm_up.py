@@ -1,0 +1,255 @@
+"""Before the first call is taken a photograph is localized: rendered, with a known pose, by everything that is real.
+
+So what is broken shows at the start, in one sentence, and not in the calls; and while that lasts, the server says so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+import grpc
+import numpy as np
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from numpy.typing import NDArray
+from programs import gated, wait_until
+from servers import (
+    COVARIANCE,
+    StandInExtractor,
+    StandInReconstructor,
+    Stubs,
+    failure_of,
+    listening,
+    localize_request,
+    whole,
+)
+
+from mapless.geometry import RigidTransform
+from mapless.v1 import reference_service_pb2 as reference_pb
+from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
+from mapless_server.engine.engine import Engine, EngineOptions
+from mapless_server.engine.query import Caller, Query, Result
+from mapless_server.engine.tiers import Tier
+from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless_server.method.pnp import PoseStage
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.observability.metrics import Metrics
+from mapless_server.scheduling.costs import Costs
+from mapless_server.security.rate import RateLimiter
+from mapless_server.serve.assembly import MakeEngine, StartupError, engine_options, make_tiers
+from mapless_server.serve.warm_up import ROUNDS, warm_up
+from mapless_server.settings import Settings
+from mapless_server.store import Store
+
+LIMIT_S = 60.0
+TRUTH = np.array([0.25, 0.025, 0.0])
+"""Where the rendered photograph was taken, from what `warm_up` says of it."""
+
+
+def test_the_rendered_scene_is_localized_within_centimetres_by_what_is_real(tmp_path: Path) -> None:
+    results: list[Result] = []
+
+    async def test() -> None:
+        with Store.open(tmp_path) as store:
+            engine = Engine(store, make_tiers(Settings(data_dir=tmp_path)), EngineOptions())
+            localize = engine.localize
+
+            async def watched(query: Query, caller: Caller, source: Any) -> Any:
+                result, visits = await localize(query, caller, source)
+                results.append(result)
+                return result, visits
+
+            engine.localize = watched  # type: ignore[method-assign, assignment]
+            try:
+                await warm_up(engine)
+            finally:
+                await engine.close()
+
+    asyncio.run(test())
+    assert len(results) == ROUNDS
+    for result in results:
+        found = result.attempt.answer.outcome
+        assert isinstance(found, Localization)
+        assert np.linalg.norm(found.world_from_camera.translation - TRUTH) < 0.03
+        assert found.inlier_count >= 50  # else stronger features would be tried, and be cold in the first call
+        assert found.covariance is not None
+
+
+def test_every_tier_is_asked_for_its_view_of_the_references(tmp_path: Path) -> None:
+    """Whatever a network needs once, it needs before the first call."""
+    extractors = [StandInExtractor(f"stand-in {i}") for i in range(2)]
+
+    async def test() -> None:
+        with Store.open(tmp_path) as store:
+            tiers = [Tier(it, Pipeline(cast(Any, StandInReconstructor()))) for it in extractors]
+            engine = Engine(store, tiers, EngineOptions(), method=whole(lambda *_: answer_at(TRUTH)))
+            try:
+                await warm_up(engine)
+            finally:
+                await engine.close()
+
+    asyncio.run(test())
+    for extractor in extractors:
+        assert len(extractor.seen) >= 3
+
+
+def answer_at(centre: NDArray[np.float64]) -> Answer:
+    return Answer(Localization(RigidTransform(np.eye(3), centre), COVARIANCE, PoseStage.REFINED, 90, 120, 0.7))
+
+
+def engine_of(localize: Callable[..., Answer], begin: Callable[[], object] = lambda: None) -> MakeEngine:
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+        begin()
+        tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
+        return Engine(store, tiers, engine_options(settings), metrics, quota, whole(localize))
+
+    return make
+
+
+def test_the_queue_expects_what_the_last_round_took_and_not_what_the_first_did(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Kernels are compiled and pages are read in the first."""
+    seen: list[tuple[str, str, float]] = []
+    observe = Costs.observe
+
+    def watched(costs: Costs, stage: str, kind: str, seconds: float) -> None:
+        seen.append((stage, kind, seconds))
+        observe(costs, stage, kind, seconds)
+
+    monkeypatch.setattr(Costs, "observe", watched)
+
+    def localize(*_: Any) -> Answer:
+        time.sleep(0.0 if any(stage == "refine" for stage, _, _ in seen) else 0.3)
+        return answer_at(TRUTH)
+
+    async def test() -> None:
+        with Store.open(tmp_path) as store:
+            tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
+            engine = Engine(store, tiers, EngineOptions(), method=whole(localize))
+            try:
+                await warm_up(engine)
+            finally:
+                await engine.close()
+            assert [stage for stage, _, _ in seen] == ["prepare", "coarse", "refine"] * ROUNDS
+            for stage, kind, seconds in seen[-3:]:
+                assert engine.queue._schedule.costs.predict(stage, kind) == pytest.approx(seconds)
+
+    asyncio.run(test())
+
+
+def test_the_servers_own_localization_is_charged_to_nobody(tmp_path: Path) -> None:
+    """However little computing a tenant may use, and however long the first photograph takes."""
+
+    def localize(*_: Any) -> Answer:
+        time.sleep(0.5)
+        return answer_at(TRUTH)
+
+    settings = Settings(
+        host="127.0.0.1", port=0, data_dir=tmp_path, metrics=False, tenant_rate_ms=50, tenant_burst_ms=200
+    )
+    with (
+        listening(settings, Store.open(tmp_path), engine_of(localize)) as (running, _),
+        grpc.insecure_channel(running.address) as channel,
+    ):
+        status = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=10).status
+        assert status == health_pb2.HealthCheckResponse.SERVING
+
+
+def raising(error: Exception) -> Callable[..., Answer]:
+    def localize(*_: Any) -> Answer:
+        raise error
+
+    return localize
+
+
+BROKEN = {
+    "raises": (raising(RuntimeError("no kernel image")), "no kernel image"),
+    "lost": (raising(RuntimeError("CUDA error: an illegal memory access was encountered")), "about to end"),
+    "memory": (raising(MemoryError()), "too little memory"),
+    "rejects": (lambda *_: Answer(Rejection(RejectionReason.GATE, "a gate")), "a gate"),
+    "off": (lambda *_: answer_at(TRUTH + np.array([0.0, 0.0, 0.2])), "0.20 m off"),
+    "nan": (lambda *_: answer_at(TRUTH * np.nan), "not finite"),
+}
+
+
+@pytest.mark.parametrize("way", BROKEN)
+def test_a_method_that_is_broken_ends_the_start(tmp_path: Path, way: str) -> None:
+    localize, told = BROKEN[way]
+    settings = Settings(host="127.0.0.1", port=0, data_dir=tmp_path, metrics=False)
+    with (
+        pytest.raises(StartupError, match="the first localization failed") as caught,
+        listening(settings, Store.open(tmp_path), engine_of(localize)),
+    ):
+        raise AssertionError("it began to serve")
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def free_port() -> int:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return int(taken.getsockname()[1])
+
+
+@contextmanager
+def starting(folder: Path, make: MakeEngine) -> Iterator[tuple[str, Callable[[], None]]]:
+    """The address of a server that starts, and what waits until it has."""
+    port = free_port()
+    settings = Settings(host="127.0.0.1", port=port, data_dir=folder, metrics=False)
+    with ThreadPoolExecutor(1) as thread, ExitStack() as stack:
+        entering = thread.submit(stack.enter_context, listening(settings, Store.open(folder), make))
+        yield f"127.0.0.1:{port}", lambda: (entering.result(LIMIT_S), None)[1]
+
+
+@pytest.mark.parametrize("phase", ["the engine is made", "the first photograph is localized"])
+def test_a_server_that_starts_says_so_and_then_serves(tmp_path: Path, phase: str) -> None:
+    began, gate = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        began.set()
+        assert gate.wait(LIMIT_S)
+
+    def localize(*_: Any) -> Answer:
+        if phase != "the engine is made":
+            hold()
+        return answer_at(TRUTH)
+
+    make = engine_of(localize, hold if phase == "the engine is made" else lambda: None)
+    with starting(tmp_path, make) as (address, until_started), grpc.insecure_channel(address) as channel:
+        try:
+            assert began.wait(LIMIT_S)
+            health = health_pb2_grpc.HealthStub(channel)
+            stubs = Stubs(LocalizationServiceStub(channel), ReferenceServiceStub(channel))
+            for service in ("", "mapless.v1.LocalizationService", "mapless.v1.ReferenceService"):
+                asked = health.Check(health_pb2.HealthCheckRequest(service=service), timeout=10, wait_for_ready=True)
+                assert asked.status == health_pb2.HealthCheckResponse.NOT_SERVING
+            error = failure_of(stubs.localization.Localize, localize_request("s"))
+            assert (error.code, error.reason) == ("UNAVAILABLE", "STARTING")
+            assert error.retry_after_s == 1.0
+        finally:
+            gate.set()
+        until_started()
+        status = health.Check(health_pb2.HealthCheckRequest(), timeout=10).status
+        assert status == health_pb2.HealthCheckResponse.SERVING
+        stubs.references.CreateScene(reference_pb.CreateSceneRequest(scene_id="s"), timeout=10)
+        assert failure_of(stubs.localization.Localize, localize_request("absent")).code == "NOT_FOUND"
+
+
+def test_sigterm_during_the_start_ends_it(tmp_path: Path) -> None:
+    with gated(tmp_path / "server", warm_up=True) as server:
+        wait_until(lambda: server.began)
+        server.process.send_signal(signal.SIGTERM)
+        assert server.wait() == 0
+        assert "stopping before the start was over" in server.log
+        assert not server.output

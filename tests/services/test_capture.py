@@ -1,0 +1,588 @@
+"""The limits of a capture folder hold at every moment, and nothing outlives what it was made of; by planted files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import shutil
+import stat
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapless.geodesy import Datum
+from mapless.geometry import Camera, RadialTangential, RigidTransform, rotation_from_vector
+from mapless_server.observability.metrics import Metrics
+from mapless_server.scenes.retrieval.chosen import Choice
+from mapless_server.scenes.retrieval.ranking import RankedReference
+from mapless_server.services.capture import blobs as blobs_module
+from mapless_server.services.capture import files as files_module
+from mapless_server.services.capture import folder as folder_module
+from mapless_server.services.capture import held as held_module
+from mapless_server.services.capture.calls import (
+    CapturedCall,
+    CapturedPart,
+    CapturedReference,
+    decode_call,
+    encode_call,
+)
+from mapless_server.services.capture.errors import BlobGone, CaptureError, DamagedCapture
+from mapless_server.services.capture.files import write_whole
+from mapless_server.services.capture.folder import CaptureFolder, Retention
+from mapless_server.services.capture.opening import open_recorder
+from mapless_server.settings import ConfigError, load_settings
+from mapless_server.store import SceneAttributes, Store
+from mapless_tools.replay.report import Selection
+
+NOW_S = 1_800_000_000.0
+POSE = RigidTransform(rotation_from_vector([0.1, 0.2, 0.3]), np.array([1 / 3, 2e6, -0.1]))
+CAMERA = Camera(640, 480, 500.1, 500.2, 319.7, 239.3, RadialTangential(0.1, 0.01, 1e-4, 2e-4, 1e-3))
+ROOM = Retention(3600.0, 2**20)
+IMAGES = {f"{i:064x}": bytes([i]) * 30_000 for i in range(8)}
+
+
+def reference(number: int) -> CapturedReference:
+    return CapturedReference(f"r{number}", f"key-{number}", CAMERA, POSE, f"{number:064x}", {})
+
+
+def a_call(
+    number: int = 0, references: tuple[int, ...] = (0, 1), time_s: float = NOW_S, size: int = 1000
+) -> CapturedCall:
+    part = CapturedPart("image", 7, tuple(map(reference, references)))
+    request = np.random.default_rng(number).bytes(size)
+    return CapturedCall(f"id-{number}", time_s, "Localize", "acme", "hall", 5, parts=(part,), request=request)
+
+
+def blobs_of(call: CapturedCall) -> dict[str, bytes]:
+    return {name: IMAGES[name] for name in call.blobs}
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted(it for it in folder.rglob("*") if it.is_file() and it.name not in ("lock", "mapless-capture.json"))
+
+
+def opened(path: Path, retention: Retention = ROOM, clock: Callable[[], float] = lambda: NOW_S) -> CaptureFolder:
+    return CaptureFolder(path, retention, clock)
+
+
+def refuse_to_delete(stuck: set[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """From now on files that are in the set cannot be deleted."""
+    unlink = Path.unlink
+
+    def refused(path: Path, missing_ok: bool = False) -> None:
+        if path in stuck:
+            raise PermissionError(1, "Operation not permitted")
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", refused)
+
+
+def test_a_call_is_read_as_it_was_written() -> None:
+    """To the last bit, NaN among the similarities too."""
+    ranked = tuple(RankedReference(f"r{i}", f"key-{i}", value, POSE) for i, value in enumerate((1 / 3, float("nan"))))
+    attributes = SceneAttributes(Datum(47.1, 8.2, 400.3), (0.0, 0.0, -1.0))
+    parts = (CapturedPart("images[0].image", 3, (reference(1),), Choice(ranked, "vlad-1", 3)), CapturedPart("b", 4, ()))
+    call = replace(a_call(), attributes=attributes, parts=parts, circumstances={"mapless": "1"}, response=b"\x00\xff")
+    data = encode_call(call)
+    read = decode_call(data)
+    assert encode_call(read) == data
+    assert (read.request, read.response, read.attributes) == (call.request, call.response, attributes)
+    first = read.parts[0].references[0]
+    assert first.camera == CAMERA
+    np.testing.assert_array_equal(first.world_from_camera.matrix(), POSE.matrix())
+
+
+@pytest.mark.parametrize("end", [0, 3, 17, 60, -33, -1])
+def test_a_call_that_is_cut_is_damaged(end: int) -> None:
+    with pytest.raises(DamagedCapture):
+        decode_call(encode_call(a_call())[:end])
+
+
+def test_a_call_with_a_bit_changed_is_damaged() -> None:
+    data = encode_call(a_call(size=50))
+    for position in range(0, len(data), 7):
+        changed = bytearray(data)
+        changed[position] ^= 4
+        with pytest.raises(CaptureError):
+            decode_call(bytes(changed))
+
+
+def test_references_are_kept_once_and_go_with_the_last_call_that_needs_them(tmp_path: Path) -> None:
+    folder = opened(tmp_path / "c")
+    for number, references in enumerate([(0, 1), (1, 2), (1, 2)]):
+        call = a_call(number, references)
+        missing = {name: data for name, data in blobs_of(call).items() if not folder.has_blob("acme", name)}
+        assert len(missing) == (2, 1, 0)[number]
+        assert folder.add(call, missing)
+    assert len(files(tmp_path / "c")) == 3 + 3
+    for count, left in ((5, 2), (3, 1), (0, 0)):
+        folder.remove_all(folder.held()[:1])
+        assert (len(files(tmp_path / "c")), len(folder)) == ((2 + 2, 1 + 2, 0)[2 - left], left), count
+    assert folder.space_bytes == 0
+    folder.close()
+
+
+def test_only_the_owner_may_read(tmp_path: Path) -> None:
+    (tmp_path / "c").mkdir(mode=0o755)
+    folder = opened(tmp_path / "c")
+    call = a_call()
+    folder.add(call, blobs_of(call))
+    assert {stat.S_IMODE(it.stat().st_mode) for it in files(tmp_path / "c")} == {0o600}
+    assert stat.S_IMODE((tmp_path / "c").stat().st_mode) == 0o700
+    folder.close()
+
+
+def test_the_limit_of_size_holds_at_every_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Looked at after each file that is written, unfinished ones and whole blocks counted; the oldest go first."""
+    limit, most = 300_000, []
+
+    def watched(path: Path, data: bytes) -> None:
+        write_whole(path, data)
+        most.append(sum(-(-it.stat().st_size // 4096) * 4096 for it in files(tmp_path / "c")))
+
+    for module in (folder_module, blobs_module):
+        monkeypatch.setattr(module, "write_whole", watched)
+    folder = opened(tmp_path / "c", Retention(3600.0, limit))
+    random = np.random.default_rng(1)
+    for number in range(60):
+        references = tuple(random.choice(8, 3, replace=False).tolist())
+        call = a_call(number, references, size=int(random.integers(100, 60_000)))
+        missing = {name: data for name, data in blobs_of(call).items() if not folder.has_blob("acme", name)}
+        assert folder.add(call, missing)
+        assert folder.space_bytes == most[-1]
+    assert max(most) <= limit
+    kept = [decode_call(it.path.read_bytes()).request_id for it in folder.held()]
+    assert kept == [f"id-{number}" for number in range(60 - len(kept), 60)]
+    assert 2 <= len(kept) < 60
+    before = files(tmp_path / "c")
+    too_large = a_call(99, size=limit)
+    assert not folder.add(too_large, blobs_of(too_large))
+    assert files(tmp_path / "c") == before
+    folder.close()
+
+
+def test_what_is_too_old_goes_while_nothing_comes_and_at_the_start(tmp_path: Path) -> None:
+    now_s = [NOW_S]
+    folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
+    for number in range(3):
+        call = a_call(number, (number,), now_s[0])
+        folder.add(call, blobs_of(call))
+        now_s[0] += 40
+    assert len(folder) == 3
+    assert folder.expire() == pytest.approx(20, abs=1)  # the first is 120 s old, the second 80
+    assert len(folder) == 2
+    folder.close()
+    now_s[0] += 30
+    folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
+    assert [it.references for it in folder.held()] == [{("r2", "key-2")}]
+    assert len(files(tmp_path / "c")) == 2
+    folder.close()
+    now_s[0] -= 10_000  # the clock is set back: nobody knows how old it is
+    folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
+    assert files(tmp_path / "c") == []
+    folder.close()
+
+
+def test_what_is_too_old_goes_though_the_clock_is_set_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Back: what has passed counts. Ahead: the clock does. And a call that was ahead of the clock stays no longer."""
+    now_s, passed_s = [NOW_S], [0.0]
+    for module in (folder_module, held_module):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: passed_s[0]))
+    folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
+    folder.add(a_call(0, ()), {})
+    folder.add(a_call(1, (), NOW_S + 50), {})
+    now_s[0] -= 10_000
+    passed_s[0] = 99.0
+    assert (folder.expire(), len(folder)) == (1.0, 2)
+    passed_s[0] = 100.0
+    assert (folder.expire(), len(folder), files(tmp_path / "c")) == (100.0, 0, [])
+    folder.add(a_call(2, (), now_s[0]), {})
+    now_s[0] += 60
+    assert (folder.expire(), len(folder)) == (40.0, 1)
+    now_s[0] += 40
+    assert (folder.expire(), len(folder)) == (100.0, 0)
+    folder.close()
+
+
+def test_what_a_crash_left_and_what_is_damaged_is_deleted_at_the_start(tmp_path: Path) -> None:
+    """Unfinished files, blobs without a call, calls without a blob, and calls that are cut; but no foreign files."""
+    folder = opened(tmp_path / "c")
+    for number in range(3):
+        call = a_call(number, (number,))
+        folder.add(call, blobs_of(call))
+    first, second, third = folder.held()
+    folder.close()
+    first.path.write_bytes(first.path.read_bytes()[:-1])
+    next(iter(second.blobs)).unlink()
+    third.path.with_name("x.call.tmp").write_bytes(b"half")
+    (next(iter(third.blobs)).parent / f"{77:064x}").write_bytes(b"orphan")
+    (tmp_path / "c" / "notes.txt").write_text("of the operator")
+    folder = opened(tmp_path / "c")
+    assert [it.path for it in folder.held()] == [third.path]
+    assert set(files(tmp_path / "c")) == {third.path, *third.blobs, tmp_path / "c" / "notes.txt"}
+    folder.close()
+
+
+def test_what_somebody_deleted_by_hand_is_forgotten(tmp_path: Path) -> None:
+    folder = opened(tmp_path / "c")
+    for number in range(2):
+        call = a_call(number, (number,))
+        folder.add(call, blobs_of(call))
+    folder.held()[0].path.unlink()
+    next(iter(folder.held()[1].blobs)).unlink()
+    folder.forget_deleted()
+    assert (len(folder), folder.space_bytes, files(tmp_path / "c")) == (0, 0, [])
+    assert folder.add(call, blobs_of(call))
+    folder.close()
+
+
+def test_one_file_that_cannot_be_deleted_keeps_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither a call nor a blob; it stays counted, is told of, and goes when it can be deleted."""
+    now_s = [NOW_S]
+    folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
+    for number in range(4):
+        call = a_call(number, (number,))
+        folder.add(call, blobs_of(call))
+    held = folder.held()
+    stuck = {held[0].path, next(iter(held[2].blobs))}
+    refuse_to_delete(stuck, monkeypatch)
+    now_s[0] += 101
+    for _ in range(2):
+        with pytest.raises(PermissionError):
+            folder.expire()
+        assert set(files(tmp_path / "c")) == {*stuck, *held[0].blobs}
+        assert folder.space_bytes == sum(-(-it.stat().st_size // 4096) * 4096 for it in files(tmp_path / "c"))
+    monkeypatch.undo()
+    folder.expire()
+    assert (files(tmp_path / "c"), folder.space_bytes, len(folder)) == ([], 0, 0)
+    folder.close()
+
+
+@pytest.mark.parametrize("content", [b"", IMAGES[f"{0:064x}"][:-1]])
+def test_a_blob_that_was_cut_is_written_anew(tmp_path: Path, content: bytes) -> None:
+    """As a power failure leaves it; what was kept with it cannot be replayed, and goes."""
+    data = IMAGES[f"{0:064x}"]
+    name = hashlib.sha256(data).hexdigest()
+    part = CapturedPart("image", 7, (replace(reference(0), image_sha256=name),))
+    first, second = (replace(a_call(number), parts=(part,)) for number in range(2))
+    folder = opened(tmp_path / "c")
+    folder.add(first, {name: data})
+    (path,) = folder.held()[0].blobs
+    folder.close()
+    path.write_bytes(content)
+    folder = opened(tmp_path / "c")
+    assert not folder.has_blob("acme", name)
+    assert len(folder) == 0
+    folder.add(second, {name: data})
+    assert path.read_bytes() == data
+    folder.close()
+    folder = opened(tmp_path / "c")
+    assert folder.has_blob("acme", name)
+    assert len(folder) == 1
+    folder.close()
+
+
+def test_a_blob_that_went_meanwhile_is_asked_for_again(tmp_path: Path) -> None:
+    folder = opened(tmp_path / "c")
+    call = a_call()
+    with pytest.raises(BlobGone):
+        folder.add(call, {})
+    assert (files(tmp_path / "c"), folder.space_bytes) == ([], 0)
+    assert folder.add(call, blobs_of(call))
+    folder.close()
+
+
+def test_what_cannot_be_read_at_the_start_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = opened(tmp_path / "c")
+    folder.add(a_call(), blobs_of(a_call()))
+    folder.close()
+
+    def refused(path: Path) -> bytes:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    read = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda it: refused(it) if it.suffix == ".call" else read(it))
+    with pytest.raises(CaptureError, match=r"cannot be used: .*\.call: Permission denied"):
+        opened(tmp_path / "c")
+    monkeypatch.undo()
+    opened(tmp_path / "c").close()
+
+
+def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = opened(tmp_path / "c")
+
+    def full(path: Path, data: bytes) -> None:
+        if path.suffix:
+            raise OSError(28, "No space left on device")
+        write_whole(path, data)
+
+    for module in (folder_module, blobs_module):
+        monkeypatch.setattr(module, "write_whole", full)
+    with pytest.raises(OSError, match="No space"):
+        folder.add(a_call(), blobs_of(a_call()))
+    assert (files(tmp_path / "c"), folder.space_bytes, len(folder)) == ([], 0, 0)
+    folder.close()
+
+
+def test_what_cannot_be_deleted_never_makes_it_more_than_the_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others go in place of a call that cannot be deleted; where that is not enough nothing is written."""
+    limit, random = 100_000, np.random.default_rng(3)
+    folder = opened(tmp_path / "c", Retention(3600.0, limit))
+    stuck = set[Path]()
+    refuse_to_delete(stuck, monkeypatch)
+    for number in range(3):
+        folder.add(a_call(number, (number,), size=1000), blobs_of(a_call(number, (number,))))
+    first = folder.held()[0]
+    stuck.add(first.path)
+    assert folder.add(a_call(3, (3,), size=20_000), blobs_of(a_call(3, (3,))))
+    assert folder.held()[0].path == first.path
+    stuck.update(files(tmp_path / "c"))
+    for number in range(4, 8):
+        call = a_call(number, (number,), size=int(random.integers(30_000, 60_000)))
+        with pytest.raises(OSError, match="leaves no room"):
+            folder.add(call, blobs_of(call))
+        assert sum(-(-it.stat().st_size // 4096) * 4096 for it in files(tmp_path / "c")) == folder.space_bytes <= limit
+    folder.close()
+
+
+@pytest.mark.parametrize("left", ["lock", "marker, half", "marker, empty", "calls", "nothing"])
+def test_a_folder_that_a_killed_server_or_a_deletion_by_hand_left_is_opened(tmp_path: Path, left: str) -> None:
+    """And its limits hold again."""
+    path = tmp_path / "c"
+    folder = opened(path)
+    folder.add(a_call(), blobs_of(a_call()))
+    folder.close()
+    (path / "mapless-capture.json").unlink()
+    if left == "nothing":
+        (path / "lock").unlink()
+    if left != "calls":
+        shutil.rmtree(path / "tenants")
+    if left == "marker, half":
+        (path / "mapless-capture.json.tmp").write_text('{"for')
+    if left == "marker, empty":
+        (path / "mapless-capture.json").touch()
+    folder = opened(path, clock=lambda: NOW_S + 10_000)
+    assert sorted(it.name for it in path.rglob("*") if it.is_file()) == ["lock", "mapless-capture.json"]
+    folder.close()
+
+
+def test_a_folder_for_which_the_disk_was_full_is_opened_when_it_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files_module, "write_whole", full)
+    with pytest.raises(CaptureError, match="No space left"):
+        opened(tmp_path / "c")
+    monkeypatch.undo()
+    opened(tmp_path / "c").close()
+
+
+def test_a_folder_that_is_deleted_by_hand_is_made_anew_by_its_server_alone(tmp_path: Path) -> None:
+    path = tmp_path / "c"
+    folder = opened(path)
+    folder.add(a_call(), blobs_of(a_call()))
+    shutil.rmtree(path)
+    with pytest.raises(BlobGone):
+        folder.add(a_call(1), {})
+    assert folder.add(a_call(1), blobs_of(a_call(1)))
+    assert len(folder) == 1
+    assert stat.S_IMODE(path.stat().st_mode) == 0o700
+    with pytest.raises(CaptureError, match="in use by another server"):
+        opened(path)
+    shutil.rmtree(path)
+    other = opened(path)
+    with pytest.raises(CaptureError, match="in use by another server"):
+        folder.add(a_call(2), blobs_of(a_call(2)))
+    assert files(path) == []
+    other.close()
+    folder.close()
+    opened(path).close()
+
+
+def with_header(data: bytes, change: Callable[[dict[str, Any]], object]) -> bytes:
+    """The file of a call with another header, and the digest of that."""
+    header, _, messages = data[32:].partition(b"\n")
+    content = json.loads(header)
+    change(content)
+    body = json.dumps(content).encode() + b"\n" + messages
+    return hashlib.sha256(body).digest() + body
+
+
+ODD_VALUES: tuple[Any, ...] = (
+    *(math.nan, math.inf, -math.inf, 1e300, -1e300, 10**400, -1, 0, True, None, NOW_S + 61, NOW_S + 59),
+    *("", "..", "/", "\ud800", "\0", "acme/../other", [], [[]], {}, {"a": {}}, ["acme"], [float("nan")], "x" * 300),
+)
+
+
+def places_in(content: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Of each of the values in a header, the inner ones too."""
+    inner = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    for name, it in inner:
+        yield (*path, name)
+        yield from places_in(it, (*path, name))
+
+
+def set_at(place: tuple[Any, ...], value: Any, content: Any) -> None:
+    for name in place[:-1]:
+        content = content[name]
+    content[place[-1]] = value
+
+
+def test_nothing_that_a_header_says_keeps_a_call_beyond_its_time(tmp_path: Path) -> None:
+    """Any value of it, changed to anything, by somebody who can make digests: the call goes at once, or on time."""
+    now_s, kept = [NOW_S], 0
+    path = tmp_path / "c"
+    folder = opened(path)
+    call = replace(
+        a_call(size=10), parts=(CapturedPart("image", 7, (replace(reference(0), views={"a": f"{1:064x}"}),)),)
+    )
+    folder.add(call, blobs_of(call))
+    (held,) = folder.held()
+    folder.close()
+    data = held.path.read_bytes()
+    places = list(places_in(json.loads(data[32:].partition(b"\n")[0])))
+    random = np.random.default_rng(0)
+    for place in places:
+        is_vital = place in (("tenant",), ("scene_id",), ("time_s",))
+        for index in range(len(ODD_VALUES)) if is_vital else random.choice(len(ODD_VALUES), 1).tolist():
+            now_s[0] = NOW_S
+            changed = with_header(data, partial(set_at, place, ODD_VALUES[index]))
+            write_whole(held.path, changed)
+            for blob in held.blobs:
+                write_whole(blob, IMAGES[blob.name])
+            try:
+                folder = opened(path, clock=lambda: now_s[0])
+            except CaptureError as error:  # of a format to come
+                assert "its format" in str(error)  # noqa: PT017
+                continue
+            kept += len(folder)
+            now_s[0] += ROOM.keep_s + 60
+            assert 0 < folder.expire() <= ROOM.keep_s
+            assert (files(path), len(folder), folder.space_bytes) == ([], 0, 0)
+            folder.close()
+    assert kept > 10
+
+
+def test_a_call_of_another_scene_than_its_place_says_is_deleted(tmp_path: Path) -> None:
+    """Who deletes that scene would not know of it."""
+    folder = opened(tmp_path / "c")
+    folder.add(a_call(), blobs_of(a_call()))
+    (held,) = folder.held()
+    folder.close()
+    write_whole(held.path, with_header(held.path.read_bytes(), lambda header: header.update(scene_id="other")))
+    folder = opened(tmp_path / "c")
+    assert files(tmp_path / "c") == []
+    folder.close()
+
+
+def test_calls_of_the_same_moment_do_not_take_one_anothers_place(tmp_path: Path) -> None:
+    """As of two servers, one after the other, with the same process id, when the clock is set back between."""
+    for count in (1, 2, 3):
+        folder = opened(tmp_path / "c")
+        folder.add(a_call(count, ()), {})
+        assert len(folder) == len(files(tmp_path / "c")) == count
+        folder.close()
+
+
+def test_what_is_larger_than_all_may_be_is_deleted_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may be larger than the memory."""
+    folder = opened(tmp_path / "c")
+    folder.add(a_call(), blobs_of(a_call()))
+    (held,) = folder.held()
+    folder.close()
+    with held.path.open("r+b") as file:
+        file.truncate(ROOM.max_bytes + 1)
+    monkeypatch.setattr(held_module, "decode_call", lambda _: pytest.fail("read"))
+    folder = opened(tmp_path / "c")
+    assert files(tmp_path / "c") == []
+    folder.close()
+
+
+@pytest.mark.parametrize("place", ["tenants", "tenants/acme", "tenants/acme/blobs", "tenants/acme/calls/hall"])
+@pytest.mark.parametrize("fault", ["link", "locked"])
+def test_what_cannot_be_looked_into_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, fault: str
+) -> None:
+    """Nobody would see to it that what is in there goes; and what lies elsewhere is not deleted."""
+    path = tmp_path / "c"
+    folder = opened(path)
+    folder.add(a_call(), blobs_of(a_call()))
+    folder.close()
+    before = len(files(path))
+    if fault == "link":
+        (path / place).rename(tmp_path / "elsewhere")
+        (path / place).symlink_to(tmp_path / "elsewhere")
+    else:
+        scandir = os.scandir
+
+        def locked(at: Any) -> Any:
+            if Path(at) == path / place:
+                raise PermissionError(13, "Permission denied", str(at))
+            return scandir(at)
+
+        monkeypatch.setattr(os, "scandir", locked)
+    with pytest.raises(CaptureError, match=rf"cannot be used: .*{place}: (a symbolic link|Permission denied)"):
+        opened(path)
+    with pytest.raises(CaptureError, match=rf"{place} cannot be read: (a symbolic link|Permission denied)"):
+        Selection().files(path)
+    monkeypatch.undo()
+    elsewhere = files(tmp_path / "elsewhere")
+    assert len(files(path)) + len(elsewhere) == before
+
+
+def test_folders_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
+    folder = opened(tmp_path / "c")
+    with pytest.raises(CaptureError, match="in use by another server"):
+        opened(tmp_path / "c")
+    folder.close()
+    (tmp_path / "c" / "mapless-capture.json").write_text(json.dumps({"format": 2}))
+    with pytest.raises(CaptureError, match="has format 2"):
+        opened(tmp_path / "c")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("years of work")
+    with pytest.raises(CaptureError, match="holds something else"):
+        opened(tmp_path / "full")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CaptureError, match="cannot be used"):
+        opened(tmp_path / "file")
+    if os.geteuid():
+        (tmp_path / "locked").mkdir(mode=0o500)
+        with pytest.raises(CaptureError, match="cannot be used"):
+            opened(tmp_path / "locked")
+
+
+@pytest.mark.parametrize(("capture", "data"), [("d/c", "d"), ("d", "d"), ("d", "d/c"), ("d/../d/c", "d")])
+def test_the_store_and_what_is_captured_are_apart(tmp_path: Path, capture: str, data: str) -> None:
+    with pytest.raises(ConfigError, match="folders apart"):
+        load_settings({"capture_dir": tmp_path / capture, "data_dir": tmp_path / data})
+
+
+@pytest.mark.parametrize("flags", [{"capture_hours": 0}, {"capture_mib": 0}])
+def test_senseless_settings_are_refused(flags: dict[str, object]) -> None:
+    with pytest.raises(ConfigError):
+        load_settings(flags)
+
+
+def test_what_is_no_tenant_is_refused(tmp_path: Path) -> None:
+    settings = load_settings({"capture_dir": tmp_path / "captured", "capture_tenants": "a,../b"}).settings
+    with pytest.raises(CaptureError, match="capture_tenants"), Store.open(tmp_path / "store") as store:
+        open_recorder(settings, store, Metrics())
+    assert not (tmp_path / "captured").exists()
+
+
+def test_nothing_is_captured_unless_it_is_asked_for() -> None:
+    assert load_settings({}).settings.capture_dir is None

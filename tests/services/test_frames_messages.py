@@ -1,0 +1,113 @@
+"""An answer's pose in its caller's axes and on the Earth, as messages; the conversions have tests of their own."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from google.protobuf import json_format
+
+from mapless import wire
+from mapless.axes import Axes
+from mapless.geodesy import Datum, GeoPose
+from mapless.geometry import Quaternion, RigidTransform
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.wire import FieldError
+from mapless_server.services.messages.frames import axes_from_message, session_from_message, set_frames
+
+AXES: wire.ProtoEnum = pb.Axes
+H = math.sqrt(0.5)
+# In a world with y up: at (1, 2, 3), looks along +x, upright, so its right is +z.
+LOOKS_ALONG_X = RigidTransform(np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]]), np.array([1.0, 2.0, 3.0]))
+# In a world with x east, y north, z up: at the origin, looks east, upright, so its right is south.
+LOOKS_EAST = RigidTransform(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
+COVARIANCE = np.arange(36.0).reshape(6, 6)
+
+
+def test_a_headset_is_given_all_it_needs_in_its_own_axes() -> None:
+    """Unity's camera looks along its z: it turns by 90 degrees about y, up, to look along x; z is mirrored."""
+    session_from_camera = RigidTransform(np.eye(3), np.array([0.0, 0.0, 5.0]))
+    message = pb.Localization()
+    set_frames(message, LOOKS_ALONG_X, COVARIANCE, Axes.UNITY, session_from_camera, None)
+    framed = message.in_axes
+    assert framed.axes == pb.AXES_UNITY
+    assert quaternion_of(framed.world_from_camera) == pytest.approx((0, H, 0, H))
+    assert translation_of(framed.world_from_camera) == pytest.approx((1, 2, -3))
+    signs = np.array([1, 1, -1, -1, -1, 1])
+    np.testing.assert_array_equal(np.reshape(framed.covariance.row_major, (6, 6)), COVARIANCE * np.outer(signs, signs))
+    # The session's origin is 5 m behind the camera: at x = 1 - 5.
+    assert quaternion_of(framed.world_from_session) == pytest.approx((0, H, 0, H))
+    assert translation_of(framed.world_from_session) == pytest.approx((-4, 2, -3))
+    assert not message.HasField("geo_pose")
+
+
+@pytest.mark.parametrize("axes", Axes)
+def test_what_is_not_known_is_absent_and_not_zero(axes: Axes) -> None:
+    message = pb.Localization()
+    set_frames(message, LOOKS_ALONG_X, None, axes, None, None)
+    assert {field.name for field, _ in message.in_axes.ListFields()} == {"axes", "world_from_camera"}
+    assert AXES.Name(message.in_axes.axes) == f"AXES_{axes.name}"
+
+
+def test_who_asks_for_no_axes_is_answered_in_opencvs() -> None:
+    message = pb.Localization()
+    axes = axes_from_message(pb.LocalizeOptions())
+    set_frames(message, LOOKS_ALONG_X, COVARIANCE, axes, LOOKS_ALONG_X, None)
+    assert message.in_axes.axes == pb.AXES_OPENCV
+    assert message.in_axes.world_from_camera == wire.transform_to_message(LOOKS_ALONG_X)
+    np.testing.assert_array_equal(message.in_axes.covariance.row_major, COVARIANCE.ravel())
+    found = wire.transform_from_message(message.in_axes.world_from_session, "")
+    np.testing.assert_allclose(found.matrix(), np.eye(4), atol=1e-12)
+
+
+def test_json_of_a_geopose_is_the_standards_with_its_zeros() -> None:
+    message = pb.Localization()
+    set_frames(message, LOOKS_EAST, None, Axes.OPENCV, None, Datum(0, 0, 0))
+    content = json_format.MessageToDict(message.geo_pose)
+    assert set(content) == {"position", "quaternion"}
+    assert (set(content["position"]), set(content["quaternion"])) == ({"lat", "lon", "h"}, {"x", "y", "z", "w"})
+    found = GeoPose.from_json(content)
+    assert (found.lat, found.lon, found.h) == pytest.approx((0, 0, 0), abs=1e-9)
+    assert tuple(vars(found.quaternion).values()) == pytest.approx((0, 0, 0, 1), abs=1e-9)
+
+
+@pytest.mark.parametrize("far_m", [1.01e7, -1e300, 1.7e308])
+def test_a_session_pose_so_far_away_that_sums_of_it_are_no_numbers_is_refused(far_m: float) -> None:
+    request = pb.LocalizeRequest(session_from_camera=wire.transform_to_message(LOOKS_ALONG_X))
+    assert session_from_message(request) is not None
+    request.session_from_camera.translation_m.z = far_m
+    with pytest.raises(FieldError) as caught:
+        session_from_message(request)
+    assert caught.value.field == "session_from_camera.translation_m.z"
+
+
+def test_axes_that_there_are_not_are_refused() -> None:
+    for number in (6, -1):
+        with pytest.raises(FieldError) as caught:
+            axes_from_message(pb.LocalizeOptions(axes=number))  # type: ignore[arg-type]
+        assert caught.value.field == "options.axes"
+    names = {axes_from_message(pb.LocalizeOptions(axes=number)) for number in AXES.values()}
+    assert names == set(Axes)
+
+
+def test_a_devices_pose_is_read_as_it_is_given() -> None:
+    request = pb.LocalizeRequest()
+    assert session_from_message(request) is None
+    request.session_from_camera.CopyFrom(wire.transform_to_message(LOOKS_ALONG_X))
+    found = session_from_message(request)
+    assert found is not None
+    np.testing.assert_allclose(found.matrix(), LOOKS_ALONG_X.matrix(), atol=1e-12)
+    request.session_from_camera.rotation.w = 3
+    with pytest.raises(FieldError) as caught:
+        session_from_message(request)
+    assert caught.value.field == "session_from_camera.rotation"
+
+
+def quaternion_of(message: object) -> tuple[float, ...]:
+    q: Quaternion = wire.transform_from_message(message, "").quaternion()  # type: ignore[arg-type]
+    return q.x, q.y, q.z, q.w
+
+
+def translation_of(message: object) -> tuple[float, ...]:
+    return tuple(wire.transform_from_message(message, "").translation)  # type: ignore[arg-type]

@@ -1,0 +1,539 @@
+"""The recorder never delays or fails a call, counts what it drops, and forgets what the store forgets; all planted."""
+
+from __future__ import annotations
+
+import gc
+import math
+import re
+import threading
+import time
+import weakref
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import grpc
+import numpy as np
+import pytest
+from programs import LIMIT_S, wait_until
+from servers import CAMERA, PHOTO, localize_request, pose, serving
+
+from mapless import Client, NewReference, wire
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless_server.errors import DataLoss, NotFound, Unavailable
+from mapless_server.method.views import Features, PosedView, View
+from mapless_server.rpc.call import Call
+from mapless_server.security.principal import Principal
+from mapless_server.security.tenancy import SceneKey, key_of
+from mapless_server.services.capture import deletion as deletion_module
+from mapless_server.services.capture import recorder as recorder_module
+from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CapturedReference, decode_call
+from mapless_server.services.capture.errors import BlobGone
+from mapless_server.services.capture.files import calls_of
+from mapless_server.services.capture.folder import CaptureFolder, Retention
+from mapless_server.services.capture.recorder import Recorder
+from mapless_server.services.capture.staleness import Staleness
+from mapless_server.store import SceneAttributes, SceneRecord, Store, reading
+from mapless_server.store.reading import ReadingStore
+from mapless_server.store.rows import time_us
+
+
+@dataclass
+class Counts:
+    """Hears what is captured and what is not."""
+
+    kept: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
+
+    def captured(self) -> None:
+        self.kept += 1
+
+    def capture_dropped(self, reason: str) -> None:
+        self.dropped[reason] += 1
+
+
+def captured_in(folder: Path) -> list[Path]:
+    return sorted(calls_of(folder))
+
+
+def scenes_in(folder: Path) -> list[str]:
+    """Of the calls there, by their files' places: the server may delete them at any moment."""
+    return [it.parent.name for it in captured_in(folder)]
+
+
+@pytest.fixture
+def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Client, LocalizationServiceStub, Path]]:
+    """A server that captures, and looks at its store all the time."""
+    monkeypatch.setattr(deletion_module, "STORE_CHECK_S", 0.05)
+    folder = tmp_path / "captured"
+    with (
+        serving(tmp_path / "data", capture_dir=folder) as server,
+        Client(server.address) as client,
+        grpc.insecure_channel(server.address) as channel,
+    ):
+        client.create_scene("s")
+        client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
+        yield client, LocalizationServiceStub(channel), folder
+
+
+def test_callers_are_told(served: tuple[Client, LocalizationServiceStub, Path]) -> None:
+    _, stub, folder = served
+    answer = stub.Localize(localize_request("s"), timeout=30)
+    assert answer.diagnostics.captured
+    wait_until(lambda: captured_in(folder))
+    kept = decode_call(captured_in(folder)[0].read_bytes())
+    assert kept.response == answer.SerializeToString()
+    assert kept.request == localize_request("s").SerializeToString()
+    assert kept.request_id == answer.diagnostics.request_id
+
+
+def test_callers_who_ask_for_the_coarse_pose_first_are_told_too(
+    served: tuple[Client, LocalizationServiceStub, Path],
+) -> None:
+    _, stub, folder = served
+    final = list(stub.LocalizeProgressively(localize_request("s"), timeout=30))[-1].answer
+    assert final.diagnostics.captured
+    wait_until(lambda: captured_in(folder))
+    assert decode_call(captured_in(folder)[0].read_bytes()).response == final.SerializeToString()
+
+
+def test_callers_with_several_photographs_are_told_at_each(
+    served: tuple[Client, LocalizationServiceStub, Path],
+) -> None:
+    _, stub, folder = served
+    about: dict[str, Any] = {"image": PHOTO, "intrinsics": wire.camera_to_message(CAMERA)}
+    poses = [wire.transform_to_message(pose(x_m)) for x_m in (0.0, 0.1)]
+    images = [pb.RigImage(rig_from_camera=it, **about) for it in poses]
+    frames = [pb.SequenceFrame(session_from_camera=it, **about) for it in poses]
+    answers = (
+        stub.LocalizeRig(pb.LocalizeRigRequest(scene="scenes/s", images=images), timeout=30),
+        stub.LocalizeSequence(pb.LocalizeSequenceRequest(scene="scenes/s", frames=frames), timeout=30),
+    )
+    assert [[it.diagnostics.captured for it in answer.images] for answer in answers] == [[True, True]] * 2
+    wait_until(lambda: len(captured_in(folder)) == 2)
+    assert [decode_call(it.read_bytes()).response for it in captured_in(folder)] == [
+        it.SerializeToString() for it in answers
+    ]
+
+
+@pytest.mark.parametrize("deleted", ["scene", "reference", "scene made anew"])
+def test_what_was_made_of_a_deleted_scene_or_reference_goes(
+    served: tuple[Client, LocalizationServiceStub, Path], deleted: str
+) -> None:
+    client, _, folder = served
+    client.create_scene("other")
+    client.add_references("other", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)])
+    client.localize(PHOTO, CAMERA, "other")
+    client.localize(PHOTO, CAMERA, "s", ["r0", "r1"])
+    wait_until(lambda: len(captured_in(folder)) == 2)
+    if deleted == "reference":
+        client.delete_reference("s", "r2")  # which no call was compared with
+        client.delete_reference("s", "r1")
+    else:
+        client.delete_scene("s")
+    if deleted == "scene made anew":
+        client.create_scene("s")
+    wait_until(lambda: scenes_in(folder) == ["other"])
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    """A store with the scene "s" of each of three tenants."""
+    with Store.open(tmp_path / "data") as store:
+        for tenant in ("default", "acme", "other"):
+            store.create_scene(key_of(tenant, "s"))
+        yield store
+
+
+@contextmanager
+def recording(folder: Path, store: Store, counts: Counts, **options: Any) -> Iterator[Recorder]:
+    keep_s = options.pop("keep_s", 3600.0)
+    captured = CaptureFolder(folder / "captured", Retention(keep_s, 2**20))
+    recorder = Recorder(captured, store, counts, **options)
+    try:
+        yield recorder
+    finally:
+        recorder.close()
+
+
+def answer(recorder: Recorder, tenant: str = "default", *references: PosedView) -> pb.LocalizeResponse:
+    """Of a call that was answered with these references."""
+    call = Call("id", time.monotonic(), math.inf, Principal(tenant=tenant))
+    query = SimpleNamespace(photo=SimpleNamespace(field="image"))
+    attempt = SimpleNamespace(choice=None, references=references, generation=1, attributes=SceneAttributes())
+    part = cast(Any, (query, SimpleNamespace(attempt=attempt)))
+    response = pb.LocalizeResponse()
+    recorder.answered("Localize", localize_request("s"), response, call, [part], ())
+    return response
+
+
+def a_view() -> View:
+    return View(CAMERA, Features(*(np.zeros(shape, np.float32) for shape in ((1, 2), (1, 4), (1,)))))
+
+
+def test_a_slow_disk_holds_up_nobody(tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What does not fit into the queue is dropped at once, and counted."""
+    counts = Counts()
+    with recording(tmp_path, store, counts) as recorder:
+        monkeypatch.setattr(recorder.folder, "add", lambda *_: time.sleep(0.2))
+        for _ in range(recorder_module.MAX_WAITING + 10):
+            answer(recorder)
+        assert counts.dropped["queue"] >= 9
+        monkeypatch.undo()
+
+
+def test_the_queue_is_bounded_in_bytes(tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for one call that waits alone."""
+    monkeypatch.setattr(recorder_module, "MAX_WAITING_BYTES", 100)
+    counts, began, let_go = Counts(), threading.Event(), threading.Event()
+
+    def slow(*_: object) -> bool:
+        began.set()
+        return let_go.wait(LIMIT_S)
+
+    with recording(tmp_path, store, counts) as recorder:
+        monkeypatch.setattr(recorder.folder, "add", slow)
+        answer(recorder)
+        began.wait(LIMIT_S)
+        assert [answer(recorder).diagnostics.captured for _ in range(3)] == [True, False, False]
+        let_go.set()
+    assert (counts.kept, counts.dropped) == (2, {"queue": 2})
+
+
+def test_a_full_disk_pauses_and_fails_no_call(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What waits already is not tried either, and the log tells of the fault once."""
+    counts, tries, let_go = Counts(), [0], threading.Event()
+
+    def full(*_: object) -> bool:
+        tries[0] += 1
+        let_go.wait(LIMIT_S)
+        raise OSError(28, "No space left on device")
+
+    with recording(tmp_path, store, counts) as recorder:
+        monkeypatch.setattr(recorder.folder, "add", full)
+        for _ in range(10):
+            answer(recorder)
+        let_go.set()
+        wait_until(lambda: counts.dropped["disk"] == 10)
+        assert not answer(recorder).diagnostics.captured
+    assert (tries, counts.dropped) == ([1], {"disk": 11})
+    assert caplog.text.count("nothing is captured for 60 s: [Errno 28] No space left on device") == 1
+
+
+def test_a_fault_that_nobody_thought_of_is_told_of_once(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    counts = Counts()
+
+    def broken(*_: object) -> bool:
+        raise RuntimeError("a bug")
+
+    with recording(tmp_path, store, counts) as recorder:
+        monkeypatch.setattr(recorder.folder, "add", broken)
+        for _ in range(10):
+            answer(recorder)
+    assert counts.dropped == {"fault": 10}
+    assert caplog.text.count("a call was not captured: a bug") == 1
+    assert [it.request_id for it in caplog.records if hasattr(it, "request_id")] == ["id"]
+
+
+def test_what_still_waits_when_the_time_for_the_end_is_over_is_counted(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A disk so slow that it has written one call by then; the log tells of the others."""
+    monkeypatch.setattr(recorder_module, "CLOSING_LIMIT_S", 0.0)
+    counts, began = Counts(), threading.Event()
+    with recording(tmp_path, store, counts) as recorder:
+        add = recorder.folder.add
+
+        def slow(*args: Any) -> bool:
+            began.set()
+            wait_until(lambda: recorder.is_closing)
+            return add(*args)
+
+        monkeypatch.setattr(recorder.folder, "add", slow)
+        for _ in range(6):
+            answer(recorder)
+        began.wait(LIMIT_S)
+    assert (counts.kept, counts.dropped) == (1, {"queue": 5})
+    assert sum(int(it) for it in re.findall(r"calls were not captured: queue (\d+)", caplog.text)) == 5
+
+
+@pytest.mark.parametrize(("times", "dropped"), [(2, {}), (3, {"fault": 1})])
+def test_a_call_whose_blobs_go_meanwhile_is_gathered_again(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, times: int, dropped: dict[str, int]
+) -> None:
+    """Not for ever."""
+    counts, left = Counts(), [times]
+    with recording(tmp_path, store, counts) as recorder:
+        add = recorder.folder.add
+
+        def meanwhile(*args: Any) -> bool:
+            left[0] -= 1
+            if left[0] >= 0:
+                raise BlobGone
+            return add(*args)
+
+        monkeypatch.setattr(recorder.folder, "add", meanwhile)
+        answer(recorder)
+    assert (counts.kept, counts.dropped) == (1 - sum(dropped.values()), dropped)
+
+
+@pytest.mark.parametrize("deleted", ["scene", "scene made anew", "reference"])
+def test_what_is_deleted_while_its_call_waits_is_not_kept(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, deleted: str
+) -> None:
+    """Of a scene that is made anew neither: a call that used no reference is one of the scene before."""
+    counts, get_scene, let_go = Counts(), ReadingStore.get_scene, threading.Event()
+
+    def slow(self: Any, scene_key: SceneKey) -> SceneRecord:
+        let_go.wait(LIMIT_S)
+        return get_scene(self, scene_key)
+
+    monkeypatch.setattr(ReadingStore, "get_scene", slow)
+    with recording(tmp_path, store, counts) as recorder:
+        if deleted == "reference":
+            answer(recorder, "default", PosedView("k", "scenes/s/references/r0", a_view(), pose(0)))
+        else:
+            answer(recorder)
+            store.delete_scene(key_of("default", "s"))
+        if deleted == "scene made anew":
+            store.create_scene(key_of("default", "s"))
+        let_go.set()
+    assert (counts.kept, counts.dropped) == (0, {"deleted": 1})
+
+
+@pytest.mark.parametrize("fault", [Unavailable("the store is away"), DataLoss("damaged")])
+def test_what_the_store_cannot_say_is_counted(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, fault: Exception
+) -> None:
+    counts = Counts()
+
+    def broken(*_: object) -> Any:
+        raise fault
+
+    monkeypatch.setattr(ReadingStore, "get_scene", broken)
+    with recording(tmp_path, store, counts) as recorder:
+        answer(recorder)
+    assert (counts.kept, counts.dropped) == (0, {"store": 1})
+
+
+@pytest.mark.parametrize("stuck", ["call", "blob"])
+def test_one_file_that_cannot_be_deleted_keeps_nothing_of_other_deleted_scenes(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, stuck: str
+) -> None:
+    """A folder stands in its place, as an operator may have it."""
+    monkeypatch.setattr(deletion_module, "STORE_CHECK_S", 0.01)
+    monkeypatch.setattr(deletion_module, "EXPIRY_CHECK_S", LIMIT_S)
+    folder = CaptureFolder(tmp_path / "captured", Retention(3600.0, 2**20))
+    reference = CapturedReference("r", "k", CAMERA, pose(0), "0" * 64, {})
+    for tenant in ("acme", "other"):
+        created_us = time_us(store.get_scene(key_of(tenant, "s")).create_time)
+        part = CapturedPart("image", 1, (reference,) if tenant == "acme" else ())
+        call = CapturedCall(tenant, time.time(), "Localize", tenant, "s", created_us, parts=(part,))
+        folder.add(call, {"0" * 64: b"x"} if tenant == "acme" else {})
+    first = folder.held()[0]
+    path = first.path if stuck == "call" else next(iter(first.blobs))
+    path.unlink()
+    path.mkdir()
+    if stuck == "blob":
+        with pytest.raises(IsADirectoryError):
+            folder.remove_all([first])
+    for tenant in ("acme", "other"):
+        store.delete_scene(key_of(tenant, "s"))
+    recorder = Recorder(folder, store, Counts())
+    wait_until(lambda: [it.scene_key for it in folder.held()] == [first.scene_key][stuck == "blob" :])
+    assert captured_in(tmp_path / "captured") == []
+    recorder.close()
+
+
+def test_only_the_tenants_that_are_named_are_captured(tmp_path: Path, store: Store) -> None:
+    with recording(tmp_path, store, Counts(), tenants=frozenset({"acme"})) as recorder:
+        told = [answer(recorder, tenant).diagnostics.captured for tenant in ("default", "acme", "other")]
+    assert told == [False, True, False]
+    assert [decode_call(it.read_bytes()).tenant for it in captured_in(tmp_path / "captured")] == ["acme"]
+
+
+@pytest.mark.parametrize("fault", ["unexpected", "hanging"])
+def test_the_time_limit_holds_whatever_the_store_does(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, fault: str
+) -> None:
+    """A fault that nobody thought of, at every check; and a database that does not answer, with a call that waits."""
+    counts, checks, let_go = Counts(), [0], threading.Event()
+    with recording(tmp_path, store, counts, keep_s=0.5) as recorder:
+        answer(recorder)
+        wait_until(lambda: counts.kept == 1)
+
+        def broken(*_: object) -> Any:
+            checks[0] += 1
+            if fault == "hanging":
+                let_go.wait(LIMIT_S)
+            raise RuntimeError("no such table")
+
+        monkeypatch.setattr(ReadingStore, "get_scene", broken)
+        answer(recorder)
+        wait_until(lambda: checks[0] == 1)
+        wait_until(lambda: len(recorder.folder) == 0)
+        assert captured_in(tmp_path / "captured") == []
+        let_go.set()
+        wait_until(lambda: counts.dropped["fault"] == 1)
+        monkeypatch.undo()
+        answer(recorder)
+        wait_until(lambda: counts.kept == 2)
+
+
+def test_a_fault_of_the_store_ends_no_check(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What was deleted goes when the store is well again; the log tells of the fault once."""
+    monkeypatch.setattr(deletion_module, "STORE_CHECK_S", 0.01)
+    counts, checks = Counts(), [0]
+
+    def broken(*_: object) -> Any:
+        checks[0] += 1
+        raise RuntimeError("no such table")
+
+    with recording(tmp_path, store, counts) as recorder:
+        answer(recorder)
+        wait_until(lambda: counts.kept == 1)
+        with monkeypatch.context() as patch:
+            patch.setattr(ReadingStore, "get_scene", broken)
+            wait_until(lambda: checks[0] >= 5)
+        store.delete_scene(key_of("default", "s"))
+        wait_until(lambda: len(recorder.folder) == 0)
+    assert caplog.text.count("captured calls cannot be compared with the store: no such table") == 1
+
+
+def test_the_start_waits_for_no_store_and_a_store_that_is_away_is_asked_once_a_round(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, let_go = [0], threading.Event()
+
+    def away(*_: object) -> Any:
+        asked[0] += 1
+        let_go.wait(LIMIT_S)
+        raise Unavailable("the store is away")
+
+    with recording(tmp_path, store, Counts()) as recorder:
+        for tenant in ("default", "acme", "other"):
+            answer(recorder, tenant)
+    assert len(captured_in(tmp_path / "captured")) == 3
+    monkeypatch.setattr(ReadingStore, "get_scene", away)
+    with recording(tmp_path, store, Counts()) as recorder:  # returns, although nobody lets the store go
+        wait_until(lambda: asked[0] == 1)
+        assert len(recorder.folder) == 3
+        let_go.set()
+    assert asked[0] == 1
+
+
+class CountingStore:
+    """Counts what is asked of a scene that never changes."""
+
+    def __init__(self, keys: dict[str, str]) -> None:
+        self.keys, self.asked = keys, Counter[str]()
+
+    def get_scene(self, scene_key: SceneKey) -> SceneRecord:
+        self.asked["get_scene"] += 1
+        return SceneRecord(scene_key, 3, len(self.keys), datetime.fromtimestamp(0, timezone.utc))
+
+    def find_keys(self, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
+        self.asked["find_keys"] += 1
+        return {it: self.keys[it] for it in reference_ids if it in self.keys}
+
+
+def test_a_scene_that_does_not_change_is_asked_for_its_references_once(tmp_path: Path) -> None:
+    """However many calls come and go; and what is not there is found out all the same."""
+    folder, counting = CaptureFolder(tmp_path / "c", Retention(3600.0, 2**24)), CountingStore({"r0": "k0", "r1": "k1"})
+    staleness = Staleness(cast(Store, counting))
+
+    def add(number: int, key: str) -> None:
+        reference = CapturedReference(f"r{number % 2}", key, CAMERA, pose(0), "0" * 64, {})
+        part = CapturedPart("image", 3, (reference,))
+        folder.add(CapturedCall(f"{number}", time.time(), "Localize", "acme", "s", 0, parts=(part,)), {"0" * 64: b"x"})
+
+    for number in range(20):
+        add(number, f"k{number % 2}")
+        assert staleness.delete_stale(folder) == 0
+        if number > 10:
+            folder.remove_all(folder.held()[:1])
+    assert counting.asked == {"get_scene": 20, "find_keys": 2}
+    add(20, "another key")
+    assert staleness.delete_stale(folder) == 1
+    folder.close()
+
+
+@pytest.mark.parametrize("fault", [DataLoss("damaged"), RuntimeError("no such column"), Unavailable("away")])
+def test_what_is_wrong_with_one_scene_keeps_nothing_of_another(tmp_path: Path, fault: Exception) -> None:
+    """A damaged scene is there; of what nobody thought of the caller hears, when all others have been looked at."""
+    folder = CaptureFolder(tmp_path / "c", Retention(3600.0, 2**20))
+    for scene_id in ("a", "b", "c"):
+        folder.add(CapturedCall(scene_id, time.time(), "Localize", "acme", scene_id, 0), {})
+
+    def get_scene(scene_key: SceneKey) -> SceneRecord:
+        if scene_key.endswith("b"):
+            raise fault
+        raise NotFound("there is none")
+
+    with nullcontext() if isinstance(fault, DataLoss) else pytest.raises(type(fault)):
+        assert Staleness(cast(Store, SimpleNamespace(get_scene=get_scene))).delete_stale(folder) == 2
+    left = ["b", "c"] if isinstance(fault, Unavailable) else ["b"]
+    assert [it.parent.name for it in captured_in(tmp_path / "c")] == left
+    folder.close()
+
+
+def test_what_the_folder_has_is_not_read_again_and_queries_keep_their_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Features of each of two extractors are read once for all calls, and neither hits nor misses are counted."""
+    read, features = Counter[str](), reading._features
+
+    def counted(connection: Any, ids: Any, extractor: str) -> Any:
+        read[threading.current_thread().name] += len(ids)
+        return features(connection, ids, extractor)
+
+    monkeypatch.setattr(reading, "_features", counted)
+    store = Store.open(tmp_path / "data")
+    folder = tmp_path / "captured"
+    with (
+        serving(tmp_path / "data", store=store, features=("cheap", "strong"), workers=1, capture_dir=folder) as server,
+        Client(server.address) as client,
+    ):
+        client.create_scene("s")
+        client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(5)])
+        client.localize(PHOTO, CAMERA, "s", [f"r{i}" for i in range(5)])
+        wait_until(lambda: len(captured_in(folder)) == 1)
+        before = read["capture"]
+        for count in range(2, 6):
+            client.localize(PHOTO, CAMERA, "s", [f"r{i}" for i in range(5)])
+            wait_until(lambda count=count: len(captured_in(folder)) == count)  # type: ignore[misc]
+        kept = decode_call(captured_in(folder)[-1].read_bytes())
+        views = [set(it.views) for it in kept.parts[0].references]
+        described = sum(len(it) for it in views)
+        assert {"cheap"} <= set.intersection(*views)
+        # What has no features of an extractor yet may have them the next time: only that is looked for.
+        assert read["capture"] - before == 4 * (10 - described)
+        hits_and_misses = store.reference_cache.hits + store.reference_cache.misses
+        assert hits_and_misses == 5 * 5
+
+
+def test_what_waits_holds_no_features(tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reference's view that was used is free as soon as the call is answered, however long the disk takes."""
+    let_go = threading.Event()
+    with recording(tmp_path, store, Counts()) as recorder:
+        monkeypatch.setattr(recorder.folder, "add", lambda *_: let_go.wait(LIMIT_S))
+        view = a_view()
+        held = weakref.ref(view)
+        answer(recorder)
+        answer(recorder, "default", PosedView("k", "scenes/s/references/r0", view, pose(0)))
+        del view
+        gc.collect()
+        assert held() is None
+        let_go.set()

@@ -1,0 +1,185 @@
+"""Who watches a scene sees its answers and no other scene's, a few at most, and nothing once it is over."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import weakref
+
+import pytest
+
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.errors import FailedPrecondition, Overloaded, Unavailable
+from mapless_server.security.tenancy import key_of
+from mapless_server.services.watching import MAX_WATCHERS, MAX_WATCHERS_OF_TENANT, QUEUE_LENGTH, Watch, Watchers
+
+HALL, OTHER = key_of("default", "hall"), key_of("default", "other")
+REQUEST = pb.LocalizeRequest(image=b"photograph")
+REQUEST.intrinsics.width_px = 640
+LIMIT_S = 10.0
+
+
+def answer(inliers: int) -> pb.LocalizeResponse:
+    return pb.LocalizeResponse(localization=pb.Localization(inlier_count=inliers))
+
+
+def publish(watchers: Watchers, inliers: int, scene: str = HALL, debug: pb.Debug | None = None) -> None:
+    watchers.publish(scene, REQUEST, answer(inliers), debug)  # type: ignore[arg-type]
+
+
+async def next_of(watch: Watch) -> pb.WatchQueriesResponse:
+    return await asyncio.wait_for(watch.__anext__(), LIMIT_S)
+
+
+def inliers_of(message: pb.WatchQueriesResponse) -> int:
+    return int(message.answer.localization.inlier_count)
+
+
+def test_an_answer_reaches_those_who_watch_its_scene_with_the_photograph_and_the_matches() -> None:
+    async def run() -> None:
+        watchers = Watchers(True)
+        first, second, elsewhere = watchers.watch(HALL), watchers.watch(HALL), watchers.watch(OTHER)
+        waits = asyncio.ensure_future(elsewhere.__anext__())
+        publish(watchers, 7, debug=pb.Debug(error_px=[0.5]))
+        for watch in (first, second):
+            seen = await next_of(watch)
+            assert (seen.image, seen.intrinsics.width_px, inliers_of(seen)) == (b"photograph", 640, 7)
+            assert list(seen.answer.debug.error_px) == [0.5]
+            assert seen.missed_count == 0
+        assert not waits.done()
+        waits.cancel()
+
+    asyncio.run(run())
+
+
+def test_what_waits_for_a_watcher_keeps_nothing_else_of_the_request() -> None:
+    """A part of a message keeps the whole message, so that each photograph would be held twice."""
+
+    async def run() -> None:
+        watchers = Watchers(True)
+        watch = watchers.watch(HALL)
+        request = pb.LocalizeRequest()
+        request.CopyFrom(REQUEST)
+        watchers.publish(HALL, request, answer(1), None)
+        request.intrinsics.width_px = 111
+        assert (await next_of(watch)).intrinsics.width_px == 640
+
+    asyncio.run(run())
+
+
+def test_a_photograph_as_large_as_a_message_may_be_is_left_out_and_the_answer_is_told() -> None:
+    async def run() -> None:
+        watchers = Watchers(True, 2000)
+        watch = watchers.watch(HALL)
+        for size in (1000, 1999, 5):
+            request = pb.LocalizeRequest(image=bytes(size))
+            watchers.publish(HALL, request, answer(size), pb.Debug(error_px=[0.5] * 10))
+        seen = [await next_of(watch) for _ in range(3)]
+        assert [len(it.image) for it in seen] == [1000, 0, 5]
+        assert [inliers_of(it) for it in seen] == [1000, 1999, 5]
+        assert all(it.ByteSize() <= 2000 for it in seen)
+
+    asyncio.run(run())
+
+
+def test_the_callers_own_answer_stays_as_it_was() -> None:
+    watchers = Watchers(True)
+    response = answer(3)
+
+    async def run() -> None:
+        watch = watchers.watch(HALL)
+        watchers.publish(HALL, REQUEST, response, pb.Debug(error_px=[0.5]))
+        response.localization.inlier_count = 99
+        assert inliers_of(await next_of(watch)) == 3
+
+    asyncio.run(run())
+    assert not response.HasField("debug")
+
+
+def test_who_reads_too_slowly_misses_the_oldest_and_is_told_how_many() -> None:
+    async def run() -> None:
+        watchers = Watchers(True)
+        watch = watchers.watch(HALL)
+        for i in range(QUEUE_LENGTH + 4):
+            publish(watchers, i)
+        seen = [await next_of(watch) for _ in range(QUEUE_LENGTH)]
+        assert [inliers_of(it) for it in seen] == [4 + i for i in range(QUEUE_LENGTH)]
+        assert [it.missed_count for it in seen] == [4] + [0] * (QUEUE_LENGTH - 1)
+
+    asyncio.run(run())
+
+
+def test_nothing_is_kept_when_nobody_watches() -> None:
+    async def run() -> None:
+        watchers = Watchers(True)
+        assert not watchers.is_watched(HALL)
+        publish(watchers, 1)
+        watch = watchers.watch(HALL)
+        assert watchers.is_watched(HALL)
+        assert not watchers.is_watched(OTHER)
+        publish(watchers, 2)
+        assert inliers_of(await next_of(watch)) == 2  # not what came before it began
+        await watch.aclose()
+        assert not watchers.is_watched(HALL)
+        kept = weakref.ref(watch)
+        del watch
+        gc.collect()
+        assert kept() is None
+
+    asyncio.run(run())
+
+
+def test_it_ends_when_the_server_stops_whether_something_waits_or_not() -> None:
+    async def run() -> None:
+        watchers = Watchers(True)
+        idle, late = watchers.watch(HALL), watchers.watch(HALL)
+        waits = asyncio.ensure_future(idle.__anext__())
+        await asyncio.sleep(0)
+        publish(watchers, 1)
+        assert inliers_of(await waits) == 1
+        waits = asyncio.ensure_future(idle.__anext__())
+        await asyncio.sleep(0)
+        watchers.close()
+        with pytest.raises(Unavailable) as ended:
+            await asyncio.wait_for(waits, LIMIT_S)
+        assert ended.value.reason == "DRAINING"
+        with pytest.raises(Unavailable):
+            await next_of(late)
+
+    asyncio.run(run())
+
+
+def test_it_has_to_be_allowed() -> None:
+    watchers = Watchers(False)
+    with pytest.raises(FailedPrecondition, match="allow_watching") as refused:
+        watchers.watch(HALL)
+    assert refused.value.reason == "WATCHING_NOT_ALLOWED"
+    assert not watchers.is_watched(HALL)
+
+
+def test_one_tenant_cannot_keep_the_others_from_watching() -> None:
+    async def run() -> None:
+        watchers = Watchers(True)
+        for i in range(MAX_WATCHERS_OF_TENANT):
+            watchers.watch(key_of("loud", f"scene-{i}"))
+        with pytest.raises(Overloaded):
+            watchers.watch(key_of("loud", "scene-0"))
+        mine = watchers.watch(key_of("quiet", "scene-0"))
+        publish(watchers, 5, key_of("loud", "scene-0"))
+        publish(watchers, 6, key_of("quiet", "scene-0"))
+        assert inliers_of(await next_of(mine)) == 6  # the other tenant's scene of the same name is another scene
+
+    asyncio.run(run())
+
+
+def test_there_is_a_limit_for_all() -> None:
+    async def run() -> None:
+        watchers = Watchers(True)
+        watches = [watchers.watch(key_of(f"tenant-{i}", "hall")) for i in range(MAX_WATCHERS)]
+        with pytest.raises(Overloaded) as refused:
+            watchers.watch(HALL)
+        assert refused.value.retry_after_s is not None
+        await watches[0].aclose()
+        watchers.watch(HALL)
+
+    asyncio.run(run())

@@ -1,0 +1,293 @@
+"""What is known of a scene as a whole is kept exactly, changed one by one, forgotten with it; on either database."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sqlalchemy import Connection, Row
+from stores import DATABASES, EXTRACTOR, Place, Shared, make_reference, place_on
+
+from mapless.geodesy import Datum, enu_from_y_up
+from mapless.geometry import Quaternion, rotation_from_vector
+from mapless.scenes import Calibration, unit_vector
+from mapless_server import errors
+from mapless_server.security.principal import DEFAULT_TENANT
+from mapless_server.security.tenancy import SceneKey
+from mapless_server.store import ContradictingDown, SceneAttributes, Store, codec, leftovers, queries
+
+OFFICE, HALL, NOWHERE = map(SceneKey, ("office", "hall", "nowhere"))
+DATUM = Datum(47.1 / 3, -8.1 / 3, 400.1 / 3, Quaternion(0.0, 0.0, 0.6, 0.8))
+DOWN = unit_vector(0.01, -0.02, -1.0)
+CALIBRATION = Calibration(1.1 / 3, 2.2 / 3, 3.1, 4.1, 40, "sift-2048", "geometric", "BEST", "0.1.0")
+BEFORE = datetime.now(timezone.utc)
+
+
+@pytest.fixture(params=DATABASES)
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> Place:
+    return place_on(request.param, lambda: tmp_path)
+
+
+@pytest.fixture
+def store(place: Place) -> Iterator[Store]:
+    with place.open() as store:
+        yield store
+
+
+def known_of(store: Store, key: SceneKey) -> SceneAttributes:
+    """As every call tells it."""
+    scene = store.get_scene(key)
+    assert scene in store.list_scenes(DEFAULT_TENANT, 10)
+    assert store.get_attributes(key) == scene.attributes
+    return scene.attributes
+
+
+def test_nothing_is_known_of_a_scene_that_nobody_has_said_anything_of(store: Store) -> None:
+    assert store.create_scene(OFFICE).attributes == known_of(store, OFFICE) == SceneAttributes()
+
+
+def test_what_is_said_at_its_creation_is_kept_exactly(place: Place) -> None:
+    said = SceneAttributes(DATUM, DOWN, replace(CALIBRATION, create_time=BEFORE))
+    with place.open() as store:
+        assert store.create_scene(OFFICE, said).attributes == said
+        assert store.get_scene(OFFICE).generation == 1
+    with place.open() as store:
+        assert known_of(store, OFFICE) == said
+
+
+def test_each_is_changed_and_forgotten_alone_and_every_change_raises_the_generation(store: Store) -> None:
+    store.create_scene(OFFICE)
+    expected, generation = SceneAttributes(), 1
+    changes: list[dict[str, Any]] = [
+        {"datum": DATUM},
+        {"down_in_world": DOWN},
+        {"calibration": CALIBRATION},
+        {"datum": replace(DATUM, height_m=0.0)},
+        {"down_in_world": None},
+        {"datum": None, "down_in_world": DOWN},
+        {"calibration": None},
+        {"down_in_world": None},
+    ]
+    for change in changes:
+        updated = store.update_scene(OFFICE, **change)
+        expected, generation = replace(expected, **change), generation + 1
+        found = updated.attributes
+        if found.calibration is not None:  # when it was stored, by the store's clock
+            assert found.calibration.create_time is not None
+            assert BEFORE <= found.calibration.create_time <= datetime.now(timezone.utc)
+            found = replace(found, calibration=replace(found.calibration, create_time=None))
+        assert found == expected
+        assert known_of(store, OFFICE) == updated.attributes
+        assert updated == store.get_scene(OFFICE)
+        assert updated.generation == generation
+    assert expected == SceneAttributes()
+
+
+def test_who_has_the_references_in_memory_need_not_read_them_again(store: Store) -> None:
+    store.create_scene(OFFICE)
+    store.add_references(OFFICE, [make_reference("a")])
+    store.update_scene(OFFICE, datum=DATUM)
+    changes = store.list_changes(OFFICE, 2, "vlad")
+    assert (changes.generation, changes.added, changes.is_whole) == (3, (), False)
+
+
+def test_other_changes_leave_it_alone(store: Store) -> None:
+    store.create_scene(OFFICE, SceneAttributes(DATUM))
+    store.create_scene(HALL)
+    store.add_references(OFFICE, [make_reference("a")])
+    store.delete_reference(OFFICE, "a")
+    store.update_scene(HALL, down_in_world=DOWN)
+    assert known_of(store, OFFICE) == SceneAttributes(DATUM)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_a_scene_that_is_deleted_and_created_again_has_forgotten(
+    store: Store, monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
+    """Whether it is deleted in one portion, or in several."""
+    monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", 2)
+    store.create_scene(OFFICE, SceneAttributes(DATUM, DOWN))
+    if count:
+        store.add_references(OFFICE, [make_reference(f"r{i}") for i in range(count)])
+    assert store.get_attributes(OFFICE).datum == DATUM
+    store.delete_scene(OFFICE)
+    with pytest.raises(errors.NotFound):
+        store.get_attributes(OFFICE)
+    store.create_scene(OFFICE)
+    assert known_of(store, OFFICE) == SceneAttributes()
+
+
+def test_a_scene_that_is_not_there_has_none(store: Store) -> None:
+    for call in (store.get_attributes, store.get_generation, lambda key: store.update_scene(key, datum=None)):
+        with pytest.raises(errors.NotFound, match="nowhere") as caught:
+            call(NOWHERE)
+        assert caught.value.field == "scene"
+
+
+def test_a_datum_for_another_world_than_the_downs_is_refused_and_nothing_changes(store: Store) -> None:
+    """The world's y is up, and the datum, which says nothing of turning, takes its z for it."""
+    before = store.create_scene(OFFICE, SceneAttributes(down_in_world=(0.0, -1.0, 0.0)))
+    with pytest.raises(ContradictingDown, match="90 degrees off"):
+        store.update_scene(OFFICE, datum=Datum(0, 0, 0))
+    assert store.get_scene(OFFICE) == before
+    turned = Datum(0, 0, 0, enu_from_y_up(0))
+    assert store.update_scene(OFFICE, datum=turned).attributes.datum == turned
+    with pytest.raises(ContradictingDown, match="11 degrees off"):
+        store.update_scene(OFFICE, down_in_world=unit_vector(0, -1, np.tan(np.radians(11))))
+
+
+def test_down_is_what_was_said_or_what_the_datum_says_or_unknown() -> None:
+    datum = Datum(0, 0, 0, enu_from_y_up(0))
+    said = unit_vector(0.05, -1.0, 0.0)
+    assert SceneAttributes().down() is None
+    for attributes, expected in (
+        (SceneAttributes(datum), (0, -1, 0)),
+        (SceneAttributes(datum, said), said),
+        (SceneAttributes(None, said), said),
+    ):
+        down = attributes.down()
+        assert down is not None
+        np.testing.assert_allclose(down, expected, atol=1e-12)
+
+
+DAMAGES = {
+    "other bytes": "UPDATE scene SET attributes = ? WHERE scene_id = 'office'",
+    "no bytes": "UPDATE scene SET attributes = NULL WHERE scene_id = 'office' AND attributes <> ?",
+    "no checksum": "UPDATE scene SET attributes_sha256 = NULL WHERE scene_id = 'office' AND attributes <> ?",
+    "another scene's": "UPDATE scene SET attributes = (SELECT attributes FROM scene WHERE scene_id = 'hall'), "
+    "attributes_sha256 = (SELECT attributes_sha256 FROM scene WHERE scene_id = 'hall') "
+    "WHERE scene_id = 'office' AND attributes <> ?",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damage_is_told_and_can_be_mended_and_references_are_served(place: Place, damage: str) -> None:
+    with place.open() as store:
+        store.create_scene(OFFICE, SceneAttributes(DATUM))
+        store.create_scene(HALL, SceneAttributes(down_in_world=DOWN))
+        store.add_references(OFFICE, [make_reference("a")])
+    place.execute(DAMAGES[damage], b"{}")
+    with place.open() as store:
+        calls = (
+            lambda: store.get_scene(OFFICE),
+            lambda: store.get_attributes(OFFICE),
+            lambda: store.list_scenes(DEFAULT_TENANT, 10),
+            lambda: store.update_scene(OFFICE, datum=DATUM, down_in_world=None),
+        )
+        for call in calls:
+            with pytest.raises(errors.DataLoss, match="'office' is damaged"):
+                call()
+        assert store.get_scene(HALL).attributes.down_in_world == DOWN
+        assert len(store.load_references(OFFICE, None, EXTRACTOR).references) == 1
+        store.add_references(OFFICE, [make_reference("b")])
+        assert store.get_generation(OFFICE) == 3
+        store.update_scene(OFFICE, datum=DATUM, down_in_world=None, calibration=None)
+        assert known_of(store, OFFICE) == SceneAttributes(DATUM)
+
+
+def test_the_next_call_sees_what_another_server_changed() -> None:
+    place = place_on("postgresql", Path)
+    assert isinstance(place, Shared)
+    with place.open() as one, place.open() as other:
+        one.create_scene(OFFICE)
+        for datum in (DATUM, None, replace(DATUM, height_m=1.0)):
+            one.update_scene(OFFICE, datum=datum)
+            assert other.get_attributes(OFFICE).datum == datum
+        one.delete_scene(OFFICE)
+        with pytest.raises(errors.NotFound):
+            other.get_attributes(OFFICE)
+
+
+def test_changes_at_once_lose_none_of_each_other(store: Store) -> None:
+    store.create_scene(OFFICE)
+    values: list[dict[str, Any]] = [{"datum": DATUM}, {"down_in_world": DOWN}, {"calibration": CALIBRATION}]
+    rounds = 5
+    with ThreadPoolExecutor(3) as threads:
+        for _ in range(rounds):
+            list(threads.map(lambda value: store.update_scene(OFFICE, **dict.fromkeys(value)), values))
+            assert known_of(store, OFFICE) == SceneAttributes()
+            list(threads.map(lambda value: store.update_scene(OFFICE, **value), values))
+            found = known_of(store, OFFICE)
+            assert (found.datum, found.down_in_world, found.calibration is None) == (DATUM, DOWN, False)
+    assert store.get_scene(OFFICE).generation == 1 + 6 * rounds
+
+
+def test_a_store_that_nobody_else_changes_is_asked_once(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[SceneKey] = []
+    find = queries.find_attributes
+
+    def count(connection: Connection, key: SceneKey) -> Row[Any]:
+        asked.append(key)
+        return find(connection, key)
+
+    monkeypatch.setattr(queries, "find_attributes", count)
+    with place.open() as store:
+        store.create_scene(OFFICE, SceneAttributes(DATUM))
+        for _ in range(5):
+            assert store.get_attributes(OFFICE).datum == DATUM
+        assert len(asked) == (5 if isinstance(place, Shared) else 1)
+
+
+def test_a_store_that_remembers_nothing_hears_of_every_change(place: Place) -> None:
+    with place.open() as store:
+        store.create_scene(OFFICE, SceneAttributes(DATUM))
+        store.add_references(OFFICE, [make_reference("a")])
+        other = store.uncached()
+        assert other.get_attributes(OFFICE).down_in_world is None
+        assert other.load_references(OFFICE, ["a"], EXTRACTOR).generation == 2
+        store.update_scene(OFFICE, down_in_world=DOWN)
+        assert other.get_attributes(OFFICE).down_in_world == DOWN
+        store.delete_scene(OFFICE)
+        with pytest.raises(errors.NotFound):
+            other.get_attributes(OFFICE)
+        assert [it.used_bytes for it in (other._described, other._resolved, other._attributes)] == [0, 0, 0]
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+factor = st.floats(0.01, 1000)
+vector = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
+quaternion = vector.map(lambda it: Quaternion.from_matrix(rotation_from_vector(it)))
+
+
+@settings(deadline=None)
+@given(
+    st.none() | st.builds(Datum, st.floats(-90, 90), st.floats(-180, 180), st.floats(-12_000, 1e5), quaternion),
+    st.none()
+    | st.builds(
+        Calibration,
+        *[factor] * 4,
+        st.integers(1, 2**31 - 1),
+        *[st.text(max_size=20)] * 4,
+        st.none() | st.datetimes(timezones=st.just(timezone.utc)),
+    ),
+)
+def test_every_bit_comes_back(datum: Datum | None, calibration: Calibration | None) -> None:
+    for down in (None, DOWN if datum is None else tuple(datum.down_in_world().tolist())):
+        attributes = SceneAttributes(datum, down, calibration)
+        data = codec.encode_attributes(attributes)
+        sha256 = None if data is None else codec.sha256_for("x", data)
+        assert codec.decode_attributes("x", data, sha256) == attributes
+
+
+@settings(deadline=None)
+@given(st.tuples(finite, finite, finite))
+def test_directions_are_of_unit_length_whatever_they_were(vector: tuple[float, float, float]) -> None:
+    """Also of vectors whose squares are no numbers."""
+    if not any(vector):
+        with pytest.raises(ValueError, match="some length"):
+            unit_vector(*vector)
+        return
+    found = np.array(unit_vector(*vector))
+    assert np.linalg.norm(found) == pytest.approx(1)
+    largest = np.abs(vector).max()
+    np.testing.assert_allclose(
+        found * np.linalg.norm(np.array(vector) / largest), np.array(vector) / largest, atol=1e-12
+    )

@@ -1,0 +1,293 @@
+"""Who follows a scene by its changes knows at each moment what who reads it as a whole does; on either database."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stores import DATABASES, EXTRACTOR, Place, assert_same_bits, make_descriptor, make_reference, place_on, view_of
+
+from mapless_server import errors
+from mapless_server.security.tenancy import SceneKey
+from mapless_server.store import IndexedReference, NewReference, Store, changing
+from mapless_server.store.verify import verify
+
+OFFICE, HALL = SceneKey("office"), SceneKey("hall")
+NAME = "vlad"
+
+
+@pytest.fixture(scope="session", params=DATABASES)
+def database(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def place(database: str, tmp_path: Path) -> Place:
+    return place_on(database, lambda: tmp_path)
+
+
+@pytest.fixture
+def store(place: Place) -> Iterator[Store]:
+    with place.open() as store:
+        yield store
+
+
+class Follower:
+    """Has a scene in memory, and asks for nothing but what changed."""
+
+    def __init__(self) -> None:
+        self.generation: int | None = None
+        self.known: dict[str, IndexedReference] = {}
+        self.wholes = 0
+
+    def follow(self, store: Store) -> None:
+        changes = store.list_changes(OFFICE, self.generation, NAME)
+        if changes.is_whole:
+            self.known = {}
+            self.wholes += 1
+        for key in changes.removed:
+            self.known.pop(key, None)
+        self.known |= {it.key: it for it in changes.added}
+        self.generation = changes.generation
+
+
+def contents(known: dict[str, IndexedReference]) -> dict[str, tuple[object, ...]]:
+    return {
+        it.key: (
+            it.reference_id,
+            it.world_from_camera.translation.tobytes(),
+            None if it.descriptor is None else it.descriptor.tobytes(),
+        )
+        for it in known.values()
+    }
+
+
+def described(reference_id: str, seed: int = 0) -> NewReference:
+    return make_reference(reference_id, seed, count=1, dimension=16)
+
+
+def test_a_descriptor_comes_back_as_float16_keeps_it(place: Place) -> None:
+    made = [described("a", 1), make_reference("b", 2, count=1), described("c", 3)]
+    with place.open() as store:
+        store.create_scene(OFFICE)
+        store.add_references(OFFICE, made)
+    with place.open() as store:
+        changes = store.list_changes(OFFICE, None, NAME)
+        assert (changes.generation, changes.is_whole, changes.removed) == (2, True, frozenset())
+        assert [it.reference_id for it in changes.added] == ["a", "b", "c"]
+        for new, read in zip(made, changes.added, strict=True):
+            assert read.key == store.get_reference(OFFICE, new.reference_id).key
+            assert_same_bits(read.world_from_camera.rotation, new.world_from_camera.rotation)
+            assert_same_bits(read.world_from_camera.translation, new.world_from_camera.translation)
+            if new.descriptors:
+                assert read.descriptor is not None
+                assert_same_bits(read.descriptor, new.descriptors[NAME].astype(np.float16).astype(np.float32))
+                assert abs(read.descriptor @ new.descriptors[NAME] - 1) < 1e-3
+                with pytest.raises(ValueError, match="read-only"):
+                    read.descriptor[:] = 0
+            else:
+                assert read.descriptor is None
+        assert all(it.descriptor is None for it in store.list_changes(OFFICE, None, "another").added)
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.array([1, np.nan]), np.array([1e6, 0]), np.array([np.inf]), np.zeros(0), np.zeros((2, 2))]
+)
+def test_what_is_no_descriptor_is_refused(store: Store, wrong: np.ndarray) -> None:
+    store.create_scene(OFFICE)
+    vector = wrong.astype(np.float32)
+    with pytest.raises(ValueError, match="global descriptor"):
+        store.add_references(OFFICE, [replace(described("a"), descriptors={NAME: vector})])
+    (record,) = store.add_references(OFFICE, [make_reference("a")])
+    with pytest.raises(ValueError, match="global descriptor"):
+        store.add_descriptor(record.key, NAME, vector)
+    assert store.get_scene(OFFICE).generation == 2
+
+
+def test_each_change_is_told_once(store: Store) -> None:
+    store.create_scene(OFFICE)
+    store.create_scene(HALL)
+    a, b = store.add_references(OFFICE, [described("a"), described("b")])
+    start = store.list_changes(OFFICE, None, NAME).generation
+    (c,) = store.add_references(OFFICE, [described("c")])
+    store.delete_reference(OFFICE, "a")
+    store.add_references(HALL, [described("elsewhere")])
+    changes = store.list_changes(OFFICE, start, NAME)
+    assert [it.key for it in changes.added] == [c.key]
+    assert (changes.removed, changes.is_whole) == (frozenset({a.key}), False)
+    after = store.list_changes(OFFICE, changes.generation, NAME)
+    assert (after.generation, after.added, after.removed) == (changes.generation, (), frozenset())
+    # One that came and went in between is never told of as there.
+    store.add_references(OFFICE, [described("d")])
+    store.delete_reference(OFFICE, "d")
+    assert store.list_changes(OFFICE, after.generation, NAME).added == ()
+    assert b.key in {it.key for it in store.list_changes(OFFICE, None, NAME).added}
+
+
+def test_a_descriptor_found_later_is_a_change_and_the_first_one_stays(store: Store) -> None:
+    store.create_scene(OFFICE)
+    a, _ = store.add_references(OFFICE, [make_reference("a"), make_reference("b")])
+    first, second = (make_descriptor(np.random.default_rng(seed), 16) for seed in (1, 2))
+    store.add_descriptor(a.key, NAME, first)
+    changes = store.list_changes(OFFICE, 2, NAME)
+    assert changes.generation == store.get_scene(OFFICE).generation == 3
+    assert [(it.key, it.descriptor is not None) for it in changes.added] == [(a.key, True)]
+    store.add_descriptor(a.key, NAME, second)
+    assert store.list_changes(OFFICE, 2, NAME).generation == 3
+    (found,) = (it for it in store.list_changes(OFFICE, None, NAME).added if it.key == a.key)
+    assert found.descriptor is not None
+    assert_same_bits(found.descriptor, first.astype(np.float16).astype(np.float32))
+    store.delete_reference(OFFICE, "a")
+    with pytest.raises(errors.NotFound, match="deleted"):
+        store.add_descriptor(a.key, "other", first)
+    store.delete_scene(OFFICE)
+    with pytest.raises(errors.NotFound):
+        store.add_descriptor(a.key, "other", first)
+
+
+def test_one_of_many_descriptors_wins_and_counts_once(store: Store) -> None:
+    store.create_scene(OFFICE)
+    (a,) = store.add_references(OFFICE, [make_reference("a")])
+    vectors = [make_descriptor(np.random.default_rng(seed), 16) for seed in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda vector: store.add_descriptor(a.key, NAME, vector), vectors))
+    (found,) = store.list_changes(OFFICE, None, NAME).added
+    assert found.descriptor is not None
+    assert found.descriptor.tobytes() in {it.astype(np.float16).astype(np.float32).tobytes() for it in vectors}
+
+
+def test_a_new_life_and_a_generation_yet_to_come_are_read_whole(store: Store) -> None:
+    store.create_scene(OFFICE)
+    store.add_references(OFFICE, [described("a")])
+    store.delete_scene(OFFICE)
+    with pytest.raises(errors.NotFound, match="office"):
+        store.list_changes(OFFICE, 2, NAME)
+    generation = store.create_scene(OFFICE).generation
+    store.add_references(OFFICE, [described("b")])
+    for since in (1, 2, generation - 1, generation + 2):
+        changes = store.list_changes(OFFICE, since, NAME)
+        assert (changes.is_whole, [it.reference_id for it in changes.added]) == (True, ["b"])
+    assert not store.list_changes(OFFICE, generation, NAME).is_whole
+
+
+def test_tombstones_go_with_their_scene(place: Place) -> None:
+    with place.open() as store:
+        for key in (OFFICE, HALL):
+            store.create_scene(key)
+            store.add_references(key, [described("a")])
+            store.delete_reference(key, "a")
+        assert place.fetch("SELECT count(*) FROM removed_reference") == [(2,)]
+        store.delete_scene(OFFICE)
+        assert place.fetch("SELECT scene_id FROM removed_reference") == [("hall",)]
+
+
+def test_a_descriptor_goes_with_its_reference(place: Place) -> None:
+    with place.open() as store:
+        store.create_scene(OFFICE)
+        store.add_references(OFFICE, [described("a"), described("b")])
+        store.delete_reference(OFFICE, "a")
+        assert place.fetch("SELECT count(*) FROM global_descriptor") == [(1,)]
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "UPDATE global_descriptor SET data = ? WHERE reference_key = ?",
+        "UPDATE reference SET geometry = ? WHERE key = ?",
+    ],
+)
+def test_a_damaged_reference_is_named_and_left_out(place: Place, statement: str) -> None:
+    with place.open() as store:
+        store.create_scene(OFFICE)
+        bad, _ = store.add_references(OFFICE, [described("bad"), described("good")])
+        place.execute(statement, bytes(32), bad.key)
+        for _ in range(2):
+            changes = store.list_changes(OFFICE, None, NAME)
+            assert [it.reference_id for it in changes.added] == ["good"]
+            assert changes.damaged == ("bad",)
+        store.delete_reference(OFFICE, "bad")
+        assert store.list_changes(OFFICE, None, NAME).damaged == ()
+
+
+def test_another_references_descriptor_is_damage(place: Place) -> None:
+    with place.open() as store:
+        store.create_scene(OFFICE)
+        a, b = store.add_references(OFFICE, [described("a", 1), described("b", 2)])
+        ((data, sha256),) = place.fetch("SELECT data, sha256 FROM global_descriptor WHERE reference_key = ?", a.key)
+        place.execute("UPDATE global_descriptor SET data = ?, sha256 = ? WHERE reference_key = ?", data, sha256, b.key)
+        changes = store.list_changes(OFFICE, None, NAME)
+        assert [it.reference_id for it in changes.added] == ["a"]
+        assert changes.damaged == ("b",)
+
+
+STEPS = st.lists(st.tuples(st.sampled_from("addfnk"), st.integers(0, 4)), max_size=25)
+
+
+@settings(max_examples=8, deadline=None)
+@given(steps=STEPS)
+def test_following_is_reading_whole(
+    database: str, tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int]]
+) -> None:
+    """Random lives of a scene: add, delete, describe, follow, a new life, a plain look."""
+    follower = Follower()
+    with place_on(database, lambda: tmp_path_factory.mktemp("follow")).open() as store:
+        store.create_scene(OFFICE)
+        do: dict[str, Callable[[str], object]] = {
+            "a": lambda it: store.add_references(OFFICE, [make_reference(it, count=1)]),
+            "d": lambda it: store.delete_reference(OFFICE, it),
+            "f": lambda it: follower.follow(store),
+            "n": lambda it: (store.delete_scene(OFFICE), store.create_scene(OFFICE)),
+            "k": lambda it: store.add_descriptor(
+                store.get_reference(OFFICE, it).key, NAME, make_descriptor(np.random.default_rng(1), 16)
+            ),
+        }
+        for step, number in steps:
+            with suppress(errors.AlreadyExists, errors.NotFound):
+                do[step](str(number))
+        follower.follow(store)
+        whole = store.list_changes(OFFICE, None, NAME)
+        scene = store.get_scene(OFFICE)
+        snapshot = store.load_references(OFFICE, None, EXTRACTOR)
+    assert contents(follower.known) == contents({it.key: it for it in whole.added})
+    assert scene.reference_count == len(whole.added) == len(snapshot.references)
+    assert scene.generation == whole.generation == snapshot.generation
+    assert follower.wholes <= 1 + sum(step == "n" for step, _ in steps)
+
+
+def test_features_of_one_more_extractor_are_no_change(store: Store) -> None:
+    store.create_scene(OFFICE)
+    (a,) = store.add_references(OFFICE, [described("a")])
+    store.add_features(a.key, "other", view_of(make_reference("a")))
+    assert store.list_changes(OFFICE, 2, NAME).generation == 2
+
+
+def test_who_comes_after_deletions_are_forgotten_reads_all(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tombstones do not pile up; whether remembered or not, following is reading whole."""
+    remembered = 4
+    monkeypatch.setattr(changing, "GENERATIONS_REMEMBERED", remembered)
+    with place.open() as store:
+        store.create_scene(OFFICE)
+        store.add_references(OFFICE, [make_reference(f"r{it}", it, count=1) for it in range(12)])
+        followers = []
+        for index in range(12):
+            follower = Follower()
+            follower.follow(store)
+            followers.append(follower)
+            store.delete_reference(OFFICE, f"r{index}")
+            if index == 5:
+                store.add_references(OFFICE, [make_reference("late", count=1)])
+        assert place.fetch("SELECT count(*) FROM removed_reference") == [(remembered,)]
+        whole = contents({it.key: it for it in store.list_changes(OFFICE, None, NAME).added})
+        for follower in followers:
+            follower.follow(store)
+            assert contents(follower.known) == whole
+        assert [it.wholes for it in followers] == [2] * 8 + [1] * 4
+        with store.database.read() as connection:
+            assert verify(connection).faults == ()

@@ -1,0 +1,389 @@
+"""A large scene is deleted in portions, and nobody ever sees a part of it, not even after a crash in the middle."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import Connection
+from stores import DATABASES, EXTRACTOR, Folder, Place, Shared, assert_same_view, make_reference, place_on, view_of
+
+from mapless_server import errors
+from mapless_server.security.principal import DEFAULT_TENANT
+from mapless_server.security.tenancy import SceneKey
+from mapless_server.store import Store, leftovers, postgresql, reading, removing
+from mapless_server.store.backup import back_up, restore
+from mapless_server.store.leftovers import Leftovers
+from mapless_server.store.postgresql import PostgresqlDatabase
+from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
+from mapless_server.store.verify import verify
+
+OFFICE, HALL = SceneKey("office"), SceneKey("hall")
+TABLES = ("reference", "image", "features", "global_descriptor", "removed_reference")
+COUNT = 10
+
+
+@pytest.fixture(params=DATABASES)
+def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Place:
+    monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", 3)
+    return place_on(request.param, lambda: tmp_path)
+
+
+def fill(store: Store, key: SceneKey, count: int = COUNT) -> list[str]:
+    """A scene with so many references and one that was deleted; their keys."""
+    store.create_scene(key)
+    records = store.add_references(key, [make_reference(f"r{it}", it, dimension=8) for it in range(count + 1)])
+    store.delete_reference(key, f"r{count}")
+    return [it.key for it in records[:count]]
+
+
+def row_counts(place: Place) -> dict[str, int]:
+    return {table: place.fetch(f"SELECT count(*) FROM {table}")[0][0] for table in (*TABLES, "scene")}
+
+
+def before_each_portion(monkeypatch: pytest.MonkeyPatch, do: Callable[[], None]) -> None:
+    real = removing.next_portion
+
+    def next_portion(connection: Connection, at_most: int) -> Sequence[str]:
+        do()
+        return real(connection, at_most)
+
+    monkeypatch.setattr(removing, "next_portion", next_portion)
+
+
+def fail() -> None:
+    raise errors.Unavailable("the store is not there")
+
+
+def test_nothing_is_left(place: Place) -> None:
+    with place.open() as store:
+        fill(store, OFFICE)
+        store.create_scene(HALL)
+        store.add_references(HALL, [make_reference("stays", 1, dimension=8)])
+        store.delete_scene(OFFICE)
+        assert [it.scene_id for it in store.list_scenes(DEFAULT_TENANT, 10)] == ["hall"]
+        assert store.get_scene(HALL).reference_count == 1
+        assert_same_view(
+            store.load_references(HALL, ["stays"], EXTRACTOR).references[0].view, view_of(make_reference("stays", 1))
+        )
+        assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 1) | {"removed_reference": 0}
+
+
+def test_in_the_middle_it_is_gone_for_everybody(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+
+    def look() -> None:
+        seen.append(row_counts(place)["reference"])
+        # Without a cache, and read only: in SQLite, the writer's turn is not over.
+        assert store.list_scenes(DEFAULT_TENANT, 10) == []
+        for read in (
+            lambda: store.get_scene(OFFICE),
+            lambda: store.get_reference(OFFICE, "r9"),
+            lambda: store.list_references(OFFICE, 10),
+            lambda: store.load_references(OFFICE, ["r9"], EXTRACTOR),
+            lambda: store.list_changes(OFFICE, generation, "vlad"),
+            lambda: store.read_image_of(keys[9]),
+            lambda: store.add_descriptor(keys[9], "other", make_reference("a", 1, dimension=8).descriptors["vlad"]),
+        ):
+            with pytest.raises(errors.NotFound):
+                read()
+        assert not store.has_features(keys[9], EXTRACTOR)
+
+    with place.open(0) as store:
+        keys = fill(store, OFFICE)
+        generation = store.get_scene(OFFICE).generation
+        before_each_portion(monkeypatch, look)
+        store.delete_scene(OFFICE)
+    assert seen == [10, 7, 4, 1]
+
+
+def leave_some(place: Place, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A store whose scene is gone, but not what it had; their keys."""
+    with place.open() as store, monkeypatch.context() as patch:
+        keys = fill(store, OFFICE)
+        before_each_portion(patch, fail)
+        with pytest.raises(errors.Unavailable):
+            store.delete_scene(OFFICE)
+    assert row_counts(place)["reference"] == COUNT
+    return keys
+
+
+def leave_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is left when a store is opened."""
+    monkeypatch.setattr(Leftovers, "resume", lambda _: None)
+
+
+def wait_for_thread(store: Store) -> None:
+    assert store._leftovers._thread is not None
+    store._leftovers._thread.join(30)
+
+
+def test_a_crash_in_the_middle_leaves_what_nobody_sees_and_the_next_delete_removes(
+    place: Place, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    keys = leave_some(place, monkeypatch)
+    leave_alone(monkeypatch)
+    with place.open() as store:
+        assert row_counts(place)["reference"] == COUNT
+        with pytest.raises(errors.NotFound):
+            store.add_features(keys[0], "other", view_of(make_reference("a")))
+        store.create_scene(OFFICE)
+        store.add_references(OFFICE, [make_reference(f"r{it}", 100 + it, dimension=8) for it in range(COUNT)])
+        assert store.get_scene(OFFICE).reference_count == COUNT
+        assert not {it.key for it in store.list_references(OFFICE, 100)} & set(keys)
+        with store.database.read() as connection:
+            assert verify(connection).faults == ()
+        source: Any = (
+            PostgresqlDatabase.look_at(place.url)
+            if isinstance(place, Shared)
+            else SqliteDatabase.look_at(tmp_path / "data" / DATABASE_FILE)
+        )
+        with closing(source):
+            assert back_up(source, tmp_path / "backup").faults == ()
+        store.create_scene(HALL)
+        store.delete_scene(HALL)
+        assert row_counts(place)["reference"] == COUNT
+        loaded = store.load_references(OFFICE, ["r4"], EXTRACTOR).references[0]
+        assert_same_view(loaded.view, view_of(make_reference("r4", 104)))
+    other = Folder(tmp_path / "other")
+    with other.open() as store:
+        restore(tmp_path / "backup", store.database)
+        assert store.get_scene(OFFICE).reference_count == COUNT
+        assert row_counts(other)["reference"] == COUNT
+        assert row_counts(other)["scene"] == 1
+
+
+def test_what_is_left_is_deleted_by_who_deletes_the_scene_again(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_some(place, monkeypatch)
+    leave_alone(monkeypatch)
+    with place.open() as store, pytest.raises(errors.NotFound):
+        store.delete_scene(OFFICE)
+    assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+
+
+def test_what_is_left_is_deleted_when_the_store_is_opened_again_and_nobody_waits_for_it(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_some(place, monkeypatch)
+    opened = threading.Event()
+    with monkeypatch.context() as patch:
+        before_each_portion(patch, lambda: assert_true(opened.wait(30)))
+        with place.open() as store:
+            assert store.list_scenes(DEFAULT_TENANT, 10) == []
+            opened.set()
+            wait_for_thread(store)
+    assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+    with place.open() as store:
+        assert store._leftovers._thread is None
+
+
+def assert_true(it: bool) -> None:
+    assert it
+
+
+def test_closing_ends_it_after_a_portion_and_the_next_start_goes_on(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_some(place, monkeypatch)
+    monkeypatch.setattr(leftovers, "PAUSE_S", 30.0)
+    with place.open():
+        pass
+    assert 0 < row_counts(place)["reference"] <= COUNT
+    monkeypatch.setattr(leftovers, "PAUSE_S", 0.0)
+    with place.open() as store:
+        wait_for_thread(store)
+    assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+
+
+@pytest.mark.parametrize("broken", ["is_left", "next_portion"])
+def test_where_that_fails_the_store_is_opened_all_the_same_and_the_log_tells(
+    place: Place, broken: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    leave_some(place, monkeypatch)
+    with monkeypatch.context() as patch:
+        patch.setattr(removing, broken, lambda *_: fail())
+        with place.open() as store:
+            assert store.list_scenes(DEFAULT_TENANT, 10) == []
+    assert "stays until the next start or deletion of a scene: the store is not there" in caplog.text
+    assert row_counts(place)["reference"] == COUNT
+
+
+def test_a_store_that_can_only_be_read_leaves_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    place = Folder(tmp_path)
+    leave_some(place, monkeypatch)
+    monkeypatch.setattr(SqliteDatabase, "open", lambda it: SqliteDatabase._open_to_read(it / DATABASE_FILE))
+    with place.open() as store:
+        assert store._leftovers._thread is None
+    assert "what is left" not in caplog.text
+
+
+@pytest.mark.parametrize(("portion_bytes", "expected"), [(0, range(COUNT, 0, -1)), (40_000, range(COUNT, 0, -2))])
+def test_a_portion_is_bounded_by_its_bytes_and_has_one_at_least(
+    place: Place, monkeypatch: pytest.MonkeyPatch, portion_bytes: int, expected: range
+) -> None:
+    """Each has 5000 bytes of a photograph and more than 10 000 of features."""
+    monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", 100)
+    monkeypatch.setattr(removing, "PORTION_BYTES", portion_bytes)
+    seen: list[int] = []
+    with place.open() as store:
+        fill(store, OFFICE)
+        before_each_portion(monkeypatch, lambda: seen.append(row_counts(place)["reference"]))
+        store.delete_scene(OFFICE)
+    assert seen == list(expected)
+    assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+
+
+def test_between_portions_others_may_write(place: Place) -> None:
+    class Pause(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            assert timeout
+            with ThreadPoolExecutor(1) as pool:
+                pool.submit(store.create_scene, SceneKey(f"scene{len(written)}")).result(10)
+            written.append(timeout)
+            return False
+
+    written: list[float] = []
+    with place.open() as store:
+        fill(store, OFFICE)
+        store._leftovers._closing = Pause()
+        store.delete_scene(OFFICE)
+        assert len(store.list_scenes(DEFAULT_TENANT, 10)) == len(written) == 3
+
+
+def test_the_journal_stays_as_small_as_a_portion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though what is deleted is overwritten, for which it goes through the journal."""
+    place, journal = Folder(tmp_path), tmp_path / f"{DATABASE_FILE}-wal"
+    monkeypatch.setattr(removing, "PORTION_BYTES", 2**18)
+    with place.open() as store:
+        store.create_scene(OFFICE)
+        large = [replace(make_reference(f"r{it}", it), image=bytes(200_000)) for it in range(15)]
+        store.add_references(OFFICE, large)
+    with place.open() as store:
+        store.delete_scene(OFFICE)
+        assert journal.stat().st_size < 2**19
+
+
+class TestFullDisk:
+    """Where there is room in the journal for one reference, but not for two."""
+
+    def fill_up(self, monkeypatch: pytest.MonkeyPatch, room: int) -> list[int]:
+        real, tried = removing.remove, []
+
+        def remove(connection: Connection, *keys: str) -> None:
+            tried.append(len(keys))
+            if len(keys) > room:
+                raise errors.Overloaded("the store's disk is full", reason="STORE_FULL")
+            real(connection, *keys)
+
+        monkeypatch.setattr(removing, "remove", remove)
+        return tried
+
+    def test_references_are_deleted_one_by_one(self, place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+        with place.open() as store:
+            fill(store, OFFICE)
+            tried = self.fill_up(monkeypatch, 1)
+            store.delete_scene(OFFICE)
+        assert tried == [3] + [1] * COUNT
+        assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+
+    def test_without_room_for_one_it_is_said_until_there_is(
+        self, place: Place, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        with place.open() as store:
+            fill(store, OFFICE)
+            with monkeypatch.context() as patch:
+                tried = self.fill_up(patch, 0)
+                for _ in range(2):
+                    with pytest.raises(errors.Overloaded):
+                        store.delete_scene(OFFICE)
+            assert tried == [3, 1] * 2
+            with pytest.raises(errors.NotFound):
+                store.delete_scene(OFFICE)
+        assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+
+
+class TestMemory:
+    """Of scenes that are deleted nothing is held; of others all."""
+
+    def used_bytes(self, store: Store) -> tuple[int, ...]:
+        return tuple(it.used_bytes for it in (store._described, store._resolved, store._attributes))
+
+    def ask(self, store: Store, key: SceneKey) -> None:
+        store.load_references(key, ["r1", "r0"], EXTRACTOR)
+        store.get_attributes(key)
+
+    def test_what_was_remembered_is_forgotten(self, place: Place) -> None:
+        with place.open() as store:
+            for key in (OFFICE, HALL):
+                fill(store, key)
+            self.ask(store, OFFICE)
+            before = self.used_bytes(store)
+            self.ask(store, HALL)
+            assert all(now > then for now, then in zip(self.used_bytes(store)[:2], before[:2], strict=True))
+            store.delete_scene(HALL)
+            assert self.used_bytes(store) == before
+
+    @pytest.mark.parametrize("what", ["scene", "reference"])
+    def test_what_is_being_read_meanwhile_is_not_remembered(
+        self, place: Place, what: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        real = reading._features
+
+        def delete_meanwhile(*arguments: Any) -> Any:
+            found = real(*arguments)
+            with ThreadPoolExecutor(1) as pool:
+                pool.submit(store.delete_reference, OFFICE, "r0").result(30)
+                if what == "scene":
+                    pool.submit(store.delete_scene, OFFICE).result(30)
+            return found
+
+        with place.open() as store:
+            fill(store, OFFICE)
+            with monkeypatch.context() as patch:
+                patch.setattr(reading, "_features", delete_meanwhile)
+                assert len(store.load_references(OFFICE, ["r1", "r0"], EXTRACTOR).references) == 2
+            assert self.used_bytes(store)[:2] == (0, 0)
+
+
+def test_servers_that_delete_at_the_same_time_help_one_another(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not isinstance(place, Shared):
+        pytest.skip("a folder has one server")
+    with place.open() as one, place.open() as other:
+        fill(one, OFFICE)
+        fill(one, HALL)
+        entered: list[None] = []
+
+        def delete_the_other() -> None:
+            entered.append(None)
+            if len(entered) == 2:
+                other.delete_scene(HALL)
+
+        before_each_portion(monkeypatch, delete_the_other)
+        one.delete_scene(OFFICE)
+        assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+
+
+def test_a_statement_s_limit_does_not_keep_a_scene_alive(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", 3)
+    place = place_on("postgresql", lambda: tmp_path)
+    monkeypatch.setitem(postgresql._SESSION_OPTIONS, "statement_timeout", "300ms")
+    with place.open() as store:
+        fill(store, OFFICE, 20)
+        with store.database.write() as connection:
+            connection.exec_driver_sql(
+                "CREATE FUNCTION slow() RETURNS trigger AS 'BEGIN PERFORM pg_sleep(0.03); "
+                "IF TG_OP = ''DELETE'' THEN RETURN OLD; END IF; RETURN NEW; END' LANGUAGE plpgsql"
+            )
+            connection.exec_driver_sql(
+                "CREATE TRIGGER slow BEFORE UPDATE OR DELETE ON reference FOR EACH ROW EXECUTE FUNCTION slow()"
+            )
+        store.delete_scene(OFFICE)
+        assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)

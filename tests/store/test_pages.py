@@ -1,0 +1,134 @@
+"""Pages of an SQLite file that a disk has lost: the reference that lies there is named, and nothing else is.
+
+Features and descriptors here are large enough to lie on pages of their own. A page is found by what was stored in it.
+"""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from stores import EXTRACTOR, make_reference, view_of
+
+from mapless_server.errors import AlreadyExists, DataLoss, NotFound
+from mapless_server.security.tenancy import SceneKey
+from mapless_server.store import Store, leftovers
+from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
+from mapless_server.store.verify import verify
+
+SCENE = SceneKey("office")
+IDS = ["a", "b", "c"]
+PAGE_BYTES = 4096
+MADE = {it: make_reference(it, seed, count=100, dimension=6000) for seed, it in enumerate(IDS)}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    with Store.open(tmp_path) as store:
+        store.create_scene(SCENE)
+        store.add_references(SCENE, list(MADE.values()))
+    return tmp_path
+
+
+def lose_page_with(folder: Path, content: bytes) -> None:
+    path = folder / DATABASE_FILE
+    at = path.read_bytes().find(content)
+    assert at > 0
+    with path.open("r+b") as file:
+        file.seek(at // PAGE_BYTES * PAGE_BYTES)
+        file.write(bytes(PAGE_BYTES))
+
+
+def lose(folder: Path, what: str, reference_id: str) -> None:
+    made = MADE[reference_id]
+    stored = {
+        "image": made.image[4000:4016],
+        "features": view_of(made).features.descriptors.tobytes()[20_000:20_016],
+        "descriptor": made.descriptors["vlad"].astype("float16").tobytes()[6000:6016],
+    }
+    lose_page_with(folder, stored[what])
+
+
+def faults_of(folder: Path) -> tuple[str, ...]:
+    with closing(SqliteDatabase.look_at(folder / DATABASE_FILE)) as database, database.read() as connection:
+        return verify(connection).faults
+
+
+def test_features_that_are_lost_name_their_reference_and_the_others_load(folder: Path) -> None:
+    lose(folder, "features", "b")
+    with Store.open(folder) as store:
+        for asked in (IDS, ["b"], ["c", "b"], None):
+            with pytest.raises(DataLoss, match="'b' is damaged"):
+                store.load_references(SCENE, asked, EXTRACTOR)
+        loaded = store.load_references(SCENE, ["c", "a"], EXTRACTOR).references
+        assert [it.record.reference_id for it in loaded] == ["c", "a"]
+
+
+def test_an_image_that_is_lost_names_its_reference(folder: Path) -> None:
+    lose(folder, "image", "b")
+    with Store.open(folder) as store:
+        (loaded,) = store.load_references(SCENE, ["b"], EXTRACTOR).references
+        with pytest.raises(DataLoss, match="'b' is damaged"):
+            store.read_image(SCENE, "b")
+        with pytest.raises(DataLoss, match="'b' is damaged"):
+            store.read_image_of(loaded.record.key)
+        assert store.read_image(SCENE, "a") == MADE["a"].image
+
+
+def test_a_descriptor_that_is_lost_leaves_its_reference_out_of_the_index_alone(folder: Path) -> None:
+    lose(folder, "descriptor", "b")
+    with Store.open(folder) as store:
+        changes = store.list_changes(SCENE, None, "vlad")
+        assert [it.reference_id for it in changes.added] == ["a", "c"]
+        assert changes.damaged == ("b",)
+
+
+@pytest.mark.parametrize("what", ["image", "features", "descriptor"])
+def test_whatever_is_lost_the_store_says_so_and_the_reference_can_be_stored_anew(folder: Path, what: str) -> None:
+    lose(folder, what, "b")
+    named = [fault for fault in faults_of(folder) if "reference" in fault]
+    assert named
+    assert all("'b'" in fault for fault in named)
+    with Store.open(folder) as store:
+        with pytest.raises(AlreadyExists):
+            store.add_references(SCENE, [MADE["b"]])
+        store.delete_reference(SCENE, "b")
+        with pytest.raises(NotFound):
+            store.get_reference(SCENE, "b")
+        assert store.get_scene(SCENE).reference_count == 2
+        store.add_references(SCENE, [MADE["b"]])
+        assert store.read_image(SCENE, "b") == MADE["b"].image
+        assert len(store.load_references(SCENE, IDS, EXTRACTOR).references) == 3
+        assert len(store.list_changes(SCENE, None, "vlad").added) == 3
+    assert not [fault for fault in faults_of(folder) if "reference" in fault]
+
+
+@pytest.mark.parametrize("at_a_time", [1, 2, 100])
+def test_a_scene_with_lost_pages_is_deleted_and_so_is_what_else_is_deleted_later(
+    folder: Path, at_a_time: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", at_a_time)
+    lose(folder, "features", "b")
+    lose(folder, "features", "c")
+    with Store.open(folder) as store:
+        store.delete_scene(SCENE)
+        with pytest.raises(NotFound):
+            store.get_scene(SCENE)
+        store.create_scene(SCENE)
+        store.add_references(SCENE, list(MADE.values()))
+        assert store.get_scene(SCENE).reference_count == 3
+        store.delete_scene(SCENE)
+        assert store.list_scenes("default", 10) == []
+    with closing(SqliteDatabase.look_at(folder / DATABASE_FILE)) as database, database.read() as connection:
+        left = connection.exec_driver_sql("SELECT count(*) FROM reference").scalar()
+    assert left == 2, "of those that cannot be deleted"
+
+
+def test_a_lost_table_of_references_is_nobodys_fault_in_particular(folder: Path) -> None:
+    with Store.open(folder) as store:
+        key = store.get_reference(SCENE, "a").key
+    lose_page_with(folder, f"{key}office".encode())
+    with Store.open(folder) as store, pytest.raises(DataLoss, match="the store is damaged"):
+        store.load_references(SCENE, IDS, EXTRACTOR)
+    assert any(fault.startswith("database: ") for fault in faults_of(folder))

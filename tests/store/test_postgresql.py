@@ -1,0 +1,327 @@
+"""Several servers share one PostgreSQL: what one writes, the others see at once; and it may go away and come back."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+import postgres
+import psycopg
+import pytest
+from stores import EXTRACTOR, Shared, assert_same_view, make_reference, view_of
+
+from mapless_server import errors
+from mapless_server.security.principal import DEFAULT_TENANT
+from mapless_server.security.tenancy import SceneKey
+from mapless_server.store import Store, StoreError, postgresql
+
+OFFICE = SceneKey("office")
+NAME = "vlad"
+
+
+@pytest.fixture
+def place() -> Shared:
+    return Shared(postgres.shared_cluster().fresh_url())
+
+
+@pytest.fixture
+def both(place: Shared) -> Iterator[tuple[Store, Store]]:
+    with place.open() as one, place.open() as other:
+        yield one, other
+
+
+class TestSharing:
+    def test_what_one_adds_the_other_has_at_once(self, both: tuple[Store, Store]) -> None:
+        one, other = both
+        one.create_scene(OFFICE)
+        for round_, (writer, reader) in enumerate([(one, other), (other, one)] * 2):
+            name = f"r{round_}"
+            (record,) = writer.add_references(OFFICE, [make_reference(name, round_, dimension=8)])
+            for _ in range(2):  # from the database, then from memory
+                snapshot = reader.load_references(OFFICE, [name], EXTRACTOR)
+                assert snapshot.generation == writer.get_scene(OFFICE).generation
+                assert_same_view(snapshot.references[0].view, view_of(make_reference(name, round_)))
+            assert reader.get_scene(OFFICE).reference_count == round_ + 1
+            changes = reader.list_changes(OFFICE, snapshot.generation - 1, NAME)
+            assert [it.key for it in changes.added] == [record.key]
+
+    def test_what_is_in_memory_is_not_believed_after_the_other_changed_it(self, both: tuple[Store, Store]) -> None:
+        one, other = both
+        one.create_scene(OFFICE)
+        one.add_references(OFFICE, [make_reference("a", 1), make_reference("b", 2)])
+        for store in both:
+            assert len(store.load_references(OFFICE, ["a", "b"], EXTRACTOR).references) == 2
+        other.delete_reference(OFFICE, "a")
+        with pytest.raises(errors.NotFound, match="'a'"):
+            one.load_references(OFFICE, ["a", "b"], EXTRACTOR)
+        other.add_references(OFFICE, [make_reference("a", 3)])
+        loaded = one.load_references(OFFICE, ["a", "b"], EXTRACTOR)
+        assert_same_view(loaded.references[0].view, view_of(make_reference("a", 3)))
+        other.delete_scene(OFFICE)
+        with pytest.raises(errors.NotFound, match="office"):
+            one.load_references(OFFICE, ["a", "b"], EXTRACTOR)
+        with pytest.raises(errors.NotFound, match="office"):
+            one.list_changes(OFFICE, loaded.generation, NAME)
+
+    def test_a_repeated_load_reads_no_features(self, both: tuple[Store, Store], place: Shared) -> None:
+        one, other = both
+        one.create_scene(OFFICE)
+        one.add_references(OFFICE, [make_reference("a")])
+        first = other.load_references(OFFICE, ["a"], EXTRACTOR)
+        place.execute("UPDATE features SET data = ?", b"wrong")
+        one.add_references(OFFICE, [make_reference("b")])
+        again = other.load_references(OFFICE, ["a"], EXTRACTOR)
+        assert again.references[0] is first.references[0]
+        assert again.generation == first.generation + 1
+
+    def test_one_server_gets_an_id(self, both: tuple[Store, Store]) -> None:
+        both[0].create_scene(OFFICE)
+
+        def add(number: int) -> bool:
+            try:
+                both[number % 2].add_references(OFFICE, [make_reference("mine", number), make_reference(f"n{number}")])
+            except errors.AlreadyExists:
+                return False
+            return True
+
+        with ThreadPoolExecutor(8) as pool:
+            won = list(pool.map(add, range(16)))
+        assert sum(won) == 1
+        scene = both[1].get_scene(OFFICE)
+        assert (scene.reference_count, scene.generation) == (2, 2)
+
+    def test_one_server_gets_a_scene(self, both: tuple[Store, Store]) -> None:
+        def create(number: int) -> bool:
+            try:
+                both[number % 2].create_scene(OFFICE)
+            except errors.AlreadyExists:
+                return False
+            return True
+
+        with ThreadPoolExecutor(8) as pool:
+            assert sum(pool.map(create, range(16))) == 1
+        assert both[0].get_scene(OFFICE).generation == 1
+
+    def test_changers_of_one_scene_wait_for_one_another_and_nothing_is_lost(self, both: tuple[Store, Store]) -> None:
+        both[0].create_scene(OFFICE)
+
+        def change(number: int) -> None:
+            store = both[number % 2]
+            for index in range(5):
+                name = f"{number}-{index}"
+                (record,) = store.add_references(OFFICE, [make_reference(name, count=1)])
+                store.add_features(record.key, "other", view_of(make_reference(name, count=1)))
+                if index % 2:
+                    store.delete_reference(OFFICE, name)
+
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(change, range(8)))
+        scene = both[0].get_scene(OFFICE)
+        assert (scene.reference_count, scene.generation) == (8 * 3, 1 + 8 * 7)
+        assert len(both[1].list_references(OFFICE, 100)) == 24
+
+    def test_one_server_describes_a_reference(self, both: tuple[Store, Store]) -> None:
+        both[0].create_scene(OFFICE)
+        (record,) = both[0].add_references(OFFICE, [make_reference("a")])
+
+        def describe(number: int) -> bool:
+            try:
+                both[number % 2].add_features(record.key, "other", view_of(make_reference("a", number)))
+            except errors.AlreadyExists:
+                return False
+            return True
+
+        with ThreadPoolExecutor(8) as pool:
+            assert sum(pool.map(describe, range(16))) == 1
+
+    def test_a_scene_deleted_while_others_add_to_it_is_gone_or_whole(self, both: tuple[Store, Store]) -> None:
+        one, other = both
+        one.create_scene(OFFICE)
+
+        def add(number: int) -> None:
+            try:
+                other.add_references(OFFICE, [make_reference(f"{number}", count=1)])
+            except errors.NotFound:
+                return
+
+        with ThreadPoolExecutor(4) as pool:
+            adders = [pool.submit(add, number) for number in range(12)]
+            one.delete_scene(OFFICE)
+            for adder in adders:
+                adder.result(timeout=30)
+        assert one.list_scenes(DEFAULT_TENANT, 10) == []
+        assert one.create_scene(OFFICE).reference_count == 0
+
+
+@contextmanager
+def own_cluster() -> Iterator[postgres.Cluster]:
+    postgres.require()
+    cluster = postgres.Cluster()
+    try:
+        yield cluster
+    finally:
+        cluster.remove()
+
+
+def operations(store: Store) -> tuple[Callable[[], object], ...]:
+    return (
+        lambda: store.get_scene(OFFICE),
+        lambda: store.list_scenes(DEFAULT_TENANT, 10),
+        lambda: store.load_references(OFFICE, ["a"], EXTRACTOR),
+        lambda: store.list_changes(OFFICE, 1, NAME),
+        lambda: store.read_image(OFFICE, "a"),
+        lambda: store.add_references(OFFICE, [make_reference("lost")]),
+        lambda: store.delete_reference(OFFICE, "a"),
+        lambda: store.create_scene(SceneKey("lost")),
+    )
+
+
+class TestGoingAway:
+    @pytest.mark.parametrize("how", [signal.SIGQUIT, signal.SIGINT])
+    def test_errors_but_no_data_are_lost_and_all_works_again(self, how: signal.Signals) -> None:
+        with own_cluster() as cluster, Shared(cluster.fresh_url()).open() as store:
+            store.create_scene(OFFICE)
+            acknowledged = []
+            for life in range(2):
+                name = f"r{life}"
+                store.add_references(OFFICE, [make_reference("a", 9)] if life == 0 else [make_reference(name, life)])
+                acknowledged.append("a" if life == 0 else name)
+                with ThreadPoolExecutor(4) as pool:  # connections to be thrown away
+                    list(pool.map(lambda _: store.get_scene(OFFICE), range(8)))
+                cluster.stop(how)
+                for operation in operations(store):
+                    with pytest.raises(errors.Unavailable) as caught:
+                        operation()
+                    assert caught.value.reason == "STORE_UNAVAILABLE"
+                    assert caught.value.retry_after_s == 1
+                    assert "\n" not in str(caught.value)
+                cluster.start()
+                assert [it.reference_id for it in store.list_references(OFFICE, 10)] == acknowledged
+                loaded = store.load_references(OFFICE, ["a"], EXTRACTOR).references[0]
+                assert_same_view(loaded.view, view_of(make_reference("a", 9)))
+                assert store.get_scene(OFFICE).reference_count == len(acknowledged)
+
+    def test_a_connection_that_is_ended_is_one_error_at_most(self, place: Shared) -> None:
+        with place.open() as store:
+            store.create_scene(OFFICE)
+            for _ in range(3):
+                with postgres.shared_cluster().connect() as connection:
+                    connection.execute(
+                        "SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity "
+                        "WHERE application_name = 'mapless-server'"
+                    )
+                assert store.get_scene(OFFICE).generation == 1  # a dead connection is noticed before it is used
+
+    def test_a_change_cut_off_in_its_middle_leaves_nothing(self, place: Shared) -> None:
+        with place.open() as store:
+            store.create_scene(OFFICE)
+
+            def change() -> None:
+                with store.database.write() as connection:
+                    connection.exec_driver_sql("UPDATE scene SET reference_count = 5")
+                    pid = connection.exec_driver_sql("SELECT pg_backend_pid()").scalar()
+                    with postgres.shared_cluster().connect() as other:
+                        other.execute("SELECT pg_terminate_backend(%s, 5000)", [pid])
+                    connection.exec_driver_sql("UPDATE scene SET reference_count = 6")
+
+            with pytest.raises(errors.Unavailable):
+                change()
+            assert store.get_scene(OFFICE).reference_count == 0
+
+
+class TestLimits:
+    def test_who_waits_too_long_for_a_lock_is_told_to_come_back(
+        self, place: Shared, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setitem(postgresql._SESSION_OPTIONS, "lock_timeout", "50ms")
+        with place.open() as store:
+            store.create_scene(OFFICE)
+            with psycopg.connect(place.url) as other:
+                other.execute("SELECT * FROM scene_generation FOR UPDATE")
+                with pytest.raises(errors.Unavailable, match="busy"):
+                    store.add_references(OFFICE, [make_reference("a")])
+                assert store.get_scene(OFFICE).generation == 1  # who reads does not wait
+            store.add_references(OFFICE, [make_reference("a")])
+
+    def test_more_threads_than_connections_wait_or_are_told(
+        self, place: Shared, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(postgresql, "CONNECTIONS_AT_MOST", 4)
+        monkeypatch.setattr(postgresql, "CONNECTION_WAIT_S", 0.05)
+        with place.open() as store:
+            store.create_scene(OFFICE)
+            with ThreadPoolExecutor(16) as pool:  # they hold one for less than that
+                monkeypatch.setattr(postgresql, "CONNECTION_WAIT_S", 5.0)
+                held = [store.database.read() for _ in range(4)]
+                for it in held:
+                    it.__enter__()
+                with pytest.raises(errors.Unavailable, match="busy"):
+                    store.get_scene(OFFICE)
+                for it in held:
+                    it.__exit__(None, None, None)
+                assert len({it.generation for it in pool.map(lambda _: store.get_scene(OFFICE), range(4))}) == 1
+
+    def test_settings_of_every_connection(self, place: Shared) -> None:
+        expected = {
+            "synchronous_commit": "on",
+            "statement_timeout": "1min",
+            "lock_timeout": "5s",
+            "idle_in_transaction_session_timeout": "1min",
+            "application_name": "mapless-server",
+        }
+        with place.open() as store:
+            for transaction, isolation in (
+                (store.database.read(), "repeatable read"),
+                (store.database.write(), "read committed"),
+            ):
+                with transaction as connection:
+                    for name, value in (expected | {"transaction_isolation": isolation}).items():
+                        assert connection.exec_driver_sql(f"SHOW {name}").scalar() == value
+            with store.database.read() as connection, pytest.raises(Exception, match="read-only"):
+                connection.exec_driver_sql("DELETE FROM scene")
+
+    def test_an_operator_may_be_stricter(self, place: Shared) -> None:
+        url = place.url + "%20-csynchronous_commit%3Dremote_apply&application_name=mine"
+        with Store.connect(url) as store, store.database.read() as connection:
+            assert connection.exec_driver_sql("SHOW synchronous_commit").scalar() == "remote_apply"
+            assert connection.exec_driver_sql("SHOW application_name").scalar() == "mine"
+
+
+class TestOpening:
+    @pytest.mark.parametrize(
+        "url",
+        [
+            "sqlite:///x",
+            "mysql://u:secret@h/db",
+            "postgresql://u:secret@h",
+            "postgresql://u:sec@ret:secret@h:port/db",
+            "postgresql://u:p@secret@127.0.0.1:1/db",
+            "postgresql://u:p@127.0.0.1/secret@127.0.0.1:1/db",
+            "secret",
+            "",
+            "postgresql://u:secret@127.0.0.1:1/db",
+            "postgresql://127.0.0.1:1/db?password=secret&user=u",
+            "postgresql://u:secret@no-such-host.invalid/db",
+        ],
+    )
+    def test_a_wrong_url_is_one_sentence_without_the_password(self, url: str) -> None:
+        with pytest.raises(StoreError) as caught:
+            Store.connect(url)
+        assert "secret" not in str(caught.value)
+        assert ("%40" in str(caught.value)) == (url.count("@") > 1 and "port" not in url)
+        assert "\n" not in str(caught.value)
+        assert caught.value.__cause__ is None
+
+    def test_a_database_that_is_not_there_is_named(self) -> None:
+        url = postgres.shared_cluster().fresh_url().replace("/postgres?", "/nowhere?")
+        with pytest.raises(StoreError, match='database "nowhere" does not exist'):
+            Store.connect(url)
+
+    def test_another_encoding_is_refused(self) -> None:
+        cluster = postgres.shared_cluster()
+        with cluster.connect() as connection:
+            connection.execute("CREATE DATABASE latin ENCODING 'SQL_ASCII' TEMPLATE template0")
+        with pytest.raises(StoreError, match="SQL_ASCII"):
+            Store.connect(cluster.fresh_url().replace("/postgres?", "/latin?"))

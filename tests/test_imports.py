@@ -1,0 +1,149 @@
+"""The rooms of the server are a ladder: an import goes downward, and nowhere in a circle."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCES = {"mapless": "client", "mapless_server": "server", "mapless_tools": "server", "mapless_ray": "deploy/ray"}
+LADDER = (
+    "serve",
+    "services",
+    "rpc",
+    "observability",
+    "engine",
+    "scenes",
+    "store",
+    "security",
+    "method",
+    "networks",
+    "images",
+    "scheduling",
+)
+"""The rooms of mapless_server, the highest first; each may import those after it."""
+LOOSE = ("__init__", "__main__", "errors", "extras", "settings")
+"""Modules of mapless_server outside its rooms, which import no room; but `__main__`, which starts the process."""
+
+
+def modules_of(package: str) -> dict[str, Path]:
+    """Every module of a package that people write, by its dotted name."""
+    base = ROOT / SOURCES[package]
+    paths = [path for path in (base / package).rglob("*.py") if "_pb2" not in path.name]
+    return {".".join(path.relative_to(base).with_suffix("").parts).removesuffix(".__init__"): path for path in paths}
+
+
+def imports_of(module: str, path: Path, known: dict[str, Path], *, deferred: bool) -> Iterator[str]:
+    """The modules of `known` that a module imports; `deferred` ones too, which stand in functions."""
+    tree = ast.parse(path.read_text())
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    for node in ast.walk(tree) if deferred else _at_import(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in known)
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*parts, *([node.module] if node.module else [])])
+            for alias in node.names:
+                name = f"{base}.{alias.name}"
+                if name in known or base in known:
+                    yield name if name in known else base
+
+
+def _at_import(node: ast.AST) -> Iterator[ast.AST]:
+    """What runs when a module is imported, or is read by a type checker: everything outside functions."""
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield child
+            yield from _at_import(child)
+
+
+def graph(*packages: str, deferred: bool) -> dict[str, set[str]]:
+    """What each module imports; a package's own modules count as imported by those who import the package."""
+    known = {name: path for package in packages for name, path in modules_of(package).items()}
+    return {name: set(imports_of(name, path, known, deferred=deferred)) - {name} for name, path in known.items()}
+
+
+def room_of(module: str) -> str:
+    """`mapless_server.method.coarse.grids` is in the room `method`."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else "__init__"
+
+
+def circles(edges: dict[str, set[str]]) -> list[list[str]]:
+    """The strongly connected components of more than one node (Tarjan 1972)."""
+    order: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(node: str) -> None:
+        order[node] = low[node] = len(order)
+        stack.append(node)
+        for following in edges.get(node, ()):
+            if following not in order:
+                visit(following)
+            if following in stack:
+                low[node] = min(low[node], low[following])
+        if low[node] == order[node]:
+            component = stack[stack.index(node) :]
+            del stack[stack.index(node) :]
+            if len(component) > 1:
+                found.append(sorted(component))
+
+    for node in edges:
+        if node not in order:
+            visit(node)
+    return found
+
+
+def test_rooms_are_those_of_the_ladder() -> None:
+    folder = ROOT / "server" / "mapless_server"
+    assert {path.name for path in folder.iterdir() if (path / "__init__.py").exists()} == set(LADDER)
+    assert {path.stem for path in folder.glob("*.py")} <= set(LOOSE)
+
+
+@pytest.mark.xfail(strict=True, reason="networks/weights/fit.py imports method")
+def test_imports_between_rooms_go_downward() -> None:
+    upward = [
+        f"{module} imports {other}"
+        for module, others in graph("mapless_server", deferred=True).items()
+        for other in others
+        if room_of(other) in LADDER
+        and (
+            room_of(module) in ("errors", "extras", "settings")
+            or (room_of(module) in LADDER and LADDER.index(room_of(module)) > LADDER.index(room_of(other)))
+        )
+    ]
+    assert not upward
+
+
+def test_server_and_client_import_no_tools() -> None:
+    packages = ("mapless", "mapless_server", "mapless_tools", "mapless_ray")
+    tools = [
+        f"{module} imports {other}"
+        for module, others in graph(*packages, deferred=True).items()
+        for other in others
+        if module.startswith(("mapless.", "mapless_server")) and other.startswith(("mapless_tools", "mapless_ray"))
+    ]
+    assert not tools
+
+
+@pytest.mark.xfail(strict=True, reason="circles inside method")
+def test_no_module_is_in_a_circle_of_imports() -> None:
+    assert circles(graph("mapless", "mapless_server", "mapless_tools", deferred=False)) == []
+
+
+@pytest.mark.xfail(strict=True, reason="circles inside method")
+def test_no_room_inside_method_is_in_a_circle() -> None:
+    """Nor the packages inside a room, taken as a whole."""
+    parts: dict[str, set[str]] = {}
+    for module, others in graph("mapless_server", deferred=False).items():
+        if room_of(module) == "method":
+            part = ".".join(module.split(".")[:3])
+            parts.setdefault(part, set()).update(
+                ".".join(other.split(".")[:3]) for other in others if room_of(other) == "method"
+            )
+    assert circles({part: others - {part, "mapless_server.method"} for part, others in parts.items()}) == []

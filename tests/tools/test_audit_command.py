@@ -1,0 +1,123 @@
+"""What the audit command prints and writes, of findings that need no server."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import StringIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from mapless import ReferenceAudit, Unavailable
+from mapless_tools.cli.app import app
+from mapless_tools.cli.audit import Examined, cells_of, summary_of, table_of, timeout_s, to_html, to_json, worst_first
+
+
+def finding(name: str, verdict: str, offset_m: float = 0.0, focal_ratio: float = 1.0) -> ReferenceAudit:
+    return ReferenceAudit(
+        f"scenes/hall/references/{name}", verdict, f"<{name}>", 8, 200, 150, 0.7, offset_m, 0.25, focal_ratio, ""
+    )
+
+
+FINDINGS = [
+    finding("fine", "CONSISTENT"),
+    finding("near", "WRONG_POSE", 0.05),
+    finding("dark", "UNVERIFIABLE", focal_ratio=0.0),
+    finding("far", "WRONG_POSE", 0.5),
+    finding("swapped", "SWAPPED_IMAGE"),
+]
+
+
+def test_the_worst_comes_first() -> None:
+    names = [a.name.rsplit("/", 1)[-1] for a in worst_first(FINDINGS)]
+    assert names == ["swapped", "far", "near", "dark", "fine"]
+
+
+def test_the_summary_counts_every_finding() -> None:
+    expected = "5 references: 1 swapped image, 2 wrong pose, 1 unverifiable, 1 consistent"
+    assert summary_of(Examined("hall", worst_first(FINDINGS), 5)) == expected
+    assert summary_of(Examined("hall", total=0)) == "0 references: none"
+
+
+def test_an_audit_that_was_stopped_says_how_far_it_came() -> None:
+    stopped = Examined("hall", worst_first(FINDINGS[:2]), 40, "the server is gone")
+    assert summary_of(stopped).startswith("stopped after 2 of 40 references (the server is gone); 2 references: ")
+    content = to_json(stopped)
+    assert (content["stopped"], content["reference_count"], len(content["references"])) == ("the server is gone", 40, 2)
+    assert "stopped after 2 of 40" in to_html(stopped)
+
+
+def test_a_page_has_time_for_all_its_references_and_no_more_than_servers_give() -> None:
+    assert [timeout_s(size) for size in (1, 10, 100, 1000)] == [8.0, 35.0, 305.0, 600.0]
+
+
+@pytest.mark.parametrize(
+    ("failure", "code", "why"),
+    [
+        (Unavailable("UNAVAILABLE", "the server is gone"), 1, "gone"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (SystemExit(143), 143, "terminated"),
+    ],
+    ids=["error", "ctrl-c", "sigterm"],
+)
+def test_what_was_found_before_the_end_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException, code: int, why: str
+) -> None:
+    asked: list[float | None] = []
+
+    class Ending:
+        def get_scene(self, scene: str) -> Any:
+            return SimpleNamespace(reference_count=40)
+
+        def audit_scene(self, scene: str, *, page_size: int, timeout_s: float | None) -> Iterator[ReferenceAudit]:
+            asked.append(timeout_s)
+            yield from FINDINGS
+            raise failure
+
+    @contextmanager
+    def connected(*_: Any) -> Iterator[Ending]:
+        yield Ending()
+
+    monkeypatch.setattr("mapless_tools.ingest.connection.connected", connected)
+    report, html = tmp_path / "report.json", tmp_path / "report.html"
+    arguments = ["audit", "hall", "--address", "127.0.0.1:1", "--report", str(report), "--html", str(html)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == code
+    content = json.loads(report.read_text())
+    assert [r["verdict"] for r in content["references"]] == [a.verdict for a in worst_first(FINDINGS)]
+    assert why in content["stopped"]
+    assert f"stopped after {len(FINDINGS)} of 40 references" in result.output.replace("\n", "")
+    assert "stopped after" in html.read_text()
+    assert asked == [35.0]
+
+
+def test_figures_that_are_not_known_are_dashes_not_zeros() -> None:
+    assert cells_of(finding("dark", "UNVERIFIABLE", focal_ratio=0.0))[2:5] == ("-", "-", "-")
+
+
+def test_the_given_focal_length_is_told_by_how_much_it_is_wrong() -> None:
+    assert cells_of(finding("long", "WRONG_INTRINSICS", focal_ratio=1 / 1.05))[4] == "+5.0"
+
+
+def test_the_table_has_a_row_for_each_reference() -> None:
+    """As wide as a terminal."""
+    console = Console(width=80, record=True, file=StringIO())
+    console.print(table_of(FINDINGS))
+    text = console.export_text()
+    assert all(a.name.rpartition("/")[2] in text for a in FINDINGS)
+
+
+def test_the_reports_hold_every_reference_and_names_cannot_break_the_page() -> None:
+    content = json.loads(json.dumps(to_json(Examined("hall", FINDINGS, 5)), allow_nan=False))
+    assert [r["verdict"] for r in content["references"]] == [a.verdict for a in FINDINGS]
+    page = to_html(Examined("hall", FINDINGS, 5))
+    assert page.count('<tr class="') == 5
+    assert page.count('<tr class="alarm">') == 3
+    assert "&lt;far&gt;" in page
+    assert "<far>" not in page

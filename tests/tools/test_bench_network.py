@@ -1,0 +1,216 @@
+"""The networks' benchmark: its counts are the published ones, what it measures is what it says, failures are told."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F  # noqa: N812
+from small_networks import SMALL, references_of, small_runner
+from small_networks import photograph as photograph_of
+from torch.nn.attention import SDPBackend
+
+from mapless.geometry import Camera
+from mapless_server.method.coarse import Reconstruction, reconstruct_one
+from mapless_server.method.coarse.device import DeviceReconstruction
+from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
+from mapless_server.method.views import Features, View
+from mapless_server.networks.network import Sizes
+from mapless_tools.bench_network import host
+from mapless_tools.bench_network.command import bench_network
+from mapless_tools.bench_network.forward import Forward, max_difference
+from mapless_tools.bench_network.operations import H200, Operations, count_operations
+from mapless_tools.bench_network.planted import UNITS_PER_METRE, PlantedReconstructor, true_points
+from mapless_tools.bench_network.report import Figure, markdown, table
+from mapless_tools.bench_network.subject import Work, make_network, operations_of
+from mapless_tools.bench_network.variants import with_low_precision_stream
+from mapless_tools.demo.room import Photo
+
+GRID = (3, 4)
+SIZES = SMALL["pi3"]
+
+
+def test_the_full_network_executes_the_published_number_of_operations() -> None:
+    """11 views of 392x294: the count of the official modules, 16.506794665636 TFLOP, 4.0 of them attention's own."""
+    operations = operations_of("pi3", Work(11, 11, grid=(21, 28)))
+    assert operations.flop == pytest.approx(16_506_794_665_636, rel=1e-5)
+    attention = 380_253_536_256 + 285_190_152_192 + 3_137_091_674_112 + 3 * 79_219_486_720
+    assert operations.attention_flop == attention
+
+
+@pytest.mark.parametrize(("encoded", "mapped"), [(3, 3), (1, 2), (1, 0)])
+def test_operations_follow_the_closed_formula(encoded: int, mapped: int) -> None:
+    """24 C^2 a token and block, 4 T^2 C a sequence and block; and the layers outside of the blocks."""
+    views, patches, width = 3, GRID[0] * GRID[1], SIZES.width
+    tokens = patches + 5
+
+    def block(sequences: int, length: int) -> int:
+        return sequences * (24 * width**2 * length + 4 * length**2 * width)
+
+    def head(width_out: int) -> int:
+        return 2 * tokens * width * (2 * width + width_out) + SIZES.head_depth * block(1, tokens)
+
+    encoding = 2 * patches * 3 * 14**2 * width + (SIZES.encoder_depth + 1) * block(1, tokens)
+    decoding = 2 * block(1, views * tokens) + block(views, tokens)
+    camera = 2 * SIZES.camera_width**2 * (2 * 3 * patches + 2) + 2 * SIZES.camera_width * 12
+    maps = 2 * head(width) + 2 * patches * width * 4 * 14**2
+    expected = encoded * encoding + decoding + views * (head(SIZES.camera_width) + camera) + mapped * maps
+    rotations = views * 3 * 2 * 3**3  # the products of 3x3 matrices that find the nearest rotation, at most
+    counted = operations_of("pi3", Work(encoded, mapped, views, GRID), SIZES).flop
+    assert expected <= counted <= expected + rotations
+
+
+def test_bytes_between_products_are_counted_once_read_and_once_written() -> None:
+    x, weight = torch.empty(8, 16, device="meta"), torch.empty(32, 16, device="meta")
+
+    def work() -> None:
+        y = F.gelu(F.linear(x, weight))
+        F.linear(x.view(2, 4, 16), weight)
+        (y.view(4, 64) + y.view(4, 64)).to(torch.float32)  # views and conversions to the same type move nothing
+
+    wide, narrow = 8 * 32 * 4, 8 * 16 * 4
+    assert count_operations(work) == Operations(
+        flop=2 * (2 * 8 * 16 * 32),
+        float32_flop=2 * (2 * 8 * 16 * 32),
+        kernels=4,
+        eager_bytes=2 * wide + 3 * wide,
+        fused_bytes=2 * (narrow + wide) + 2 * wide,
+    )
+
+
+def test_convolutions_in_single_precision_are_counted_apart() -> None:
+    """Those of Pi3X's heads; what they execute in all is what a counter inside torch says."""
+    x = torch.empty(2, 8, 5, 6, device="meta")
+    kernel, transposed = torch.empty(4, 8, 3, 3, device="meta"), torch.empty(8, 4, 2, 2, device="meta")
+    operations = count_operations(lambda: (F.conv2d(x, kernel, padding=1), F.conv_transpose2d(x, transposed, stride=2)))
+    assert operations.tf32_flop == operations.flop == 2 * 2 * 5 * 6 * 8 * 4 * (9 + 4)
+    low = count_operations(lambda: F.conv2d(x.to(torch.bfloat16), kernel.to(torch.bfloat16)))
+    assert low.tf32_flop == low.float32_flop == 0
+
+
+def test_prediction_is_never_below_the_floor_and_a_compiled_network_is_faster() -> None:
+    operations = operations_of("pi3", Work(1, 2, 3, (5, 7)), Sizes(1024, 16, 1, 4, 1))
+    assert operations.floor_s(H200) < operations.predicted_s(H200, True) <= operations.predicted_s(H200, False)
+
+
+@pytest.mark.parametrize("name", ["pi3", "pi3x"])
+def test_random_network_is_nowhere_zero_and_says_something_finite(name: str) -> None:
+    network = make_network(name, SMALL[name], seed=3)
+    assert all(float((parameter != 0).float().mean()) > 0.99 for parameter in network.parameters())
+    output = network(torch.rand(1, 2, 3, 42, 56))
+    for tensor in vars(output).values():
+        assert bool(tensor.isfinite().all())
+        assert float(tensor.std()) > 0.01
+
+
+def test_forward_from_kept_tokens_is_the_forward_of_everything() -> None:
+    """Where kernels round alike for any number of views, as here; and a stream in bfloat16 is another computation."""
+    network = make_network("pi3", SIZES)
+    forward = Forward(network, SDPBackend.MATH, 3, GRID)
+    everything = forward.run(Work(3, 2, 3, GRID))
+    kept = forward.run(Work(1, 2, 3, GRID))
+    forward.scene.images = forward.scene.images.flip(0)
+    other = forward.run(Work(1, 2, 3, GRID))
+    assert max_difference(kept, everything) <= 1e-6
+    assert max_difference(other, everything) > 1e-2
+    with_low_precision_stream(network)
+    low = Forward(network, SDPBackend.MATH, 3, GRID).run(Work(3, 2, 3, GRID))
+    assert 0 < max_difference(low, everything) < 0.3
+
+
+def plane_photo() -> Photo:
+    """A tilted plane, 2 m away at the centre."""
+    camera = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
+    rows, columns = np.indices((72, 96))
+    rays = camera.rays(np.stack([columns, rows], axis=-1))
+    depth = (2.0 / (1.0 + 0.3 * rays[..., 0] - 0.2 * rays[..., 1])).astype(np.float32)
+    pose = references_of([photograph_of(np.zeros((72, 96, 3), np.uint8))])[0].world_from_camera
+    return Photo("plane", np.full((72, 96, 3), 90, np.uint8), camera, pose, depth)
+
+
+def test_planted_points_lie_on_the_true_surface() -> None:
+    points = true_points(plane_photo()).astype(float) / UNITS_PER_METRE
+    on_plane = points[..., 2] + 0.3 * points[..., 0] - 0.2 * points[..., 1]
+    np.testing.assert_allclose(on_plane, 2.0, atol=0.01)  # depth is read at the nearest of coarser pixels
+
+
+@pytest.mark.parametrize("keep_on_device", [True, False])
+def test_planted_reconstruction_is_the_truth_up_to_scale(keep_on_device: bool) -> None:
+    photos = [replace(plane_photo(), name=str(i), image=np.full((72, 96, 3), 40 * i, np.uint8)) for i in range(3)]
+    pictures = [photograph_of(photo.image, photo.camera) for photo in photos]
+    references = references_of(pictures[1:])
+    poses = [photos[0].world_from_camera, *(reference.world_from_camera for reference in references)]
+    truth = {
+        picture.sha256: replace(photo, world_from_camera=pose)
+        for picture, photo, pose in zip(pictures, photos, poses, strict=True)
+    }
+    nothing = Features(np.empty((0, 2), np.float32), np.empty((0, 4), np.float32), np.empty(0, np.float32))
+    query = View(photos[0].camera, nothing, pictures[0])
+    network = NetworkReconstructor(small_runner("pi3"), NetworkOptions(keep_on_device=keep_on_device))
+    outcome = reconstruct_one(PlantedReconstructor(network, truth, torch.device("cpu")), query, references)
+    network.close()
+    if isinstance(outcome, DeviceReconstruction):
+        outcome = outcome.fetch()
+    assert isinstance(outcome, Reconstruction)
+    anchor = poses[1].inverse()
+    for view, pose in zip((*outcome.references, outcome.query), (*poses[1:], poses[0]), strict=True):
+        expected = anchor.compose(pose)
+        np.testing.assert_allclose(view.local_from_camera.rotation, expected.rotation, atol=1e-6)
+        np.testing.assert_allclose(
+            view.local_from_camera.translation / UNITS_PER_METRE, expected.translation, atol=1e-6
+        )
+    np.testing.assert_array_equal(outcome.references[0].point_map, true_points(photos[1]))
+
+
+def test_table_shows_every_number_beside_its_floor() -> None:
+    figures = [
+        Figure("forward", "compiled", 50.0, "ms", 51.0, floor_ms=25.0, predicted_ms=48.0, target=60.0),
+        Figure("query", "sustained", 11.0, "queries/s", target=12.0, target_is_least=True),
+        Figure("memory", "peak", None, "GB", target=8.0, note="there is no CUDA device"),
+    ]
+    assert [figure.is_met for figure in figures] == [True, False, None]
+    rows = markdown("a device", figures)[-3:]
+    assert rows[0] == "| forward | compiled | 50 ms | 51 | 25 | 2 | 48 | at most 60 | yes |  |"
+    assert rows[1] == "| query | sustained | 11 queries/s |  |  |  |  | at least 12 | no |  |"
+    assert rows[2] == "| memory | peak | not measured |  |  |  |  | at most 8 |  | there is no CUDA device |"
+
+
+def test_printed_table_fits_a_screen_and_says_what_is_not_measured() -> None:
+    """Long notes are elsewhere; operations have a floor in another unit, and no ratio to it."""
+    note = "very long " * 16
+    figures = [
+        Figure("pi3, 11 views", "references' tokens kept, references mapped", 34.3, "TFLOP", None, 43.5, 91.0),
+        Figure("pi3, 11 views", "eager", 100.0, "ms", 101.0, 43.5, 115.0, 150.0, note=note),
+        Figure("queries", "sustained, 8 threads", None, "queries/s", target=12.0, target_is_least=True, note=note),
+    ]
+    lines = table(figures)
+    assert max(map(len, lines)) <= 120
+    assert [line for line in lines if "pi3, 11 views" in line] == ["pi3, 11 views"]
+    assert "floor, ms" in lines[0]
+    assert lines[2].split()[-4:] == ["34.3", "TFLOP", "43.5", "91"]
+    assert lines[3].split() == ["eager", "100", "ms", "101", "43.5", "2.3", "115", "at", "most", "150", "yes"]
+    assert " ".join(lines).count("very") == 16
+    assert lines[6].startswith("Not measured: queries, sustained, 8 threads: very long")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_part_that_fails_says_so_and_the_rest_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(host, "compare_rounding", lambda: iter([Figure("rounding", "difference", 0.01, "")]))
+    figures = bench_network(quick=True, only=["attention", "memory-pi3", "rounding"], output=tmp_path)
+    assert [(it.part, it.note) for it in figures[:2]] == [
+        (part, "RuntimeError: there is no CUDA device") for part in ("attention", "memory-pi3")
+    ]
+    assert figures[2:] == [Figure("rounding", "difference", 0.01, "")]
+    written = json.loads((tmp_path / "network.json").read_text())
+    assert [it["value"] for it in written["figures"]] == [it.value for it in figures]
+    assert (tmp_path / "network.md").read_text().count("not measured") == 2
+    printed = capsys.readouterr().out
+    assert "There is no CUDA device" in printed
+    assert "attention: 0 figures, 1 not measured, " in printed
+    assert printed.count("rounding: 1 figures") == 1

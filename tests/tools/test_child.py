@@ -1,0 +1,95 @@
+"""A server as a child process: it is told apart from one that does not start, and always ends."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import SecretStr
+
+from mapless import Client
+from mapless_server.store.sqlite import DATABASE_FILE
+from mapless_tools import child
+
+
+def start_instead(monkeypatch: pytest.MonkeyPatch, program: str) -> list[subprocess.Popen[str]]:
+    """Children run this program in place of a server; returns those that were started."""
+    real, started = subprocess.Popen, []
+
+    def popen(command: list[str], **options: Any) -> subprocess.Popen[str]:
+        started.append(real([sys.executable, "-c", program], **options))
+        return started[-1]
+
+    monkeypatch.setattr("mapless_tools.child.subprocess.Popen", popen)
+    return started
+
+
+def test_a_server_that_does_not_start_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    started = start_instead(monkeypatch, "import sys; sys.exit(7)")
+    with pytest.raises(child.ServerFailed, match="exit code 7"), child.child_server(tmp_path):
+        pass
+    assert started[0].poll() == 7
+
+
+def test_a_child_s_store_is_the_one_it_is_given(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Not the one of the environment: who measures in a folder of their own must not write to everybody's database."""
+    asked: list[tuple[list[str], dict[str, str]]] = []
+
+    def popen(command: list[str], env: dict[str, str], **_: Any) -> subprocess.Popen[str]:
+        asked.append((command, env))
+        raise child.ServerFailed
+
+    monkeypatch.setattr("mapless_tools.child.subprocess.Popen", popen)
+    monkeypatch.setenv("MAPLESS_DATABASE_URL", "postgresql://u:secret@theirs/db")
+    for store in (tmp_path, SecretStr("postgresql://u:secret@ours/db")):
+        with pytest.raises(child.ServerFailed), child.child_server(store):
+            pass
+    (command, _), (other_command, other_environment) = asked
+    assert command[command.index("--data-dir") + 1] == str(tmp_path)
+    assert "--data-dir" not in other_command
+    assert "secret" not in " ".join(other_command)
+    assert other_environment["MAPLESS_DATABASE_URL"] == "postgresql://u:secret@ours/db"
+
+
+def test_a_log_in_a_file_has_what_a_child_that_does_not_start_says(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "server.log"
+    with (
+        pytest.raises(child.ServerFailed, match=rf"is in {re.escape(str(log))}$"),
+        child.child_server(tmp_path / "data", {"--workers": "none"}, log=log),
+    ):
+        pass
+    assert "workers" in log.read_text()
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("module", [None, "mapless_tools.load.no_op"])
+def test_a_child_on_a_folder_does_not_reach_for_a_database(
+    module: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    config = tmp_path / "mapless.toml"
+    config.write_text('database_url = "postgresql://u:secret@127.0.0.1:1/db"\nwarm_up = false\n')
+    monkeypatch.setenv("MAPLESS_CONFIG", str(config))
+    monkeypatch.setenv("MAPLESS_DATABASE_URL", "postgresql://u:secret@127.0.0.1:1/db")
+    data_dir = tmp_path / "data"
+    data_dir.mkdir()
+    started = child.child_module(module, str(data_dir)) if module else child.child_server(data_dir)
+    with started as server, Client(server.address) as client:
+        client.create_scene("mine")
+        assert (data_dir / DATABASE_FILE).is_file()
+
+
+def test_a_server_is_stopped_when_its_user_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    announce = "print('mapless-server listening on 127.0.0.1:7', flush=True)"
+    started = start_instead(monkeypatch, f"import time; {announce}; time.sleep(600)")
+
+    def fail() -> None:
+        with child.child_server(tmp_path) as server:
+            raise ValueError(server.address)
+
+    with pytest.raises(ValueError, match=r"127\.0\.0\.1:7"):
+        fail()
+    assert started[0].poll() is not None

@@ -1,0 +1,307 @@
+"""The evaluation's split, figures and reports, on planted results."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from images import encode, textured
+from rich.console import Console
+
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless_server.images.decode import ImageLimits
+from mapless_tools.bench.latency import Latency
+from mapless_tools.bench.report import BenchResult, as_json, markdown
+from mapless_tools.bench.scenes import BenchScene, Figures, met
+from mapless_tools.child import Memory
+from mapless_tools.dataset import Dataset, Frame
+from mapless_tools.evaluate.metrics import QueryResult, pose_error, quantile, stage_share, summarize, trajectory_radius
+from mapless_tools.evaluate.plan import EvaluationOptions, Split, check_images, split_frames
+from mapless_tools.evaluate.report import print_report, to_json
+from mapless_tools.evaluate.run import Evaluation
+
+
+def result(translation: float, rotation_deg: float = 0.01, latency_ms: float = 100.0) -> QueryResult:
+    missed = math.isinf(translation)
+    return QueryResult(
+        name="q",
+        references=("a", "b"),
+        translation_error=translation,
+        rotation_error_deg=math.inf if missed else rotation_deg,
+        reference_distance=2.0,
+        position_68=None if missed else 0.01,
+        inlier_count=0 if missed else 100,
+        match_count=0 if missed else 200,
+        rejection="LOW_OVERLAP" if missed else "",
+        message="2 of [8] matches" if missed else "",
+        latency_ms=latency_ms,
+        stage_ms={"decode": 10.0, "pnp": 30.0},
+        backend="geometric",
+        features="sift",
+    )
+
+
+def evaluation(*results: QueryResult, metric: bool = True, references: int | None = None) -> Evaluation:
+    dataset = Dataset("kitchen", (), metric, "survey")
+    return Evaluation(dataset, EvaluationOptions(references), 30, 4.0, results)
+
+
+MISSED = result(math.inf)
+
+
+class TestSplit:
+    def test_follows_the_stated_formula(self) -> None:
+        split = split_frames(600, EvaluationOptions(reference_count=30))
+        assert split.references == tuple(round(i * 599 / 29) for i in range(30))
+        assert split.queries == tuple(round(3 + i * 593 / 39) for i in range(40))
+        assert split.queries[0] == 3
+        assert split.queries[-1] == 596
+
+    def test_rounds_half_to_even_as_numpy_does(self) -> None:
+        assert split_frames(10, EvaluationOptions(reference_count=3, query_count=2)).references == (0, 4, 9)
+
+    def test_leaves_each_frame_out_once(self) -> None:
+        assert split_frames(11, EvaluationOptions()) == Split(tuple(range(11)), tuple(range(11)))
+
+    def test_leaves_some_out_if_fewer_queries_are_wanted(self) -> None:
+        assert split_frames(11, EvaluationOptions(query_count=3)).queries == (0, 5, 10)
+
+    @given(
+        frames=st.integers(2, 700),
+        references=st.integers(2, 60),
+        queries=st.integers(1, 80),
+    )
+    def test_gives_frames_that_exist_and_no_query_that_is_a_reference(
+        self, frames: int, references: int, queries: int
+    ) -> None:
+        try:
+            split = split_frames(frames, EvaluationOptions(references, queries))
+        except ValueError:
+            margin = 3 if frames >= 8 else 0
+            places = {round(x) for x in np.linspace(margin, frames - 1 - margin, queries)}
+            assert references > frames or places <= {round(x) for x in np.linspace(0, frames - 1, references)}
+            return
+        assert len(split.references) == references
+        assert 1 <= len(split.queries) <= queries
+        assert not set(split.references) & set(split.queries)
+        assert all(0 <= i < frames for i in split.references + split.queries)
+        assert list(split.queries) == sorted(set(split.queries))
+
+    @pytest.mark.parametrize(
+        ("frames", "options", "words"),
+        [
+            (10, EvaluationOptions(11), "11 references"),
+            (2, EvaluationOptions(), "at least 3"),
+            (6, EvaluationOptions(6), "no frame is left"),
+            (20, EvaluationOptions(20), "no frame is left"),
+        ],
+    )
+    def test_refuses_what_cannot_be_split(self, frames: int, options: EvaluationOptions, words: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            split_frames(frames, options)
+
+    def test_takes_queries_to_the_ends_where_the_margin_does_not_fit(self) -> None:
+        assert split_frames(5, EvaluationOptions(2)) == Split((0, 4), (1, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("reference_count", 1), ("query_count", 0), ("k", 0), ("k", 65), ("variant", "bset"), ("scale_strategy", "")],
+)
+def test_options_check_themselves(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=str(value) or "scale"):
+        EvaluationOptions(**{name: value})  # type: ignore[arg-type]
+
+
+class TestCheckImages:
+    def frame(self, folder: Path, width: int, height: int) -> Frame:
+        file = folder / "a.png"
+        file.write_bytes(encode(".png", textured(96, 64)))
+        return Frame("a", file, Camera(width, height, 80.0, 80.0, 48.0, 32.0), RigidTransform.identity())
+
+    def test_passes_an_image_of_its_cameras_size(self, tmp_path: Path) -> None:
+        check_images([self.frame(tmp_path, 96, 64)], ImageLimits())
+
+    def test_names_the_image_of_another_size(self, tmp_path: Path) -> None:
+        with pytest.raises(ValueError, match=r"a\.png has 96x64 pixels, cameras\.json says 64x96"):
+            check_images([self.frame(tmp_path, 64, 96)], ImageLimits())
+
+    def test_names_what_is_no_image(self, tmp_path: Path) -> None:
+        frame = self.frame(tmp_path, 96, 64)
+        frame.image_path.write_bytes(b"GIF89a")
+        with pytest.raises(ValueError, match=r"a\.png: the image"):
+            check_images([frame], ImageLimits())
+
+
+class TestMetrics:
+    def test_pose_error_is_of_the_camera_centre_and_the_orientation(self) -> None:
+        true = RigidTransform(rotation_from_vector([0.3, -0.2, 0.1]), np.array([1.0, 2.0, 3.0]))
+        turn = rotation_from_vector([0.0, math.radians(2.0), 0.0])
+        answered = RigidTransform(true.rotation @ turn, true.translation + np.array([0.03, 0.0, 0.04]))
+        assert pose_error(true, answered) == pytest.approx((0.05, 2.0))
+        assert pose_error(true, true) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+    def test_medians_and_recall_of_planted_errors(self) -> None:
+        summary = summarize([result(t, r) for t, r in [(0.004, 0.5), (0.03, 1.5), (0.05, 5.0), (0.2, 1.0), (0.3, 0.1)]])
+        assert summary.median_translation == pytest.approx(0.05)
+        assert summary.median_rotation_deg == pytest.approx(1.0)
+        assert summary.p90_translation == pytest.approx(0.26)
+        assert summary.recall == {"1cm_1deg": 0.2, "5cm_5deg": 0.6, "25cm_2deg": 0.6}
+        assert summary.median_relative == pytest.approx(0.025)
+
+    def test_a_rejection_counts_as_infinitely_wrong(self) -> None:
+        summary = summarize([result(0.01), result(0.02), MISSED])
+        assert (summary.query_count, summary.localized_count) == (3, 2)
+        assert summary.median_translation == pytest.approx(0.02)
+        assert math.isinf(summary.p90_translation)
+        assert summary.recall["25cm_2deg"] == pytest.approx(2 / 3)
+        assert summary.rejections == {"LOW_OVERLAP": 1}
+        assert math.isinf(summarize([result(0.01), MISSED]).median_translation)
+
+    def test_rejecting_never_improves_a_figure(self) -> None:
+        bad = summarize([result(0.01), result(0.02), result(9.0, 90.0)])
+        rejected = summarize([result(0.01), result(0.02), MISSED])
+        assert rejected.median_translation >= bad.median_translation
+        assert rejected.p90_translation >= bad.p90_translation
+        assert all(rejected.recall[name] <= bad.recall[name] for name in bad.recall)
+
+    def test_the_first_call_is_not_in_the_latency(self) -> None:
+        summary = summarize([result(0.01, latency_ms=ms) for ms in (900.0, 100.0, 200.0, 300.0)])
+        assert (summary.latency_p50_ms, summary.latency_first_ms) == (200.0, 900.0)
+        assert summarize([result(0.01, latency_ms=7.0)]).latency_p50_ms == 7.0
+
+    def test_share_of_claimed_radii_that_held(self) -> None:
+        assert summarize([result(0.005), result(0.02), MISSED]).claim_held == 0.5
+        assert summarize([MISSED]).claim_held is None
+
+    def test_stage_shares_sum_to_one(self) -> None:
+        assert stage_share([result(0.01), MISSED]) == {"decode": 0.25, "pnp": 0.75}
+        assert stage_share([replace(MISSED, stage_ms={})]) == {}
+
+    @given(st.lists(st.floats(0, 1e6), min_size=1, max_size=50), st.sampled_from([0.5, 0.9, 0.95]))
+    def test_quantile_is_numpys_on_finite_values(self, values: list[float], share: float) -> None:
+        assert quantile(values, share) == pytest.approx(float(np.quantile(values, share)))
+
+    @pytest.mark.parametrize("missed", [1, 2, 4, 5])
+    def test_quantile_is_never_nan(self, missed: int) -> None:
+        values = [1.0] * (5 - missed) + [math.inf] * missed
+        assert not any(math.isnan(quantile(values, share)) for share in (0.5, 0.9, 0.95))
+
+    def test_trajectory_radius_is_the_root_mean_square(self) -> None:
+        assert trajectory_radius(np.array([[0.0, 0, 0], [2, 0, 0]])) == pytest.approx(1.0)
+
+
+class TestReport:
+    KEYS = (
+        "queries localized median_translation_m median_rotation_deg p90_translation_m recall latency_ms variant backend"
+    )
+
+    def test_json_has_the_promised_fields(self) -> None:
+        content = to_json(evaluation(result(0.01), result(0.02), references=30))
+        assert set(self.KEYS.split()) <= set(content)
+        assert set(content["recall"]) == {"5cm_5deg", "1cm_1deg", "25cm_2deg"}
+        assert {"p50", "p95"} <= set(content["latency_ms"])
+        assert content["median_translation_m"] == pytest.approx(0.015)
+        assert content["per_query"][0]["translation_m"] == 0.01
+        assert content["ground_truth"] == "survey"
+
+    def test_features_are_those_of_every_answer(self) -> None:
+        """Where stronger features answered some queries, and their stages are one sum for people."""
+        stages = {"decode": 10.0, "pnp": 20.0, "aliked-n16-1024px/coarse": 50.0, "aliked-n16-1024px/pnp": 20.0}
+        stronger = replace(result(0.01), features="aliked-n16-1024px", stage_ms=stages)
+        mixed = evaluation(stronger, *[replace(result(0.01), stage_ms={})] * 2)
+        content = to_json(mixed)
+        assert content["features"] == {"sift": 2, "aliked-n16-1024px": 1}
+        assert [query["features"] for query in content["per_query"]] == ["aliked-n16-1024px", "sift", "sift"]
+        text = printed(mixed)
+        assert "geometric, sift 2, aliked-n16-1024px 1;" in text
+        assert "decode 10 %, pnp 20 %, aliked 70 % " in text
+        assert to_json(evaluation(result(0.01)))["features"] == "sift"
+
+    def test_infinite_is_null(self) -> None:
+        content = to_json(evaluation(MISSED, MISSED))
+        json.dumps(content, allow_nan=False)
+        assert content["median_translation_m"] is None
+        assert content["claimed_68_held"] is None
+        assert content["per_query"][0]["rejection"] == {"reason": "LOW_OVERLAP", "message": "2 of [8] matches"}
+
+    def test_an_arbitrary_unit_is_never_called_a_metre(self) -> None:
+        content = to_json(evaluation(result(0.02), metric=False))
+        assert content["median_translation_m"] is None
+        assert set(content["recall"].values()) == {None}
+        assert "translation_m" not in content["per_query"][0]
+        assert content["relative"]["median_translation_units"] == 0.02
+        assert content["relative"]["median_translation_of_reference_radius"] == pytest.approx(0.005)
+
+    def test_table_of_metres(self) -> None:
+        text = printed(evaluation(result(0.01), result(0.02), MISSED))
+        assert "2 of 3" in text
+        assert "2.00 cm" in text
+        assert "infinite" in text
+        assert "2 of [8] matches" in text, "brackets are not markup"
+
+    def test_table_of_an_arbitrary_unit(self) -> None:
+        text = printed(evaluation(result(0.02), metric=False))
+        assert "0.02 units" in text
+        assert " cm" not in text
+        assert "recall" not in text.split("Medians")[0]
+        assert "arbitrary" in text
+
+
+def printed(measured: Evaluation) -> str:
+    file = io.StringIO()
+    print_report(measured, Console(file=file, width=200))
+    return file.getvalue()
+
+
+class TestBench:
+    SCENE = BenchScene("kitchen", 5, Figures(1.0, 0.23, 2), Figures(0.87, 0.208, 37))
+
+    def test_a_target_asks_for_errors_and_for_localized_queries(self) -> None:
+        target = self.SCENE.target
+        assert met(target, summarize([result(0.01), result(0.01), MISSED]))
+        assert not met(target, summarize([result(0.01), MISSED]))
+        assert not met(target, summarize([result(0.011), result(0.011)]))
+        assert not met(target, summarize([result(0.01, 0.24), result(0.01, 0.24)]))
+        everything = replace(target, localized=None)
+        assert not met(everything, summarize([result(0.01), result(0.01), MISSED]))
+
+    def test_report_is_a_table_for_people_and_json_for_programs(self) -> None:
+        calls = (result(0.01, latency_ms=100.0), result(0.01, latency_ms=300.0))
+        latency = Latency((900.0, 700.0), calls, calls, Memory(200.0, 300.0))
+        measured = BenchResult(
+            "CPU, 2 cores",
+            [(self.SCENE, evaluation(*calls, references=5))],
+            [evaluation(result(0.02), MISSED, metric=False)],
+            latency,
+            ["fountain-P11"],
+            quick=False,
+        )
+        text = "\n".join(markdown(measured))
+        assert "| kitchen | 5 | 2 of 2 | 1.00 cm / 0.010° | 1.00 cm / 0.230°, 2 of 40 | yes |" in text
+        assert "| kitchen | 1 of 2 | infinite / infinite | infinite | infinite |" in text
+        assert "median of 2 | 800 |" in text
+        assert "peak 300 MiB" in text
+        assert "fountain-P11" in text
+        assert "Rejected in kitchen, leave one out: 1 LOW_OVERLAP." in text
+        content = json.loads(json.dumps(as_json(measured), allow_nan=False))
+        assert content["scenes"][0]["target_met"] is True
+        assert content["latency"]["warm_p50_ms"] == 200.0
+
+    def test_a_quick_run_is_not_held_against_the_targets(self) -> None:
+        text = "\n".join(markdown(BenchResult("CPU", [(self.SCENE, evaluation(MISSED))], [], None, [], quick=True)))
+        assert "Quick run" in text
+        assert "| - |" in text
+
+    def test_every_line_of_a_table_has_as_many_cells_as_its_head(self) -> None:
+        lines = markdown(
+            BenchResult("CPU", [(self.SCENE, evaluation(MISSED, references=5))], [], None, [], quick=False)
+        )
+        assert len({line.count("|") for line in lines if line.startswith("|")}) == 1

@@ -1,0 +1,569 @@
+"""Evaluation as in the paper: who is a reference, what is averaged, what is kept, what is drawn; on planted results."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import xml.etree.ElementTree as ElementTree
+from contextlib import nullcontext
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from images import textured
+
+from mapless import Internal
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless_server.method.views import Features, View
+from mapless_server.observability.provenance import commit_of
+from mapless_server.settings import Settings
+from mapless_tools.dataset import Dataset, Frame, Refusal
+from mapless_tools.evaluate import suite as suite_module
+from mapless_tools.evaluate.averages import groups_of
+from mapless_tools.evaluate.benchmarks import BENCHMARKS, ScenePlace, find_scenes
+from mapless_tools.evaluate.charts import ablation, along_sequence, cumulative, sparsity
+from mapless_tools.evaluate.figures import write_figures
+from mapless_tools.evaluate.journal import Journal
+from mapless_tools.evaluate.metrics import QueryResult
+from mapless_tools.evaluate.page import page
+from mapless_tools.evaluate.pairs import chosen, pairs_file, read_pairs
+from mapless_tools.evaluate.paper import DENSE
+from mapless_tools.evaluate.pictures import WorstQuery, data_uri, fit_true_poses
+from mapless_tools.evaluate.plan import EvaluationOptions, PlannedQuery, UsageError
+from mapless_tools.evaluate.protocol import Method, SuiteOptions, split_scene
+from mapless_tools.evaluate.provenance import Provenance
+from mapless_tools.evaluate.suite import Apparatus, Failure, Run, SceneWork, Suite, measure
+from mapless_tools.evaluate.svg import Axis, Chart, Curve, draw, log_range
+from mapless_tools.evaluate.tables import FAILED, NOTHING, OURS, Table, format_median, tables_of, text_lines
+
+CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
+
+
+def frame(name: str, split: str, folder: Path = Path("/data")) -> Frame:
+    return Frame(name, folder / f"{name}.png", CAMERA, RigidTransform.identity(), split)
+
+
+def dataset(train: int = 40, test: int = 9, **fields: Any) -> Dataset:
+    frames = [frame(f"r{i}", "train") for i in range(train)] + [frame(f"q{i}", "test") for i in range(test)]
+    return Dataset("chess", tuple(frames), True, "7-Scenes", "SfM", "7scenes", **fields)
+
+
+def result(name: str, translation_m: float, rotation_deg: float = 0.5) -> QueryResult:
+    missed = math.isinf(translation_m)
+    return QueryResult(
+        name=name,
+        references=("r0", "r1"),
+        translation_error=translation_m,
+        rotation_error_deg=math.inf if missed else rotation_deg,
+        reference_distance=math.inf if missed else 1.0,
+        position_68=None if missed else 0.01,
+        inlier_count=0 if missed else 30,
+        match_count=0 if missed else 40,
+        rejection="LOW_OVERLAP" if missed else "",
+        message="<b>none</b>" if missed else "",
+        latency_ms=100.0,
+        stage_ms={"decode": 1.0, "pnp": 3.0},
+        backend="geometric",
+        features="sift",
+        best_reference="" if missed else "r1",
+        pose=None if missed else (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0),
+    )
+
+
+def suite(medians_m: dict[str, float], options: SuiteOptions | None = None, layout: str = "7scenes") -> Suite:
+    """Each scene with a median error of its own, the sparse settings twice as bad, other scales thrice."""
+    options = options or SuiteOptions(sparse=(30, 5))
+    scenes, runs = [], []
+    for name, median_m in medians_m.items():
+        place = ScenePlace(name, Path("/data") / name, layout)
+        data = dataset()
+        splits = tuple(split_scene(data, setting, options) for setting in options.settings(place))
+        scenes.append(SceneWork(place, data, splits, None))
+        for split in splits:
+            for method in options.methods():
+                worse = (1 if split.setting == DENSE else 2) * (1 if method.scale == "two_stage" else 3)
+                errors = [worse * median_m * (0.5 + i / 8) for i in range(len(split.queries))]
+                results = tuple(result(q.name, e) for q, e in zip(split.queries, errors, strict=True))
+                runs.append(Run(scenes[-1], split, method, results, Path("/out/runs/x.jsonl")))
+    made = Provenance("0.1.0", "abc1234", {"pi3": "f" * 64}, {"backend": "geometric"}, "a <CPU>", "2026-11-21T00:00:00")
+    return Suite(options, made, tuple(scenes), tuple(runs), ())
+
+
+class TestPaper:
+    @pytest.mark.parametrize("name", ["7scenes", "cambridge"])
+    def test_the_printed_average_is_the_mean_of_the_printed_scenes(self, name: str) -> None:
+        """A law of the paper's tables that a slip in copying breaks; what was averaged there was not rounded yet."""
+        benchmark = BENCHMARKS[name]
+        lines = [method for method in benchmark.paper.methods if method.scenes]
+        assert len(lines) >= 13
+        for method in lines:
+            assert list(method.scenes) == list(benchmark.scenes)
+            translation, rotation = np.mean(list(method.scenes.values()), axis=0)
+            average = method.average[DENSE]
+            assert average is not None
+            assert average[0] == pytest.approx(translation, rel=0.05, abs=0.6), method.name
+            assert average[1] == pytest.approx(rotation, rel=0.1, abs=0.06), method.name
+
+    @pytest.mark.parametrize("name", list(BENCHMARKS))
+    def test_what_the_paper_says_of_its_own_method(self, name: str) -> None:
+        benchmark = BENCHMARKS[name]
+        (ours,) = (method for method in benchmark.paper.methods if method.variant == "full")
+        dense = {"7scenes": (1.3, 0.41), "12scenes": (0.4, 0.19), "cambridge": (11, 0.27)}
+        sparsest = {"7scenes": (5.9, 1.61), "12scenes": (16.9, 2.56), "cambridge": (25, 0.53)}
+        assert tuple(ours.average) == (DENSE, *benchmark.sparse)
+        assert ours.average[DENSE] == dense[name]
+        assert ours.average[benchmark.sparse[-1]] == sparsest[name]
+
+    def test_benchmarks_have_as_many_scenes_as_their_names_say(self) -> None:
+        assert [len(BENCHMARKS[name].scenes) for name in ("7scenes", "12scenes", "cambridge")] == [7, 12, 4]
+
+
+class TestProtocol:
+    def test_settings_are_the_papers_unless_others_are_given(self) -> None:
+        indoors, outdoors = (ScenePlace("x", Path("x"), layout) for layout in ("12scenes", "cambridge"))
+        assert SuiteOptions().settings(indoors) == (DENSE, 30, 20, 10, 5)
+        assert SuiteOptions().settings(outdoors) == (DENSE, 60, 50, 40, 30)
+        assert SuiteOptions(protocols=("sparse",), sparse=(4, 8)).settings(outdoors) == (8, 4)
+        with pytest.raises(UsageError, match="--sparse"):
+            SuiteOptions().settings(ScenePlace("own", Path("own"), "cameras"))
+
+    def test_every_variant_has_the_first_scale_and_the_papers_variant_has_all(self) -> None:
+        options = SuiteOptions(variants=("best", "full"), scales=("two_stage", "trajectory"))
+        assert options.methods() == (
+            Method("best", "two_stage"),
+            Method("full", "two_stage"),
+            Method("full", "trajectory"),
+        )
+        assert replace(options, variants=("best",)).methods()[-1] == Method("best", "trajectory")
+
+    @pytest.mark.parametrize(
+        ("fields", "words"),
+        [
+            ({"layout": "8scenes"}, "8scenes"),
+            ({"protocols": ()}, "protocol"),
+            ({"protocols": ("dense", "dense")}, "twice"),
+            ({"sparse": (10, -5)}, "-5"),
+            ({"variants": ("bset",)}, "bset"),
+            ({"scales": ("guess",)}, "guess"),
+            ({"k": 0}, "1 to 64"),
+            ({"k": 65}, "65"),
+            ({"stride": 0}, "stride"),
+            ({"max_queries": -1}, "max-queries"),
+            ({"choice": "luck"}, "luck"),
+        ],
+    )
+    def test_options_check_themselves(self, fields: dict[str, Any], words: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            SuiteOptions(**fields)
+
+    def test_dense_takes_all_training_frames_and_all_test_frames(self) -> None:
+        split = split_scene(dataset(), DENSE, SuiteOptions())
+        assert [f.name for f in split.references] == [f"r{i}" for i in range(40)]
+        assert [f.name for f in split.queries] == [f"q{i}" for i in range(9)]
+
+    def test_sparse_is_uniform_from_the_first_to_the_last(self) -> None:
+        split = split_scene(dataset(), 4, SuiteOptions(max_queries=3))
+        assert [f.name for f in split.references] == ["r0", "r13", "r26", "r39"]
+        assert [f.name for f in split.queries] == ["q0", "q4", "q8"]
+        assert split.test_count == 9
+
+    def test_a_stride_thins_the_dense_setting_only(self) -> None:
+        assert len(split_scene(dataset(), DENSE, SuiteOptions(stride=10)).references) == 4
+        assert len(split_scene(dataset(), 30, SuiteOptions(stride=10)).references) == 30
+
+    @pytest.mark.parametrize(
+        ("data", "setting", "options", "words"),
+        [
+            (dataset(test=0), DENSE, SuiteOptions(), "no frame of the test split"),
+            (dataset(train=0), 5, SuiteOptions(), "no frame of the train split"),
+            (dataset(), 41, SuiteOptions(), "40 training frames, 41"),
+            (dataset(), DENSE, SuiteOptions(stride=40), "leaves 1 of 40"),
+            (dataset(train=65), DENSE, SuiteOptions(choice="given"), "64 references at most, not 65"),
+            (dataset(train=1001), DENSE, SuiteOptions(choice="matches"), "too many to compare"),
+        ],
+    )
+    def test_what_cannot_be_split_is_refused(
+        self, data: Dataset, setting: int, options: SuiteOptions, words: str
+    ) -> None:
+        with pytest.raises(UsageError, match=words):
+            split_scene(data, setting, options)
+
+    def test_own_photographs_without_a_split_are_spread(self) -> None:
+        frames = tuple(replace(f, split="") for f in dataset().frames)
+        own = Dataset("own", frames, True, "", format="cameras")
+        split = split_scene(own, 5, SuiteOptions())
+        assert len(split.references) == 5
+        assert split.test_count == 49 - 5
+        assert not {f.name for f in split.references} & {f.name for f in split.queries}
+        with pytest.raises(UsageError, match="no frame of the train split"):
+            split_scene(own, DENSE, SuiteOptions())
+
+
+class TestScenes:
+    def seven(self, folder: Path) -> Path:
+        for sequence in ("seq-01", "seq-02"):
+            (folder / sequence).mkdir(parents=True)
+        (folder / "TrainSplit.txt").write_text("sequence1\n")
+        return folder
+
+    def test_finds_one_scene_and_many_in_the_papers_order(self, tmp_path: Path) -> None:
+        for name in ("stairs", "chess", "attic"):
+            self.seven(tmp_path / name)
+        assert [place.name for place in find_scenes(tmp_path)] == ["chess", "stairs", "attic"]
+        (only,) = find_scenes(tmp_path / "chess", "7scenes")
+        assert (only.name, only.layout, only.path) == ("chess", "7scenes", tmp_path / "chess")
+
+    def test_finds_the_rooms_of_buildings(self, tmp_path: Path) -> None:
+        for room in ("office1/lounge", "apt1/living", "apt1/kitchen"):
+            (tmp_path / room / "data").mkdir(parents=True)
+            (tmp_path / room / "info.txt").write_text("")
+        assert [p.name for p in find_scenes(tmp_path)] == ["apt1/kitchen", "apt1/living", "office1/lounge"]
+        assert [p.name for p in find_scenes(tmp_path / "apt1" / "living")] == ["apt1/living"]
+
+    def test_says_what_it_looked_for(self, tmp_path: Path) -> None:
+        with pytest.raises(UsageError, match="is not a folder"):
+            find_scenes(tmp_path / "nowhere")
+        with pytest.raises(UsageError, match=r"cameras\.json"):
+            find_scenes(tmp_path)
+        self.seven(tmp_path / "chess")
+        with pytest.raises(UsageError, match=r"dataset_train\.txt.*has the layout 7scenes"):
+            find_scenes(tmp_path, "cambridge")
+
+
+class TestPairs:
+    def write(self, folder: Path, *lines: str) -> Path:
+        file = folder / "pairs.txt"
+        file.write_text("\n".join(lines) + "\n")
+        return file
+
+    def test_gives_the_first_k_that_are_references_of_the_setting(self, tmp_path: Path) -> None:
+        file = self.write(tmp_path, "q0.png r7.png", "q0 r3", "q0.png r3.png", "q0.png r5.png", "", "q1.png r0.png")
+        pairs = read_pairs(file, dataset(), Path("/data"))
+        query, references = frame("q0", "test"), {"r3", "r5", "r7"}
+        assert [f.name for f in chosen(pairs, query, references, 2)] == ["r7", "r3"]
+        assert [f.name for f in chosen(pairs, query, {"r3"}, 2)] == ["r3"]
+        with pytest.raises(UsageError, match="no reference of the query q1"):
+            chosen(pairs, frame("q1", "test"), references, 2)
+
+    @pytest.mark.parametrize(
+        ("line", "words"),
+        [
+            ("q0.png", "line 2: a query and a reference"),
+            ("q0.png r99.png", r"line 2: chess has no image 'r99\.png'"),
+            ("r0.png r1.png", "line 2: r0 is not in the test split"),
+            ("q0.png q1.png", "line 2: q1 is not in the train split"),
+        ],
+    )
+    def test_names_the_line_that_is_wrong(self, tmp_path: Path, line: str, words: str) -> None:
+        with pytest.raises(UsageError, match=words):
+            read_pairs(self.write(tmp_path, "q0.png r1.png", line), dataset(), Path("/data"))
+
+    def test_finds_the_file_of_a_scene(self, tmp_path: Path) -> None:
+        file = self.write(tmp_path)
+        assert pairs_file(file, "apt1/living", 1) == file
+        (tmp_path / "apt1_living.txt").touch()
+        assert pairs_file(tmp_path, "apt1/living", 2) == tmp_path / "apt1_living.txt"
+        with pytest.raises(UsageError, match="one file for 2 scenes"):
+            pairs_file(file, "apt1/living", 2)
+        with pytest.raises(UsageError, match=r"no file .*chess\.txt"):
+            pairs_file(tmp_path, "chess", 2)
+        with pytest.raises(UsageError, match="has no pairs"):
+            read_pairs(file, dataset(), Path("/data"))
+
+
+class TestJournal:
+    IDENTITY: ClassVar = {"variant": "best", "commit": "abc"}
+
+    def test_gives_back_what_it_was_given(self, tmp_path: Path) -> None:
+        results = [result("q0", 0.0123), result("q1", math.inf)]
+        journal = Journal(tmp_path, "chess.dense", self.IDENTITY)
+        for it in results:
+            journal.add(it)
+        assert list(Journal(tmp_path, "chess.dense", self.IDENTITY).results.values()) == results
+
+    def test_another_identity_is_another_file(self, tmp_path: Path) -> None:
+        Journal(tmp_path, "chess.dense", self.IDENTITY).add(result("q0", 0.01))
+        other = Journal(tmp_path, "chess.dense", self.IDENTITY | {"commit": "def"})
+        assert other.results == {}
+        other.add(result("q0", 0.02))
+        assert Journal(tmp_path, "chess.dense", self.IDENTITY).results["q0"].translation_error == 0.01
+
+    def test_survives_a_tear_at_every_byte(self, tmp_path: Path) -> None:
+        """A crash leaves whole lines and a piece; the piece is cut off, and the run goes on behind the last line."""
+        journal = Journal(tmp_path, "chess.dense", self.IDENTITY)
+        journal.add(result("q0", 0.01))
+        one = journal.path.stat().st_size
+        journal.add(result("q1", 0.02))
+        content = journal.path.read_bytes()
+        for size in range(0, len(content), 7):
+            journal.path.write_bytes(content[:size])
+            again = Journal(tmp_path, "chess.dense", self.IDENTITY)
+            assert list(again.results) == (["q0"] if size >= one else [])
+            again.add(result("q1", 0.02))
+            assert "q1" in Journal(tmp_path, "chess.dense", self.IDENTITY).results
+
+
+class TestMeasure:
+    """The suite's own logic, with a server that is not there."""
+
+    def measure(
+        self, folder: Path, options: SuiteOptions, monkeypatch: pytest.MonkeyPatch, limit: int = 99
+    ) -> tuple[list[str], Suite]:
+        """The calls that were made until the one after `limit` failed, as setting/variant/query, and the figures."""
+        calls: list[str] = []
+
+        def localize(
+            client: object, scene: str, query: PlannedQuery, given: EvaluationOptions, references: object
+        ) -> QueryResult:
+            if len(calls) == limit:
+                raise Internal("GONE", "the server is gone")
+            calls.append(f"{scene}/{given.variant}/{query.frame.name}")
+            return result(query.frame.name, 0.01)
+
+        monkeypatch.setattr(suite_module, "child_server", lambda _: nullcontext(SimpleNamespace(address="nowhere")))
+        monkeypatch.setattr(suite_module, "Client", lambda *_: nullcontext())
+        monkeypatch.setattr(suite_module, "store_references", lambda *_: None)
+        monkeypatch.setattr(suite_module, "localize_query", localize)
+        planned = suite({"chess": 0.01}, options)
+        apparatus = Apparatus(options, Settings(), planned.provenance, folder, lambda *_: None)
+        return calls, measure(planned.scenes, apparatus, None, lambda _: None)
+
+    def test_goes_on_where_it_ended(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        options = SuiteOptions(sparse=(5,), variants=("best", "full"), max_queries=3)
+        wanted = [f"{s}/{v}/{q}" for s in ("dense", "N-5") for v in options.variants for q in ("q0", "q4", "q8")]
+        calls, measured = self.measure(tmp_path, options, monkeypatch, limit=4)
+        assert calls == wanted[:4]
+        assert [(run.split.setting, run.method.variant) for run in measured.runs] == [(DENSE, "best")]
+        assert [failure.scene for failure in measured.failures] == ["chess"]
+        assert "the server is gone" in measured.failures[0].message
+        calls, measured = self.measure(tmp_path, options, monkeypatch)
+        assert calls == wanted[4:]
+        assert (len(measured.runs), len(measured.failures)) == (4, 0)
+        calls, measured = self.measure(tmp_path, options, monkeypatch)
+        assert calls == []
+        assert (len(measured.runs), len(measured.failures)) == (4, 0)
+
+    def test_other_options_are_other_runs_and_more_queries_are_not(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        options = SuiteOptions(protocols=("dense",), max_queries=3)
+        for its, count in ((options, 3), (replace(options, k=5), 3), (replace(options, max_queries=None), 9 - 3)):
+            calls, _ = self.measure(tmp_path, its, monkeypatch)
+            assert len(calls) == count
+
+
+class TestAverages:
+    def test_the_average_is_the_mean_of_the_scenes_medians(self) -> None:
+        (group,) = groups_of(suite({"chess": 0.01, "fire": 0.03}))
+        average = group.average(DENSE, Method("best", "two_stage"))
+        assert average is not None
+        assert average.median_translation_m == pytest.approx(0.02)
+        assert (average.scenes, average.complete) == (("chess", "fire"), False)
+        assert average.recall["5cm_5deg"] == pytest.approx((1 + 1) / 2)
+        assert (average.localized, average.queries) == (18, 18)
+
+    def test_one_lost_scene_loses_the_average(self) -> None:
+        (group,) = groups_of(suite({"chess": 0.01, "fire": math.inf}))
+        average = group.average(DENSE, Method("best", "two_stage"))
+        assert average is not None
+        assert math.isinf(average.median_translation_m)
+        assert average.localized == 9
+
+    def test_scenes_that_the_paper_leaves_out_are_not_in_its_average(self) -> None:
+        names = dict.fromkeys(BENCHMARKS["cambridge"].scenes, 0.1)
+        (group,) = groups_of(suite({**names, "GreatCourt": 9.0}, layout="cambridge"))
+        average = group.average(DENSE, Method("best", "two_stage"))
+        assert average is not None
+        assert average.complete
+        assert average.median_translation_m == pytest.approx(0.1)
+
+    def test_benchmarks_are_kept_apart(self) -> None:
+        indoors, outdoors = suite({"chess": 0.01}), suite({"ShopFacade": 0.1}, layout="cambridge")
+        both = replace(indoors, scenes=indoors.scenes + outdoors.scenes, runs=indoors.runs + outdoors.runs)
+        assert [group.title for group in groups_of(both)] == ["7Scenes", "Cambridge Landmarks"]
+
+
+OPTIONS = SuiteOptions(sparse=(30, 5), variants=("best", "full"), scales=("two_stage", "trajectory"))
+
+
+def row(table: Table, name: str) -> tuple[str, ...]:
+    (its,) = (row.cells for row in table.rows if row.cells[0] == name)
+    return its
+
+
+class TestTables:
+    def test_our_figures_stand_beside_the_papers(self) -> None:
+        (group,) = groups_of(suite({"chess": 0.01, "fire": math.inf}, OPTIONS))
+        dense, by_setting, recall, scenes, scales, _ = tables_of(group)
+        assert row(dense, "mapless best") == ("mapless best", "1.00/0.500", FAILED, *5 * [NOTHING], FAILED)
+        assert row(dense, "L3 (paper)")[1:3] == ("0.6/0.21", "1.2/0.46")
+        assert row(by_setting, "ACE + GS-CPR (paper)")[1:] == ("0.8/0.25", "1.5/0.42", FAILED)
+        assert "2 of the paper's 7 scenes" in dense.notes[-1]
+        assert row(recall, "mapless best, dense")[-1] == "9 of 18"
+        assert row(scenes, "chess, full") == ("chess, full", "1.00/0.500", "2.00/0.500", "2.00/0.500")
+        assert row(scales, "trajectory")[0] == "trajectory"
+
+    def test_units_are_centimetres_and_degrees(self) -> None:
+        assert format_median(1.234, 0.5678) == "1.23/0.568"
+        assert format_median(2950.4, 20.634) == "2950/20.63"
+        assert format_median(math.inf, math.inf) == FAILED
+
+    @pytest.mark.parametrize("layout", ["7scenes", "12scenes", "cambridge", "cameras"])
+    def test_every_line_has_as_many_cells_as_the_head(self, layout: str) -> None:
+        (group,) = groups_of(suite({"chess": 0.01}, OPTIONS, layout))
+        for table in tables_of(group):
+            assert {len(line.cells) for line in table.rows} == {len(table.head)}
+            assert any(line.whose == OURS for line in table.rows)
+            assert len({len(line) for line in text_lines(table)}) == 1
+
+
+class TestCharts:
+    def test_decades_hold_all_values(self) -> None:
+        assert log_range([0.3, 40.0, math.inf], 0.01) == pytest.approx((0.1, 100.0))
+        assert log_range([0.0], 0.01) == pytest.approx((0.01, 0.1))
+        assert log_range([math.inf], 0.01) == (1.0, 10.0)
+
+    def test_equal_factors_are_equal_steps(self) -> None:
+        axis = Axis("cm", 0.1, 1000.0, True)
+        assert np.diff([axis.share(10.0**p) for p in range(-1, 4)]) == pytest.approx([0.25] * 4)
+        assert (axis.share(0.0), axis.share(1e9)) == (0.0, 1.0)
+        assert [value for value, _ in axis.ticks()] == pytest.approx([0.1, 1, 10, 100, 1000])
+
+    def test_a_failure_is_a_cross_and_breaks_the_line(self) -> None:
+        y = Axis("translation error, cm", 0.1, 10.0, True)
+        points = ((0.0, 1.0), (1.0, 2.0), (2.0, math.inf), (3.0, 1.0), (4.0, 1.0))
+        svg = ElementTree.fromstring(draw(Chart("a < b", Axis("query", 0, 4), y, (Curve("best & all", points),))))
+        assert len(svg.findall("polyline")) == 2
+        assert len(svg.findall("path")) == 1
+        texts = [it.text for it in svg.findall("text")]
+        assert {"a < b", "query", "translation error, cm", "best & all"} <= set(texts)
+        assert "nan" not in ElementTree.tostring(svg, "unicode")
+
+    def test_all_that_the_report_draws_is_there_and_well_formed(self) -> None:
+        (group,) = groups_of(suite({"chess": 0.01, "fire": math.inf}, OPTIONS))
+        charts = [*sparsity(group), *cumulative(group), *ablation(group), *along_sequence(group, "fire")]
+        assert len(charts) == 2 + 4 + 2 + 2
+        for chart in charts:
+            ElementTree.fromstring(draw(chart))
+            assert "cm" in chart.y.label + chart.x.label or "°" in chart.y.label + chart.x.label
+
+    def test_cumulative_curves_rise_to_the_share_that_was_localized(self) -> None:
+        measured = suite({"chess": 0.01, "fire": math.inf})
+        (group,) = groups_of(measured)
+        shares = [y for _, y in cumulative(group)[0].curves[0].points]
+        assert shares == sorted(shares)
+        assert shares[-1] == pytest.approx(50.0)
+
+    def test_a_long_sequence_keeps_its_worst(self) -> None:
+        (group,) = groups_of(suite({"chess": 0.01}))
+        (key,) = (key for key in group.runs if key[1] == DENSE)
+        many = tuple(result(f"q{i}", 5.0 if i == 777 else 0.01) for i in range(2000))
+        group.runs[key] = replace(group.runs[key], results=many)
+        curve = along_sequence(group, "chess")[0].curves[0]
+        assert len(curve.points) <= 400
+        assert max(y for _, y in curve.points) == 500.0
+
+
+class TestPictures:
+    def test_a_match_fits_if_it_lies_where_the_true_poses_put_it(self) -> None:
+        random = np.random.default_rng(1)
+        points = random.uniform([-1, -1, 3], [1, 1, 6], (50, 3))
+        poses = [
+            RigidTransform(rotation_from_vector(random.normal(0, 0.05, 3)), np.array([x, 0.1 * x, 0.0]))
+            for x in (0, 0.4)
+        ]
+        camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+        pixels = [camera.project(pose.inverse().apply(points)) for pose in poses]
+        pixels[1][25:] += random.choice([-40, 40], (25, 1)) * np.array([0.0, 1.0])  # across the epipolar lines
+        views = [
+            View(camera, Features(p.astype(np.float32), np.zeros((50, 2), np.float32), np.ones(50, np.float32)))
+            for p in pixels
+        ]
+        frames = [Frame(name, Path(name), camera, pose) for name, pose in zip("ab", poses, strict=True)]
+        matches = np.stack([np.arange(50), np.arange(50)], axis=1).astype(np.int32)
+        assert fit_true_poses(frames[0], frames[1], views[0], views[1], matches).tolist() == [True] * 25 + [False] * 25
+
+    def test_a_picture_is_a_jpeg_in_an_address(self) -> None:
+        assert data_uri(textured(96, 64)).startswith("data:image/jpeg;base64,/9j/")
+
+
+class TestFiles:
+    def test_json_and_csv_tell_the_same(self, tmp_path: Path) -> None:
+        measured = suite({"chess": 0.01, "fire": math.inf}, OPTIONS)
+        write_figures(replace(measured, failures=(Failure("heads", "no server"),)), tmp_path)
+        content = json.loads((tmp_path / "evaluation.json").read_text())
+        with (tmp_path / "evaluation.csv").open(newline="") as stream:
+            runs = list(csv.DictReader(stream))
+        with (tmp_path / "queries.csv").open(newline="") as stream:
+            queries = list(csv.DictReader(stream))
+        assert len(content["runs"]) == len(runs) == 2 * 3 * 3
+        assert len(queries) == sum(run["queries"] for run in content["runs"])
+        assert content["provenance"]["commit"] == "abc1234"
+        assert content["runs"][0]["median_translation_cm"] == pytest.approx(1.0)
+        assert content["runs"][0]["ground_truth"] == "SfM"
+        assert {run["median_translation_cm"] for run in content["runs"] if run["scene"] == "fire"} == {None}
+        assert {run["median_translation_cm"] for run in runs if run["scene"] == "fire"} == {""}
+        assert content["failures"] == [{"scene": "heads", "message": "no server"}]
+        assert content["paper"]["7scenes"]["methods"][-1]["average"]["dense"] == [1.3, 0.41]
+
+    def test_commit_of_what_is_no_checkout_is_empty(self, tmp_path: Path) -> None:
+        assert commit_of(tmp_path) == ""
+
+
+class _Balance(HTMLParser):
+    """Whether every element that is opened is closed, in order; and which addresses are asked for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+class TestPage:
+    def test_is_whole_and_needs_nothing_else(self) -> None:
+        measured = suite({"chess": 0.01, "fire": math.inf}, replace(OPTIONS, max_queries=5))
+        scene = replace(measured.scenes[0], dataset=dataset(refused=(Refusal("q77", "image: <missing>"),)))
+        measured = replace(measured, scenes=(scene, measured.scenes[1]), failures=(Failure("heads", "it <died>"),))
+        run = measured.runs[-1]
+        shown = [WorstQuery(run, run.results[0], data_uri(textured(96, 64)), "r0", 9, 4)]
+        text = page(measured, shown)
+        parser = _Balance()
+        parser.feed(text)
+        assert parser.open == []
+        assert all(address.startswith("data:image/jpeg") for address in parser.addresses)
+        assert len(parser.addresses) == 1
+        assert "<script" not in text
+        for words in (
+            "abc1234",
+            "f" * 64,
+            "a &lt;CPU&gt;",
+            "2026-11-21",
+            "chess, fire: SfM (the paper&#x27;s figures: SfM pseudo ground truth",
+            "chess: 5 of 9 queries, evenly spread",
+            "heads is not complete: it &lt;died&gt;",
+            "q77: image: &lt;missing&gt;",
+            "not localized, LOW_OVERLAP: &lt;b&gt;none&lt;/b&gt;",
+            "4 of 9 matches fit the true poses",
+            "prefers-color-scheme: dark",
+            "L3 (paper)",
+        ):
+            assert words in text, words
+
+    def test_nothing_measured_is_still_a_report(self) -> None:
+        measured = replace(suite({"chess": 0.01}), runs=(), failures=(Failure("chess", "no server"),))
+        parser = _Balance()
+        parser.feed(page(measured, []))
+        assert parser.open == []

@@ -1,0 +1,134 @@
+"""Recognizing layouts, reading cameras.json frame by frame, and writing folders that read back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from layouts import CAMERA, Truth, assert_reads, reasons, truth, write_image
+
+from mapless.geometry import Fisheye, RadialTangential
+from mapless_tools.dataset import read_folder
+from mapless_tools.ingest.command import FORMAT_NAMES
+from mapless_tools.ingest.formats import FORMATS, read_dataset, recognize
+from mapless_tools.ingest.formats.colmap.writing import PosedImage
+from mapless_tools.ingest.formats.writing import LAYOUTS, image_name, write_file
+
+TRUTH = truth()
+
+
+def write_layout(folder: Path, layout: str, planted: Truth = TRUTH) -> Path:
+    images = []
+    for i, pose in enumerate(planted.poses):
+        write_image(folder / "images" / f"{i}.png", seed=i)
+        images.append(PosedImage(f"{i}.png", planted.camera, pose))
+    for path, text in LAYOUTS[layout](images, "a test").items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        write_file(folder / path, text.encode())
+    return folder
+
+
+@pytest.mark.parametrize("layout", list(LAYOUTS))
+@pytest.mark.parametrize("lens", [None, RadialTangential(0.1, -0.2, k3=0.3), Fisheye(0.1, 0.2, 0.3, 0.4), Fisheye()])
+def test_a_layout_that_is_written_is_recognized_and_reads_back(tmp_path: Path, layout: str, lens: Any) -> None:
+    planted = Truth(TRUTH.poses, replace(CAMERA, distortion=lens))
+    folder = write_layout(tmp_path, layout, planted)
+    dataset = read_dataset(folder)
+    assert dataset.format == layout
+    assert_reads(dataset, planted)
+
+
+def test_a_folder_of_two_layouts_is_not_guessed_at(tmp_path: Path) -> None:
+    write_layout(write_layout(tmp_path, "cameras"), "colmap")
+    with pytest.raises(ValueError, match="cameras, colmap; say which with --format"):
+        read_dataset(tmp_path)
+    for layout in ("cameras", "colmap"):
+        assert_reads(read_dataset(tmp_path, layout), TRUTH)
+
+
+def test_folders_without_a_layout_and_layouts_without_a_name(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no layout that is known"):
+        recognize(tmp_path)
+    with pytest.raises(ValueError, match="is not a folder"):
+        read_dataset(tmp_path / "none")
+    with pytest.raises(ValueError, match="not 'bundler'"):
+        read_dataset(tmp_path, "bundler")
+    for layout in FORMATS:
+        with pytest.raises(ValueError, match=str(tmp_path)):
+            read_dataset(tmp_path, layout)
+
+
+def test_the_commands_help_names_all_layouts() -> None:
+    assert FORMAT_NAMES.split(", ") == ["auto", *FORMATS]
+
+
+def test_cameras_json_keeps_what_is_usable_and_names_the_rest(tmp_path: Path) -> None:
+    file = write_layout(tmp_path, "cameras") / "cameras.json"
+    content = json.loads(file.read_text())
+    good = content["frames"][0]
+    left_handed = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
+    content["frames"] += [
+        dict(good),
+        dict(good, image="../images/0.png"),
+        dict(good, image=str(tmp_path / "images" / "0.png")),
+        dict(good, image="images/none.png"),
+        dict(content["frames"][1], image="images/4.png", world_from_camera=left_handed),
+        dict(good, image="images/5.png", width=0),
+        dict(good, image="images/6.png", split="holdout"),
+        dict(good, image="images/7.png", lens="mirror ball"),
+        dict(good, image="x" * 5000),
+    ]
+    for i in range(4, 8):
+        write_image(tmp_path / "images" / f"{i}.png", seed=i)
+    file.write_text(json.dumps(content))
+    dataset = read_dataset(tmp_path)
+    assert len(dataset.frames) == 4
+    why = list(reasons(dataset).values())
+    expected = ["named twice", "leads out", "leads out", "no file", "reflection", "width", "split", "lens", "name too"]
+    assert len(why) == len(expected)
+    for reason, part in zip(why, expected, strict=True):
+        assert part in reason
+    assert "frames[4] (images/0.png)" in next(iter(reasons(dataset)))
+    with pytest.raises(ValueError, match=r"cameras\.json: frames\[5\].*leads out"):
+        read_folder(tmp_path)  # what we wrote ourselves is right, or not ours
+
+
+def test_a_folder_with_nothing_usable_says_why_of_the_first(tmp_path: Path) -> None:
+    file = write_layout(tmp_path, "cameras") / "cameras.json"
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        del frame["K"]
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"none of 4 frames.*frames\[0\].*K is missing"):
+        read_dataset(tmp_path)
+
+
+def test_splits_and_ground_truth_of_cameras_json(tmp_path: Path) -> None:
+    file = write_layout(tmp_path, "cameras") / "cameras.json"
+    content = json.loads(file.read_text()) | {"ground_truth": "laser scan"}
+    for frame, split in zip(content["frames"], ("train", "test", "", "train"), strict=True):
+        frame["split"] = split
+    file.write_text(json.dumps(content))
+    for dataset in (read_dataset(tmp_path), read_folder(tmp_path)):
+        assert dataset.ground_truth == "laser scan"
+        assert [frame.split for frame in dataset.frames] == ["train", "test", "", "train"]
+
+
+def test_long_ids_come_back_from_their_file_names(tmp_path: Path) -> None:
+    name = image_name("r" * 128, b"\x89PNG")
+    write_image(tmp_path / "images" / name)
+    text = LAYOUTS["cameras"]([PosedImage(name, CAMERA, TRUTH.poses[0])], "a test")["cameras.json"]
+    (tmp_path / "cameras.json").write_text(text)
+    (frame,) = read_dataset(tmp_path).frames
+    assert frame.name == "r" * 128
+
+
+def test_files_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    write_file(tmp_path / "a", b"first")
+    with pytest.raises(TypeError):
+        write_file(tmp_path / "a", "no bytes")  # type: ignore[arg-type]
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("a", b"first")]

@@ -1,0 +1,332 @@
+"""Storing references through a server that is busy, away, full, or refuses one of a message."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from layouts import CAMERA, truth, write_image
+
+from mapless import (
+    AlreadyExists,
+    DeadlineExceeded,
+    Internal,
+    InvalidArgument,
+    MaplessError,
+    NewReference,
+    NotFound,
+    PermissionDenied,
+    Reference,
+    ResourceExhausted,
+    Unavailable,
+)
+from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless_tools.dataset import Dataset, Frame
+from mapless_tools.ingest.existing import KnownReferences
+from mapless_tools.ingest.items import BATCH_BYTES, BATCH_COUNT
+from mapless_tools.ingest.report import ImportReport
+from mapless_tools.ingest.upload import Uploader
+from mapless_tools.ingest.waiting import UploadOptions
+
+Fault = Callable[[Sequence[NewReference], int], MaplessError | None]
+"""What the server answers to a message and to which call, None to store it."""
+
+QUICK = UploadOptions(parallel=2, busy_patience_s=1.0, away_patience_s=1.2)
+
+
+class Server:
+    """Stands for the client and its server: stores messages whole, unless a fault is planted."""
+
+    def __init__(self, fault: Fault = lambda message, call: None) -> None:
+        self.stored: dict[str, Reference] = {}
+        self.messages: list[list[str]] = []
+        self.in_flight = self.most_in_flight = 0
+        self.is_closed = False
+        self._fault = fault
+        self._lock = threading.Lock()
+
+    def add_references(self, scene: str, references: Sequence[NewReference]) -> None:
+        with self._lock:
+            self.messages.append([reference.reference_id for reference in references])
+            call = len(self.messages)
+            self.in_flight += 1
+            self.most_in_flight = max(self.most_in_flight, self.in_flight)
+        try:
+            error = self._fault(references, call)
+            if error is not None:
+                raise error
+            self.store(references)
+        finally:
+            with self._lock:
+                self.in_flight -= 1
+
+    def store(self, references: Sequence[NewReference]) -> None:
+        with self._lock:
+            if any(reference.reference_id in self.stored for reference in references):
+                raise AlreadyExists("ALREADY_EXISTS", "the id is taken", field="requests[0].reference_id")
+            self.stored |= {reference.reference_id: as_stored(reference) for reference in references}
+
+    def get_reference(self, scene: str, reference_id: str) -> Reference:
+        if reference_id not in self.stored:
+            raise NotFound("NOT_FOUND", "no such reference")
+        return self.stored[reference_id]
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+def as_stored(new: NewReference) -> Reference:
+    assert isinstance(new.image, bytes)
+    sha256 = hashlib.sha256(new.image).hexdigest()
+    now = datetime.now(timezone.utc)
+    return Reference("s", new.reference_id, new.camera, new.world_from_camera, sha256, 9, now)
+
+
+def frames_in(folder: Path, count: int = 20) -> list[Frame]:
+    frames = []
+    for i, pose in enumerate(truth(count).poses):
+        write_image(folder / f"{i:03d}.png", seed=i)
+        frames.append(Frame(f"r{i:03d}", folder / f"{i:03d}.png", CAMERA, pose))
+    return frames
+
+
+def upload(server: Any, frames: Sequence[Frame], options: UploadOptions = QUICK) -> ImportReport:
+    report = ImportReport("s", Dataset("d", tuple(frames), True, ""), frames)
+    Uploader(server, KnownReferences(server.stored.values()), report, options, lambda *_: None).run()
+    return report
+
+
+def names(frames: Sequence[Frame]) -> list[str]:
+    return [frame.name for frame in frames]
+
+
+def refusals(report: ImportReport) -> dict[str, str]:
+    return {item.frame: item.reason for item in report.refused}
+
+
+def test_all_are_stored_in_bounded_messages_with_bounded_many_in_flight(tmp_path: Path) -> None:
+    frames = frames_in(tmp_path)
+    server = Server()
+    report = upload(server, frames)
+    assert report.went_well
+    assert sorted(report.added) == sorted(server.stored) == names(frames)
+    assert max(map(len, server.messages)) <= BATCH_COUNT
+    assert server.most_in_flight <= QUICK.parallel
+    assert server.stored["r007"].image_sha256 == hashlib.sha256(frames[7].image_path.read_bytes()).hexdigest()
+
+
+def test_large_photographs_go_in_smaller_messages(tmp_path: Path) -> None:
+    frames = frames_in(tmp_path, 4)
+    for frame in frames:
+        with frame.image_path.open("ab") as file:
+            file.write(bytes(BATCH_BYTES // 2))  # behind a PNG's end anything may stand
+    server = Server()
+    assert upload(server, frames, UploadOptions(parallel=1)).went_well
+    assert server.messages == [["r000"], ["r001"], ["r002"], ["r003"]]
+
+
+def test_a_second_run_stores_nothing_and_says_so(tmp_path: Path) -> None:
+    frames = frames_in(tmp_path)
+    server = Server()
+    upload(server, frames)
+    messages = len(server.messages)
+    report = upload(server, frames)
+    assert report.went_well
+    assert (len(report.skipped), report.added, len(server.messages)) == (20, [], messages)
+
+
+def test_what_differs_from_what_is_there_is_refused_with_the_difference(tmp_path: Path) -> None:
+    frames = frames_in(tmp_path, 4)
+    server = Server()
+    upload(server, frames)
+    write_image(frames[0].image_path, seed=99)
+    moved = replace(frames[1], world_from_camera=frames[1].world_from_camera.shifted([0, 0.05, 0]))
+    zoomed = replace(frames[2], camera=replace(CAMERA, focal_x_px=90.0))
+    report = upload(server, [frames[0], moved, zoomed, frames[3]])
+    assert not report.went_well
+    why = refusals(report)
+    assert "its image differs" in why["r000"]
+    assert "0.05 m" in why["r001"]
+    assert "focal_x_px is 80.0, not 90.0" in why["r002"]
+    assert [item.frame for item in report.skipped] == ["r003"]
+
+
+@pytest.mark.parametrize(
+    ("moved_m", "turned_deg", "is_same"),
+    [(9e-4, 0.0, True), (0.0, 9e-3, True), (1.1e-3, 0.0, False), (0, 0.011, False)],
+)
+def test_the_same_photograph_with_almost_the_same_pose_is_skipped(
+    tmp_path: Path, moved_m: float, turned_deg: float, is_same: bool
+) -> None:
+    (frame,) = frames_in(tmp_path, 1)
+    far = replace(frame, world_from_camera=frame.world_from_camera.shifted([4e5, 5e6, 0]))
+    server = Server()
+    upload(server, [far])
+    moved = far.world_from_camera.shifted([moved_m, 0, 0])
+    turned = RigidTransform(moved.rotation @ rotation_from_vector([np.radians(turned_deg), 0, 0]), moved.translation)
+    report = upload(server, [replace(far, world_from_camera=turned)])
+    assert (len(report.skipped), len(report.refused)) == ((1, 0) if is_same else (0, 1))
+
+
+def test_what_is_refused_is_not_counted_as_stored(tmp_path: Path) -> None:
+    frames = frames_in(tmp_path, 4)
+    frames[1].image_path.write_bytes(b"")
+    told: list[tuple[int, int]] = []
+    report = ImportReport("s", Dataset("d", tuple(frames), True, ""), frames)
+    uploader = Uploader(Server(), KnownReferences([]), report, QUICK, lambda step, *counts: told.append(counts))  # type: ignore[arg-type]
+    uploader.run()
+    assert told == [(0, 4), (3, 3)]
+
+
+def test_the_same_image_under_another_id_is_the_same_reference(tmp_path: Path) -> None:
+    frames = frames_in(tmp_path, 3)
+    twin = Frame("twin", frames[0].image_path, CAMERA, frames[0].world_from_camera)
+    elsewhere = Frame("elsewhere", frames[1].image_path, CAMERA, RigidTransform.identity())
+    report = upload(Server(), [*frames, twin, elsewhere], UploadOptions(parallel=1))
+    assert [(item.frame, item.reason) for item in report.skipped] == [("twin", "the same image as r000")]
+    assert "as r001" in refusals(report)["elsewhere"]
+
+
+def test_a_photograph_that_the_server_refuses_is_taken_out_alone(tmp_path: Path) -> None:
+    """It names which of the message it is."""
+
+    def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
+        for i, reference in enumerate(message):
+            if reference.reference_id in ("r003", "r005"):
+                return InvalidArgument("INVALID_ARGUMENT", "cannot be decoded", field=f"requests[{i}].reference.image")
+        return None
+
+    frames = frames_in(tmp_path, 10)
+    report = upload(Server(fault), frames)
+    assert refusals(report) == dict.fromkeys(("r003", "r005"), "reference.image: cannot be decoded")
+    assert len(report.added) == 8
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        InvalidArgument("INVALID_ARGUMENT", "something is wrong"),
+        ResourceExhausted("RESOURCE_EXHAUSTED", "the message is too large"),
+        Internal("INTERNAL", "internal error", request_id="abc"),
+    ],
+)
+def test_what_the_server_does_not_name_is_found_by_sending_parts(tmp_path: Path, error: MaplessError) -> None:
+    def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
+        return error if any(reference.reference_id == "r006" for reference in message) else None
+
+    report = upload(Server(fault), frames_in(tmp_path, 10))
+    (reason,) = refusals(report).values()
+    assert error.message in reason
+    assert error.request_id in reason
+    assert (len(report.added), report.stopped) == (9, "")
+
+
+def test_a_busy_server_is_waited_for_as_long_as_it_asks(tmp_path: Path) -> None:
+    def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
+        busy = ResourceExhausted("RESOURCE_EXHAUSTED", "busy", reason="OVERLOADED", retry_after_s=0.05)
+        return busy if call <= 3 else None
+
+    server = Server(fault)
+    assert upload(server, frames_in(tmp_path, 4)).went_well
+    assert len(server.messages) == 4
+
+
+def test_a_server_that_goes_away_is_waited_for(tmp_path: Path) -> None:
+    def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
+        return Unavailable("UNAVAILABLE", "starting") if call == 1 else None
+
+    assert upload(Server(fault), frames_in(tmp_path, 4)).went_well
+
+
+@pytest.mark.parametrize("kind", [Unavailable, DeadlineExceeded])
+def test_a_message_that_was_stored_although_its_answer_was_lost_counts_as_added(
+    tmp_path: Path, kind: type[MaplessError]
+) -> None:
+    server = Server()
+
+    def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
+        if call > 1:
+            return None
+        server.store(message)
+        return kind("UNAVAILABLE", "connection reset")
+
+    server._fault = fault
+    report = upload(server, frames_in(tmp_path, 4), UploadOptions(parallel=1))
+    assert (sorted(report.added), report.skipped) == (["r000", "r001", "r002", "r003"], [])
+
+
+def test_references_that_somebody_else_adds_meanwhile_are_skipped(tmp_path: Path) -> None:
+    frames = frames_in(tmp_path, 4)
+    server = Server()
+
+    def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
+        if call == 1:
+            server.store(message[:2])
+        return None
+
+    server._fault = fault
+    report = upload(server, frames, UploadOptions(parallel=1))
+    assert [item.frame for item in report.skipped] == ["r000", "r001"]
+    assert report.added == ["r002", "r003"]
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (ResourceExhausted("RESOURCE_EXHAUSTED", "disk", reason="STORE_FULL", retry_after_s=1.0), "the store is full"),
+        (Unavailable("UNAVAILABLE", "no route"), "cannot be reached: no route"),
+        (ResourceExhausted("RESOURCE_EXHAUSTED", "busy", retry_after_s=0.2), "stays too busy"),
+        (PermissionDenied("PERMISSION_DENIED", "may not write"), "may not write"),
+    ],
+)
+def test_what_hits_all_ends_the_import_and_the_next_run_goes_on(
+    tmp_path: Path, error: MaplessError, message: str
+) -> None:
+    server = Server(lambda references, call: error if call > 1 else None)
+    frames = frames_in(tmp_path)
+    report = upload(server, frames, UploadOptions(parallel=1, busy_patience_s=0.5, away_patience_s=0.6))
+    assert message in report.stopped
+    assert not report.went_well
+    assert report.untried_count == 20 - BATCH_COUNT
+    assert (len(report.added), report.refused) == (BATCH_COUNT, [])
+    server._fault = lambda references, call: None
+    assert upload(server, frames).went_well
+    assert sorted(server.stored) == names(frames)
+
+
+def test_an_interruption_ends_it_soon_and_keeps_what_is_in(tmp_path: Path) -> None:
+    """Ctrl-C comes as an exception in the thread that waits."""
+    began = threading.Event()
+
+    class Interrupted(Server):
+        def add_references(self, scene: str, references: Sequence[NewReference]) -> None:
+            super().add_references(scene, references)
+            if len(self.messages) == 1:
+                began.set()
+                raise KeyboardInterrupt
+
+    server = Interrupted()
+    with pytest.raises(KeyboardInterrupt):
+        upload(server, frames_in(tmp_path), UploadOptions(parallel=1))
+    assert began.is_set()
+    assert (server.is_closed, len(server.messages)) == (True, 1)
+
+
+def test_files_that_are_not_what_the_camera_took_are_refused_before_they_are_sent(tmp_path: Path) -> None:
+    frames = frames_in(tmp_path, 4)
+    write_image(frames[0].image_path, 0, 48, 32)
+    frames[1].image_path.write_bytes(b"GIF89a")
+    frames[2].image_path.unlink()
+    server = Server()
+    why = refusals(upload(server, frames))
+    assert "48x32 pixels, its camera 96x64" in why["r000"]
+    assert "not a JPEG" in why["r001"]
+    assert "No such file" in why["r002"]
+    assert server.messages == [["r003"]]

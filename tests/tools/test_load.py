@@ -1,0 +1,569 @@
+"""The load generator: arrivals are Poisson's, every call is accounted for once, and time counts from the intention."""
+
+import asyncio
+import itertools
+import json
+import math
+import os
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import grpc
+import numpy as np
+import pytest
+from google.rpc import error_details_pb2, status_pb2
+from grpc_status import rpc_status
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_tools.load.arrivals import Kind, Mix, PlannedCall, Requests, plan_calls, poisson_times
+from mapless_tools.load.chart import SIZE_PX, draw_load
+from mapless_tools.load.no_op import CAMERA, padded_photo
+from mapless_tools.load.pipeline import PipelineOptions, PipelineResult, pipeline_checks, pipeline_json
+from mapless_tools.load.records import CallRecord, Fate, account_of, latencies, percentile
+from mapless_tools.load.report import Check, check_lines, machine_lines, step_lines, update_json
+from mapless_tools.load.requests import photo_request, read_answer
+from mapless_tools.load.scrape import Scrape, parse_metrics, reconcile
+from mapless_tools.load.sender import Target, connected, send_closed_loop, send_open_loop
+from mapless_tools.load.step import ServerUnderLoad, Step, run_step
+from mapless_tools.load.watch import ProcessSample, going_first, read_process, trend
+
+METHOD = "/toy.Toy/Call"
+GOOD, BAD = b"good", b"bad"
+REQUESTS = Requests((GOOD,), (BAD,))
+Handler = Callable[[bytes, Any], Awaitable[bytes]]
+
+
+def record(fate: Fate = Fate.ANSWERED, at_s: float = 0.0, took_s: float = 0.1, sent_late_s: float = 0.0) -> CallRecord:
+    code, detail, kind = {
+        Fate.ANSWERED: ("OK", "localized", Kind.QUERY),
+        Fate.REFUSED: ("RESOURCE_EXHAUSTED", "QUEUE_FULL", Kind.QUERY),
+        Fate.BAD_REQUEST: ("INVALID_ARGUMENT", "IMAGE_FORMAT", Kind.BAD_IMAGE),
+        Fate.HUNG_UP: ("CANCELLED", "", Kind.CANCELLED),
+        Fate.OVERDUE: ("DEADLINE_EXCEEDED", "", Kind.QUERY),
+        Fate.TOO_HURRIED: ("DEADLINE_EXCEEDED", "", Kind.HURRIED),
+        Fate.FAILED: ("INTERNAL", "INTERNAL", Kind.QUERY),
+    }[fate]
+    return CallRecord(kind, 0, at_s, at_s + sent_late_s, at_s + took_s, 1.0, code, detail)
+
+
+# Arrivals
+
+
+def test_arrivals_have_the_rate_and_the_independence_of_a_poisson_process() -> None:
+    rate, duration_s = 50.0, 400.0
+    times = poisson_times(rate, duration_s, np.random.default_rng(7))
+    assert (np.diff(times) >= 0).all()
+    assert times[0] >= 0
+    assert times[-1] < duration_s
+    assert abs(len(times) - rate * duration_s) < 4 * math.sqrt(rate * duration_s)
+    # Gaps are exponential: their spread is their mean, and a share of 1/e of them is longer.
+    gaps = np.diff(times)
+    assert np.std(gaps) == pytest.approx(1 / rate, rel=0.05)
+    assert np.mean(gaps > 1 / rate) == pytest.approx(1 / math.e, abs=0.02)
+    # In whole seconds the counts vary as much as they are large, and say nothing of the next second's.
+    counts = np.bincount(times.astype(int), minlength=int(duration_s))
+    assert np.var(counts) == pytest.approx(rate, rel=0.25)
+    assert abs(np.corrcoef(counts[:-1], counts[1:])[0, 1]) < 0.2
+
+
+def test_clients_together_make_the_rate_in_order_of_time_with_the_mix_asked_for() -> None:
+    mix = Mix(cancelled_share=0.1, bad_share=0.2, cancel_within_s=0.5)
+    plan = plan_calls(100.0, 100.0, 8, REQUESTS, mix, seed=3)
+    assert [call.at_s for call in plan] == sorted(call.at_s for call in plan)
+    assert abs(len(plan) - 10_000) < 400
+    by_client = Counter(call.client for call in plan)
+    assert sorted(by_client) == list(range(8))
+    assert all(abs(count - 1250) < 150 for count in by_client.values())
+    kinds = Counter(call.kind for call in plan)
+    assert kinds[Kind.CANCELLED] / len(plan) == pytest.approx(0.1, abs=0.01)
+    assert kinds[Kind.BAD_IMAGE] / len(plan) == pytest.approx(0.2, abs=0.015)
+    for call in plan:
+        assert call.request == (BAD if call.kind is Kind.BAD_IMAGE else GOOD)
+        assert (call.cancel_after_s is not None) == (call.kind is Kind.CANCELLED)
+        assert call.cancel_after_s is None or 0 <= call.cancel_after_s <= 0.5
+
+
+def test_the_same_seed_plans_the_same_calls_and_another_one_others() -> None:
+    def times(seed: int) -> list[float]:
+        return [call.at_s for call in plan_calls(20.0, 10.0, 2, REQUESTS, Mix(), seed)]
+
+    assert times(1) == times(1)
+    assert times(1) != times(2)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Mix(cancelled_share=0.6, bad_share=0.6),
+        lambda: Mix(cancelled_share=-0.1),
+        lambda: plan_calls(1.0, 1.0, 0, REQUESTS, Mix(), 0),
+        lambda: plan_calls(0.0, 1.0, 1, REQUESTS, Mix(), 0),
+        lambda: plan_calls(1.0, 1.0, 1, Requests((GOOD,)), Mix(bad_share=0.5), 0),
+        lambda: account_of([], 1.0, 1.0),
+        lambda: percentile([], 0.5),
+    ],
+)
+def test_senseless_arguments_are_refused(make: Callable[[], object]) -> None:
+    with pytest.raises(ValueError, match=r"\w"):
+        make()
+
+
+# Accounts
+
+
+@given(st.lists(st.floats(0, 1e6), min_size=1), st.floats(0.001, 1))
+def test_a_percentile_is_the_smallest_value_that_so_many_do_not_exceed(values: list[float], share: float) -> None:
+    found = percentile(values, share)
+    assert found in values
+    assert sum(value <= found for value in values) >= share * len(values) * (1 - 1e-9)
+    smaller = [value for value in values if value < found]
+    if smaller:
+        assert sum(value <= max(smaller) for value in values) < share * len(values) * (1 + 1e-9)
+
+
+def test_percentiles_of_known_values() -> None:
+    found = latencies([i / 1000 for i in range(1, 201)])
+    figures = (found.count, found.p50_ms, found.p95_ms, found.p99_ms, found.max_ms)
+    assert figures == pytest.approx((200, 100, 190, 198, 200))
+    assert latencies([]).p99_ms is None
+
+
+@pytest.mark.parametrize(
+    ("code", "detail", "kind", "took_s", "fate"),
+    [
+        ("OK", "localized", Kind.QUERY, 0.1, Fate.ANSWERED),
+        ("OK", "rejected LOW_OVERLAP", Kind.QUERY, 0.1, Fate.ANSWERED),
+        ("OK", "localized", Kind.CANCELLED, 0.1, Fate.ANSWERED),
+        ("OK", "localized", Kind.QUERY, 1.1, Fate.OVERDUE),
+        ("RESOURCE_EXHAUSTED", "QUEUE_FULL", Kind.QUERY, 0.1, Fate.REFUSED),
+        ("RESOURCE_EXHAUSTED", "", Kind.QUERY, 0.1, Fate.FAILED),
+        ("UNAVAILABLE", "DRAINING", Kind.QUERY, 0.1, Fate.REFUSED),
+        ("UNAVAILABLE", "", Kind.QUERY, 0.1, Fate.FAILED),
+        ("DEADLINE_EXCEEDED", "DEADLINE_INFEASIBLE", Kind.QUERY, 0.1, Fate.REFUSED),
+        ("DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED", Kind.QUERY, 0.9, Fate.OVERDUE),
+        ("DEADLINE_EXCEEDED", "", Kind.QUERY, 1.0, Fate.OVERDUE),
+        ("INVALID_ARGUMENT", "IMAGE_FORMAT", Kind.BAD_IMAGE, 0.1, Fate.BAD_REQUEST),
+        ("INVALID_ARGUMENT", "IMAGE_FORMAT", Kind.QUERY, 0.1, Fate.FAILED),
+        ("CANCELLED", "", Kind.CANCELLED, 0.1, Fate.HUNG_UP),
+        ("CANCELLED", "", Kind.QUERY, 0.1, Fate.FAILED),
+        ("INTERNAL", "INTERNAL", Kind.QUERY, 0.1, Fate.FAILED),
+    ],
+)
+def test_how_a_call_ended_for_its_caller(code: str, detail: str, kind: Kind, took_s: float, fate: Fate) -> None:
+    assert CallRecord(kind, 0, 0.0, 0.0, took_s, 1.0, code, detail).fate is fate
+
+
+@given(st.lists(st.tuples(st.sampled_from(Fate), st.floats(0, 9.99), st.floats(0, 3)), max_size=40))
+def test_every_call_is_in_the_account_once_and_no_rate_exceeds_what_was_offered(
+    calls: list[tuple[Fate, float, float]],
+) -> None:
+    records = [record(fate, at_s, took_s) for fate, at_s, took_s in calls]
+    account = account_of(records, 10.0, 2.0)
+    assert sum(account.fates.values()) == sum(account.outcomes.values()) == account.sent == len(records)
+    assert account.fates == Counter(r.fate.value for r in records)
+    shares = account.goodput_per_s + account.refused_per_s + account.overdue_per_s
+    assert shares <= account.offered_per_s + 1e-9
+    assert account.answers.count + account.refusals.count <= account.offered_per_s * 8 + 1e-9
+
+
+def test_rates_leave_out_the_beginning_and_answers_that_come_too_late() -> None:
+    records = [
+        record(at_s=1.0),  # before it has settled
+        record(at_s=3.0),
+        record(at_s=4.0, took_s=1.3, sent_late_s=0.5),  # in time for its deadline, not for who wanted it
+        record(Fate.REFUSED, at_s=5.0, took_s=0.02),
+        record(Fate.OVERDUE, at_s=6.0, took_s=1.0),
+    ]
+    account = account_of(records, 10.0, 2.0)
+    assert account.offered_per_s == pytest.approx(4 / 8)
+    assert account.goodput_per_s == pytest.approx(1 / 8)
+    assert account.refused_per_s == account.overdue_per_s == pytest.approx(1 / 8)
+    assert account.completed_per_s == pytest.approx(2 / 8)
+    assert account.answers.max_ms == pytest.approx(1300)
+    assert account.refusals.max_ms == pytest.approx(20)
+    assert account.send_lag.max_ms == pytest.approx(500)
+
+
+# Calls
+
+
+@asynccontextmanager
+async def toy_server(handler: Handler, deadline_s: float = 30.0, clients: int = 2) -> AsyncIterator[Target]:
+    """A server in this loop, and connections to it."""
+    server = grpc.aio.server()
+    methods = {"Call": grpc.unary_unary_rpc_method_handler(handler)}
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("toy.Toy", methods),))
+    port = server.add_insecure_port("127.0.0.1:0")
+    await server.start()
+    try:
+        async with connected(f"127.0.0.1:{port}", METHOD, clients, deadline_s, bytes.decode) as target:
+            yield target
+    finally:
+        await server.stop(None)
+
+
+async def abort(context: Any, code: grpc.StatusCode, reason: str) -> bytes:
+    message = status_pb2.Status(code=code.value[0], message="no")
+    message.details.add().Pack(error_details_pb2.ErrorInfo(reason=reason, domain="mapless"))
+    status = rpc_status.to_status(message)
+    await context.abort(status.code, status.details, (*status.trailing_metadata, ("x-request-id", "1")))
+    raise AssertionError("abort raises")
+
+
+def test_every_call_of_a_server_that_refuses_some_and_never_answers_others_is_accounted_for_once() -> None:
+    number = 0
+
+    async def handler(request: bytes, context: Any) -> bytes:
+        nonlocal number
+        if request == BAD:
+            return await abort(context, grpc.StatusCode.INVALID_ARGUMENT, "IMAGE_FORMAT")
+        number += 1
+        if number % 3 == 1:
+            return await abort(context, grpc.StatusCode.RESOURCE_EXHAUSTED, "QUEUE_FULL")
+        if number % 3 == 2:
+            await asyncio.sleep(60)
+        return b"localized"
+
+    plan = plan_calls(400.0, 0.5, 2, REQUESTS, Mix(0.2, 0.2, 0.05), seed=5)
+
+    async def run() -> list[CallRecord]:
+        async with toy_server(handler, deadline_s=0.4) as target:
+            return await send_open_loop(target, plan)
+
+    records = asyncio.run(run())
+    assert [(r.at_s, r.kind, r.client) for r in records] == [(c.at_s, c.kind, c.client) for c in plan]
+    account = account_of(records, 0.5)
+    assert sum(account.fates.values()) == len(plan)
+    assert account.count(Fate.FAILED) == 0
+    assert account.count(Fate.BAD_REQUEST) == sum(call.kind is Kind.BAD_IMAGE for call in plan)
+    assert set(account.outcomes) <= {
+        "OK localized",
+        "RESOURCE_EXHAUSTED QUEUE_FULL",
+        "DEADLINE_EXCEEDED",
+        "INVALID_ARGUMENT IMAGE_FORMAT",
+        "CANCELLED",
+    }
+    for fate in (Fate.ANSWERED, Fate.REFUSED, Fate.OVERDUE, Fate.HUNG_UP):
+        assert account.count(fate) > 0
+    for r in records:
+        assert r.at_s <= r.sent_s <= r.ended_s
+
+
+def test_a_server_that_stalls_shows_in_the_latency_of_every_call_that_was_to_be_made_meanwhile() -> None:
+    released_s = math.inf
+
+    async def run() -> tuple[list[CallRecord], float]:
+        nonlocal released_s
+        loop, gate, seen = asyncio.get_running_loop(), asyncio.Event(), 0
+        plan = [PlannedCall(0.01 * i, i, Kind.QUERY, GOOD) for i in range(20)]
+
+        async def handler(_: bytes, __: Any) -> bytes:
+            nonlocal seen, released_s
+            seen += 1
+            if seen == len(plan):  # it has not waited for answers: all are there while not one is answered
+                released_s = loop.time()
+                gate.set()
+            await gate.wait()
+            return b"localized"
+
+        async with toy_server(handler) as target:
+            begin_s = loop.time()
+            return await send_open_loop(target, plan, begin_s), begin_s
+
+    records, begin_s = asyncio.run(run())
+    assert [r.fate for r in records] == [Fate.ANSWERED] * 20
+    for r in records:
+        assert r.latency_s >= released_s - begin_s - r.at_s - 1e-9
+
+
+def test_a_generator_that_comes_late_itself_counts_from_when_it_should_have_come() -> None:
+    async def handler(_: bytes, __: Any) -> bytes:
+        return b"localized"
+
+    async def run() -> list[CallRecord]:
+        async with toy_server(handler) as target:
+            late_by_5_s = asyncio.get_running_loop().time() - 5.0
+            plan = [PlannedCall(float(i), i, Kind.QUERY, GOOD) for i in range(3)]
+            return await send_open_loop(target, plan, late_by_5_s)
+
+    records = asyncio.run(run())
+    assert [r.latency_s >= 5.0 - r.at_s for r in records] == [True] * 3
+    lag = account_of(records, 10.0).send_lag
+    assert lag.max_ms is not None
+    assert lag.max_ms >= 5000
+
+
+def test_a_closed_loop_keeps_so_many_calls_in_progress_and_goes_round_the_requests() -> None:
+    running = most = 0
+    seen: Counter[bytes] = Counter()
+
+    async def handler(request: bytes, _: Any) -> bytes:
+        nonlocal running, most
+        running, most = running + 1, max(most, running + 1)
+        seen[request] += 1
+        await asyncio.sleep(0.01)
+        running -= 1
+        return b"localized"
+
+    async def run() -> list[CallRecord]:
+        async with toy_server(handler) as target:
+            return await send_closed_loop(target, [b"a", b"b", b"c"], 3, 0.3)
+
+    records = asyncio.run(run())
+    assert most == 3
+    assert sum(seen.values()) == len(records)
+    assert max(seen.values()) - min(seen.values()) <= 1
+
+
+def test_who_is_refused_in_a_closed_loop_comes_back_when_the_server_asks_for_it() -> None:
+    came_s: list[float] = []
+
+    async def handler(_: bytes, context: Any) -> bytes:
+        came_s.append(asyncio.get_running_loop().time())
+        status = status_pb2.Status(code=8, message="too much to do")
+        for detail in (
+            error_details_pb2.ErrorInfo(reason="QUEUE_FULL"),
+            error_details_pb2.RetryInfo(retry_delay={"nanos": 100_000_000}),
+        ):
+            status.details.add().Pack(detail)
+        context.set_trailing_metadata((("grpc-status-details-bin", status.SerializeToString()),))
+        await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, "too much to do")
+        return b""
+
+    async def run() -> list[CallRecord]:
+        async with toy_server(handler) as target:
+            return await send_closed_loop(target, [b"a"], 1, 0.55)
+
+    records = asyncio.run(run())
+    assert {(it.fate, it.retry_after_s) for it in records} == {(Fate.REFUSED, 0.1)}
+    assert 2 <= len(records) <= 6
+    assert min(later - sooner for sooner, later in itertools.pairwise(came_s)) > 0.09
+
+
+# The server's process and its own account
+
+
+def test_a_process_is_read_and_its_threads_and_files_are_counted() -> None:
+    before = read_process(os.getpid(), 0.0)
+    opened = [os.open(os.devnull, os.O_RDONLY) for _ in range(5)]
+    try:
+        after = read_process(os.getpid(), 1.0)
+    finally:
+        for descriptor in opened:
+            os.close(descriptor)
+    assert after.descriptors == before.descriptors + 5
+    assert after.threads >= 1
+    assert after.resident_mib > 1
+    assert after.cpu_s >= before.cpu_s
+
+
+def test_the_generator_goes_before_the_server_while_it_measures_and_not_after() -> None:
+    def niceness(process_id: int) -> int:
+        return os.getpriority(os.PRIO_PROCESS, process_id)
+
+    before = niceness(0)
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as server:
+        with going_first(server.pid):
+            assert niceness(server.pid) - niceness(0) == 5
+        assert niceness(0) == before
+        server.communicate(b"\n")
+
+
+def test_a_trend_finds_the_planted_slope_and_doubts_one_that_is_only_noise() -> None:
+    random = np.random.default_rng(11)
+    times = np.arange(0.0, 600.0, 2.0)
+    noise = random.normal(0.0, 1.0, len(times))
+    growing = trend(times.tolist(), (100 + 0.5 * times / 60 + noise).tolist())
+    assert growing.low < 0.5 < growing.high
+    assert growing.grows
+    flat = trend(times.tolist(), (100 + noise).tolist())
+    assert flat.low < 0 < flat.high
+    assert not flat.grows
+    constant = trend([0.0, 1.0, 2.0], [7.0, 7.0, 7.0])
+    assert (constant.mean, constant.per_minute, constant.grows) == (7.0, 0.0, False)
+    # A step up and down again in long waves is not taken for hundreds of independent samples.
+    waves = trend(times.tolist(), (100 + np.sign(np.sin(times / 60))).tolist())
+    assert waves.high - waves.low > 3 * (flat.high - flat.low)
+
+
+PAGE = """
+grpc_server_started_total{grpc_service="s",grpc_method="Localize"} 12.0
+grpc_server_handled_total{grpc_service="s",grpc_method="Localize",grpc_code="OK"} 7.0
+grpc_server_handled_total{grpc_service="s",grpc_method="Localize",grpc_code="CANCELLED"} 5.0
+grpc_server_handled_total{grpc_service="s",grpc_method="GetScene",grpc_code="OK"} 99.0
+mapless_jobs_terminated_total{stage="refine",outcome="ok"} 6.0
+mapless_jobs_terminated_total{stage="coarse",outcome="ok"} 1.0
+# TYPE mapless_event_loop_lag_seconds histogram
+mapless_event_loop_lag_seconds_bucket{le="0.01"} 90.0
+mapless_event_loop_lag_seconds_bucket{le="0.02"} 100.0
+mapless_event_loop_lag_seconds_bucket{le="+Inf"} 100.0
+mapless_event_loop_lag_seconds_count 100.0
+mapless_event_loop_lag_seconds_sum 0.5
+"""
+
+
+def test_the_metrics_page_is_read_and_its_differences_taken() -> None:
+    after = parse_metrics(PAGE)
+    assert after.started == 12
+    assert after.handled == {"OK": 7, "CANCELLED": 5}
+    assert after.terminated == {"ok": 7}
+    assert after.longest_lag_s == 0.02
+    before = replace(
+        after, started=10, handled={"OK": 6, "CANCELLED": 4}, lag_buckets={0.01: 80, 0.02: 90, math.inf: 90}
+    )
+    since = after.since(before)
+    assert (since.started, since.handled, since.longest_lag_s) == (2, {"OK": 1, "CANCELLED": 1}, 0.01)
+    assert parse_metrics("").longest_lag_s is None
+
+
+@pytest.mark.parametrize(
+    ("handled", "complete"),
+    [
+        ({"OK": 6, "RESOURCE_EXHAUSTED": 2, "CANCELLED": 2}, True),
+        ({"OK": 7, "RESOURCE_EXHAUSTED": 2, "CANCELLED": 1}, True),  # answered while its caller hung up
+        ({"OK": 6, "RESOURCE_EXHAUSTED": 2}, True),  # both given up before the server saw them
+        ({"OK": 5, "RESOURCE_EXHAUSTED": 2, "CANCELLED": 3}, False),  # an answer that the server did not count
+        ({"OK": 6, "RESOURCE_EXHAUSTED": 2, "CANCELLED": 3}, False),  # one call more than were made
+        ({"OK": 8, "RESOURCE_EXHAUSTED": 3, "CANCELLED": 0}, False),
+    ],
+)
+def test_both_accounts_agree_but_for_calls_that_were_given_up(handled: dict[str, int], complete: bool) -> None:
+    codes = ["OK"] * 6 + ["RESOURCE_EXHAUSTED"] * 2 + ["CANCELLED", "DEADLINE_EXCEEDED"]
+    server = Scrape(sum(handled.values()), handled, {}, {})
+    assert reconcile(codes, server).complete is complete
+    assert not reconcile(codes, replace(server, started=server.started + 1)).complete
+
+
+# Requests
+
+
+def test_the_padded_photo_is_an_image_of_the_size_asked_for() -> None:
+    for size_bytes in (1_000, 70_000, 300_000):
+        photo = padded_photo(size_bytes)
+        assert abs(len(photo) - size_bytes) < 100
+        pixels = decode_image(photo, ImageLimits())
+        assert pixels.shape == (CAMERA.height_px, CAMERA.width_px, 3)
+
+
+def test_a_request_holds_the_photograph_and_the_names_of_references() -> None:
+    message = pb.LocalizeRequest.FromString(photo_request(b"photo", CAMERA, ["a", "b"]))
+    assert message.image == b"photo"
+    assert list(message.references) == ["scenes/load/references/a", "scenes/load/references/b"]
+    assert message.intrinsics.width_px == CAMERA.width_px
+
+
+def test_what_an_answer_says() -> None:
+    localized = pb.LocalizeResponse(localization=pb.Localization(pose_stage=pb.POSE_STAGE_REFINED))
+    coarse = pb.LocalizeResponse(localization=pb.Localization(pose_stage=pb.POSE_STAGE_COARSE))
+    rejected = pb.LocalizeResponse(rejection=pb.Rejection(reason=pb.REJECTION_REASON_LOW_OVERLAP))
+    answers = [read_answer(message.SerializeToString()) for message in (localized, coarse, rejected)]
+    assert answers == ["localized", "coarse", "rejected LOW_OVERLAP"]
+
+
+# Reports
+
+
+def step(name: str, asked_per_s: float | None, records: Sequence[CallRecord], told: Scrape | None = None) -> Step:
+    samples = [ProcessSample(float(i), 400.0 + (i % 2), 14, 25, 1.8 * i) for i in range(11)]
+    account = account_of(records, 10.0)
+    codes = [r.code for r in records]
+    return Step(name, asked_per_s, 10.0, account, codes, samples, 0.0, told, 0.1, 10.0)
+
+
+def planted_result(slowest_refusal_s: float = 0.004) -> PipelineResult:
+    """A server that answers 8 a second in 0.2 s, and refuses the rest."""
+
+    def calls(answered: int, refused: int) -> list[CallRecord]:
+        answers = [record(at_s=10 * i / max(answered, 1) * 0.9, took_s=0.2 + 0.001 * i) for i in range(answered)]
+        refusals = [record(Fate.REFUSED, at_s=10 * i / max(refused, 1), took_s=0.003) for i in range(refused)]
+        if refusals:
+            refusals[-1] = replace(refusals[-1], ended_s=refusals[-1].at_s + slowest_refusal_s)
+        return answers + refusals
+
+    told = Scrape(0, {}, {}, {0.01: 100, math.inf: 100})
+    options = PipelineOptions(shares=(0.7, 1.0, 3.0))
+    steps = [
+        step("70 %", 5.6, calls(56, 0), told),
+        step("100 %", 8.0, calls(78, 2), told),
+        step("300 %", 24.0, calls(79, 161), told),
+    ]
+    ramp = [step("2 at a time", None, calls(80, 0), told)]
+    unloaded = step("unloaded", None, calls(80, 0), told)
+    return PipelineResult("a planted place", options, unloaded, ramp, 8.0, steps)
+
+
+def test_bars_are_met_by_a_good_server_and_a_slow_refusal_misses_its_own() -> None:
+    def by_figure(result: PipelineResult) -> dict[str, bool | None]:
+        return {check.figure: check.met for check in pipeline_checks(result)}
+
+    good, slow = by_figure(planted_result()), by_figure(planted_result(slowest_refusal_s=0.051))
+    ours = {figure: met for figure, met in good.items() if "CPU" not in figure}  # the machine's cores decide that
+    assert set(ours.values()) == {True}
+    different = [figure for figure in good if good[figure] is not slow[figure]]
+    assert different == ["slowest of 161 refusals at 3 times saturation"]
+
+
+def test_the_picture_is_a_png_of_the_stated_size_and_not_blank() -> None:
+    picture = cv2.imdecode(np.frombuffer(draw_load(planted_result()), np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    assert picture.shape == (SIZE_PX[1], SIZE_PX[0], 3)
+    assert len(np.unique(picture.astype(np.uint32) @ np.array([1, 256, 65536], np.uint32))) > 50
+
+
+def test_a_step_without_a_single_answer_can_be_drawn_and_reported() -> None:
+    result = planted_result()
+    refused = [record(Fate.REFUSED, at_s=0.1 * i, took_s=0.003) for i in range(50)]
+    result = replace(result, steps=[*result.steps[:2], step("300 %", 24.0, refused)])
+    assert draw_load(result)[:4] == b"\x89PNG"
+    assert any("300 %" in line for line in step_lines(result.all_steps))
+    goodput = next(check for check in pipeline_checks(result) if check.figure.startswith("goodput"))
+    assert goodput.met is False
+
+
+def test_the_file_of_figures_keeps_the_parts_that_were_measured_before(tmp_path: Path) -> None:
+    result = planted_result()
+    file = tmp_path / "load.json"
+    update_json(file, "pipeline", pipeline_json(result), pipeline_checks(result))
+    update_json(file, "soak", {"figure": 1}, [])
+    content = json.loads(file.read_text())
+    assert sorted(content) == ["pipeline", "soak"]
+    assert content["pipeline"]["steps"][2]["share_of_saturation"] == 3.0
+    assert content["pipeline"]["steps"][2]["refusals"]["count"] == 161
+    verdicts = [line for line in check_lines(pipeline_checks(result)) if "| yes |" in line or "**no**" in line]
+    assert len(verdicts) == len(content["pipeline"]["checks"])
+
+
+def test_a_step_watches_the_process_and_takes_the_servers_account_of_that_time_only(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pages = iter([Scrape(10, {"OK": 10}, {}, {}), Scrape(13, {"OK": 13}, {}, {})])
+    monkeypatch.setattr("mapless_tools.load.step.read_metrics", lambda _: next(pages))
+
+    async def send() -> list[CallRecord]:
+        await asyncio.sleep(0.05)
+        return [record(at_s=0.01 * i, took_s=0.01) for i in range(3)]
+
+    under_load = ServerUnderLoad(os.getpid(), "nowhere")
+    measured = asyncio.run(run_step("toy", under_load, send, 1.0, sample_every_s=0.01))
+    assert measured.told is not None
+    assert (measured.told.started, measured.told.handled) == (3, {"OK": 3})
+    assert measured.answers == 3
+    assert len(measured.samples) >= 2
+    assert [s.at_s for s in measured.samples] == sorted(s.at_s for s in measured.samples)
+
+
+def test_the_machine_is_blamed_for_a_missed_bar_where_more_wanted_to_run_than_it_has_cores_and_only_there() -> None:
+    met, missed = (Check("overdue", "", "0", it) for it in (True, False))
+    assert "6.3 threads wanted to run on 2 cores" in machine_lines([met, missed], 6.3, 2)[0]
+    assert machine_lines([met, missed], 1.9, 2) == []
+    assert machine_lines([met], 6.3, 2) == []

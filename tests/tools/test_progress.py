@@ -1,0 +1,18 @@
+"""Progress where nobody watches: a line when a step begins, and some more on its way."""
+
+import pytest
+
+from mapless_tools.progress import LINES, progress_bars
+
+
+def test_lines_are_few_however_long_a_step_is(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_bars() as progress:
+        for done in range(1001):
+            progress("storing", done, 1000)
+        progress("checking", 0, 3)
+    out, err = capsys.readouterr()
+    lines = err.splitlines()
+    assert out == ""
+    assert lines[0] == "storing: 1000"
+    assert lines[LINES] == "storing: 1000 of 1000"
+    assert lines[LINES + 1 :] == ["checking: 3"]

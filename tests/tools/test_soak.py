@@ -1,0 +1,181 @@
+"""A soak's verdict: planted leaks are found, and neither noise, waves nor a curve that has settled is taken for one."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from mapless.geometry import Array
+from mapless_tools.load.arrivals import Kind, Mix, Requests, plan_calls
+from mapless_tools.load.records import CallRecord, Fate
+from mapless_tools.load.scrape import Series
+from mapless_tools.load.slopes import MIN_SAMPLES, Slope, slope
+from mapless_tools.load.soak import MIN_SETTLED_S, UNITS, SoakOptions, least_minutes, slopes_of
+from mapless_tools.load.soak_chart import draw_soak
+from mapless_tools.load.state import ServerState, Watched, read_state
+
+EVERY_S = 10.0
+TIMES_S = np.arange(0.0, 2400.0, EVERY_S)
+"""Forty minutes, as of an hour are left after its first third."""
+
+
+def waves(alike: float, spread: float, seed: int) -> Array:
+    """Noise in which each sample is like the one before: an autoregressive process of order one."""
+    random = np.random.default_rng(seed)
+    noise: Array = random.normal(0.0, spread, len(TIMES_S))
+    for i in range(1, len(noise)):
+        noise[i] = alike * noise[i - 1] + np.sqrt(1 - alike**2) * noise[i]
+    return noise
+
+
+def found(values: np.ndarray) -> Slope:
+    return slope(TIMES_S.tolist(), (500 + values).tolist())
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.9])
+def test_a_leak_of_a_mebibyte_a_minute_is_found(alike: float) -> None:
+    leak = found(TIMES_S / 60 + waves(alike, 3.0, 1))
+    assert leak.low < 60 < leak.high
+    assert leak.grows
+    assert leak.verdict == "grows"
+
+
+def test_a_descriptor_that_is_left_open_every_ten_minutes_is_found() -> None:
+    steps = found(np.floor(TIMES_S / 600))
+    assert steps.grows
+    assert steps.low < 6 < steps.high + 2
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.9])
+def test_of_noise_without_a_slope_nearly_all_is_flat(alike: float) -> None:
+    flat = sum(found(waves(alike, 3.0, seed)).is_flat for seed in range(12))
+    assert flat >= 11
+
+
+def test_a_warm_up_is_no_leak_whether_it_was_left_out_or_not() -> None:
+    def warmed(since_s: float) -> np.ndarray:
+        return 200 * (1 - np.exp(-(TIMES_S + since_s) / 180)) + waves(0.5, 1.0, 2)
+
+    assert found(warmed(1200)).is_flat
+    assert not found(warmed(0)).grows
+
+
+def test_a_third_of_wild_samples_moves_it_little() -> None:
+    wild = TIMES_S / 60 + waves(0.0, 1.0, 3)
+    wild[::4] += np.random.default_rng(4).choice([-500.0, 500.0], len(wild[::4]))
+    assert found(wild).per_hour == pytest.approx(60, abs=6)
+
+
+def test_what_never_changes_is_flat_without_any_doubt() -> None:
+    constant = found(np.zeros(len(TIMES_S)))
+    assert (constant.level, constant.per_hour, constant.low, constant.high) == (500, 0, 0, 0)
+
+
+def test_a_day_of_samples_is_thinned_and_its_slope_kept() -> None:
+    times = np.arange(0.0, 86_400.0, EVERY_S)
+    values = 100 + times / 3600 + np.random.default_rng(5).normal(0, 2, len(times))
+    day = slope(times.tolist(), values.tolist())
+    assert day.low < 1 < day.high
+    assert day.grows
+
+
+@pytest.mark.parametrize("times", [[0.0] * 20, list(range(MIN_SAMPLES - 1)), list(range(20, 0, -1))])
+def test_too_few_samples_or_none_in_order_are_refused(times: list[float]) -> None:
+    with pytest.raises(ValueError, match="slope needs"):
+        slope(times, [1.0] * len(times))
+
+
+# What is watched
+
+
+def state(at_s: float, **held: float) -> ServerState:
+    return replace(ServerState(at_s, 500.0, 400.0, 5e5, 20.0, 30.0, 15.0, 40.0, 0.0, 1.0, at_s), **held)
+
+
+def test_slopes_leave_out_the_settling_and_say_nothing_of_too_short_a_time() -> None:
+    climbing = [state(at, resident_mib=min(500.0, at)) for at in np.arange(0.0, 3600.0, EVERY_S).tolist()]
+    slopes = slopes_of(climbing, 1200)
+    assert set(slopes) == set(UNITS)
+    assert slopes["resident_mib"].is_flat
+    assert slopes_of(climbing, 3600 - MIN_SETTLED_S) == {}
+
+
+@pytest.mark.parametrize("options", [SoakOptions(), SoakOptions(settle_share=0.0), SoakOptions(sample_every_s=60.0)])
+def test_the_least_minutes_give_slopes_and_three_fewer_give_none(options: SoakOptions) -> None:
+    def looked_at(minutes: float) -> dict[str, Slope]:
+        # The first look comes at once, the last before the end.
+        times = np.arange(0.0, 60 * minutes, options.sample_every_s).tolist()
+        return slopes_of([state(at) for at in times], options.settle_share * 60 * minutes)
+
+    least = least_minutes(options)
+    assert set(looked_at(least)) == set(UNITS)
+    assert looked_at(least - 3) == {}
+
+
+def test_a_process_is_looked_at_with_its_files_sockets_and_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pages = [
+        Series({"mapless_event_loop_lag_seconds_sum": s, "mapless_event_loop_lag_seconds_count": n})
+        for s, n in ((1.0, 100.0), (1.5, 200.0))
+    ]
+    monkeypatch.setattr("mapless_tools.load.state.read_series", lambda _: pages.pop(0))
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "file").write_bytes(bytes(2**20))
+    watched = Watched(os.getpid(), "nowhere", tmp_path)
+    first, series = read_state(watched, 0.0, None)
+    second, _ = read_state(watched, 1.0, series)
+    assert first.data_mib == pytest.approx(1.0, abs=0.1)
+    assert 0 < first.unique_mib <= first.resident_mib
+    assert first.threads >= 1
+    assert first.sockets <= first.descriptors
+    assert second.loop_lag_ms == pytest.approx(5.0)
+
+
+def test_the_picture_is_an_svg_with_a_panel_for_each_figure() -> None:
+    seen = [state(at, waiting_jobs=at % 3) for at in np.arange(0.0, 900.0, EVERY_S).tolist()]
+    drawn = ElementTree.fromstring(draw_soak(seen, slopes_of(seen, 300)))
+    panels = [it for it in drawn.iter() if it.get("role") == "img"]
+    assert len(panels) == len(UNITS)
+    assert "flat" in "".join(drawn.itertext())
+
+
+# What is called
+
+
+def test_calls_in_a_hurry_have_a_deadline_of_their_own_and_are_no_failures() -> None:
+    mix = Mix(cancelled_share=0.1, bad_share=0.1, hurried_share=0.3, hurry_s=0.4)
+    plan = plan_calls(50.0, 20.0, 2, Requests((b"good",), (b"bad",)), mix, seed=0)
+    hurried = [call for call in plan if call.kind is Kind.HURRIED]
+    assert len(hurried) / len(plan) == pytest.approx(0.3, abs=0.05)
+    assert all(call.deadline_s is not None and 0 < call.deadline_s <= 0.4 for call in hurried)
+    assert all(call.deadline_s is None for call in plan if call.kind is not Kind.HURRIED)
+    told = CallRecord(Kind.HURRIED, 0, 0.0, 0.0, 0.1, 0.1, "DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED")
+    assert told.fate is Fate.TOO_HURRIED
+    assert replace(told, kind=Kind.QUERY).fate is Fate.OVERDUE
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: SoakOptions(rate_per_s=0.0),
+        lambda: SoakOptions(churn=-1.0),
+        lambda: SoakOptions(settle_share=1.0),
+        lambda: Mix(hurried_share=0.6, bad_share=0.5),
+        lambda: Mix(hurry_s=0.0),
+    ],
+)
+def test_senseless_options_are_refused(make: Callable[[], object]) -> None:
+    with pytest.raises(ValueError, match="must be"):
+        make()
+
+
+def test_the_options_can_be_written_down() -> None:
+    assert json.loads(json.dumps(vars(SoakOptions())))["churn"] == 1.0

@@ -1,0 +1,341 @@
+"""What the viewer draws lies where it belongs, what it says is text, and it serves its own pages alone."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import datetime, timezone
+from typing import Any
+from urllib.request import Request, urlopen
+
+import cv2
+import numpy as np
+import pytest
+from images import encode
+from typer.testing import CliRunner
+
+from mapless import Datum, Quaternion, Reference, Scene
+from mapless.answers import Accuracy, Debug, Diagnostics, Hint, Hypothesis, LocalizationResult, ReferenceUse, Rejected
+from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
+from mapless_tools.cli.app import app
+from mapless_tools.view.meshes import ellipsoid, enlargement, rays
+from mapless_tools.view.pictures import INLIER, OVERLAY_PX, colours_at, overlay, read_picture
+from mapless_tools.view.queries import Query
+from mapless_tools.view.scenery import lay_out, spread_out
+
+CAMERA = Camera(1800, 1350, 1500.0, 1500.0, 899.5, 674.5)
+NOW = datetime(2026, 11, 21, tzinfo=timezone.utc)
+SCENE = Scene("hall", 1, 3, NOW)
+HOSTILE = "`</script><img src=x onerror=alert(1)> {process.exit()} **bold**\n# head"
+
+
+def reference(number: int, pose: RigidTransform) -> Reference:
+    return Reference("hall", f"r{number}", CAMERA, pose, "", 0, NOW)
+
+
+def upright(x_m: float, y_m: float = 0.0, turn: float = 0.0) -> RigidTransform:
+    """A level camera in a world whose z points up, far from its origin: it looks north, turned about the vertical."""
+    level = RigidTransform.from_matrix([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]).rotation
+    return RigidTransform(rotation_from_vector([0, 0, turn]) @ level, np.array([4e5 + x_m, 5e6 + y_m, 30.0]))
+
+
+def query(pose: RigidTransform | None, debug: Debug | None = None, image: bytes = b"", text: str = "why") -> Query:
+    uses = (ReferenceUse(f"scenes/hall/references/{text}", 9, 7),)
+    used = Diagnostics(text, "geometric", "", "sift", "BEST", 1, uses, None, {}, 0.0, 0.2, 96, 64, "0.1.0")
+    if pose is None:
+        hint = Hint("pnp", "LOOK_AT_REFERENCE", text, "")
+        return Query(4, image, CAMERA, Rejected("LOW_OVERLAP", text, used, hint=hint, debug=debug))
+    accuracy = Accuracy(0.01, 0.02, 0.1, 0.2, False)
+    found = LocalizationResult(pose, np.eye(6), accuracy, "REFINED", 7, 9, 0.5, used, trust=0.3, debug=debug)
+    return Query(4, image, CAMERA, found)
+
+
+class TestShapes:
+    def test_the_ellipsoid_holds_95_percent(self) -> None:
+        random = np.random.default_rng(4)
+        root = random.normal(size=(6, 6))
+        covariance = root @ root.T
+        vertices, faces = ellipsoid(covariance)
+        inside = np.linalg.inv(covariance[:3, :3])
+        reach = np.einsum("ni,ij,nj->n", vertices, inside, vertices)
+        np.testing.assert_allclose(reach, reach[0])
+        errors = random.multivariate_normal(np.zeros(3), covariance[:3, :3], 100_000)
+        share = (np.einsum("ni,ij,nj->n", errors, inside, errors) <= reach[0]).mean()
+        assert share == pytest.approx(0.95, abs=0.004)
+        assert faces.max() == len(vertices) - 1
+
+    @pytest.mark.parametrize(
+        "axes", [np.diag([1.0, 4.0, 9.0]), np.array([[2.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0, 0, 1]])]
+    )
+    def test_its_faces_look_outwards(self, axes: Array) -> None:
+        vertices, faces = ellipsoid(axes)
+        a, b, c = (vertices[faces[:, i]] for i in range(3))
+        normals, middle = np.cross(b - a, c - a), (a + b + c) / 3
+        outwards = np.einsum("ni,ni->n", normals, middle)
+        assert (outwards > -1e-9).all()
+        assert (outwards > 1e-6).mean() > 0.8  # at the poles they have no area
+
+    def test_a_small_one_is_enlarged_and_one_without_size_is_not(self) -> None:
+        assert enlargement(np.eye(6) * 1e-6, 0.3) == 100
+        assert enlargement(np.eye(6), 0.3) == 1
+        assert enlargement(np.zeros((6, 6)), 0.3) == 1
+
+    def test_rays_lead_to_the_points_and_no_further(self) -> None:
+        centre, points = np.array([1.0, 2.0, 3.0]), np.random.default_rng(0).normal(0, 5, (50, 3))
+        np.testing.assert_allclose(rays(centre, points, 100, 1e3)[:, 1], points)
+        few = rays(centre, points, 10, 2.0)
+        assert few.shape == (10, 2, 3)
+        np.testing.assert_allclose(few[:, 0], np.broadcast_to(centre, (10, 3)))
+        assert np.linalg.norm(few[:, 1] - few[:, 0], axis=1).max() <= 2 + 1e-9
+        assert rays(centre, points[:0], 10, 2.0).shape == (0, 2, 3)
+
+
+class TestScenery:
+    def test_a_world_far_from_its_origin_is_drawn_near_zero(self) -> None:
+        scenery = lay_out(SCENE, [reference(i, upright(i)) for i in range(5)], 10)
+        drawn = [scenery.placed(it.world_from_camera) for it in scenery.references]
+        assert max(float(np.abs(it.translation).max()) for it in drawn) <= 4
+        np.testing.assert_array_equal(drawn[0].rotation, upright(0).rotation)
+        assert 0.2 < scenery.size_m < 0.5
+        assert 3 < scenery.extent_m < 5
+
+    @pytest.mark.parametrize(
+        ("scene", "down"),
+        [
+            (SCENE, (0, 0, -1)),
+            (replace(SCENE, down_in_world=(0.0, 1.0, 0.0)), (0, 1, 0)),
+            # The world's y axis points up, since it is turned to the Earth's.
+            (
+                replace(SCENE, datum=Datum(48.0, 8.0, 100.0, Quaternion(np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)))),
+                (0, -1, 0),
+            ),
+        ],
+        ids=["guessed", "told", "datum"],
+    )
+    def test_which_way_is_down(self, scene: Scene, down: tuple[float, float, float]) -> None:
+        scenery = lay_out(scene, [reference(i, upright(i, turn=i)) for i in range(6)], 10)
+        np.testing.assert_allclose(scenery.down, down, atol=1e-6)
+
+    def test_few_of_thousands_are_spread_over_the_scene(self) -> None:
+        random = np.random.default_rng(3)
+        crowd = random.normal(0, 0.1, (3000, 2))
+        corners = np.array([(50.0, 0.0), (0.0, 40.0), (-30.0, -30.0)])
+        spots = np.concatenate([crowd, corners])
+        chosen = spread_out(spots, 4)
+        assert set(chosen[1:].tolist()) == {3000, 3001, 3002}
+        everything = spread_out(spots[-20:], 100)
+        assert sorted(everything.tolist()) == list(range(20))
+        assert len(set(spread_out(np.zeros((9, 6)), 5).tolist())) == 5
+
+    def test_cameras_at_one_place_count_by_where_they_look(self) -> None:
+        around = [reference(i, upright(0, turn=2 * np.pi * i / 12)) for i in range(12)]
+        scenery = lay_out(SCENE, [*around, *(reference(20 + i, upright(0)) for i in range(50))], 12)
+        looks = np.stack([scenery.references[i].world_from_camera.rotation[:, 2] for i in scenery.pictured])
+        apart = np.linalg.norm(looks[:, None] - looks[None], axis=2) + 9 * np.eye(12)
+        assert apart.min() > 0.5
+        assert scenery.size_m == 0.3
+
+    def test_neighbours_see_about_the_same(self) -> None:
+        scenery = lay_out(SCENE, [reference(i, upright(i, turn=0 if i < 6 else np.pi)) for i in range(12)], 12)
+        assert [it.reference_id for it in scenery.neighbours(2, 2)] in (["r1", "r3"], ["r3", "r1"])
+        assert "r2" not in {it.reference_id for it in scenery.neighbours(2, 50)}
+
+    def test_a_scene_without_references_is_refused(self) -> None:
+        with pytest.raises(ValueError, match="no references"):
+            lay_out(SCENE, [], 10)
+
+
+class TestPictures:
+    def matched(self) -> tuple[bytes, Debug]:
+        """A grey photograph and points planted in it, of which every fifth is matched wrongly."""
+        random = np.random.default_rng(6)
+        x = upright(0).apply(random.uniform((-2, -1.5, 4), (2, 1.5, 6), (40, 3)))
+        pixels = CAMERA.project(upright(0).inverse().apply(x))
+        is_inlier = np.arange(40) % 5 != 0
+        image = encode(".png", np.full((1350, 1800, 3), 90, np.uint8))
+        return image, Debug(pixels, x, is_inlier, np.zeros(40), np.zeros(40, int), pixels)
+
+    def test_dots_lie_where_points_are_seen(self) -> None:
+        image, debug = self.matched()
+        drawn = overlay(query(upright(0), debug, image))
+        assert drawn.shape == (round(OVERLAY_PX * 0.75), OVERLAY_PX, 3)
+        scale = OVERLAY_PX / 1800
+        for (x, y), is_inlier in zip(debug.query_px, debug.is_inlier, strict=True):
+            column, row = round(scale * (x + 0.5) - 0.5), round(scale * (y + 0.5) - 0.5)
+            if is_inlier and 2 < row < drawn.shape[0] - 3 and 2 < column < OVERLAY_PX - 3:
+                assert np.abs(drawn[row, column].astype(int) - INLIER).max() < 40
+
+    def test_a_photograph_without_matches_or_pose_is_shown_as_it_is(self) -> None:
+        image, debug = self.matched()
+        assert (overlay(query(None, None, image)) == 90).all()
+        assert not (overlay(query(None, debug, image)) == 90).all()
+
+    def test_a_small_one_is_enlarged(self) -> None:
+        small = encode(".png", np.full((48, 64, 3), 90, np.uint8))
+        assert OVERLAY_PX / 2 < overlay(query(None, None, small)).shape[1] <= OVERLAY_PX
+
+    def test_colours_are_those_of_the_pixels(self) -> None:
+        random = np.random.default_rng(1)
+        coarse = random.integers(0, 256, (27, 36, 3)).astype(np.uint8)
+        whole = cv2.resize(coarse, (1800, 1350), interpolation=cv2.INTER_NEAREST)
+        reduced = read_picture(encode(".png", np.asarray(whole, np.uint8)), 360)
+        pixels = random.uniform((0, 0), (1799, 1349), (200, 2))
+        cells = (pixels + 0.5) / 50
+        inner = (np.abs(cells % 1 - 0.5) < 0.3).all(axis=1)
+        expected = coarse[cells[:, 1].astype(int), cells[:, 0].astype(int)]
+        np.testing.assert_allclose(colours_at(reduced, CAMERA, pixels)[inner].astype(int), expected[inner], atol=2)
+
+
+class TestWords:
+    def test_a_query_is_told_in_a_line_and_in_full(self) -> None:
+        found, lost = query(upright(0)), query(None)
+        assert found.label == "#4 localized to 2.0 cm"
+        assert "**95 % within** 2.0 cm and 0.20°" in found.details()
+        assert "7 of 9" in found.details()
+        assert lost.label == "#4 not localized: low overlap"
+        assert "**Not localized**: `why`" in lost.details()
+
+    @pytest.mark.parametrize("pose", [upright(0), None])
+    def test_what_came_from_elsewhere_stands_in_code(self, pose: RigidTransform | None) -> None:
+        details = query(pose, text=HOSTILE).details()
+        outside = "".join(details.split("`")[0::2])
+        assert "<" not in outside
+        assert "{" not in outside
+        assert "bold" not in outside
+        assert "\n#" not in details
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """Where viser serves."""
+    pytest.importorskip("viser", reason="needs the extra view")
+    from mapless_tools.view.guarded import GuardedViser
+
+    server = GuardedViser("127.0.0.1", 0, "test")
+    assert server.request_share_url() is None
+    yield f"127.0.0.1:{server.get_port()}"
+    server.stop()
+
+
+class TestGuard:
+    def status(self, address: str, **headers: str) -> int:
+        try:
+            with urlopen(Request(f"http://{address}/", headers=headers), timeout=10) as answer:
+                return int(answer.status)
+        except OSError as error:
+            return int(getattr(error, "code", 0))
+
+    def test_its_own_page_is_served(self, address: str) -> None:
+        assert self.status(address) == 200
+        assert self.status(address, Host=address.replace("127.0.0.1", "localhost")) == 200
+
+    def test_by_another_name_it_is_not_there(self, address: str) -> None:
+        assert self.status(address, Host="rebound.example") == 403
+        assert self.status(address, Host=f"rebound.example:{address.rpartition(':')[2]}") == 403
+
+    @pytest.mark.parametrize("origin", ["http://elsewhere.example", "https://127.0.0.1", "null", "http://localhost:1"])
+    def test_another_page_cannot_connect(self, address: str, origin: str) -> None:
+        websockets = pytest.importorskip("websockets.sync.client")
+        from websockets.exceptions import InvalidStatus
+
+        with pytest.raises(InvalidStatus) as refused:
+            websockets.connect(f"ws://{address}", origin=origin)
+        assert refused.value.response.status_code == 403
+
+    def test_its_own_page_can(self, address: str) -> None:
+        websockets = pytest.importorskip("websockets.sync.client")
+        import viser
+
+        own = f"http://{address}"
+        with websockets.connect(f"ws://{address}", origin=own, subprotocols=[f"viser-v{viser.__version__}"]) as socket:
+            assert socket.recv(timeout=10)
+
+
+class TestCommand:
+    def run(self, *arguments: str) -> Any:
+        return CliRunner().invoke(app, ["view", "hall", "--no-open", *arguments])
+
+    @pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "::"])
+    def test_it_stays_on_this_machine(self, host: str) -> None:
+        result = self.run("--host", host)
+        assert result.exit_code == 2
+        assert "not a loopback address" in result.stderr
+        assert "ssh -L" in result.stderr
+
+    def test_without_viser_it_says_what_to_install(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        for name in [it for it in sys.modules if it == "viser" or it.startswith(("viser.", "mapless_tools.view."))]:
+            monkeypatch.delitem(sys.modules, name)
+        monkeypatch.setitem(sys.modules, "viser", None)
+        result = self.run()
+        assert result.exit_code == 2
+        assert "pip install 'mapless[view]'" in result.stderr
+
+    def test_senseless_numbers_are_refused(self) -> None:
+        pytest.importorskip("viser", reason="needs the extra view")
+        result = self.run("--max-pictured", "0")
+        assert result.exit_code == 2
+        assert "max_pictured" in result.stderr
+
+    def test_a_server_that_is_not_there(self) -> None:
+        pytest.importorskip("viser", reason="needs the extra view")
+        before = threading.active_count()
+        result = self.run("--address", "127.0.0.1:1", "--port", "0")
+        assert result.exit_code == 1
+        assert "UNAVAILABLE" in result.stderr
+        assert threading.active_count() <= before + 1
+
+
+def test_the_extra_is_named_where_it_is_missing() -> None:
+    from mapless_server.extras import install_hint
+
+    assert "mapless[view]" in install_hint(ModuleNotFoundError("no", name="viser"))
+
+
+def test_a_port_that_is_taken_is_not_exchanged_for_another() -> None:
+    pytest.importorskip("viser", reason="needs the extra view")
+    from mapless_tools.view.guarded import GuardedViser
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(RuntimeError, match=f"port {port} of 127.0.0.1 is taken"):
+            GuardedViser("127.0.0.1", port, "test")
+
+
+def test_queries_of_every_outcome_come_and_go() -> None:
+    pytest.importorskip("viser", reason="needs the extra view")
+    from mapless_tools.view.guarded import GuardedViser
+    from mapless_tools.view.stage import MAX_QUERIES, Stage
+
+    image, debug = TestPictures().matched()
+    hypotheses = (Hypothesis(upright(0), 9, ()), Hypothesis(upright(3), 8, ()))
+    lost = query(None, debug, image)
+    assert isinstance(lost.answer, Rejected)
+    ambiguous = replace(lost, answer=replace(lost.answer, reason="AMBIGUOUS", hypotheses=hypotheses))
+    outcomes = [query(upright(0), debug, image), query(upright(1), None, image), lost, ambiguous]
+    server = GuardedViser("127.0.0.1", 0, "test")
+    try:
+        scenery = lay_out(SCENE, [reference(i, upright(i)) for i in range(9)], 6)
+        stage = Stage(server, scenery, "hall", lambda reference_id: image)
+        stage.show_picture("r4", read_picture(image, 160))
+        for number in range(MAX_QUERIES + 5):
+            stage.show_query(replace(outcomes[number % 4], number=number + 1))
+        stage.show_points(debug.x_in_world, np.zeros((40, 3), np.uint8))
+        stage.show_points(debug.x_in_world, np.zeros((40, 3), np.uint8))
+        stage.say("live", True)
+        assert "None yet" in stage._nothing.content
+        stage.say("not shown", False)
+        assert "yet" not in stage._nothing.content
+        names = {name for name in server.scene._handle_from_node_name if name.startswith("/queries/")}
+    finally:
+        server.stop()
+    kept = range(6, MAX_QUERIES + 6)
+    cameras = {1: 1, 2: 1, 3: 0, 0: 2}
+    assert {it for it in names if "/camera-" in it} == {
+        f"/queries/{number}/camera-{i}" for number in kept for i in range(cameras[number % 4])
+    }
+    assert {it for it in names if it.endswith("/right")} == {
+        f"/queries/{number}/right" for number in kept if number % 4 == 1
+    }
