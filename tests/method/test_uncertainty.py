@@ -21,7 +21,7 @@ from mapless_server.method.priors.known import rotation_vector
 from mapless_server.method.structure import Structure
 from mapless_server.method.support import Support
 from mapless_server.method.uncertainty.covariance import UncertaintyOptions, scale_covariance
-from mapless_server.method.uncertainty.pose_covariance import pose_covariance
+from mapless_server.method.pose_covariance import pose_covariance
 
 POSITION, ROTATION = slice(0, 3), slice(3, 6)
 PLAIN = UncertaintyOptions(shrinkage=0.0, shared_matches=1e9, position_factor=1.0, rotation_factor=1.0)

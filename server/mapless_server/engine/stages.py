@@ -23,7 +23,7 @@ from mapless_server.method.localize import Answer, Coarse, Localization, Prepare
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.retrieve import spread_choice
 from mapless_server.method.support import Support
-from mapless_server.method.trust.hints import hinted
+from mapless_server.method.hints import hinted
 from mapless_server.method.turns import Turn
 from mapless_server.method.views import PosedView, View
 from mapless_server.scenes.library import Loaded, NotDescribedYet, load_usable

@@ -40,7 +40,7 @@ from .structure import Structure, build_structure
 from .support import Support
 from .trust.gate import doubts
 from .trust.judge import judge
-from .uncertainty.pose_covariance import pose_covariance
+from .pose_covariance import pose_covariance
 from .views import PosedView, View
 
 __all__ = [

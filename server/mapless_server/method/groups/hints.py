@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from ..answer import Answer
 from ..rejection import Advice, Hint, Rejection, RejectionReason
-from ..trust.hints import HintOptions
+from ..hints import HintOptions
 from ..views import PosedView
 
 STAGE = "join"

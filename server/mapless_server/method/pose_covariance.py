@@ -10,14 +10,14 @@ import numpy as np
 
 from mapless.geometry import Array
 
-from ..pnp import PoseEstimate, PoseStage
-from ..priors.known import NO_PRIORS, Priors
-from ..scale import MetricScale
-from ..structure import observe
-from ..support import Support
-from ..views import PosedView
-from .covariance import Uncertainty, UncertaintyOptions, one_match_covariance, scale_covariance, uncertainty_of
-from .linearization import grounds_of, linearize, tracks_with_query
+from .pnp import PoseEstimate, PoseStage
+from .priors.known import NO_PRIORS, Priors
+from .scale import MetricScale
+from .structure import observe
+from .support import Support
+from .views import PosedView
+from .uncertainty.covariance import Uncertainty, UncertaintyOptions, one_match_covariance, scale_covariance, uncertainty_of
+from .uncertainty.linearization import grounds_of, linearize, tracks_with_query
 
 
 def pose_covariance(

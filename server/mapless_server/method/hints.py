@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..answer import Answer
-from ..rejection import Advice, Hint, Rejection, RejectionReason
-from ..views import PosedView, View
+from .answer import Answer
+from .rejection import Advice, Hint, Rejection, RejectionReason
+from .views import PosedView, View
 
 _STAGES = {
     RejectionReason.NO_USABLE_REFERENCES: "coarse",
