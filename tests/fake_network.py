@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scenes import SyntheticScene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, resized_pixel, rotation_from_vector
-from mapless_server.method.coarse import Bucket, Outcome, ReconstructedView, Reconstruction, Request
+from mapless_server.method.coarse import Bucket, Outcome, Request
+from mapless_server.method.reconstruction import ReconstructedView, Reconstruction
 from mapless_server.method.views import PosedView, View
 
 

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from scenes import SyntheticScene
 
 from mapless.geometry import RigidTransform, Similarity, rotation_from_vector
-from mapless_server.method.correspond import Correspondences, Matches
+from mapless_server.method.correspond import Correspondences
 from mapless_server.method.match import PointMatches
 from mapless_server.method.observations import ONE_PIXEL, KeypointNoise, adjust_points, estimate_noise, triangulate
 from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
 from mapless_server.method.scale import MetricScale, ScaleStage
 from mapless_server.method.structure import Structure, observe
 from mapless_server.method.tracks import Tracks
-from mapless_server.method.views import PosedView
+from mapless_server.method.views import Matches, PosedView
 
 
 def true_correspondences(scene: SyntheticScene) -> Correspondences:

@@ -25,7 +25,8 @@ from mapless_server.method.localize import Variant
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.priors.known import PriorKind
 from mapless_server.method.rejection import Advice, RejectionReason
-from mapless_server.method.scale import ScaleStage, ScaleStrategy
+from mapless_server.method.scale import ScaleStage
+from mapless_server.method.scale_equations import ScaleStrategy
 from mapless_server.services.localization import LocalizationService
 from mapless_server.services.references import ReferenceService
 

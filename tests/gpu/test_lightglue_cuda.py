@@ -15,7 +15,7 @@ import torch
 from scenes import random_for
 from small_networks import small_network
 
-from mapless_server.method.lightglue import LightGlue
+from mapless_server.networks.lightglue import LightGlue
 from mapless_server.networks.runner import NetworkRunner
 
 pytestmark = [

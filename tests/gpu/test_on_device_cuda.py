@@ -14,7 +14,7 @@ from device import CASES, VARIANTS, Case, assert_same
 from mapless_server.method.on_device import Refined, prepare
 from mapless_server.method.on_device.compute import Options, compute
 from mapless_server.method.on_device.transfer import upload
-from mapless_server.method.scale import ScaleOptions
+from mapless_server.method.scale_equations import ScaleOptions
 
 pytestmark = [
     pytest.mark.gpu,

@@ -17,14 +17,13 @@ from mapless_server.method.correspond import (
     OPTIONS,
     CorrespondOptions,
     Matcher,
-    Matches,
     epipolar_distance_px,
     epipolar_distances_px,
     make_matcher,
     mutual_matches,
 )
 from mapless_server.method.features import FEATURES
-from mapless_server.method.views import Features, PosedView, View
+from mapless_server.method.views import Features, Matches, PosedView, View
 
 
 def features(descriptors: Array, keypoints: Array | None = None) -> Features:

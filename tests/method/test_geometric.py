@@ -11,9 +11,10 @@ from planted import moved_references, true_correspondences
 from scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
-from mapless_server.method.coarse import ReconstructedView, Reconstruction, Request, reconstruct_one
+from mapless_server.method.coarse import Request, reconstruct_one
 from mapless_server.method.coarse.geometric import GeometricOptions, GeometricReconstructor
 from mapless_server.method.correspond import Correspondences, Matcher
+from mapless_server.method.reconstruction import ReconstructedView, Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import PosedView, View
 

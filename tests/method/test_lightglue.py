@@ -23,7 +23,12 @@ from safetensors.torch import save_file  # noqa: E402
 from torch import Tensor  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
-from mapless_server.method.lightglue import LightGlue, LightGlueMatching, LightGlueOptions, Padded, load_lightglue  # noqa: E402
+from mapless_server.method.lightglue import LightGlueMatching, LightGlueOptions, Padded  # noqa: E402
+from mapless_server.networks.lightglue import (  # noqa: E402
+    LightGlue,
+    load_lightglue,
+    load_superpoint_lightglue,
+)
 from mapless_server.networks.weights import CheckpointError  # noqa: E402
 
 DIMENSION = 32
@@ -256,7 +261,6 @@ def test_senseless_options_are_refused() -> None:
 def test_superpoints_is_transformers_own(tmp_path: Path) -> None:
     """Random weights in transformers' network and, translated, in ours: the same scores for the same keypoints."""
     transformers = pytest.importorskip("transformers", reason="the superpoint extra is not installed")
-    from mapless_server.method.superpoint_lightglue import load_superpoint_lightglue
 
     detector = transformers.SuperPointConfig(
         encoder_hidden_sizes=[4, 4, 4, 4], decoder_hidden_size=4, descriptor_decoder_dim=256

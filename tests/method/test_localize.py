@@ -16,10 +16,10 @@ from scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for,
 import mapless_server.method.localize as method
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method import pnp
-from mapless_server.method.coarse import Bucket, Outcome, Reconstruction, Reconstructor, Request
+from mapless_server.method.coarse import Bucket, Outcome, Reconstructor, Request
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.geometric import GeometricReconstructor
-from mapless_server.method.correspond import Correspondences, Matcher, Matches
+from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.localize import (
     MIN_FEATURES,
     Answer,
@@ -36,9 +36,11 @@ from mapless_server.method.localize import (
     refine,
 )
 from mapless_server.method.pnp import PoseStage
+from mapless_server.method.reconstruction import Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.scale import ScaleStage, ScaleStrategy
-from mapless_server.method.views import Features, PosedView, View
+from mapless_server.method.scale import ScaleStage
+from mapless_server.method.scale_equations import ScaleStrategy
+from mapless_server.method.views import Features, Matches, PosedView, View
 
 SCENE = make_scene(random_for("localize"), SceneOptions(point_count=400, reference_count=5))
 MATCHER = Matcher()

@@ -28,12 +28,13 @@ from small_networks import GRIDS, SMALL, photograph, references_of, small_networ
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.engine.failures import failure_of
-from mapless_server.method.coarse import Bucket, Outcome, Reconstruction, Request, reconstruct_one
+from mapless_server.method.coarse import Bucket, Outcome, Request, reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor, condition_poses
 from mapless_server.method.coarse.token_cache import TokenCacheOptions
+from mapless_server.method.reconstruction import Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import PosedView, View
 from mapless_server.networks import pi3

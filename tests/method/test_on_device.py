@@ -12,11 +12,12 @@ from fake_network import FakeNetwork
 from scenes import SceneOptions, random_for
 
 from mapless.geometry import RigidTransform
-from mapless_server.method.coarse import Reconstruction
 from mapless_server.method.correspond import Correspondences
 from mapless_server.method.match import one_to_one as one_to_one_on_host
+from mapless_server.method.reconstruction import Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.scale import ScaleOptions, ScaleStage, ScaleStrategy
+from mapless_server.method.scale import ScaleStage
+from mapless_server.method.scale_equations import ScaleOptions, ScaleStrategy
 from mapless_server.method.structure import StructureOptions, tracks_of
 
 pytest.importorskip("torch", reason="the networks' extra is not installed")

@@ -13,11 +13,18 @@ from hypothesis import strategies as st
 from scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import RigidTransform, Similarity, rotation_angle_deg, rotation_from_vector
-from mapless_server.method.coarse import ReconstructedView, Reconstruction
 from mapless_server.method.correspond import Correspondences
+from mapless_server.method.reconstruction import ReconstructedView, Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.scale import MetricScale, ScaleOptions, ScaleStage, ScaleStrategy, estimate_scale
-from mapless_server.method.scale_equations import pairs_of, trajectory_radius, trajectory_scale, triangulate_depths
+from mapless_server.method.scale import MetricScale, ScaleStage, estimate_scale
+from mapless_server.method.scale_equations import (
+    ScaleOptions,
+    ScaleStrategy,
+    pairs_of,
+    trajectory_radius,
+    trajectory_scale,
+    triangulate_depths,
+)
 
 EXACT = SceneOptions(noise_px=0.0)
 TRIANGULATION = ScaleOptions(strategy=ScaleStrategy.TRIANGULATION)

@@ -28,7 +28,6 @@ from mapless_server.method.observations import (
     soft_l1_weight,
     solve_symmetric,
     triangulate,
-    trustworthy,
 )
 from mapless_server.method.structure import (
     PAPER_STRUCTURE,
@@ -37,6 +36,7 @@ from mapless_server.method.structure import (
     build_structure,
     observe,
     predicted_points,
+    trustworthy,
 )
 from mapless_server.method.tracks import Tracks
 from mapless_server.method.views import Features, PosedView, View

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from planted import true_correspondences, true_tracks
 from scenes import SceneOptions, make_scene, random_for
 
-from mapless_server.method.correspond import Matches
 from mapless_server.method.tracks import Tracks, build_tracks
+from mapless_server.method.views import Matches
 
 Pairs = Mapping[tuple[int, int], Matches]
 Track = frozenset[tuple[int, int]]

@@ -17,11 +17,11 @@ from scenes import SceneOptions, SyntheticScene, make_scene, random_for
 from mapless.geometry import Array, RigidTransform, Similarity
 from mapless_server.method.adjust import AdjustOptions, adjust_pose
 from mapless_server.method.pnp import PnpOptions, PoseEstimate, PoseStage, solve_pose
+from mapless_server.method.pose_covariance import pose_covariance
 from mapless_server.method.priors.known import rotation_vector
 from mapless_server.method.structure import Structure
 from mapless_server.method.support import Support
 from mapless_server.method.uncertainty.covariance import UncertaintyOptions, scale_covariance
-from mapless_server.method.pose_covariance import pose_covariance
 
 POSITION, ROTATION = slice(0, 3), slice(3, 6)
 PLAIN = UncertaintyOptions(shrinkage=0.0, shared_matches=1e9, position_factor=1.0, rotation_factor=1.0)

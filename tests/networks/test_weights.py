@@ -566,8 +566,8 @@ def test_a_file_that_the_network_refuses_is_refused_at_once(
 def test_all_weights_are_compared_or_it_is_said_why_not(
     monkeypatch: pytest.MonkeyPatch, folder: Path, file: Path, name: str
 ) -> None:
-    for module in ("features.aliked", "features.xfeat", "features.superpoint", "lightglue", "superpoint_lightglue"):
-        monkeypatch.delitem(sys.modules, f"mapless_server.method.{module}", raising=False)
+    for module in ("checkpoint", "local_features", "lightglue"):
+        monkeypatch.delitem(sys.modules, f"mapless_server.networks.{module}", raising=False)
     for module in ("torch", "kornia.feature", "transformers"):
         monkeypatch.setitem(sys.modules, module, None)
     reason = add(named(name), file, folder, unofficial=True).not_compared

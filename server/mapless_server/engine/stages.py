@@ -16,16 +16,15 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.method import localize as method
-from mapless_server.method.correspond import Matches
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.groups.tracked import tracked_support
+from mapless_server.method.hints import hinted
 from mapless_server.method.localize import Answer, Coarse, Localization, Prepared
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.retrieve import spread_choice
 from mapless_server.method.support import Support
-from mapless_server.method.hints import hinted
 from mapless_server.method.turns import Turn
-from mapless_server.method.views import PosedView, View
+from mapless_server.method.views import Matches, PosedView, View
 from mapless_server.scenes.library import Loaded, NotDescribedYet, load_usable
 from mapless_server.scenes.retrieval.chosen import Choice
 from mapless_server.scenes.retrieval.narrowing import Narrowing

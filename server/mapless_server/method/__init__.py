@@ -1,15 +1,26 @@
 """The method: from photographs with features to a pose, or why there is none. It knows no service, store or queue.
 
-views, features/      photographs, and their local features
-retrieve              which references resemble a photograph
-correspond            matches among references, and of the query with them (lightglue: by a network)
-localize              the stages in order, on one screen:
-coarse/             query and references reconstructed together, up to scale
-scale               metric scale, initial pose             (equations: scale_equations)
-structure           metric points                          (tracks, observations)
-match               which keypoints of the query show them
-pnp                 the pose, and whether to believe it
-adjust              (ours) everything adjusted together
-on_device/            scale, structure and match where a network left its output (arrays: either library)
-accuracy              what a covariance claims
+Begin with `localize`, the stages in order. A module imports only modules above it in this list, which has no circle:
+
+arrays, stopwatch, turns     either NumPy or torch; time of the stages; a call that may end early
+views, reconstruction        photographs with features and poses; what the coarse stage gives
+rejection                    "no pose" is a result
+features/                    local features of a photograph
+lightglue, correspond        matches among references, and of the query with them (lightglue: by a network)
+retrieve, epipolar           which references resemble a photograph; whether matches fit poses
+keypoints, tracks            keypoints through all references; observations of the same point
+scale_equations, scale       metric scale, initial pose
+observations, structure      metric points
+match                        which keypoints of the query show them
+priors/                      what is known of the query's pose beforehand
+uncertainty/                 how far a pose may be off: parts of its covariance
+pnp, support                 the pose; what it rests on
+adjust                       (ours) everything adjusted together
+trust/                       whether a pose is believed
+pose_covariance              the covariance of an answer's pose
+answer, hints                what the method answers; what to do about a rejection
+coarse/                      query and references reconstructed together, up to scale
+on_device/                   scale, structure and match where a network left its output
+localize                     the stages in order
+groups/                      several photographs posed together
 """

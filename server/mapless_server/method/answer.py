@@ -13,7 +13,8 @@ from .match import PAPER_MATCH, MatchOptions
 from .pnp import PnpOptions, PoseStage
 from .priors.known import PriorCheck
 from .rejection import Rejection
-from .scale import MetricScale, ScaleStrategy
+from .scale import MetricScale
+from .scale_equations import ScaleStrategy
 from .structure import PAPER_STRUCTURE, StructureOptions
 from .support import Support
 from .trust.gate import GateOptions

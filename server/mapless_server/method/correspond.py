@@ -26,10 +26,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, cross_matrix
 
-from .views import Features, PosedView, View
-
-Matches = NDArray[np.int32]
-"""(M, 2): keypoint indices in the first and in the second view."""
+from .views import Features, Matches, PosedView, View
 
 
 @dataclass(frozen=True)
@@ -229,7 +226,9 @@ def make_matcher(features: str, threads: int = 1, weights: Path | None = None, d
         raise ValueError(f"unknown features {features!r}; known: {', '.join(OPTIONS)}")
     if weights is None:
         return Matcher(OPTIONS[features], threads)
-    from .lightglue import LightGlueMatching, load_lightglue
+    from mapless_server.networks.lightglue import load_lightglue
+
+    from .lightglue import LightGlueMatching
 
     return Matcher(OPTIONS[features], threads, LightGlueMatching(load_lightglue(features, weights), device))
 

@@ -17,8 +17,8 @@ import poselib
 
 from mapless.geometry import Array
 
-from .correspond import Matches, fundamental_matrix, mutual_matches
-from .views import PosedView, View
+from .correspond import fundamental_matrix, mutual_matches
+from .views import Matches, PosedView, View
 
 
 @dataclass(frozen=True)

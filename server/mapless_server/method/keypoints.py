@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array
 
 from .arrays import AnyArray, namespace
-from .coarse import Reconstruction
+from .reconstruction import Reconstruction
 from .views import PosedView
 
 

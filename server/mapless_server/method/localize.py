@@ -27,21 +27,23 @@ from mapless.geometry import Array
 
 from .adjust import adjust_pose
 from .answer import Answer, Localization, LocalizeOptions, Variant, is_better, shifted
-from .coarse import Bucket, Outcome, Reconstruction, Reconstructor, Request, reconstruct_one
+from .coarse import Bucket, Outcome, Reconstructor, Request, reconstruct_one
 from .coarse.geometric import GeometricReconstructor
-from .correspond import Correspondences, Matcher, Matches
+from .correspond import Correspondences, Matcher
 from .match import MatchOptions, PointMatches, match_points
 from .pnp import PoseStage, solve_pose
+from .pose_covariance import pose_covariance
 from .priors.known import NO_PRIORS, Priors
+from .reconstruction import Reconstruction
 from .rejection import Rejection, RejectionReason
-from .scale import MetricScale, ScaleOptions, estimate_scale
+from .scale import MetricScale, estimate_scale
+from .scale_equations import ScaleOptions
 from .stopwatch import timed
 from .structure import Structure, build_structure
 from .support import Support
 from .trust.gate import doubts
 from .trust.judge import judge
-from .pose_covariance import pose_covariance
-from .views import PosedView, View
+from .views import Matches, PosedView, View
 
 __all__ = [
     "MIN_FEATURES",

@@ -6,15 +6,11 @@ Everything works on NumPy's arrays and on torch's tensors (see `arrays`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .arrays import AnyArray, apply, identity, length, median, multiply, namespace, normalize, normalize_jacobian
 from .tracks import Grouping
-
-if TYPE_CHECKING:
-    from .structure import StructureOptions
 
 
 @dataclass(frozen=True)
@@ -222,19 +218,6 @@ def estimate_noise(observations: Observations, x_in_world: AnyArray, noise: Keyp
     by_size_squared = median(observations.sigma_px**2 - noise.level_px**2, used)
     level_px = xp.clip(observed_px**2 - by_size_squared, MIN_NOISE_LEVEL_PX**2, None) ** 0.5
     return replace(noise, level_px=xp.where(used.sum() < 30, noise.level_px, level_px))
-
-
-def trustworthy(observations: Observations, x_in_world: AnyArray, options: StructureOptions) -> AnyArray:
-    """Which points (P,) are finite, explained by all their observations and seen under enough parallax."""
-    xp = namespace(x_in_world)
-    limit = options.max_residual_sigma
-    explained = observations.max_by_point(length(observations.residuals(x_in_world))) < (limit or np.inf)
-    centre, _ = observations.rays()
-    direction = x_in_world[observations.point] - centre
-    direction = direction / length(direction)[:, None]
-    cosine = (direction * direction[observations.tracks.starts][observations.point]).sum(-1)
-    parallax_deg = xp.rad2deg(xp.arccos(xp.clip(cosine, -1, 1)))
-    return explained & (observations.max_by_point(parallax_deg) >= options.min_parallax_deg)
 
 
 def _cost(observations: Observations, residuals: AnyArray, loss_scale_sigma: float) -> AnyArray:

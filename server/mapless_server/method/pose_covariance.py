@@ -15,9 +15,15 @@ from .priors.known import NO_PRIORS, Priors
 from .scale import MetricScale
 from .structure import observe
 from .support import Support
-from .views import PosedView
-from .uncertainty.covariance import Uncertainty, UncertaintyOptions, one_match_covariance, scale_covariance, uncertainty_of
+from .uncertainty.covariance import (
+    Uncertainty,
+    UncertaintyOptions,
+    one_match_covariance,
+    scale_covariance,
+    uncertainty_of,
+)
 from .uncertainty.linearization import grounds_of, linearize, tracks_with_query
+from .views import PosedView
 
 
 def pose_covariance(

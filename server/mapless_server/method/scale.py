@@ -18,19 +18,11 @@ import numpy as np
 
 from mapless.geometry import RigidTransform, Similarity
 
-from .coarse import Reconstruction
 from .correspond import Correspondences
+from .reconstruction import Reconstruction
 from .rejection import Rejection, RejectionReason
-from .scale_equations import Weighed, gather, predict, trajectory_radius, weigh
+from .scale_equations import ScaleOptions, Weighed, gather, predict, trajectory_radius, weigh
 from .views import PosedView
-
-
-class ScaleStrategy(str, Enum):
-    """Which stages may give the scale."""
-
-    TRIANGULATION = "triangulation"
-    TRAJECTORY = "trajectory"
-    TWO_STAGE = "two_stage"
 
 
 class ScaleStage(str, Enum):
@@ -38,68 +30,6 @@ class ScaleStage(str, Enum):
 
     TRIANGULATION = "triangulation"
     TRAJECTORY = "trajectory"
-
-
-@dataclass(frozen=True)
-class ScaleOptions:
-    """Options of the scale. Numbers "of the paper" are its own; each of the others says what it adds.
-
-    Attributes:
-        strategy: two stages, as in the paper; or one of them alone, to compare.
-        min_baseline_m, max_baseline_m: pairs of references that are triangulated (of the paper). Closer ones see no
-            depth, farther ones hardly see the same things.
-        min_parallax_deg: angle at which the two rays of a triangulated match must meet. The paper bounds the baseline
-            alone, but 0.3 m tells nothing about what is 100 m away: one pixel at a focal length of 800 px is 0.07 deg,
-            so an angle of 1 deg gives a depth to 7 %, about the gate's 5 %. 0 keeps every match.
-        min_ratios: fewest depth ratios, two from a match, for their median to count. The median of 12 matches errs by
-            1.25 / sqrt(12) of their spread: 3.6 % for a spread of 10 %, inside the gate. Fewer leave it to stage 2.
-        max_matches: most matches that are triangulated, evenly chosen among more: 32 references can have 400 000, but
-            the median of 20 000 errs by less than a hundredth of their spread.
-        max_deviation: deviation below which the scale of stage 1 is adopted at once (of the paper).
-        inlier_distance_m: a camera agrees with a scale of stage 2 when its aligned centre comes this close to the known
-            one (of the paper).
-        max_pair_cameras: stage 2 tries every pair of so many cameras, evenly chosen among more. All 496 pairs of 32
-            stand for the paper's 500 random ones, so that an answer is reproducible.
-        min_radius_m: smallest trajectory radius of the references that tells a scale: poses are known to about 1 cm.
-        min_radius_per_depth: the same as a share of the scene's depth, which is how predicted poses err. At 0.002 the
-            references' images differ by the parallax of 1.6 px at a focal length of 800 px: noise of a keypoint.
-    """
-
-    strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
-    min_baseline_m: float = 0.3
-    max_baseline_m: float = 10.0
-    min_parallax_deg: float = 1.0
-    min_ratios: int = 24
-    max_matches: int = 20_000
-    max_deviation: float = 0.05
-    inlier_distance_m: float = 0.10
-    max_pair_cameras: int = 32
-    min_radius_m: float = 0.01
-    min_radius_per_depth: float = 0.002
-
-    def __post_init__(self) -> None:
-        if not (
-            0 < self.min_baseline_m <= self.max_baseline_m
-            and 0 <= self.min_parallax_deg < 90
-            and self.min_ratios >= 1
-            and self.max_matches >= 1
-            and self.max_deviation >= 0
-            and self.inlier_distance_m > 0
-            and self.max_pair_cameras >= 2
-            and self.min_radius_m > 0
-            and self.min_radius_per_depth >= 0
-        ):
-            raise ValueError(f"senseless options: {self}")
-
-    @property
-    def by_triangulation(self) -> bool:
-        """Whether stage 1 may give the scale."""
-        return self.strategy is not ScaleStrategy.TRAJECTORY
-
-    @property
-    def by_trajectory(self) -> bool:
-        """Whether stage 2 may."""
-        return self.strategy is not ScaleStrategy.TRIANGULATION
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,7 @@ import numpy as np
 
 from mapless.geometry import Array
 
-from .arrays import AnyArray, length
-from .coarse import Reconstruction
+from .arrays import AnyArray, length, namespace
 from .correspond import Correspondences
 from .keypoints import keypoint_depths, keypoint_offsets, keypoint_rays
 from .observations import (
@@ -33,8 +32,8 @@ from .observations import (
     better_start,
     estimate_noise,
     triangulate,
-    trustworthy,
 )
+from .reconstruction import Reconstruction
 from .scale import MetricScale
 from .tracks import Tracks, build_tracks
 from .views import PosedView
@@ -167,6 +166,19 @@ def refine_points(observations: Observations, x_in_world: AnyArray, options: Str
             observations, points = observations.prune(explained, points)
         points = adjust_points(observations, points, options.loss_scale_sigma, options.iterations)
     return RefinedPoints(points, observations, trustworthy(observations, points, options), noise)
+
+
+def trustworthy(observations: Observations, x_in_world: AnyArray, options: StructureOptions) -> AnyArray:
+    """Which points (P,) are finite, explained by all their observations and seen under enough parallax."""
+    xp = namespace(x_in_world)
+    limit = options.max_residual_sigma
+    explained = observations.max_by_point(length(observations.residuals(x_in_world))) < (limit or np.inf)
+    centre, _ = observations.rays()
+    direction = x_in_world[observations.point] - centre
+    direction = direction / length(direction)[:, None]
+    cosine = (direction * direction[observations.tracks.starts][observations.point]).sum(-1)
+    parallax_deg = xp.rad2deg(xp.arccos(xp.clip(cosine, -1, 1)))
+    return explained & (observations.max_by_point(parallax_deg) >= options.min_parallax_deg)
 
 
 def observe(tracks: Tracks, references: Sequence[PosedView], noise: KeypointNoise) -> Observations:

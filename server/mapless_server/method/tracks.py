@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from mapless.geometry import Array
 
 from .arrays import AnyArray
-from .correspond import Matches
+from .views import Matches
 
 
 class Grouping(Protocol):

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform
 
+Matches = NDArray[np.int32]
+"""(M, 2): keypoint indices in the first and in the second of two views."""
+
 
 @dataclass(frozen=True, eq=False)
 class Features:

@@ -19,4 +19,9 @@ Beside them one that describes a whole image by one vector, of the same blocks:
 
     megaloc.py     MegaLoc (Berton and Masone 2025): DINOv2, SALAD, a linear layer
     salad.py       tokens to one vector by optimal transport
+
+And those of local features and of their matching:
+
+    local_features.py   ALIKED, XFeat, SuperPoint: other packages' networks, with weights of ours
+    lightglue.py        LightGlue (Lindenberger et al. 2023), of kornia's layers
 """

@@ -14,10 +14,11 @@ import torch
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.method.coarse import Bucket, Outcome, ReconstructedView, Reconstruction, Request
+from mapless_server.method.coarse import Bucket, Outcome, Request
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.grids import GridOptions, common_grid, lay_out
 from mapless_server.method.coarse.network import NetworkReconstructor
+from mapless_server.method.reconstruction import ReconstructedView, Reconstruction
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.views import PosedView, View
 from mapless_tools.demo.room import Photo

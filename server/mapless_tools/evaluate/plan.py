@@ -14,7 +14,7 @@ from mapless_server.images.decode import ImageLimits, decode_image, image_size
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.localize import Variant
 from mapless_server.method.retrieve import choose_references
-from mapless_server.method.scale import ScaleStrategy
+from mapless_server.method.scale_equations import ScaleStrategy
 from mapless_server.method.views import PosedView, View
 from mapless_server.settings import available_cores
 from mapless_tools.dataset import Dataset, Frame

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapless_server.method.correspond import Matches
 from mapless_server.method.epipolar import pair_error_px
-from mapless_server.method.views import PosedView
+from mapless_server.method.views import Matches, PosedView
 
 from .pairs import Pair
 

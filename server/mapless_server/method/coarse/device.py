@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mapless.geometry import Camera, RigidTransform
 
-from . import ReconstructedView, Reconstruction
+from ..reconstruction import ReconstructedView, Reconstruction
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,16 +17,17 @@ from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..correspond import Correspondences
 from ..match import PointMatches, vote
-from ..observations import FIRST_GUESS, adjust_points, triangulate, trustworthy
+from ..observations import FIRST_GUESS, adjust_points, triangulate
 from ..pnp import PnpOptions, ransac, reprojection_errors_px
 from ..priors.informed import informed_pose
 from ..priors.known import NO_PRIORS, Priors
+from ..reconstruction import ReconstructedView, Reconstruction
 from ..rejection import Rejection, RejectionReason
-from ..structure import Structure, StructureOptions, observe
+from ..structure import Structure, StructureOptions, observe, trustworthy
 from ..tracks import build_tracks
 from ..trust.gate import GateOptions, log10_false_alarms, told_false_alarms
 from ..views import PosedView, View
-from . import Bucket, Outcome, ReconstructedView, Reconstruction, Request
+from . import Bucket, Outcome, Request
 
 
 @dataclass(frozen=True)

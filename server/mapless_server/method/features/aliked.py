@@ -6,18 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from kornia.feature import ALIKED
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera
-from mapless_server.networks.checkpoint import load_strictly
+from mapless_server.networks.local_features import load_aliked
 
 from ..views import View
 from .image import reduce_image, view_of
 from .network import LearnedOptions, array_of, image_tensor
-
-DERIVED = {"dkd.hw_grid": None}
-"""Computed by kornia, so not in the authors' file."""
 
 
 class AlikedExtractor:
@@ -37,10 +33,8 @@ class AlikedExtractor:
 
     def __init__(self, weights: Path, device: str = "cpu", options: LearnedOptions | None = None) -> None:
         self.options = options or LearnedOptions()
-        # A threshold of 0 lets kornia take the strongest maxima. With one it takes any if none is above it.
-        self._network = ALIKED("aliked-n16", max_num_keypoints=self.options.max_keypoints, detection_threshold=0.0)
+        self._network, sha256 = load_aliked(weights, self.options.max_keypoints)
         self._device = torch.device(device)
-        sha256 = load_strictly(self._network, weights, optional=DERIVED)
         self._network.to(self._device).eval()
         self.name = self.options.label("aliked-n16", sha256)
 

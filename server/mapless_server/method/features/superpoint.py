@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from transformers import SuperPointConfig, SuperPointForKeypointDetection
+from transformers import SuperPointConfig
 
 from mapless.geometry import Camera
-from mapless_server.networks.checkpoint import load_strictly
+from mapless_server.networks.local_features import load_superpoint
 
 from ..views import View
 from .image import reduce_image, view_of
@@ -45,9 +45,8 @@ class SuperPointExtractor:
         config = config or SuperPointConfig()
         config.keypoint_threshold, config.max_keypoints = self.options.min_score, self.options.max_keypoints
         config.nms_radius = WINDOW_PX // 2
-        self._network = SuperPointForKeypointDetection(config)
+        self._network, sha256 = load_superpoint(weights, config)
         self._device = torch.device(device)
-        sha256 = load_strictly(self._network, weights, optional={})
         self._network.to(self._device).eval()
         self.name = self.options.label("superpoint", sha256)
 

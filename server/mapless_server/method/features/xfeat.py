@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from kornia.feature.xfeat import InterpolateSparse2d, XFeatModel
+from kornia.feature.xfeat import InterpolateSparse2d
 from numpy.typing import NDArray
 from torch.nn.functional import log_softmax, max_pool2d, normalize, pixel_shuffle
 
 from mapless.geometry import Camera
-from mapless_server.networks.checkpoint import load_strictly
+from mapless_server.networks.local_features import load_xfeat
 
 from ..views import View
 from .image import reduce_image, view_of
@@ -46,9 +46,8 @@ class XfeatExtractor:
 
     def __init__(self, weights: Path, device: str = "cpu", options: LearnedOptions | None = None) -> None:
         self.options = options or LearnedOptions(min_score=0.05)
-        self._network = XFeatModel()
+        self._network, sha256 = load_xfeat(weights)
         self._device = torch.device(device)
-        sha256 = load_strictly(self._network, weights, optional={})
         self._network.to(self._device).eval()
         self.name = self.options.label("xfeat", sha256)
 

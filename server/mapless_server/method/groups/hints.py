@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ..answer import Answer
-from ..rejection import Advice, Hint, Rejection, RejectionReason
 from ..hints import HintOptions
+from ..rejection import Advice, Hint, Rejection, RejectionReason
 from ..views import PosedView
 
 STAGE = "join"

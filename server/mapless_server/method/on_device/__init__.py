@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera
 
-from ..coarse import map_cells
 from ..coarse.device import DeviceReconstruction
 from ..correspond import Correspondences
 from ..match import MatchOptions, PointMatches
 from ..observations import KeypointNoise
+from ..reconstruction import map_cells
 from ..rejection import Rejection, RejectionReason
-from ..scale import MetricScale, ScaleOptions, check_references, judge, not_finite
-from ..scale_equations import gather
+from ..scale import MetricScale, check_references, judge, not_finite
+from ..scale_equations import ScaleOptions, gather
 from ..structure import Structure, StructureOptions, tracks_of
 from ..tracks import Tracks
 from ..views import PosedView, View

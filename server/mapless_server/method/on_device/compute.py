@@ -14,8 +14,7 @@ from ..coarse.device import DeviceReconstruction
 from ..keypoints import positive
 from ..match import MatchOptions
 from ..observations import back_project
-from ..scale import ScaleOptions
-from ..scale_equations import Known, Predicted, Weighed, weigh
+from ..scale_equations import Known, Predicted, ScaleOptions, Weighed, weigh
 from ..structure import StructureOptions, refine_points
 from .match import DevicePoints, MatchInputs, match_on_device
 from .structure import DeviceTracks, StructureInputs, observe_on_device

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform, rotation_angle_deg
 
-from ..correspond import Matches
 from ..pnp import PnpOptions, ransac, reprojection_errors_px
 from ..rejection import Hypothesis
 from ..support import Support
 from ..uncertainty.accuracy import Accuracy, accuracy_from_covariance
 from ..uncertainty.perturbation import pose_hessian, world_covariance
+from ..views import Matches
 from .gate import false_alarms
 
 

@@ -22,9 +22,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..correspond import Matches
 from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
 from ..support import Support
+from ..views import Matches
 from .ambiguity import AmbiguityOptions, find_rival
 from .evidence import FEATURES, Evidence, evidence_of
 from .focal import Focal, FocalOptions, wrong_focal

@@ -51,11 +51,11 @@ def try_loading(weights: Weights, file: Path) -> str | None:
     """
     try:
         if weights.purpose == "features":
-            from mapless_server.method.features import make_extractor
+            from mapless_server.networks.local_features import LOADERS
 
-            make_extractor(weights.name, file)
+            LOADERS[weights.name](file)
         elif weights.purpose == "matching":
-            from mapless_server.method.lightglue import load_lightglue
+            from mapless_server.networks.lightglue import load_lightglue
 
             load_lightglue(weights.name.removesuffix("-lightglue"), file)
         else:

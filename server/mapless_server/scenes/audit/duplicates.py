@@ -6,8 +6,7 @@ from enum import Enum
 
 import numpy as np
 
-from mapless_server.method.correspond import Matches
-from mapless_server.method.views import PosedView
+from mapless_server.method.views import Matches, PosedView
 
 from .options import AuditOptions
 

@@ -16,12 +16,12 @@ from threading import Lock
 import numpy as np
 
 from mapless.geometry import Array
-from mapless_server.method.correspond import Correspondences, Matches, epipolar_distance_px, mutual_matches
+from mapless_server.method.correspond import Correspondences, epipolar_distance_px, mutual_matches
 from mapless_server.method.match import vote
 from mapless_server.method.observations import Observations, invert_symmetric, triangulate
 from mapless_server.method.structure import Structure, StructureOptions, observe, refine_points
 from mapless_server.method.tracks import Tracks, build_tracks
-from mapless_server.method.views import PosedView
+from mapless_server.method.views import Matches, PosedView
 
 from .resection import Sighting
 
