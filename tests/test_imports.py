@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import ast
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 SOURCES = {"mapless": "client", "mapless_server": "server", "mapless_tools": "server", "mapless_ray": "deploy/ray"}
@@ -142,3 +145,27 @@ def test_no_room_inside_method_is_in_a_circle() -> None:
                 ".".join(other.split(".")[:3]) for other in others if room_of(other) == "method"
             )
     assert circles({part: others - {part, "mapless_server.method"} for part, others in parts.items()}) == []
+
+
+def packages_of(room: str) -> set[str]:
+    """What the modules of a room import from outside mapless: the first two parts of each name."""
+    names: set[str] = set()
+    for path in (ROOT / "server" / "mapless_server" / room).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names.add(node.module)
+    return {".".join(name.split(".")[:2]) for name in names}
+
+
+@pytest.mark.parametrize("room", LADDER[LADDER.index("engine") :])
+def test_rooms_below_rpc_know_neither_grpc_nor_messages(room: str) -> None:
+    if room != "security":  # which reads the certificates of connections
+        known = packages_of(room)
+        assert not {name for name in known if name.split(".")[0] in ("grpc", "google", "grpc_status")}
+        assert not known & {"mapless.v1", "mapless.wire"}
+
+
+def test_the_queue_needs_nothing_but_the_standard_library() -> None:
+    assert {name.split(".")[0] for name in packages_of("scheduling")} <= sys.stdlib_module_names | {"mapless_server"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import filecmp
 import importlib.metadata
 import inspect
@@ -40,34 +39,6 @@ RPCS = [
     for module, name, servicer in SERVICES
     for method in module.DESCRIPTOR.services_by_name[name].methods
 ]
-SERVER = ROOT / "server" / "mapless_server"
-# What answers, guards and counts calls, what starts that, and what calls it; all else is below, and knows neither grpc
-# nor messages.
-ABOVE = {
-    *(
-        "__init__",
-        "__main__",
-        "cli",
-        "serve",
-        "running",
-        "service",
-        "services",
-        "group_service",
-        "progressive",
-        "reference_service",
-        "watching",
-        "rpc",
-        "grpc_server",
-        "status",
-        "receiving",
-        "sending",
-    ),
-    *("commands", "messages", "security", "observability", "demo", "ingest", "evaluation", "bench", "load"),
-    *("calibration", "capture", "view"),
-}
-BELOW = sorted(
-    {path.stem for path in SERVER.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()} - ABOVE
-)
 
 
 @pytest.mark.parametrize(("servicer", "rpc"), RPCS)
@@ -108,51 +79,6 @@ def test_the_client_imports_nothing_heavy() -> None:
     heavy = {"torch", "cv2", "scipy", "sqlalchemy", "pydantic", "typer", "poselib", "grpc_status"}
     assert imported & (heavy | {"mapless_server"}) == set()
     assert {"grpc", "numpy"} <= imported
-
-
-def imports_of(path: Path) -> set[str]:
-    """Everything a file names in its imports, relative names made absolute."""
-    found: set[str] = set()
-    package = ["mapless_server", *path.relative_to(SERVER).parts[:-1]]
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
-            module = ".".join(filter(None, [base, node.module]))
-            found |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
-    return found
-
-
-@pytest.mark.parametrize("module", BELOW)
-def test_nothing_below_the_service_knows_grpc(module: str) -> None:
-    source = SERVER / module
-    files = sorted(source.rglob("*.py")) if source.is_dir() else [source.with_suffix(".py")]
-    forbidden = {"grpc", "google", *(f"mapless.{part}" for part in ("v1", "wire"))}
-    forbidden |= {f"mapless_server.{part}" for part in ("rpc", "service", "serve")}
-    for path in files:
-        names = imports_of(path)
-        assert not {name for name in names for bad in forbidden if name == bad or name.startswith(bad + ".")}, path
-
-
-@pytest.mark.parametrize(
-    ("package", "beside_itself"),
-    [
-        ("method", {"networks", "weights", "stopwatch"}),
-        ("networks", {"weights"}),
-        ("scheduling", set()),
-    ],
-)
-def test_the_method_knows_no_queue_and_the_queue_no_method(package: str, beside_itself: set[str]) -> None:
-    for path in sorted((SERVER / package).rglob("*.py")):
-        known = {name.split(".")[1] for name in imports_of(path) if name.startswith("mapless_server.")}
-        assert known <= beside_itself | {package}, path
-
-
-def test_the_queue_knows_nothing_of_vision_or_calls() -> None:
-    for path in sorted((SERVER / "scheduling").rglob("*.py")):
-        imported = {name.partition(".")[0] for name in imports_of(path)} - {"mapless_server"}
-        assert imported <= sys.stdlib_module_names, path
 
 
 def test_the_public_names() -> None:

@@ -51,7 +51,7 @@ def rows(heading: str) -> list[list[str]]:
 
 def test_the_table_of_errors_has_every_reason_and_none_that_is_not() -> None:
     """A class's own reason is its status's name, which stands in the table in any case."""
-    sources = "".join(path.read_text() for path in SERVER.rglob("*.py"))
+    sources = "".join(path.read_text() for path in SERVER.parent.rglob("*.py"))
     there = set(re.findall(r'(?:reason=|_Malformed\(".*", )"([A-Z_]+)"', sources))
     there |= {refusal.name for refusal in Refusal}
     assert {"QUEUE_FULL", "IMAGE_UNKNOWN_FORMAT", "TOKEN_EXPIRED", "STORE_FULL"} <= there

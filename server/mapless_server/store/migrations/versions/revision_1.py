@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlalchemy as sa
 from alembic import op
 
-from .. import write_version
+from mapless_server.store.migrations import write_version
 
 revision = "1"
 down_revision = None
