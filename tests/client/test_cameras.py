@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf import json_format
-from images import encode
+from support.images import encode
 
 from mapless import Camera, RadialTangential, read_camera, read_cameras, read_pose, wire
 from mapless.geometry import RigidTransform, rotation_from_vector

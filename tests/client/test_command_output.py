@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted_answers import diagnostics, localized, rejected
+from support.planted_answers import diagnostics, localized, rejected
 
 from mapless.answers import PriorCheck
 from mapless.axes import Axes

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import grpc
 import pytest
-from certificates import authority, signed
+from support.certificates import authority, signed
 
 from mapless import Client, ConnectOptions, MaplessError
 

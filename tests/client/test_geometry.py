@@ -8,12 +8,12 @@ from functools import reduce
 import cv2
 import numpy as np
 import pytest
-from compare import assert_pose_close
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jacobians import assert_jacobian
-from scenes import CAMERA, random_for
 from scipy.spatial.transform import Rotation
+from support.compare import assert_pose_close
+from support.jacobians import assert_jacobian
+from support.scenes import CAMERA, random_for
 
 from mapless.geometry import (
     Array,

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import grpc
 import pytest
 from google.rpc import error_details_pb2, status_pb2
-from planted_answers import diagnostics, localized, rejected
+from support.planted_answers import diagnostics, localized, rejected
 
 from mapless import wire
 from mapless.__main__ import main

@@ -8,7 +8,7 @@ import struct
 import cv2
 import numpy as np
 import pytest
-from images import encode
+from support.images import encode
 
 from mapless.pixels import size_of_image
 

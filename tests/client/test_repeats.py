@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf.message import Message
-from played import Played
+from support.played import Played
 
 from mapless import wire
 from mapless.calls import asking, groups, localization, references

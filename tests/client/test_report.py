@@ -12,8 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from images import encode, textured, with_exif_orientation
-from planted_answers import CAMERA, NOW, debug, diagnostics, localized, rejected, truth
+from support.images import encode, textured, with_exif_orientation
+from support.planted_answers import CAMERA, NOW, debug, diagnostics, localized, rejected, truth
 
 from mapless.answers import (
     Accuracy,

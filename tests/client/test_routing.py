@@ -8,11 +8,11 @@ from typing import Any
 
 import grpc
 import pytest
-from clients import Connect, awaiting
 from google.protobuf import empty_pb2
 from google.protobuf.message import Message
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.clients import Connect, awaiting
 
 from mapless import Client, ConnectOptions, names
 from mapless.errors import MaplessError

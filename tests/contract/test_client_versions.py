@@ -10,7 +10,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from servers import PHOTO, serving
+from support.servers import PHOTO, serving
 
 ROOT = Path(__file__).parents[2]
 (_LISTED,) = re.findall(

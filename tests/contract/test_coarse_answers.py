@@ -8,7 +8,7 @@ from concurrent import futures
 import grpc
 import numpy as np
 import pytest
-from servers import CAMERA, PHOTO, pose
+from support.servers import CAMERA, PHOTO, pose
 
 from mapless import Client, DeadlineExceeded, LocalizationResult, wire
 from mapless.v1 import localization_service_pb2 as pb

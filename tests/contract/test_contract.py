@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from servers import CAMERA, PHOTO, pose, serving
+from support.servers import CAMERA, PHOTO, pose, serving
 
 import mapless
 import mapless_server

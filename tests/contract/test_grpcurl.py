@@ -19,7 +19,7 @@ import grpc
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
-from servers import CAMERA, PHOTO, pose, serving
+from support.servers import CAMERA, PHOTO, pose, serving
 
 from mapless import Client, NewReference, wire
 

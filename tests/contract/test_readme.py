@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 import typer.main
-from images import encode, textured
 from prometheus_client import generate_latest
-from servers import pose, serving
+from support.images import encode, textured
+from support.servers import pose, serving
 
 from mapless import Client, NewReference, RigidTransform
 from mapless import errors as client_errors

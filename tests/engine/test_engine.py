@@ -13,8 +13,8 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from images import encode, textured
-from servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
+from support.images import encode, textured
+from support.servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
 
 from mapless.geometry import RigidTransform
 from mapless_server.engine.describing import Description

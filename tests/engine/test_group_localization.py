@@ -13,7 +13,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-from servers import CAMERA
+from support.servers import CAMERA
 
 from mapless_server.engine.engine import JOIN, Engine, EngineOptions
 from mapless_server.engine.groups import localize_each

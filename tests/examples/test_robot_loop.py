@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import pytest
 from google.protobuf import json_format
-from images import textured
-from servers import CAMERA, PHOTO, pose, serving
+from support.images import textured
+from support.servers import CAMERA, PHOTO, pose, serving
 
 from mapless import Client, NewReference, wire
 

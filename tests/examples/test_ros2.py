@@ -14,8 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from images import textured
-from servers import CAMERA, PHOTO, pose, serving
+from support.images import textured
+from support.servers import CAMERA, PHOTO, pose, serving
 
 from mapless import Client, Fisheye, NewReference, RadialTangential, RigidTransform
 from mapless.geometry import rotation_from_vector

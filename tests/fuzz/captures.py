@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from layouts import opengl
+from support.layouts import opengl
 
 from mapless_tools.ingest.formats import Intrinsics, ReadOptions
 from mapless_tools.ingest.formats.colmap.writing import PosedImage

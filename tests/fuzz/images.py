@@ -17,7 +17,7 @@ from random import Random
 
 import cv2
 import numpy as np
-from images import cmyk_jpeg, encode, textured, with_exif_orientation
+from support.images import cmyk_jpeg, encode, textured, with_exif_orientation
 
 from mapless_server.errors import InvalidArgument
 from mapless_server.images.decode import ImageLimits, decode_image, image_size

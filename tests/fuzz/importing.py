@@ -16,7 +16,7 @@ from random import Random
 from zlib import crc32
 
 import numpy as np
-from layouts import truth
+from support.layouts import truth
 
 from mapless.geometry import Camera
 from mapless.names import check_id

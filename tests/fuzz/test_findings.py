@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from images import encode, textured
+from support.images import encode, textured
 
 from fuzz import benchmarks, captures, colmap
 from fuzz.importing import Layout

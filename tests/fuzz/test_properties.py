@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from images import encode, textured
 from rich.console import Console
+from support.images import encode, textured
 
 from fuzz import localization
 from fuzz.importing import CAMERA, image_of

@@ -12,8 +12,8 @@ pytest.importorskip("kornia", reason="the networks' extra is not installed")
 
 import numpy as np
 import torch
-from scenes import random_for
-from small_networks import small_network
+from support.scenes import random_for
+from support.small_networks import small_network
 
 from mapless_server.networks.lightglue import LightGlue
 from mapless_server.networks.runner import NetworkRunner

@@ -11,10 +11,10 @@ pytest.importorskip("torch", reason="the networks' extra is not installed")
 
 import numpy as np
 import torch
-from images import textured
 from safetensors.torch import save_file
-from small_megaloc import SMALL_MEGALOC, ruled_megaloc
-from small_networks import photograph, view_of
+from support.images import textured
+from support.small_megaloc import SMALL_MEGALOC, ruled_megaloc
+from support.small_networks import photograph, view_of
 
 from mapless_server.networks import blocks
 from mapless_server.scenes.retrieval.megaloc import MegaLocDescriptor, MegaLocOptions

@@ -12,7 +12,7 @@ pytest.importorskip("torch", reason="the networks' extra is not installed")
 pytest.importorskip("PIL", reason="the networks' extra is not installed")
 
 import torch
-from small_networks import GRIDS, small_network, small_request
+from support.small_networks import GRIDS, small_network, small_request
 
 from mapless_server.method.coarse import Outcome, Request, reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction

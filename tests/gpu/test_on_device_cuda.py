@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("torch", reason="the networks' extra is not installed")
 
 import torch
-from device import CASES, VARIANTS, Case, assert_same
+from support.device import CASES, VARIANTS, Case, assert_same
 
 from mapless_server.method.on_device import Refined, prepare
 from mapless_server.method.on_device.compute import Options, compute

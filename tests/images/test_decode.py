@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from images import cmyk_jpeg, encode, png_claiming, textured, with_exif_orientation
+from support.images import cmyk_jpeg, encode, png_claiming, textured, with_exif_orientation
 
 from mapless_server.errors import InvalidArgument
 from mapless_server.images.decode import ImageLimits, decode_image, image_size

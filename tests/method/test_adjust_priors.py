@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from compare import assert_pose_close, pose_error
-from jacobians import assert_jacobian
-from planted import NOISE, true_structure
-from scenes import SceneOptions, SyntheticScene, make_scene, random_for
+from support.compare import assert_pose_close, pose_error
+from support.jacobians import assert_jacobian
+from support.planted import NOISE, true_structure
+from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.adjust import AdjustOptions, _pose_problem, _State, adjust_pose

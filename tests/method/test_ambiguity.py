@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from compare import assert_pose_close
-from scenes import make_scene, random_for
+from support.compare import assert_pose_close
+from support.scenes import make_scene, random_for
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.method.correspond import Matcher

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import random_for
+from support.scenes import random_for
 
 from mapless import geometry
 from mapless.geometry import Array

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from planted import same_points
-from scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
+from support.planted import same_points
+from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method import correspond

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import random_for
+from support.scenes import random_for
 
 from mapless.geometry import Array
 from mapless_server.method.uncertainty.dispersion import Dispersion, Grounds, Sightings, disperse

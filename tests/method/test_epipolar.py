@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from images import encode
 from numpy.typing import NDArray
-from scenes import CAMERA, SceneOptions, look_at, make_scene, observe, random_for, unit_rows
+from support.images import encode
+from support.scenes import CAMERA, SceneOptions, look_at, make_scene, observe, random_for, unit_rows
 
 from mapless.geometry import Camera, Quaternion, RigidTransform, rotation_from_vector
 from mapless_server.method.epipolar import consistent_matches, pair_error_px, sampson_px

@@ -7,9 +7,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from images import textured
 from numpy.typing import NDArray
-from scenes import random_for
+from support.images import textured
+from support.scenes import random_for
 
 from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential
 from mapless_server.method.features import (

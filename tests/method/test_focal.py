@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import true_structure
-from scenes import SceneOptions, SyntheticScene, make_scene, random_for
+from support.planted import true_structure
+from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
 from mapless_server.method.rejection import Advice, RejectionReason

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pnp_problems import POSE, Problem, planted, problem_of
-from scenes import CAMERA, random_for
+from support.pnp_problems import POSE, Problem, planted, problem_of
+from support.scenes import CAMERA, random_for
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.match import PointMatches

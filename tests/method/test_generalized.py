@@ -6,8 +6,8 @@ import ctypes
 
 import numpy as np
 import pytest
-from compare import assert_pose_close
-from scenes import CAMERA, random_for
+from support.compare import assert_pose_close
+from support.scenes import CAMERA, random_for
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.groups.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from compare import assert_pose_close
-from planted import moved_references, true_correspondences
-from scenes import SceneOptions, SyntheticScene, make_scene, random_for
+from support.compare import assert_pose_close
+from support.planted import moved_references, true_correspondences
+from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.coarse import Request, reconstruct_one

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from compare import assert_pose_close, pose_error
-from scenes import CAMERA, random_for
+from support.compare import assert_pose_close, pose_error
+from support.scenes import CAMERA, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.match import PointMatches

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 pytest.importorskip("torch", reason="the networks' extra is not installed")
 pytest.importorskip("PIL", reason="the networks' extra is not installed")
 
-from images import textured
 from PIL import Image
+from support.images import textured
 
 from mapless.geometry import Array, Camera, Fisheye, RadialTangential
 from mapless_server.method.coarse.grids import (

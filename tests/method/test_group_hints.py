@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from groups import NOTHING
-from scenes import make_scene, random_for
+from support.groups import NOTHING
+from support.scenes import make_scene, random_for
 
 from mapless_server.method.answer import Answer
 from mapless_server.method.groups.hints import hinted_group

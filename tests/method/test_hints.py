@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import make_scene, random_for
+from support.scenes import make_scene, random_for
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.answer import Answer, Localization

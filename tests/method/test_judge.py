@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from planted import true_structure
-from scenes import SceneOptions, make_scene, random_for
+from support.planted import true_structure
+from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason

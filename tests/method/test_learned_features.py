@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from images import textured
 from numpy.typing import NDArray
-from scenes import random_for
+from support.images import textured
+from support.scenes import random_for
 
 from mapless.geometry import Array, Camera, RadialTangential
 from mapless_server.method.features import FeatureExtractor, make_extractor

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import CAMERA, random_for, unit_rows
+from support.scenes import CAMERA, random_for, unit_rows
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.correspond import make_matcher

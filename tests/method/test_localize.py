@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from compare import assert_pose_close, pose_error
-from device import on_device
-from fake_network import FakeNetwork, FakeNetworkOptions
-from planted import moved_references
-from scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for, unit_rows
+from support.compare import assert_pose_close, pose_error
+from support.device import on_device
+from support.fake_network import FakeNetwork, FakeNetworkOptions
+from support.planted import moved_references
+from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for, unit_rows
 
 import mapless_server.method.localize as method
 from mapless.geometry import Array, RigidTransform, rotation_from_vector

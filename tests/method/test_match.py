@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from planted import true_correspondences, true_structure
-from scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
+from support.planted import true_correspondences, true_structure
+from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.correspond import Correspondences

@@ -22,9 +22,18 @@ pytest.importorskip("torch", reason="the networks' extra is not installed")
 pytest.importorskip("PIL", reason="the networks' extra is not installed")
 
 import torch
-from images import textured
 from safetensors.torch import save_file
-from small_networks import GRIDS, SMALL, photograph, references_of, small_network, small_request, small_runner, view_of
+from support.images import textured
+from support.small_networks import (
+    GRIDS,
+    SMALL,
+    photograph,
+    references_of,
+    small_network,
+    small_request,
+    small_runner,
+    view_of,
+)
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.engine.failures import failure_of

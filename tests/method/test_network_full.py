@@ -12,9 +12,9 @@ import pytest
 PROGRAM = """
 import resource, sys
 sys.path[:0] = sys.argv[1:]
-from parity_rule import ruled_network
-from small_networks import photograph, references_of, view_of
-from images import textured
+from support.parity_rule import ruled_network
+from support.small_networks import photograph, references_of, view_of
+from support.images import textured
 from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.coarse import reconstruct_one
 from mapless_server.method.reconstruction import Reconstruction

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_network import FakeNetwork
-from scenes import SceneOptions, random_for
+from support.fake_network import FakeNetwork
+from support.scenes import SceneOptions, random_for
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.correspond import Correspondences
@@ -23,7 +23,7 @@ from mapless_server.method.structure import StructureOptions, tracks_of
 pytest.importorskip("torch", reason="the networks' extra is not installed")
 
 import torch
-from device import CASES, VARIANTS, Case, Watch, assert_same, case_of, on_device
+from support.device import CASES, VARIANTS, Case, Watch, assert_same, case_of, on_device
 from torch import Tensor
 
 from mapless_server.method.coarse.device import DeviceReconstruction

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from jacobians import assert_jacobian, finite_differences
-from scenes import CAMERA, random_for
+from support.jacobians import assert_jacobian, finite_differences
+from support.scenes import CAMERA, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.priors.known import rotation_vector

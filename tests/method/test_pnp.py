@@ -7,10 +7,10 @@ from importlib.metadata import version
 import numpy as np
 import poselib
 import pytest
-from compare import assert_pose_close
-from planted import true_structure
-from pnp_problems import POSE, Problem, planted, problem_of
-from scenes import CAMERA, SceneOptions, make_scene, random_for
+from support.compare import assert_pose_close
+from support.planted import true_structure
+from support.pnp_problems import POSE, Problem, planted, problem_of
+from support.scenes import CAMERA, SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method import pnp

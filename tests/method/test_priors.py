@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
-from jacobians import assert_jacobian
-from scenes import random_for
 from scipy.special import chdtrc, chdtri
+from support.jacobians import assert_jacobian
+from support.scenes import random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.priors.known import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
+from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method.retrieve import RetrieveOptions, choose_references, spread_choice

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from compare import assert_pose_close
-from groups import NOTHING, caller_pose, images_of, looking
-from jacobians import assert_jacobian
-from scenes import SceneOptions, random_for
+from support.compare import assert_pose_close
+from support.groups import NOTHING, caller_pose, images_of, looking
+from support.jacobians import assert_jacobian
+from support.scenes import SceneOptions, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.groups.rig import RigEstimate, RigFreedom, RigOptions, solve_rig

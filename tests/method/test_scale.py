@@ -7,10 +7,10 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from fake_network import FakeNetwork, FakeNetworkOptions
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import SceneOptions, SyntheticScene, make_scene, random_for
+from support.fake_network import FakeNetwork, FakeNetworkOptions
+from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import RigidTransform, Similarity, rotation_angle_deg, rotation_from_vector
 from mapless_server.method.correspond import Correspondences

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from compare import assert_pose_close, pose_error
-from groups import NOTHING, caller_pose, drifting, error_m, images_of, rescaled, walk
-from jacobians import assert_jacobian
-from scenes import SceneOptions, look_at, random_for
+from support.compare import assert_pose_close, pose_error
+from support.groups import NOTHING, caller_pose, drifting, error_m, images_of, rescaled, walk
+from support.jacobians import assert_jacobian
+from support.scenes import SceneOptions, look_at, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.groups.drift import DriftOptions, SequenceFreedom, world_from_session_at

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_network import FakeNetwork, FakeNetworkOptions
-from jacobians import assert_jacobian
 from numpy.typing import NDArray
-from planted import metric_scale, true_correspondences, true_tracks
-from scenes import CAMERA, SceneOptions, SyntheticScene, arc_poses, make_scene, random_for
 from scipy.optimize import least_squares
+from support.fake_network import FakeNetwork, FakeNetworkOptions
+from support.jacobians import assert_jacobian
+from support.planted import metric_scale, true_correspondences, true_tracks
+from support.scenes import CAMERA, SceneOptions, SyntheticScene, arc_poses, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method.correspond import Correspondences

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from planted import true_correspondences, true_tracks
-from scenes import SceneOptions, make_scene, random_for
+from support.planted import true_correspondences, true_tracks
+from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless_server.method.tracks import Tracks, build_tracks
 from mapless_server.method.views import Matches

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from planted import NOISE, disturbed, metric_scale, stages, true_structure
-from scenes import SceneOptions, SyntheticScene, make_scene, random_for
+from support.planted import NOISE, disturbed, metric_scale, stages, true_structure
+from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity
 from mapless_server.method.adjust import AdjustOptions, adjust_pose

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from images import textured
 from numpy.typing import NDArray
-from parity_rule import images, weights
 from safetensors.torch import save_file
-from small_megaloc import SMALL_MEGALOC, ruled_megaloc
-from small_networks import NOTHING, photograph, view_of
+from support.images import textured
+from support.parity_rule import images, weights
+from support.small_megaloc import SMALL_MEGALOC, ruled_megaloc
+from support.small_networks import NOTHING, photograph, view_of
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 

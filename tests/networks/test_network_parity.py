@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from parity_rule import images, network_without_weights, ruled_network, weights
 from safetensors.torch import save_file
+from support.parity_rule import images, network_without_weights, ruled_network, weights
 
 from mapless_server.networks.checkpoint import load_strictly
 from mapless_server.networks.conditions import rays_from_directions, rays_from_intrinsics

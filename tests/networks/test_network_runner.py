@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from parity_rule import images, ruled_network, weights
+from support.parity_rule import images, ruled_network, weights
 from torch import Tensor
 from torch._dynamo.utils import counters
 

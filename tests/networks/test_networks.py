@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from parity_rule import images, ruled_network
+from support.parity_rule import images, ruled_network
 from torch import Tensor
 
 from mapless_server.networks.blocks import rope_table

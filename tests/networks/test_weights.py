@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from safetensors_files import entry, safetensors, with_header
+from support.safetensors_files import entry, safetensors, with_header
 
 from mapless_server.networks.weights import (
     CATALOGUE,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import pytest
-from groups import drifting, rescaled
+from support.groups import drifting, rescaled
 
 from mapless import (
     Client,

@@ -12,8 +12,8 @@ from typing import Any
 
 import grpc
 import pytest
-import raw_http2
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from support import raw_http2
 
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import SceneOptions, make_scene
+from support.scenes import SceneOptions, make_scene
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.views import Features, PosedView

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import SceneOptions, SyntheticScene, look_at, make_scene
+from support.scenes import SceneOptions, SyntheticScene, look_at, make_scene
 
 from mapless.geometry import RigidTransform
 from mapless_server.scenes.audit import CoverageVerdict, PairMatches, check_coverage, surroundings_of

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from planted_damage import damage
-from scenes import SceneOptions, make_scene
+from support.planted_damage import damage
+from support.scenes import SceneOptions, make_scene
 
 from mapless.geometry import RigidTransform
 from mapless_server.errors import NotFound, Unavailable

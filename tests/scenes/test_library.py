@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from images import encode, textured
 from numpy.typing import NDArray
-from planted_damage import damage
-from servers import CAMERA, StandInExtractor, pose
+from support.images import encode, textured
+from support.planted_damage import damage
+from support.servers import CAMERA, StandInExtractor, pose
 
 from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, RequestError

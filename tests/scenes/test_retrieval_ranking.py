@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scenes import random_for, unit_rows
+from support.scenes import random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.scenes.retrieval.index import Entries, SceneIndex

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
+from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
 from mapless.geometry import Array
 from mapless_server.method.features import SiftExtractor

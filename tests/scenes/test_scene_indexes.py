@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from images import encode, textured
-from planted_damage import damage
-from servers import CAMERA, StandInDescriptor, StandInExtractor, pose
+from support.images import encode, textured
+from support.planted_damage import damage
+from support.servers import CAMERA, StandInDescriptor, StandInExtractor, pose
 
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.turns import Turn

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from images import encode, textured
+from support.images import encode, textured
 
 from mapless import wire
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector

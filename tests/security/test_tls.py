@@ -16,8 +16,8 @@ from typing import Any
 
 import grpc
 import pytest
-from certificates import DAY, Pair, authority, signed
 from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, PrivateFormat
+from support.certificates import DAY, Pair, authority, signed
 
 from mapless import Client, ConnectOptions, MaplessError, Unavailable
 from mapless.__main__ import main

@@ -21,8 +21,8 @@ import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from numpy.typing import NDArray
-from programs import gated, wait_until
-from servers import (
+from support.programs import gated, wait_until
+from support.servers import (
     COVARIANCE,
     StandInExtractor,
     StandInReconstructor,

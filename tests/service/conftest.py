@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import grpc
 import pytest
-from servers import CAMERA, PHOTO, RunningServer, Stubs, pose, serving
+from support.servers import CAMERA, PHOTO, RunningServer, Stubs, pose, serving
 
 from mapless import Client, NewReference
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from images import encode
-from planted_damage import damage
-from servers import listening
-from wall import wall
+from support.images import encode
+from support.planted_damage import damage
+from support.servers import listening
+from support.wall import wall
 
 from mapless import Camera, Client, InvalidArgument, NewReference, NotFound, RigidTransform
 from mapless_server.security.tenancy import SceneKey

@@ -22,12 +22,12 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
-from disks import fail, failing_disk, mount, small_disk
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from images import encode
-from programs import wait_until
-from servers import CAMERA, PHOTO, StandInMethod, pose, serving
 from sqlalchemy import Connection
+from support.disks import fail, failing_disk, mount, small_disk
+from support.images import encode
+from support.programs import wait_until
+from support.servers import CAMERA, PHOTO, StandInMethod, pose, serving
 
 from mapless import (
     Client,

@@ -17,10 +17,10 @@ from datetime import datetime, timedelta, timezone
 from functools import partial
 from pathlib import Path
 
-import programs
 import pytest
-from programs import Program, program, wait_until
-from servers import CAMERA, PHOTO, pose
+from support import programs
+from support.programs import Program, program, wait_until
+from support.servers import CAMERA, PHOTO, pose
 
 from mapless import Client, ConnectOptions, DeadlineExceeded, LocalizationResult, NewReference, Unauthenticated
 from mapless_server.security.tokens import create_token
@@ -60,7 +60,7 @@ def jumping(folder: Path, **settings: object) -> Iterator[tuple[Program, Clock]]
     folder.mkdir()
     clock = Clock(folder)
     given = [f"{name}={value}" for name, value in settings.items()]
-    with program(folder, [programs.__file__, str(folder), "asks", *given], **clock.environment) as server:
+    with program(folder, [*programs.GATED, str(folder), "asks", *given], **clock.environment) as server:
         yield server, clock
 
 

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import psycopg
 import pytest
-from disks import mount, small_disk
-from images import encode
-from postgres import Cluster, require
-from programs import wait_until
-from servers import CAMERA, PHOTO, pose, serving
+from support.disks import mount, small_disk
+from support.images import encode
+from support.postgres import Cluster, require
+from support.programs import wait_until
+from support.servers import CAMERA, PHOTO, pose, serving
 
 from mapless import (
     AlreadyExists,

@@ -14,10 +14,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from images import encode, textured
-from servers import CAMERA, COVARIANCE, RunningServer, pose, serving
+from support.images import encode, textured
+from support.servers import CAMERA, COVARIANCE, RunningServer, pose, serving
+from support.wall import wall
 from typer.testing import CliRunner
-from wall import wall
 
 from mapless import Camera, Client, LocalizationResult, NewReference, RigidTransform
 from mapless.geometry import rotation_from_vector

@@ -13,7 +13,7 @@ from typing import Any
 
 import grpc
 import pytest
-from servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose, serving
+from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose, serving
 
 from mapless import (
     Client,

@@ -13,8 +13,8 @@ from typing import Any
 
 import grpc
 import pytest
-from clients import Connect, awaiting, failing, losing, status
-from servers import CAMERA, PHOTO, RunningServer, pose, serving
+from support.clients import Connect, awaiting, failing, losing, status
+from support.servers import CAMERA, PHOTO, RunningServer, pose, serving
 
 from mapless import (
     AlreadyExists,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf import json_format
-from servers import CAMERA, PHOTO, RunningServer, pose
+from support.servers import CAMERA, PHOTO, RunningServer, pose
 
 import mapless
 from mapless import wire

@@ -14,16 +14,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import envoys
 import grpc
 import pytest
 import yaml  # type: ignore[import-untyped]
-from certificates import authority, signed
-from envoys import ENVOY, Gateway, configured, fetched, gateway, program, wait_until
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
-from postgres import shared_cluster
-from programs import gated
-from servers import CAMERA, PHOTO, RunningServer, localize_request, pose, serving
+from support import envoys
+from support.certificates import authority, signed
+from support.envoys import ENVOY, Gateway, configured, fetched, gateway, program, wait_until
+from support.postgres import shared_cluster
+from support.programs import gated
+from support.servers import CAMERA, PHOTO, RunningServer, localize_request, pose, serving
 
 from mapless import (
     Client,

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from images import encode
+from support.images import encode
+from support.wall import Shot, wall
 from typer.testing import CliRunner, Result
-from wall import Shot, wall
 
 from mapless.geometry import Camera
 from mapless_tools.evaluate.cli import evaluate_command

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from images import encode
+from support.images import encode
+from support.wall import wall
 from typer.testing import CliRunner
-from wall import wall
 
 from mapless.geometry import Camera
 from mapless_tools.cli.app import app

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 import typer
-from images import encode, textured
-from layouts import CAMERA, assert_same_camera, assert_same_pose, by_name, truth
-from planted_damage import damage
-from servers import RunningServer, serving
+from support.images import encode, textured
+from support.layouts import CAMERA, assert_same_camera, assert_same_pose, by_name, truth
+from support.planted_damage import damage
+from support.servers import RunningServer, serving
 from typer.testing import CliRunner, Result
 
 from mapless import Client, Datum, NewReference, Scene

@@ -22,13 +22,12 @@ from typing import Any, cast
 
 import grpc
 import numpy as np
-import programs
 import pytest
-import raw_http2
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from images import encode
-from programs import gated, program, real, wait_until
-from servers import (
+from support import raw_http2
+from support.images import encode
+from support.programs import gated, program, real, wait_until
+from support.servers import (
     CAMERA,
     PHOTO,
     RunningServer,
@@ -299,12 +298,10 @@ class TestMethods:
         """Not noticed as hanging; and with the real limit, in the time that deploy/kubernetes gives."""
         folder = tmp_path / "server"
         script = f"""if True:
-            import sys
             from pathlib import Path
-            sys.path.insert(0, {str(Path(programs.__file__).parent)!r})
-            import programs
-            from mapless_server import serve
-            serve.CLOSING_LIMIT_S = 0.5
+            from support import programs
+            from mapless_server.serve import run
+            run.CLOSING_LIMIT_S = 0.5
             programs._main(Path({str(folder)!r}), "hangs", ["workers=1", "drain_grace_s=0.1"])
         """
         with (

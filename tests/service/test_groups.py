@@ -11,9 +11,9 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
-from compare import assert_pose_close
-from images import encode
-from servers import CAMERA, PHOTO, Stubs, failure_of, pose, serving
+from support.compare import assert_pose_close
+from support.images import encode
+from support.servers import CAMERA, PHOTO, Stubs, failure_of, pose, serving
 
 from mapless import (
     Camera,

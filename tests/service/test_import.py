@@ -14,11 +14,11 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 import typer
-from images import encode
-from layouts import CAMERA, assert_same_camera, assert_same_pose, truth, write_image
-from servers import RunningServer
+from support.images import encode
+from support.layouts import CAMERA, assert_same_camera, assert_same_pose, truth, write_image
+from support.servers import RunningServer
+from support.wall import wall
 from typer.testing import CliRunner, Result
-from wall import wall
 
 from mapless import Client
 from mapless.geometry import Camera

@@ -19,8 +19,8 @@ import grpc
 import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from images import encode
-from servers import CAMERA, PHOTO, RunningServer, pose, serving
+from support.images import encode
+from support.servers import CAMERA, PHOTO, RunningServer, pose, serving
 
 from mapless import Client, ConnectOptions, LocalizationResult, NewReference, Unavailable
 from mapless.geometry import Camera
@@ -209,9 +209,9 @@ def test_a_product_is_computed_by_one_thread_unless_told_otherwise(environment: 
     """The libraries read the environment when they are imported, so the command line must not import them."""
     program = """if True:
         import sys
-        from mapless_server import cli
+        from mapless_tools.cli import app
         assert not {"numpy", "scipy", "cv2", "grpc"} & {*sys.modules}
-        cli.configure_libraries(cli.Settings())
+        app.configure_libraries(app.Settings())
         import os
         print(os.environ["OPENBLAS_NUM_THREADS"])
     """

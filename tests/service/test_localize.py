@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from images import cmyk_jpeg, encode, png_claiming, textured, with_exif_orientation
-from servers import CAMERA, COVARIANCE, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose
+from support.images import cmyk_jpeg, encode, png_claiming, textured, with_exif_orientation
+from support.servers import CAMERA, COVARIANCE, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose
 
 from mapless import (
     Client,

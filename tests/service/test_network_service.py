@@ -14,9 +14,9 @@ pytest.importorskip("torch", reason="the networks' extra is not installed")
 pytest.importorskip("PIL", reason="the networks' extra is not installed")
 
 import torch
-from images import encode, textured
-from servers import listening
-from small_networks import GRIDS, small_network
+from support.images import encode, textured
+from support.servers import listening
+from support.small_networks import GRIDS, small_network
 
 from mapless import Client, LocalizationResult, NewReference, Rejected
 from mapless.geometry import Camera, RigidTransform

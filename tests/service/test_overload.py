@@ -18,10 +18,10 @@ from typing import Any, cast
 import grpc
 import numpy as np
 import pytest
-from images import encode, textured
-from programs import wait_until
 from prometheus_client.parser import text_string_to_metric_families
-from servers import (
+from support.images import encode, textured
+from support.programs import wait_until
+from support.servers import (
     CAMERA,
     PHOTO,
     StandInExtractor,
@@ -260,7 +260,7 @@ def test_what_is_foreseen_to_come_too_late_is_not_even_begun(tmp_path: Path) -> 
 def test_what_waits_for_a_network_is_one_batch_and_its_references_are_encoded_once(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch", reason="the networks' extra is not installed")
     pytest.importorskip("PIL", reason="the networks' extra is not installed")
-    from small_networks import GRIDS, small_network
+    from support.small_networks import GRIDS, small_network
 
     from mapless_server.method import localize as real
     from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor

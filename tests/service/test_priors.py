@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from servers import CAMERA, PHOTO, pose
+from support.servers import CAMERA, PHOTO, pose
 
 from mapless import Client, InvalidArgument, LocalizationResult, NewReference, PositionPrior, Priors
 from mapless.geodesy import Datum, geodetic_from_world

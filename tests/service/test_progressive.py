@@ -14,11 +14,11 @@ from typing import Any, cast
 import grpc
 import numpy as np
 import pytest
-from compare import assert_pose_close
-from corner import CAMERA as CORNER_CAMERA
-from corner import photograph
-from corner import pose as corner_pose
-from servers import (
+from support.compare import assert_pose_close
+from support.corner import CAMERA as CORNER_CAMERA
+from support.corner import photograph
+from support.corner import pose as corner_pose
+from support.servers import (
     CAMERA,
     PHOTO,
     StandInDescriptor,

@@ -16,8 +16,8 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
-from clients import Awaiting, status
-from servers import CAMERA, PHOTO, pose
+from support.clients import Awaiting, status
+from support.servers import CAMERA, PHOTO, pose
 
 from mapless import (
     Client,

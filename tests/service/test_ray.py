@@ -22,10 +22,10 @@ import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
-from postgres import Cluster as Database
-from postgres import require
 from pydantic import SecretStr
-from servers import CAMERA, PHOTO, localize_request, pose, serving
+from support.postgres import Cluster as Database
+from support.postgres import require
+from support.servers import CAMERA, PHOTO, localize_request, pose, serving
 
 from mapless import (
     Client,
@@ -53,7 +53,7 @@ from mapless_tools.load.requests import photo_request
 
 pytest.importorskip("ray.serve", reason="needs Ray Serve: the extra `ray`")
 
-from ray_app import FAILS, HANGS, SECRET
+from support.ray_app import FAILS, HANGS, SECRET
 
 from mapless_ray.trial.callers import Calls, Scenes, calling
 from mapless_ray.trial.cluster import Cluster, Replica, application, running_cluster
@@ -206,7 +206,7 @@ class Guarded:
 
     def application(self, **settings: Any) -> dict[str, Any]:
         given = {"workers": 2, "tokens_file": str(self.tokens_file), "stall_limit_s": 4.0, "allow_watching": True}
-        return application(given | settings, import_path="ray_app:build", **AT_ONCE)
+        return application(given | settings, import_path="support.ray_app:build", **AT_ONCE)
 
     @contextmanager
     def stub(self, address: str | None = None) -> Iterator[LocalizationServiceStub]:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from images import encode, textured
-from programs import wait_until
-from servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, pose, serving
+from support.images import encode, textured
+from support.programs import wait_until
+from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, pose, serving
 
 from mapless import (
     AlreadyExists,

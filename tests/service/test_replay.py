@@ -18,11 +18,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import corner
 import numpy as np
 import pytest
-from images import encode, textured
-from programs import wait_until
+from support import corner
+from support.images import encode, textured
+from support.programs import wait_until
 
 from mapless import (
     Client,

@@ -20,15 +20,15 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import corner
 import cv2
 import grpc
 import numpy as np
 import psycopg
 import pytest
-from images import encode, textured
-from postgres import shared_cluster
-from programs import LIMIT_S, Program, wait_until
+from support import corner
+from support.images import encode, textured
+from support.postgres import shared_cluster
+from support.programs import LIMIT_S, Program, wait_until
 
 from mapless import (
     AlreadyExists,

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from images import encode, textured
-from planted_damage import damage
-from servers import CAMERA, RunningServer, pose, serving
+from support.images import encode, textured
+from support.planted_damage import damage
+from support.servers import CAMERA, RunningServer, pose, serving
 
 from mapless import (
     Camera,

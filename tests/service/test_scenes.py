@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from servers import CAMERA, PHOTO, Stubs, failure_of, pose, serving
+from support.servers import CAMERA, PHOTO, Stubs, failure_of, pose, serving
 
 from mapless import UNCHANGED, Calibration, Client, Datum, InvalidArgument, NewReference, NotFound, Quaternion
 from mapless.geodesy import enu_from_y_up

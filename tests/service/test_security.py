@@ -13,10 +13,10 @@ from typing import Any
 
 import grpc
 import pytest
-from certificates import Pair, authority, signed
 from google.protobuf.message import Message
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
-from servers import CAMERA, PHOTO, RunningServer, failure_of, localize_request, pose, serving
+from support.certificates import Pair, authority, signed
+from support.servers import CAMERA, PHOTO, RunningServer, failure_of, localize_request, pose, serving
 
 from mapless import (
     Client,

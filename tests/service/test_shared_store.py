@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from images import encode, textured
-from postgres import Cluster, require, shared_cluster
-from servers import CAMERA, PHOTO, pose, serving
+from support.images import encode, textured
+from support.postgres import Cluster, require, shared_cluster
+from support.servers import CAMERA, PHOTO, pose, serving
 
 from mapless import Client, ConnectOptions, LocalizationResult, NewReference, NotFound, Unavailable
 from mapless_server.store import Store, StoreError

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from servers import CAMERA, PHOTO, RunningServer, pose, serving
+from support.servers import CAMERA, PHOTO, RunningServer, pose, serving
 
 import mapless
 from mapless import Client, ConnectOptions, LocalizationResult, NewReference, shortcut

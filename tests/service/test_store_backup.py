@@ -12,7 +12,17 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from stores import DATABASES, EXTRACTOR, Folder, Place, Shared, assert_same_view, make_reference, place_on, view_of
+from support.stores import (
+    DATABASES,
+    EXTRACTOR,
+    Folder,
+    Place,
+    Shared,
+    assert_same_view,
+    make_reference,
+    place_on,
+    view_of,
+)
 from typer.testing import CliRunner
 
 from mapless.geodesy import Datum

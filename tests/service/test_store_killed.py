@@ -19,10 +19,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import postgres
 import pytest
-from programs import wait_until
-from stores import DATABASES, Folder, Place, Shared
+from support import postgres
+from support.programs import wait_until
+from support.stores import DATABASES, Folder, Place, Shared
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server import errors

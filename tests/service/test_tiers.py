@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from servers import CAMERA, PHOTO, pose, serving
+from support.servers import CAMERA, PHOTO, pose, serving
 
 from mapless import Client, NewReference
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from chromium import Page, browsing, needs_chromium
-from corner import CAMERA, photograph, pose
 from numpy.typing import NDArray
+from support.chromium import Page, browsing, needs_chromium
+from support.corner import CAMERA, photograph, pose
 
 from mapless import Client, ConnectOptions, LocalizationResult, NewReference
 from mapless_tools.child import child_server

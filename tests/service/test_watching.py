@@ -11,7 +11,7 @@ from typing import Any
 
 import grpc
 import pytest
-from servers import CAMERA, PHOTO, RunningServer, localize_request, pose, serving
+from support.servers import CAMERA, PHOTO, RunningServer, localize_request, pose, serving
 
 from mapless import Client, ConnectOptions, LocalizationResult, NewReference
 from mapless.errors import from_rpc_error

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
-from safetensors_files import safetensors
+from support.safetensors_files import safetensors
 from typer.testing import CliRunner, Result
 
 from mapless_server.networks.weights import catalogue, sources

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import true_structure
-from scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
+from support.planted import true_structure
+from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, Camera, Fisheye, RadialTangential, RigidTransform
 from mapless.v1 import localization_service_pb2 as pb

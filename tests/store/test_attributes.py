@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy import Connection, Row
-from stores import DATABASES, EXTRACTOR, Place, Shared, make_reference, place_on
+from support.stores import DATABASES, EXTRACTOR, Place, Shared, make_reference, place_on
 
 from mapless.geodesy import Datum, enu_from_y_up
 from mapless.geometry import Quaternion, rotation_from_vector

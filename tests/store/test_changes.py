@@ -12,7 +12,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stores import DATABASES, EXTRACTOR, Place, assert_same_bits, make_descriptor, make_reference, place_on, view_of
+from support.stores import (
+    DATABASES,
+    EXTRACTOR,
+    Place,
+    assert_same_bits,
+    make_descriptor,
+    make_reference,
+    place_on,
+    view_of,
+)
 
 from mapless_server import errors
 from mapless_server.security.tenancy import SceneKey

@@ -12,7 +12,17 @@ from typing import Any
 
 import pytest
 from sqlalchemy import Connection
-from stores import DATABASES, EXTRACTOR, Folder, Place, Shared, assert_same_view, make_reference, place_on, view_of
+from support.stores import (
+    DATABASES,
+    EXTRACTOR,
+    Folder,
+    Place,
+    Shared,
+    assert_same_view,
+    make_reference,
+    place_on,
+    view_of,
+)
 
 from mapless_server import errors
 from mapless_server.security.principal import DEFAULT_TENANT

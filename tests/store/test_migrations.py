@@ -10,7 +10,17 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import Connection, insert, text
-from stores import DATABASES, EXTRACTOR, Folder, Place, Shared, assert_same_view, make_reference, place_on, view_of
+from support.stores import (
+    DATABASES,
+    EXTRACTOR,
+    Folder,
+    Place,
+    Shared,
+    assert_same_view,
+    make_reference,
+    place_on,
+    view_of,
+)
 
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import SceneAttributes, Store, StoreError, rows

@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from stores import EXTRACTOR, make_reference, view_of
+from support.stores import EXTRACTOR, make_reference, view_of
 
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
 from mapless_server.security.tenancy import SceneKey

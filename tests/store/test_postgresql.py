@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
-import postgres
 import psycopg
 import pytest
-from stores import EXTRACTOR, Shared, assert_same_view, make_reference, view_of
+from support import postgres
+from support.stores import EXTRACTOR, Shared, assert_same_view, make_reference, view_of
 
 from mapless_server import errors
 from mapless_server.security.principal import DEFAULT_TENANT

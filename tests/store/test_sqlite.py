@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from stores import EXTRACTOR, Folder, make_reference
+from support.stores import EXTRACTOR, Folder, make_reference
 
 from mapless_server import errors
 from mapless_server.security.principal import DEFAULT_TENANT

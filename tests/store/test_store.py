@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy.exc import IntegrityError
-from stores import (
+from support.stores import (
     DATABASES,
     EXTRACTOR,
     Folder,

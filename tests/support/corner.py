@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from images import encode
 from numpy.typing import NDArray
-from scenes import look_at
 
 from mapless.geometry import Camera, RigidTransform
+from support.images import encode
+from support.scenes import look_at
 
 CAMERA = Camera(512, 384, 430.0, 430.0, 255.5, 191.5)
 SIDE_M = 4.0

@@ -9,9 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_network import FakeNetwork, FakeNetworkOptions
-from planted import true_correspondences
-from scenes import SceneOptions, SyntheticScene, make_scene, random_for, unit_rows
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -27,6 +24,9 @@ from mapless_server.method.scale import MetricScale, estimate_scale
 from mapless_server.method.scale_equations import ScaleOptions
 from mapless_server.method.structure import PAPER_STRUCTURE, Structure, StructureOptions, build_structure
 from mapless_server.method.views import Matches
+from support.fake_network import FakeNetwork, FakeNetworkOptions
+from support.planted import true_correspondences
+from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for, unit_rows
 
 VARIANTS: dict[str, tuple[StructureOptions | None, MatchOptions | None]] = {
     "coarse": (None, None),

@@ -20,11 +20,11 @@ from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import yaml  # type: ignore[import-untyped]
-from certificates import Pair, authority, signed
 
 from mapless import ConnectOptions
+from support.certificates import Pair, authority, signed
 
-ENVOY = Path(__file__).parents[1] / "deploy" / "envoy" / "gateway"
+ENVOY = Path(__file__).parents[2] / "deploy" / "envoy" / "gateway"
 HEALTH_INTERVAL_S = 0.2
 LIMIT_S = 60.0
 Json = dict[str, Any]

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scenes import SyntheticScene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, resized_pixel, rotation_from_vector
 from mapless_server.method.coarse import Bucket, Outcome, Request
 from mapless_server.method.reconstruction import ReconstructedView, Reconstruction
 from mapless_server.method.views import PosedView, View
+from support.scenes import SyntheticScene, random_for
 
 
 @dataclass(frozen=True)

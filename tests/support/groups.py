@@ -6,8 +6,6 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-from planted import true_structure
-from scenes import SceneOptions, SyntheticScene, look_at, make_scene, observe
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.answer import Answer, Localization
@@ -17,6 +15,8 @@ from mapless_server.method.observations import KeypointNoise
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.support import Support
+from support.planted import true_structure
+from support.scenes import SceneOptions, SyntheticScene, look_at, make_scene, observe
 
 NOISE = KeypointNoise(0.5, 0.0)
 MATCH = MatchOptions()

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from images import encode, textured
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_tools.dataset import Dataset, Frame
+from support.images import encode, textured
 
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.25, 30.75)
 

@@ -7,7 +7,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scenes import SyntheticScene
 
 from mapless.geometry import RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.correspond import Correspondences
@@ -18,6 +17,7 @@ from mapless_server.method.scale import MetricScale, ScaleStage
 from mapless_server.method.structure import Structure, observe
 from mapless_server.method.tracks import Tracks
 from mapless_server.method.views import Matches, PosedView
+from support.scenes import SyntheticScene
 
 
 def true_correspondences(scene: SyntheticScene) -> Correspondences:

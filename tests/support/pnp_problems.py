@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scenes import CAMERA
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.match import PointMatches
@@ -11,6 +10,7 @@ from mapless_server.method.observations import ONE_PIXEL
 from mapless_server.method.structure import Structure
 from mapless_server.method.tracks import Tracks
 from mapless_server.method.views import Features, View
+from support.scenes import CAMERA
 
 POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
 Problem = tuple[View, Structure, PointMatches]

@@ -20,8 +20,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
-from servers import StandInExtractor, StandInMethod, StandInReconstructor, whole
-
 from mapless_server.engine.engine import Engine
 from mapless_server.engine.tiers import Tier
 from mapless_server.method.localize import Answer, Pipeline
@@ -32,8 +30,11 @@ from mapless_server.serve.assembly import engine_options
 from mapless_server.serve.run import serve
 from mapless_server.settings import Settings, load_settings
 from mapless_server.store import Store
+from support.servers import StandInExtractor, StandInMethod, StandInReconstructor, whole
 
 LIMIT_S = 60.0
+TESTS = Path(__file__).parents[1]
+GATED = ("-m", "support.programs")
 _ANNOUNCEMENT = "mapless-server listening on "
 
 
@@ -102,13 +103,14 @@ class Program:
 def program(folder: Path, arguments: Sequence[str], **environment: str) -> Iterator[Program]:
     """A Python program with its log in the folder; it is gone when the block is left."""
     folder.mkdir(exist_ok=True)
+    paths = (str(TESTS), os.environ.get("PYTHONPATH"))
     with (folder / "log").open("a") as log:
         process = subprocess.Popen(
             [sys.executable, *arguments],
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,
-            env={**os.environ, **environment},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), **environment},
         )
     deadline = threading.Timer(LIMIT_S, process.kill)  # reading its output has no deadline
     deadline.start()
@@ -133,7 +135,7 @@ def real(folder: Path, **settings: Any) -> Iterator[Program]:
 def gated(folder: Path, kind: str = "asks", **settings: Any) -> Iterator[Program]:
     """The program that is this file; its method "asks" whether anybody still waits for it, or "hangs" for good."""
     given = [f"{name}={value}" for name, value in settings.items()]
-    with program(folder, [__file__, str(folder), kind, *given]) as running:
+    with program(folder, [*GATED, str(folder), kind, *given]) as running:
         yield running
 
 

@@ -13,7 +13,6 @@ from typing import Any, cast
 
 import numpy as np
 from ray.serve import Application
-from servers import COVARIANCE, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
 
 from mapless.geometry import Similarity
 from mapless_ray.app import deployed
@@ -28,6 +27,7 @@ from mapless_server.security.rate import RateLimiter
 from mapless_server.serve.assembly import engine_options
 from mapless_server.settings import Settings
 from mapless_server.store import Store
+from support.servers import COVARIANCE, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
 
 FAILS, HANGS, ENDS = -1.0, -2.0, -3.0
 """With an exception; never; and the process with it."""

@@ -15,7 +15,6 @@ from typing import Any, cast
 import grpc
 import numpy as np
 import pytest
-from images import encode, textured
 from numpy.typing import NDArray
 
 from mapless import MaplessError, wire
@@ -37,6 +36,7 @@ from mapless_server.serve.assembly import MakeEngine, engine_options
 from mapless_server.serve.running import Running, running_server
 from mapless_server.settings import Settings
 from mapless_server.store import Store
+from support.images import encode, textured
 
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
 PHOTO = encode(".png", textured())

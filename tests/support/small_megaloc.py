@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
-from parity_rule import weights
 from torch import Tensor
 
 from mapless_server.networks.megaloc import MegaLoc, MegaLocSizes
+from support.parity_rule import weights
 
 SMALL_MEGALOC = MegaLocSizes(64, 4, 3, hidden=32, clusters=8, cluster_width=16, token_width=24, length=96)
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from images import textured
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
@@ -17,6 +16,7 @@ from mapless_server.networks.network import Network, Sizes
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.pi3x import Pi3X
 from mapless_server.networks.runner import NetworkRunner
+from support.images import textured
 
 SMALL = {
     "pi3": Sizes(64, 4, encoder_depth=3, decoder_depth=4, head_depth=2, camera_width=32),

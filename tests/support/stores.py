@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import postgres
 import psycopg
 
 from mapless.geometry import Camera, Distortion, RigidTransform, rotation_from_vector
 from mapless_server.method.views import Features, View
 from mapless_server.store import NewReference, Store, sqlite
 from mapless_server.store.store import DEFAULT_CACHE_BYTES
+from support import postgres
 
 EXTRACTOR = "sift"
 DATABASES = ("sqlite", "postgresql")

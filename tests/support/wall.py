@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from images import textured
 from numpy.typing import NDArray
-from scenes import random_for
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from support.images import textured
+from support.scenes import random_for
 
 PIXELS_PER_METRE = 150.0
 BOARDS_M = ((5.0, 9.0, 7.0), (3.6, 1.6, 1.1))

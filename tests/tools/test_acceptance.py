@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
-from scenes import SceneOptions, make_scene, random_for
+from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless_server.method.localize import Localization, LocalizeOptions
 from mapless_server.method.rejection import Rejection

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
-from small_networks import SMALL, references_of, small_runner
-from small_networks import photograph as photograph_of
+from support.small_networks import SMALL, references_of, small_runner
+from support.small_networks import photograph as photograph_of
 from torch.nn.attention import SDPBackend
 
 from mapless.geometry import Camera

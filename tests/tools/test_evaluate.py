@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from images import encode, textured
 from rich.console import Console
+from support.images import encode, textured
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.images.decode import ImageLimits

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from images import textured
+from support.images import textured
 
 from mapless import Internal
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector

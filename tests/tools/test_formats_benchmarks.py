@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import assert_reads, assert_same_camera, assert_same_pose, by_name, reasons, truth, write_image
+from support.layouts import assert_reads, assert_same_camera, assert_same_pose, by_name, reasons, truth, write_image
 
 from mapless.geometry import Camera, RadialTangential, RigidTransform
 from mapless_tools.ingest.formats import Intrinsics, ReadOptions, read_dataset

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from layouts import (
+from support.layouts import (
     CAMERA,
     Truth,
     assert_reads,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import CAMERA, Truth, assert_reads, assert_same_camera, reasons, truth, write_image
+from support.layouts import CAMERA, Truth, assert_reads, assert_same_camera, reasons, truth, write_image
 
 from mapless.geometry import Camera, Fisheye, RadialTangential, RigidTransform
 from mapless_tools.ingest.formats import ReadOptions, read_dataset

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from layouts import CAMERA, Truth, assert_reads, reasons, truth, write_image
+from support.layouts import CAMERA, Truth, assert_reads, reasons, truth, write_image
 
 from mapless.geometry import Fisheye, RadialTangential
 from mapless_tools.dataset import read_folder

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from layouts import CAMERA, truth, write_image
+from support.layouts import CAMERA, truth, write_image
 
 from mapless import (
     AlreadyExists,

@@ -14,7 +14,7 @@ from urllib.request import Request, urlopen
 import cv2
 import numpy as np
 import pytest
-from images import encode
+from support.images import encode
 from typer.testing import CliRunner
 
 from mapless import Datum, Quaternion, Reference, Scene
