@@ -78,7 +78,7 @@ GOLDEN = {
 
 
 @pytest.mark.parametrize("case", GOLDEN, ids=lambda case: f"{case[0]}-{case[1].value}")
-def test_a_camera_is_where_and_looks_where_it_was_derived_by_hand(case: tuple[str, Axes]) -> None:
+def test_a_camera_looks_where_the_derivation_by_hand_says(case: tuple[str, Axes]) -> None:
     world_from_camera, quaternion, position = GOLDEN[case]
     found = module.pose_to(case[1], world_from_camera)
     np.testing.assert_allclose(found.translation, position, atol=1e-12)
@@ -118,7 +118,7 @@ def test_every_rotation_is_a_proper_one(axes: Axes, world_from_camera: RigidTran
 
 @settings(deadline=None)
 @given(rigid)
-def test_unity_is_arkit_mirrored_by_the_known_rule_for_quaternions(world_from_camera: RigidTransform) -> None:
+def test_unity_is_arkit_mirrored_by_the_quaternion_rule(world_from_camera: RigidTransform) -> None:
     """(x, y, z, w) of a pose in OpenGL's axes is (-x, -y, z, w) in Unity."""
     arkit = module.pose_to(Axes.ARKIT, world_from_camera).quaternion()
     unity = module.pose_to(Axes.UNITY, world_from_camera)
@@ -129,7 +129,7 @@ def test_unity_is_arkit_mirrored_by_the_known_rule_for_quaternions(world_from_ca
 # Sessions
 
 
-def test_a_headset_finds_itself_in_the_world_after_it_has_moved_on() -> None:
+def test_a_headset_that_moved_on_finds_itself_in_the_world() -> None:
     """In Unity. At capture it is at its session's origin; the answer is that it looks along the world's x."""
     at_capture = RigidTransform.identity()
     world_from_session = module.world_from_session_in(Axes.UNITY, LOOKS_ALONG_X, at_capture)
@@ -164,7 +164,7 @@ def test_a_session_leads_to_the_same_in_all_axes(
 # Covariances
 
 
-def test_a_covariance_in_unity_changes_the_signs_that_the_mirror_changes() -> None:
+def test_unity_covariance_changes_the_signs_the_mirror_changes() -> None:
     """A turn about x, from y to z, goes the other way where z does; so does one about y. One about z stays as it is."""
     covariance = np.arange(36.0).reshape(6, 6)
     signs = np.array([1, 1, -1, -1, -1, 1])

@@ -65,7 +65,7 @@ def test_a_file_that_is_none_is_named(tmp_path: Path, text: str) -> None:
 
 
 @pytest.mark.parametrize("fov_deg", [20.0, 66.0, 120.0])
-def test_the_edges_of_a_camera_from_its_field_of_view_are_so_far_apart(fov_deg: float) -> None:
+def test_edges_of_a_camera_span_its_field_of_view(fov_deg: float) -> None:
     camera = Camera.from_fov(640, 480, fov_deg)
     left, right = camera.rays([[-0.5, 239.5], [639.5, 239.5]])
     assert math.degrees(math.atan(right[0]) - math.atan(left[0])) == pytest.approx(fov_deg)

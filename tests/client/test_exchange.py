@@ -42,7 +42,7 @@ def test_what_succeeds_is_asked_once() -> None:
     assert (played.result, played.tries, played.pauses) == (Empty(), [7.0], [])
 
 
-def test_pauses_double_up_to_the_longest_and_attempts_are_counted() -> None:
+def test_pauses_double_up_to_the_longest_and_are_counted() -> None:
     options = ConnectOptions(max_attempts=6, initial_backoff_s=0.2, max_backoff_s=1.0)
     played = Played(asking(), [UNAVAILABLE], options)
     assert played.result is UNAVAILABLE
@@ -78,7 +78,7 @@ def test_laws(outcomes: list[float | None], code: str, timeout_s: float, dice: f
         assert code == "UNAVAILABLE" or pause_s >= asked_s > 0
 
 
-def test_a_call_that_somebody_between_cancelled_is_tried_again_as_one_that_may_be_done() -> None:
+def test_a_call_cancelled_by_a_proxy_is_retried_as_maybe_done() -> None:
     """A load balancer says so whose server went in the middle of the answer."""
     cancelled = MaplessError("CANCELLED", "CANCELLED")
     played = Played(asking(timeout_s=10.0), [cancelled, Empty()], ConnectOptions())
@@ -98,12 +98,12 @@ def test_who_would_come_back_after_its_deadline_is_told_at_once() -> None:
     assert (played.result, len(played.tries), played.pauses) == (refused, 1, [])
 
 
-def test_the_second_pause_is_what_a_starting_server_asks_for_and_the_first_leaves_it_to_another() -> None:
+def test_the_second_pause_is_what_a_starting_server_asks_for() -> None:
     starting = Unavailable("UNAVAILABLE", "starting", retry_after_s=1.0)
     assert Played(asking(), [starting, starting, Empty()], ConnectOptions()).pauses == pytest.approx([0.2, 1.125])
 
 
-def test_a_server_that_says_when_to_come_back_is_asked_until_the_deadline() -> None:
+def test_retries_follow_the_servers_delay_until_the_deadline() -> None:
     starting = Unavailable("UNAVAILABLE", "starting", retry_after_s=1.0)
     played = Played(asking(timeout_s=30.0), [starting], ConnectOptions())
     assert played.pauses == pytest.approx([0.2] + [1.125] * 13)
@@ -169,7 +169,7 @@ def test_an_exchange_can_go_on_after_an_error() -> None:
     assert (played.result, [call.method for call in played.calls]) == ("done", ["s/A", "s/B"])
 
 
-def test_what_is_looked_up_after_a_lost_answer_has_the_time_that_is_left_and_no_more() -> None:
+def test_the_lookup_after_a_lost_answer_has_the_remaining_time() -> None:
     """Each attempt takes a second, and there are 32 things to look up."""
 
     def each(error: MaplessError) -> Exchange[None]:

@@ -68,7 +68,7 @@ def test_places_are_where_they_are_published_to_be(geodetic: tuple[float, float,
         assert back.longitude_deg == pytest.approx(geodetic[1], abs=1e-6)
 
 
-def test_a_place_far_from_the_datum_is_where_it_is_published_to_be() -> None:
+def test_a_place_far_from_the_datum_matches_the_published_one() -> None:
     """GeographicLib: CartConvert(1) with -l 33 44 20, and LocalCartesian's example of Calais seen from Paris."""
     near = world_from_geodetic(GeoPosition(33.3, 44.4, 6000), Datum(33, 44, 20))
     np.testing.assert_allclose(near, (37288.97, 33374.29, 5783.64), atol=0.011)  # the last digit there is cut off
@@ -94,7 +94,7 @@ def test_the_world_there_and_back_is_the_same_within_10_km(it: Datum, x_in_world
 
 @settings(deadline=None)
 @given(place)
-def test_east_north_and_up_are_where_places_go_when_their_numbers_rise(it: GeoPosition) -> None:
+def test_east_north_and_up_point_where_coordinates_rise(it: GeoPosition) -> None:
     """The frame's axes against differences of `ecef_from_geodetic`, a metre or so in each direction."""
     if abs(it.latitude_deg) > 89:
         return
@@ -117,9 +117,7 @@ def test_east_north_and_up_are_where_places_go_when_their_numbers_rise(it: GeoPo
 
 
 @pytest.mark.parametrize(("latitude_deg", "longitude_deg"), [(0, 180), (60, 180), (0, 0), (90, 0), (-90, 0)])
-def test_where_signs_of_zero_would_decide_the_longitude_it_is_the_one_given(
-    latitude_deg: float, longitude_deg: float
-) -> None:
+def test_longitude_at_signed_zero_is_the_one_given(latitude_deg: float, longitude_deg: float) -> None:
     found = geodetic_from_ecef(ecef_from_geodetic(GeoPosition(latitude_deg, longitude_deg, 7.0)))
     assert found.longitude_deg == longitude_deg
     assert found.latitude_deg == pytest.approx(latitude_deg, abs=1e-12)
@@ -199,7 +197,7 @@ def test_a_world_is_turned_by_a_compass(heading_deg: float, ahead: tuple[float, 
     assert enu_from_z_up(90) == Quaternion(0, 0, 0, 1)
 
 
-def test_the_tangent_plane_is_that_of_the_pose_and_not_that_of_the_datum() -> None:
+def test_the_tangent_plane_is_at_the_pose_and_not_at_the_datum() -> None:
     """10 km straight east from the equator, along the tangent, the ground has turned away by atan(10 km / a).
 
     A camera that looks on along the tangent has its nose up by that angle, which about its left, north, is negative. It

@@ -111,7 +111,7 @@ def run(
     return caught.value.code, [json.loads(line) for line in printed.out.splitlines()], printed.err
 
 
-def test_photographs_that_are_refused_do_not_wait_behind_fresh_ones(
+def test_refused_photographs_do_not_wait_behind_new_ones(
     server: FewAtATime, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of four at a time one is taken, and answered when each of the others was refused and has come again."""
@@ -199,7 +199,7 @@ def test_what_is_captured_is_counted() -> None:
     assert (tally.text(), tally.exit_code) == (told, 1)
 
 
-def test_many_refusals_leave_one_at_a_time_and_answers_make_it_more() -> None:
+def test_refusals_lower_concurrency_and_answers_raise_it() -> None:
     pace = Pace(2)
     for _ in range(5):
         pace.failed(ResourceExhausted("RESOURCE_EXHAUSTED", "full"))

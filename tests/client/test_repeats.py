@@ -55,7 +55,7 @@ def sent() -> pb.CreateSceneRequest:
     return request
 
 
-def test_a_scene_is_ours_though_the_server_has_normalized_what_we_sent() -> None:
+def test_a_scene_normalized_by_the_server_is_still_ours() -> None:
     there = sent()
     length = math.hypot(*DOWN)
     for axis in ("x", "y", "z"):
@@ -86,7 +86,7 @@ def test_a_scene_of_another_world_is_not_ours(path: str, value: float) -> None:
     assert created(there) is TAKEN
 
 
-def test_a_scene_of_which_less_is_known_or_that_was_changed_is_not_ours() -> None:
+def test_a_scene_that_was_changed_or_lacks_fields_is_not_ours() -> None:
     assert created(pb.Scene(name="scenes/hall", generation=1)) is TAKEN
     assert created(pb.Scene(name="scenes/hall", generation=1, datum=sent().datum)) is TAKEN
     assert created(sent(), generation=2) is TAKEN
@@ -206,7 +206,7 @@ def localize() -> Exchange[Any]:
         (lambda: references.list_scenes().fetch(""), lambda: pb.ListScenesResponse(scenes=[pb.Scene()])),
     ],
 )
-def test_an_answer_that_breaks_its_contract_is_an_error_of_the_server(
+def test_an_answer_that_breaks_its_contract_is_a_server_error(
     ask: Callable[[], Exchange[Any]], answer: Callable[[], Message]
 ) -> None:
     error = Played(ask(), [answer()], ConnectOptions()).result
@@ -220,7 +220,7 @@ def test_such_an_error_says_which_field_of_which_call() -> None:
     assert "LocalizationService/Localize" in error.message
 
 
-def test_what_is_looked_up_and_breaks_its_contract_is_an_error_of_the_server_too() -> None:
+def test_a_lookup_that_breaks_its_contract_is_a_server_error() -> None:
     there = stored(requests(1)[0])
     there.world_from_camera.CopyFrom(a_pose_that_is_none())
     page = pb.ListReferencesResponse(references=[there])

@@ -141,7 +141,7 @@ def numbers_of(html: str, kind: str) -> Array:
     return np.array(found, float)
 
 
-def test_residuals_lead_from_where_points_are_seen_to_where_the_pose_puts_them() -> None:
+def test_residuals_lead_from_observed_to_projected_points() -> None:
     answer = localized()
     assert answer.debug is not None
     html = report_html(answer, PHOTO, CAMERA)
@@ -156,7 +156,7 @@ def test_residuals_lead_from_where_points_are_seen_to_where_the_pose_puts_them()
     assert (np.hypot(far[:, 2], far[:, 3]) <= 0.06 * CAMERA.width_px + 0.02).all()
 
 
-def test_small_residuals_are_drawn_longer_and_large_ones_as_they_are() -> None:
+def test_small_residuals_are_enlarged_and_large_ones_are_not() -> None:
     assert magnification(np.full((9, 2), 0.01), 1000) == 200
     assert magnification(np.full((9, 2), 50.0), 1000) == 1
     assert magnification(np.empty((0, 2)), 1000) == 1
@@ -209,7 +209,7 @@ def test_a_rejection_shows_what_to_point_the_camera_at() -> None:
     assert "Point the camera at this" not in report_html(localized(), PHOTO, CAMERA, BOTH)
 
 
-def test_references_that_share_nothing_are_neither_mapped_nor_counted() -> None:
+def test_references_without_matches_are_not_mapped_or_counted() -> None:
     uses = tuple(replace(use, match_count=0, inlier_count=0, similarity=0.0) for use in diagnostics().references)
     page = report_html(rejected(hint=None, diagnostics=replace(diagnostics(), references=uses)), PHOTO, CAMERA, BOTH)
     assert "From above" not in page
@@ -291,7 +291,7 @@ class TestPictures:
         assert b"where" not in data
         np.testing.assert_array_equal(pixels(data), pixels(image))
 
-    def test_of_application_segments_a_jpeg_keeps_those_that_decoders_need(self) -> None:
+    def test_a_jpeg_keeps_the_segments_that_decoders_need(self) -> None:
         profile, index, depth = b"ICC_PROFILE\0\1\1profile", b"MPF\0where", b"JFXX\0\x10where"
         segments = b"".join(
             bytes([0xFF, kind]) + (len(body) + 2).to_bytes(2, "big") + body
@@ -312,7 +312,7 @@ class TestPictures:
         file = write_report(localized(), large, CAMERA, tmp_path / "report.html", references=references)
         assert file.stat().st_size < 5e6
 
-    def test_without_pillow_a_large_one_is_left_out_and_the_page_says_so(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_without_pillow_a_large_photo_is_left_out_with_a_note(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(pictures, "_reduced", lambda image: None)
         assert "pillow" in pictures.picture(PHOTO, 1000).note
         assert not pictures.picture(PHOTO, 1000).uri

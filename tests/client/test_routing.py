@@ -65,7 +65,7 @@ def test_what_concerns_no_scene_says_nothing() -> None:
 
 
 @given(scene=st.one_of(st.text(), st.text().map("scenes/".__add__), st.text().map("scenes/a\n/references/".__add__)))
-def test_what_is_no_name_is_left_to_the_server_and_what_is_one_fits_a_header(scene: str) -> None:
+def test_invalid_names_pass_and_valid_names_fit_a_header(scene: str) -> None:
     for request in (localization_pb.LocalizeRequest(scene=scene), reference_pb.GetReferenceRequest(name=scene)):
         for key, value in scene_metadata(request):
             assert (key, value) == (SCENE_KEY, f"scenes/{names.check_id(value.removeprefix('scenes/'))}")

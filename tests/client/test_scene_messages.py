@@ -11,7 +11,7 @@ from mapless_server.services.messages.scenes import changes_from_message
 
 
 @pytest.mark.parametrize("seconds", [0, 1, 10**15, -(10**15)])
-def test_when_a_calibration_was_stored_is_not_the_caller_s_to_say_whatever_it_says(seconds: int) -> None:
+def test_the_caller_does_not_set_when_a_calibration_was_stored(seconds: int) -> None:
     calibration = pb.SceneCalibration(
         position_factor_68=1.0,
         position_factor_95=1.5,

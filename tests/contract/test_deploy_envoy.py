@@ -108,7 +108,7 @@ def test_ports_are_those_of_the_configuration() -> None:
 
 
 @needs_kubectl
-def test_the_servers_are_found_by_the_name_and_port_that_they_have() -> None:
+def test_servers_are_found_by_their_name_and_port() -> None:
     headless = the("Service", "mapless-headless")["spec"]
     assert headless["clusterIP"] == "None"
     server = the("Deployment", "mapless")["spec"]["template"]
@@ -192,7 +192,7 @@ def test_administration_is_for_the_pod_alone() -> None:
     assert route["match"]["path"] == "/metrics"
 
 
-def test_calls_with_a_scene_are_hashed_by_it_and_others_go_where_least_is_under_way() -> None:
+def test_calls_with_a_scene_are_hashed_and_others_balanced() -> None:
     (host,) = manager("calls")["route_config"]["virtual_hosts"]
     watching, by_scene, by_load, health = host["routes"]
     method = localization_service_pb2.DESCRIPTOR.services_by_name["LocalizationService"].methods_by_name["WatchQueries"]

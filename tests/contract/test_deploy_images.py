@@ -200,9 +200,7 @@ def test_an_image_checks_its_health_with_our_client(target: str) -> None:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_an_image_sets_settings_that_exist_and_decides_nothing_about_security(
-    target: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_image_sets_known_settings_and_none_of_security(target: str, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = settings_under(ours(environment_of(target)), monkeypatch)
     assert (settings.tls_certificate, settings.tokens_file, settings.insecure) == (None, None, False)
     assert verdict_on(settings) is Verdict.REFUSED

@@ -130,7 +130,7 @@ def limit(container: Json, source: Json) -> int:
 # The files
 
 
-def test_every_file_is_named_by_its_kustomization_and_nothing_else_is() -> None:
+def test_kustomizations_name_every_file_and_no_other() -> None:
     for kustomization in KUBERNETES.rglob("kustomization.yaml"):
         (document,) = read(kustomization)
         named = [*document.get("resources", ()), *(patch["path"] for patch in document.get("patches", ()))]

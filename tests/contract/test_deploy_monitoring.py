@@ -239,7 +239,7 @@ def test_a_panel_says_how_to_read_it_in_which_unit(panel: dict[str, Any]) -> Non
     assert len(set(references)) == len(references)
 
 
-def test_variables_are_defined_and_asked_of_series_that_there_are() -> None:
+def test_variables_are_defined_and_query_existing_series() -> None:
     variables = {it["name"]: it for it in DASHBOARD["templating"]["list"]}
     builtin = {"__rate_interval"}
     used = set(re.findall(r"\$\{?(\w+)", json.dumps([DASHBOARD["panels"], DASHBOARD["annotations"]])))

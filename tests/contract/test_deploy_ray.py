@@ -127,7 +127,7 @@ def test_settings_are_mapless_own(monkeypatch: pytest.MonkeyPatch) -> None:
     assert int(limit_bytes) == settings.max_message_mib * 2**20
 
 
-def test_every_pod_has_the_same_of_rays_settings_and_ray_knows_them() -> None:
+def test_every_pod_has_the_same_ray_settings_that_ray_knows() -> None:
     told = environment("head", "RAY_")
     assert told == environment("worker", "RAY_")
     assert told["RAY_SERVE_ENABLE_HA_PROXY"] == "1"
@@ -225,7 +225,7 @@ def test_no_service_of_ours_has_more_than_the_port_for_calls() -> None:
         assert at == {"address": headless["metadata"]["name"], "port_value": CALLS}
 
 
-def test_policies_let_in_the_gateway_ray_itself_and_who_measures() -> None:
+def test_policies_admit_the_gateway_ray_and_prometheus() -> None:
     everybody, head = POLICIES["mapless-ray"], POLICIES["mapless-ray-head"]
     assert everybody["podSelector"]["matchLabels"] == RAY
     assert head["podSelector"]["matchLabels"] == RAY | HEAD
@@ -249,7 +249,7 @@ def test_policies_let_in_the_gateway_ray_itself_and_who_measures() -> None:
     assert set(source) == {"namespaceSelector", "podSelector"}  # both at once, not one or the other
 
 
-def test_policies_let_out_to_the_database_names_and_the_clusters_api() -> None:
+def test_policies_allow_database_dns_and_the_cluster_api() -> None:
     def ports(name: str) -> list[set[int]]:
         return [{port["port"] for port in rule.get("ports", ())} for rule in POLICIES[name]["egress"]]
 

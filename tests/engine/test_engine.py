@@ -155,7 +155,7 @@ class TestTiers:
             (localized(DOUBTFUL_INLIERS), rejected(), "cheap"),
         ],
     )
-    def test_a_doubtful_answer_is_tried_again_and_the_better_one_given(
+    def test_a_doubtful_answer_is_retried_and_the_better_one_given(
         self, setting: Setting, first: Answer, second: Answer, answered: str
     ) -> None:
         setting.replies = {"cheap": first, "strong": second}
@@ -188,7 +188,7 @@ class TestTiers:
         assert isinstance(result.attempt.answer.outcome, Localization)
         assert setting.asked == ["cheap", "strong"]
 
-    def test_each_tier_works_with_its_own_features_on_one_photograph(self, setting: Setting) -> None:
+    def test_each_tier_uses_its_own_features_on_one_photograph(self, setting: Setting) -> None:
         """The photograph is decoded once; the references are those of each tier, the same ones."""
         setting.replies = {"cheap": rejected(), "strong": rejected()}
         setting.localize()
@@ -235,7 +235,7 @@ class TestTiers:
         assert "strong failed" in caplog.text
         assert "out of memory, say" in caplog.text
 
-    def test_nobody_waits_until_references_are_described_for_a_better_answer(self, setting: Setting) -> None:
+    def test_a_better_answer_never_waits_for_feature_extraction(self, setting: Setting) -> None:
         """It is done after the call, once, and the next doubtful query has the better answer."""
         setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": localized(SURE_INLIERS)}
         photo = encode(".png", textured(seed=7))
@@ -275,7 +275,7 @@ class TestTiers:
 
 
 class TestMemory:
-    def test_a_photograph_of_a_group_is_counted_once_with_its_group_and_a_single_one_by_itself(
+    def test_a_group_photo_is_counted_with_its_group_only(
         self, setting: Setting, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         setting.replies["cheap"] = localized(SURE_INLIERS)
@@ -304,7 +304,7 @@ class TestPhotograph:
             assert reference.view.photograph is not None
             np.testing.assert_array_equal(reference.view.photograph.read(), textured(seed=i))
 
-    def test_one_that_goes_while_a_network_looks_is_no_candidate_any_more(self, setting: Setting) -> None:
+    def test_one_deleted_during_the_network_is_no_candidate(self, setting: Setting) -> None:
         """The server chose it, so the caller must not hear of it."""
 
         def look(_: View, references: Sequence[PosedView], __: Any) -> Answer:

@@ -57,7 +57,7 @@ def test_a_fault_in_our_own_arithmetic_is_of_the_item(message: str) -> None:
 
 
 @pytest.mark.parametrize("message", [*LOST, *FULL])
-def test_the_words_alone_do_nothing_in_an_exception_of_another_kind(message: str) -> None:
+def test_the_text_alone_does_nothing_in_another_exception_type(message: str) -> None:
     """A caller may send a scene of that name."""
     assert failure_of(ValueError(message)) is Failure.OF_ITEM
     assert failure_of(errors.InvalidArgument(message)) is Failure.OF_REQUEST
@@ -84,7 +84,7 @@ def test_everything_else_is_of_the_item(error: Exception) -> None:
     assert failure_of(error) is Failure.OF_ITEM
 
 
-def test_what_was_handled_before_says_nothing_of_what_is_raised_now() -> None:
+def test_an_earlier_handled_failure_does_not_affect_this_one() -> None:
     def handle() -> None:
         try:
             raise RuntimeError(LOST[0])

@@ -89,7 +89,7 @@ def run(engine: Toy, work: Coroutine[Any, Any, None]) -> None:
     asyncio.run(all_of_it())
 
 
-def test_groups_in_progress_hold_no_more_than_is_allowed_and_the_others_are_refused_as_single_calls_are() -> None:
+def test_groups_in_progress_are_bounded_and_others_refused() -> None:
     engine, held, most = Toy(), 0, 0
     outcomes: Counter[str] = Counter()
 
@@ -121,7 +121,7 @@ def test_groups_in_progress_hold_no_more_than_is_allowed_and_the_others_are_refu
     run(engine, work())
 
 
-def test_what_a_group_holds_is_missing_to_single_calls_until_it_ends_whether_well_or_not() -> None:
+def test_memory_of_a_group_is_reserved_until_it_ends() -> None:
     engine = Toy()
     single = replace(PART, photo=Photo(bytes(500), CAMERA, "image"), is_part=False)
 
@@ -153,7 +153,7 @@ def test_one_caller_s_groups_leave_room_for_another_s() -> None:
     run(engine, work())
 
 
-def test_a_group_that_no_server_of_this_setting_could_hold_is_told_not_to_come_again() -> None:
+def test_a_group_too_large_for_the_setting_is_told_not_to_retry() -> None:
     engine = Toy()
 
     async def work() -> None:
@@ -164,7 +164,7 @@ def test_a_group_that_no_server_of_this_setting_could_hold_is_told_not_to_come_a
     run(engine, work())
 
 
-def test_photographs_that_were_computed_are_posed_together_however_full_the_queue_is() -> None:
+def test_computed_photos_are_posed_together_in_a_full_queue() -> None:
     engine = Toy(max_queued_s=0.3)
     is_released = threading.Event()
 

@@ -120,7 +120,7 @@ def test_whoever_is_cancelled_while_waiting_ends_it() -> None:
     run(test())
 
 
-def test_an_error_that_nobody_waits_for_any_more_is_not_reported(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_error_that_nobody_awaits_is_not_reported(caplog: pytest.LogCaptureFixture) -> None:
     async def test() -> None:
         planted = Planted([1], KeyError("planted"))
         planted.may_end.set()

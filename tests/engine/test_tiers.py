@@ -52,14 +52,12 @@ def better(cheap: Answer, strong: Answer) -> Attempt:
 
 class TestDoubt:
     @pytest.mark.parametrize("reason", RejectionReason)
-    def test_a_rejection_is_doubtful_unless_the_references_are_to_blame(self, reason: RejectionReason) -> None:
+    def test_a_rejection_is_doubtful_unless_references_caused_it(self, reason: RejectionReason) -> None:
         assert is_doubtful(rejected(reason), OPTIONS) is (reason not in UNMENDABLE)
         assert {it.name for it in UNMENDABLE} == {"NO_USABLE_REFERENCES", "DEGENERATE_REFERENCES"}
 
     @given(trust=st.floats(0, 1), sigma_m=st.floats(1e-4, 1.0))
-    def test_a_pose_is_doubtful_with_little_trust_or_a_large_radius_and_no_other_is(
-        self, trust: float, sigma_m: float
-    ) -> None:
+    def test_doubt_is_little_trust_or_a_large_radius(self, trust: float, sigma_m: float) -> None:
         radius_m = error_radius(np.eye(3) * sigma_m**2, 0.68)
         expected = trust < OPTIONS.doubtful_trust or radius_m > OPTIONS.doubtful_radius_m
         assert is_doubtful(localized(sigma_m=sigma_m, trust=trust), OPTIONS) is expected
@@ -89,7 +87,7 @@ class TestBetter:
 
     @pytest.mark.parametrize(("inliers", "tier"), [(30, None), (44, None), (45, STRONG), (300, STRONG)])
     @pytest.mark.parametrize("far", [{"x_m": 3.0}, {"turn_deg": 20.0}], ids=["far", "turned"])
-    def test_of_two_that_disagree_only_the_clearly_better_supported_is_believed(
+    def test_of_two_that_disagree_the_clearly_better_is_believed(
         self, far: dict[str, float], inliers: int, tier: Tier | None
     ) -> None:
         chosen = better(localized(inliers=30), localized(inliers=inliers, **far))
@@ -105,9 +103,7 @@ class TestBetter:
             assert isinstance(outcome, Localization)
 
     @given(apart_m=st.floats(0, 3), sigma_m=st.floats(1e-3, 0.5))
-    def test_poses_agree_within_the_sum_of_their_95_radii_or_the_stated_distance(
-        self, apart_m: float, sigma_m: float
-    ) -> None:
+    def test_poses_agree_within_the_sum_of_95_radii_or_the_distance(self, apart_m: float, sigma_m: float) -> None:
         chosen = better(localized(0.0, sigma_m, inliers=40), localized(apart_m, 0.01, inliers=40))
         reach_m = sum(accuracy_from_covariance(np.eye(6) * it**2).position_95_m for it in (sigma_m, 0.01))
         if abs(apart_m - max(reach_m, OPTIONS.same_position_m)) > 1e-9:

@@ -118,7 +118,7 @@ def test_a_camera_that_looks_along_the_maps_x_is_the_identity(messages: Any) -> 
     np.testing.assert_allclose(found.rotation, np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
 
 
-def test_the_covariance_of_the_body_is_that_of_perturbed_cameras(messages: Any) -> None:
+def test_the_covariance_of_the_body_matches_perturbed_cameras(messages: Any) -> None:
     """Monte Carlo: cameras perturbed as the covariance says put the body where its covariance says."""
     random = np.random.default_rng(7)
     half = random.normal(0, 1e-4, (6, 6))
@@ -218,7 +218,7 @@ def wait_until(condition: Callable[[], object]) -> None:
         time.sleep(0.005)
 
 
-def test_the_node_publishes_where_the_body_was_when_the_image_was_taken(
+def test_the_node_publishes_the_body_at_the_image_timestamp(
     node_module: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with serving(tmp_path / "data") as server, Client(server.address) as client:

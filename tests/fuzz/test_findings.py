@@ -74,7 +74,7 @@ def test_a_png_with_more_data_than_pixels_is_refused() -> None:
     assert caught.value.reason == "IMAGE_TOO_COMPLEX"
 
 
-def test_a_png_whose_data_goes_on_beyond_its_pixels_is_not_inflated_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_png_data_beyond_its_pixels_is_not_inflated(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sixteen megabytes of it, as many as a file may have, inflate to seventeen gigabytes."""
     flushed = zlib.compressobj(9)
     megabyte = flushed.compress(bytes(2**20)) + flushed.flush(zlib.Z_FULL_FLUSH)
@@ -179,7 +179,7 @@ def test_a_cambridge_lens_beyond_all_numbers_refuses_its_image(tmp_path: Path) -
     assert len(dataset.refused) == 1
 
 
-def test_a_name_longer_than_any_files_in_a_colmap_model_refuses_its_image(tmp_path: Path) -> None:
+def test_an_overlong_name_in_a_colmap_model_refuses_its_image(tmp_path: Path) -> None:
     """It was an OSError."""
     of = layout(colmap.LAYOUTS, "text")
     folder = written(tmp_path, of, b"cam0/1.png", b"a" * 300)
@@ -189,7 +189,7 @@ def test_a_name_longer_than_any_files_in_a_colmap_model_refuses_its_image(tmp_pa
 
 
 @pytest.mark.parametrize("size", ["0 33", "-1 33", "32 1073741825", "32 1" + 400 * "0"])
-def test_a_camera_of_no_size_is_refused_by_whatever_reads_models(tmp_path: Path, size: str) -> None:
+def test_every_reader_refuses_a_camera_without_size(tmp_path: Path, size: str) -> None:
     """Dividing by 0 was a ZeroDivisionError, by 1e400 an OverflowError, and the rest was taken."""
     of = layout(colmap.LAYOUTS, "text")
     folder = written(tmp_path / "colmap", of, b"PINHOLE 32 33", f"PINHOLE {size}".encode())
@@ -255,7 +255,7 @@ def test_what_is_told_of_a_refused_folder_can_be_printed(tmp_path: Path) -> None
     assert str(caught.value).isprintable()
 
 
-def test_printable_keeps_what_can_be_printed_and_shows_what_cannot() -> None:
+def test_printable_keeps_printable_and_shows_other_characters() -> None:
     assert printable("Küche/照片 1.jpg") == "Küche/照片 1.jpg"
     assert printable("a\x1b\n\ud800\u2028") == "a\\x1b\\n\\ud800\\u2028"
     assert len(printable("x" * 10_000)) < 1010
@@ -307,7 +307,7 @@ def test_settings_that_nothing_can_be_done_with_are_refused(tmp_path: Path, line
 @pytest.mark.parametrize(
     "data", [b"", b"{}", b"[]", b"null", b"\xff", b"1" * 5000, b"[" * 100_000, b'{"camera": 1, "world_from_camera": 2}']
 )
-def test_stored_bytes_of_another_form_are_damaged_whatever_their_checksum(data: bytes) -> None:
+def test_stored_bytes_of_another_form_are_damaged(data: bytes) -> None:
     """They were a KeyError, a TypeError or a UnicodeDecodeError, and so an internal error of the whole scene."""
     sha256 = codec.sha256_for("owner", data)
     for read in (codec.decode_geometry, codec.decode_view, codec.decode_attributes):

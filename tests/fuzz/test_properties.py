@@ -87,9 +87,7 @@ def test_a_png_has_the_size_of_its_header_or_is_refused_for_it(width: int, heigh
 
 
 @given(st.integers(0, 65535), st.integers(0, 65535), st.lists(st.binary(max_size=40), max_size=5))
-def test_a_jpeg_has_the_size_of_its_frame_whatever_stands_before_it(
-    width: int, height: int, before: list[bytes]
-) -> None:
+def test_a_jpeg_has_the_size_of_its_frame_header(width: int, height: int, before: list[bytes]) -> None:
     segments = b"".join(b"\xff\xe1" + struct.pack(">H", len(it) + 2) + it for it in before)
     data = b"\xff\xd8" + segments + b"\xff\xc0" + struct.pack(">HBHH", 17, 8, height, width) + bytes(10)
     limits = ImageLimits(max_pixels=2**40, min_side_px=0, max_side_px=2**20)
@@ -101,9 +99,7 @@ kinds = st.binary(min_size=4, max_size=4).filter(lambda kind: kind not in (b"IHD
 
 @settings(max_examples=50)
 @given(st.lists(st.tuples(kinds, st.binary(max_size=100), st.booleans()), max_size=8), st.integers(1, 200))
-def test_no_further_chunk_of_a_png_and_no_cut_of_its_data_changes_a_pixel(
-    further: list[tuple[bytes, bytes, bool]], piece: int
-) -> None:
+def test_no_extra_chunk_or_cut_of_a_png_changes_a_pixel(further: list[tuple[bytes, bytes, bool]], piece: int) -> None:
     length = int.from_bytes(PNG[33:37], "big")
     body = PNG[41 : 41 + length]
     assert PNG[37:41] == b"IDAT"
@@ -179,7 +175,7 @@ def test_a_number_that_is_none_is_refused_by_its_field(path: str, value: float) 
     )
 )
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_any_poses_and_names_come_back_from_the_layouts_that_we_write(
+def test_poses_and_names_survive_the_layouts_that_we_write(
     tmp_path_factory: pytest.TempPathFactory, layout: str, planted: list[tuple[str, RigidTransform, bool]]
 ) -> None:
     folder = tmp_path_factory.mktemp("written")
@@ -209,7 +205,7 @@ def test_any_poses_and_names_come_back_from_the_layouts_that_we_write(
 
 
 @given(st.text(st.characters(), max_size=50) | st.text(st.characters(categories=["Cs", "Cc", "Zl", "Lo"]), max_size=50))
-def test_whatever_a_file_says_of_a_frame_the_report_can_be_printed(text: str) -> None:
+def test_the_report_can_be_printed_for_any_frame_file(text: str) -> None:
     assert printable(text).isprintable()
     assert printable(printable(text)) == printable(text)
     assert text.isprintable() is (printable(text) == text)
@@ -248,7 +244,7 @@ def test_a_token_that_no_list_gave_is_refused(token: str) -> None:
 
 
 @given(st.text(max_size=140) | identifiers)
-def test_an_id_is_ascii_that_names_and_files_can_hold_or_is_refused(text: str) -> None:
+def test_an_id_is_ascii_fit_for_names_and_files_or_refused(text: str) -> None:
     try:
         names.check_id(text)
     except ValueError:
@@ -262,7 +258,7 @@ def test_an_id_is_ascii_that_names_and_files_can_hold_or_is_refused(text: str) -
 
 
 @given(st.tuples(*[finite] * 9), st.tuples(*[finite] * 12), st.integers(0, 10_000), st.integers(1, 255))
-def test_stored_geometry_comes_back_to_the_bit_and_any_other_byte_is_damage(
+def test_stored_geometry_returns_bit_for_bit_or_is_damaged(
     lens: tuple[float, ...], motion: tuple[float, ...], at: int, change: int
 ) -> None:
     camera = Camera(32, 33, lens[0], lens[1], lens[2], lens[3], RadialTangential(*lens[4:]))

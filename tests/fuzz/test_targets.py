@@ -23,7 +23,7 @@ needs_atheris = pytest.mark.skipif(
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_what_a_target_begins_with_is_accepted_and_its_mutations_break_no_law(name: str) -> None:
+def test_seeds_are_accepted_and_their_mutations_break_no_law(name: str) -> None:
     target = load(name)
     seeds = list(target.seeds())
     accepted = [target.check(seed) for seed in seeds]

@@ -89,7 +89,7 @@ def test_the_step_is_that_of_the_whole_system(damping: float) -> None:
     np.testing.assert_allclose(actual, expected, atol=2e-3 * np.abs(expected).max())
 
 
-def test_what_is_left_after_elimination_inverts_to_the_covariance() -> None:
+def test_the_eliminated_system_inverts_to_the_covariance() -> None:
     problem, state = problem_of("marginal")
     matrix, _ = dense_system(problem, state)
     cameras = 6 * len(state.rotation)
@@ -170,7 +170,7 @@ def test_matches_far_off_take_no_part() -> None:
     assert_pose_close(adjusted.world_from_camera, scene.world_from_query, metres=1e-3, degrees=0.01)
 
 
-def test_the_covariance_is_symmetric_and_says_what_it_was_told_from() -> None:
+def test_the_covariance_is_symmetric_and_names_its_source() -> None:
     """Whether it is right is asked in test_uncertainty."""
     scene = make_scene(random_for("covariance"), FEW_POINTS)
     structure, matches, estimate = stages(scene, scene.references)

@@ -99,7 +99,7 @@ def test_a_wrong_prior_is_reported_and_changes_not_a_bit(kind: str) -> None:
     assert estimate.covariance.tobytes() == without.covariance.tobytes()
 
 
-def test_gravity_that_knows_less_than_the_photograph_changes_nothing() -> None:
+def test_gravity_less_certain_than_the_photo_changes_nothing() -> None:
     scene, structure, matches = scene_of("less")
     estimate = adjusted(scene, structure, matches, Priors(gravity=gravity_at(scene.world_from_query, 3.0, 2.0)))
     (check,) = estimate.prior_checks
@@ -110,7 +110,7 @@ def test_gravity_that_knows_less_than_the_photograph_changes_nothing() -> None:
     )
 
 
-def test_what_priors_pulled_before_they_turned_out_to_know_too_little_is_undone() -> None:
+def test_the_pull_of_too_weak_priors_is_undone() -> None:
     """The pose solver, to whom points are fixed, knew less: its pull must not be seen in the answer."""
     scene, structure, matches = scene_of("undone")
     solved = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())

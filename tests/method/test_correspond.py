@@ -65,7 +65,7 @@ def test_mutual_matches_are_those_of_loops(n: int, m: int, noise: float, ratio: 
     assert matches.tolist() == slow_mutual_matches(first, second, ratio)
 
 
-def test_no_keypoint_is_matched_twice_and_a_looser_ratio_only_adds() -> None:
+def test_no_keypoint_matches_twice_and_looser_ratios_only_add() -> None:
     first, second = related(random_for("nested"), 60, 60, 0.3)
     previous: set[tuple[int, ...]] = set()
     for ratio in (0.6, 0.8, 0.9, 1.0):
@@ -191,7 +191,7 @@ def test_references_keep_true_matches_and_drop_wrong_ones() -> None:
         assert len(found) < 1.1 * len(true)
 
 
-def test_wide_matches_are_the_strict_ones_and_more_along_the_lines() -> None:
+def test_wide_matches_add_to_strict_ones_along_the_lines() -> None:
     scene = make_scene(random_for("wide"), SceneOptions(descriptor_noise=0.5, distractor_count=1500, reference_count=3))
     options = CorrespondOptions(reference_ratio=0.6, wide_similarity=0.6)
     matcher = Matcher(options)
@@ -308,7 +308,7 @@ class Fixed:
         return [np.zeros((1, 2), np.int32)] * len(references)
 
 
-def test_another_query_matching_leaves_the_references_to_the_matcher() -> None:
+def test_a_query_matcher_leaves_references_to_the_matcher() -> None:
     scene = make_scene(random_for("seam"), SceneOptions(reference_count=3))
     fixed = Fixed()
     matcher = Matcher(query_matching=fixed)

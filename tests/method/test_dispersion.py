@@ -94,7 +94,7 @@ def test_a_reference_that_shows_nothing_moves_nothing() -> None:
     np.testing.assert_allclose(found.motions[4:], 0, atol=1e-9 + 0.02 * np.abs(found.offset).max())
 
 
-def test_the_photographs_part_is_the_covariance_by_its_own_noise() -> None:
+def test_the_photographs_part_is_the_covariance_by_its_noise() -> None:
     """Residuals at the optimum of noise of 0.7 everywhere; the pose's answer to the query's noise alone is linear."""
     grounds = random_grounds("photograph", points=150)
     random, n = random_for("drawn residuals"), 150
@@ -135,7 +135,7 @@ def test_few_matches_are_no_exception(points: int) -> None:
     assert found is None or np.isfinite(found.covariance).all()
 
 
-def test_thinning_leaves_the_references_errors_and_averages_the_photographs() -> None:
+def test_thinning_keeps_reference_errors_and_averages_the_photo() -> None:
     grounds = random_grounds("thinned")
     every, thinned = disperse(grounds), disperse(replace(grounds, thinning=3))
     assert every

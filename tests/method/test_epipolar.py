@@ -58,7 +58,7 @@ def verdict_of(views: Sequence[PosedView], pairs: Sequence[MatchedPair]) -> Verd
     return judge(dict(enumerate(views)), pairs)
 
 
-def test_exact_matches_have_no_error_and_a_moved_keypoint_the_distance_it_was_moved() -> None:
+def test_a_moved_keypoint_has_the_distance_moved_as_error() -> None:
     """Sampson's distance is to first order how far both keypoints must move: one alone, moved, at most as far."""
     options = SceneOptions(noise_px=0.0, reference_count=2, distractor_count=0, seen_share=1.0)
     first, second = make_scene(random_for("sampson"), options).references
@@ -132,7 +132,7 @@ def test_each_usual_mistake_is_noticed_and_named() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.5, 2.0])
-def test_intrinsics_of_another_image_size_are_named_with_their_factor(scale: float) -> None:
+def test_intrinsics_of_another_size_are_named_with_their_factor(scale: float) -> None:
     views = planted("focal", scale)
     pairs = matched(views)
     camera = replace(CAMERA, focal_x_px=scale * CAMERA.focal_x_px, focal_y_px=scale * CAMERA.focal_y_px)

@@ -69,7 +69,7 @@ def test_few_matches_say_nothing_of_it() -> None:
     assert wrong_focal(solved(scene, 1.15), OPTIONS) is None
 
 
-def test_the_judge_rejects_it_with_both_numbers_and_says_what_to_check() -> None:
+def test_the_judge_rejects_with_both_numbers_and_a_hint() -> None:
     support = solved(planted("judge"), 1.15)
     matches = [np.empty((0, 2), np.int32)] * len(support.references)
     rejection = judge(support, matches, PnpOptions().inlier_px, 1.0, JudgeOptions()).rejection
@@ -83,7 +83,7 @@ def test_the_judge_rejects_it_with_both_numbers_and_says_what_to_check() -> None
     assert rejection.hint.best_reference in {reference.name for reference in support.references}
 
 
-def test_a_focal_length_is_wrong_beyond_the_tolerance_and_beyond_its_error_only() -> None:
+def test_a_focal_length_is_wrong_beyond_tolerance_and_error() -> None:
     wrong = Focal(log_ratio=0.2, sigma=0.01, agreeing=100, agreeing_before=40, given_px=500.0)
     assert wrong.is_wrong(OPTIONS)
     assert not replace(wrong, log_ratio=OPTIONS.max_log_ratio * 0.9).is_wrong(OPTIONS)

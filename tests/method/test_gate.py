@@ -93,7 +93,7 @@ def test_agreement_of_few_of_many_visible_points_is_doubted() -> None:
     assert not doubt_of((view, behind, few))
 
 
-def test_where_gravity_agrees_less_need_be_found_but_something_must() -> None:
+def test_agreeing_gravity_lowers_the_support_but_not_to_zero() -> None:
     view, structure, matches = planted(random_for("share"), 1000)
 
     def doubt(count: int, log10_chance: float) -> str | None:
@@ -111,7 +111,7 @@ def test_the_hull_is_that_of_a_known_rectangle() -> None:
     assert hull_share(query, matches, np.ones(5, bool)) == pytest.approx(0.25, rel=1e-4)
 
 
-def test_findable_is_what_lies_in_front_and_inside_if_there_are_features_enough() -> None:
+def test_findable_is_what_is_in_front_and_inside_the_photo() -> None:
     inside = POSE.apply(CAMERA.rays(np.array([[0.0, 0.0], [959.0, 719.0]])) * 3.0)
     outside = POSE.apply(CAMERA.rays(np.array([[-2.0, 0.0], [959.0, 722.0]])) * 3.0)
     behind = POSE.apply([0.0, 0.0, -2.0])[None]
@@ -140,7 +140,7 @@ def test_three_matches_agree_with_a_pose_by_construction() -> None:
     assert told_false_alarms(2.34) == "10^2.3 such poses expected"
 
 
-def test_false_alarms_fall_with_inliers_and_rise_with_matches_and_chance() -> None:
+def test_false_alarms_fall_with_inliers_and_rise_with_matches() -> None:
     of_inliers = [false_alarms(100, k, 1e-3) for k in range(4, 101)]
     assert np.all(np.diff(of_inliers) < 0)
     assert np.all(np.diff([false_alarms(n, 10, 1e-3) for n in range(10, 2000, 50)]) > 0)

@@ -72,7 +72,7 @@ def test_one_camera_alone_tells_no_scale() -> None:
     assert scaled_ransac(planted(random_for("one"), (50,)), OPTIONS, 100, 600) is None
 
 
-def test_the_same_matches_give_the_same_bits_whatever_random_numbers_were_drawn_before() -> None:
+def test_the_same_matches_give_the_same_bits_for_any_rng_state() -> None:
     """PoseLib draws from the C library, as any other library may."""
     libc = ctypes.CDLL(None)
     cameras = planted(random_for("bits"), (60, 40, 80), 0.3)

@@ -85,7 +85,7 @@ def test_maps_are_nan_where_nothing_is_known() -> None:
         assert (part.point_map[known][:, 2] > 0).all()
 
 
-def test_the_frame_is_that_of_the_first_reference_and_its_unit_the_median_distance() -> None:
+def test_the_frame_is_the_first_reference_scaled_by_the_median() -> None:
     scene = make_scene(random_for("frame"), EXACT)
     first = reconstruct(scene).references[0]
     assert_pose_close(first.local_from_camera, RigidTransform.identity(), metres=1e-12, degrees=1e-10)
@@ -112,7 +112,7 @@ def test_wrong_matches_are_survived() -> None:
     assert_pose_close(pose, scene.world_from_query, metres=0.02, degrees=0.2)
 
 
-def test_queries_together_are_as_alone_and_one_s_fault_is_its_own() -> None:
+def test_queries_in_a_batch_equal_single_ones_and_fail_alone() -> None:
     scenes = [make_scene(random_for("together", seed), EXACT) for seed in range(2)]
     requests = [Request(it.query, it.references, true_correspondences(it)) for it in scenes]
     without = replace(requests[0], correspondences=None)

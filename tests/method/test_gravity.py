@@ -64,7 +64,7 @@ def solved(
 
 
 @pytest.mark.parametrize("down", DOWNS.values(), ids=DOWNS)
-def test_two_matches_and_gravity_give_the_planted_pose_whatever_axis_is_down(down: list[float]) -> None:
+def test_two_matches_and_gravity_give_the_planted_pose(down: list[float]) -> None:
     for seed in range(5):
         x_in_world, pixels = seen(random_for("pairs", seed), 2, noise_px=0)
         rays = CAMERA.rays(pixels)
@@ -250,7 +250,7 @@ def test_gravity_finds_what_three_matches_do_not() -> None:
     assert found_with >= 4
 
 
-def test_a_pose_prior_stands_in_for_an_initial_pose_that_is_lost() -> None:
+def test_a_pose_prior_replaces_a_lost_initial_pose() -> None:
     """Among so many wrong matches only a search near the right pose finds the right ones."""
     x_in_world, pixels = seen(random_for("lost"), 300, wrong=292)
     prior = PosePrior(moved(POSE, np.full(6, 0.002)), np.diag([0.01] * 3 + [0.005] * 3) ** 2)

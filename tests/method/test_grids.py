@@ -198,7 +198,7 @@ def test_extreme_shapes_have_a_picture() -> None:
         assert 0 < layout.shown.mean() < 0.02
 
 
-def test_a_lens_that_shows_nothing_near_its_axis_gives_an_empty_picture() -> None:
+def test_a_lens_that_shows_nothing_gives_an_empty_picture() -> None:
     """A cut-out from the rim of a fisheye's photograph, with the intrinsics of the whole."""
     camera = Camera(200, 200, 190.0, 190.0, -400.0, 100.0, Fisheye(0.003, 0.0007, -0.002, 0.0002))
     layout = lay_out(camera, natural_grid(camera, OPTIONS), OPTIONS)

@@ -37,7 +37,7 @@ def test_every_reason_has_a_hint_of_one_sentence(reason: RejectionReason, matche
     assert hint.message.endswith(".")
 
 
-def test_the_reference_to_look_at_shares_most_with_any_of_the_photographs() -> None:
+def test_the_reference_to_look_at_shares_most_with_any_photo() -> None:
     assert hint_of(RejectionReason.GATE, (40, 60, 50), (31, 33, 70), ()).best_reference == NAMES[2]
     assert hint_of(RejectionReason.GATE, (0, 0), ()).best_reference is None
 
@@ -59,7 +59,7 @@ def test_what_is_advised_follows_from_what_is_shared(reason: RejectionReason, be
         assert str(best) in hint.message
 
 
-def test_where_no_photograph_came_to_matches_the_one_that_came_furthest_says_what_it_lacks() -> None:
+def test_without_matches_the_furthest_photo_names_what_it_lacks() -> None:
     own = Hint("coarse", Advice.SPREAD_REFERENCES, "Spread them.", NAMES[0])
     furthest = Rejection(RejectionReason.LOW_OVERLAP, "another place", own)
     images = [NOTHING, replace(NOTHING, answer=Answer(furthest))]

@@ -84,7 +84,7 @@ def test_the_numbers_are_told() -> None:
     assert "120 local features" in hint_of(RejectionReason.LOW_TEXTURE, features=120).message
 
 
-def test_the_best_reference_is_the_one_whose_matches_the_sentence_counts() -> None:
+def test_the_best_reference_is_the_one_with_counted_matches() -> None:
     assert hint_of(RejectionReason.LOW_OVERLAP).best_reference == NAMES[1]
     assert hint_of(RejectionReason.LOW_OVERLAP, (0,) * 6).best_reference is None
     rejection = Rejection(RejectionReason.GATE, "planted")
@@ -96,7 +96,7 @@ def test_the_best_reference_is_the_one_whose_matches_the_sentence_counts() -> No
     assert "shares 60 of" in outcome.hint.message
 
 
-def test_what_one_reference_alone_shows_wants_another_and_no_other_calibration() -> None:
+def test_one_reference_alone_asks_for_another_reference() -> None:
     """Its very photograph shares all features with it, and hardly any has a point."""
     alone, others = Rejection(RejectionReason.LOW_OVERLAP, "planted", tried=27), (0, 1267, 8, 0, 2, 0)
     outcome = hinted(Answer(alone, reference_match_counts=others), view_of(1267), SCENE.references).outcome

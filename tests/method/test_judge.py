@@ -149,7 +149,7 @@ def test_options_check_themselves(wrong: dict[str, tuple[float, ...]]) -> None:
         JudgeOptions(**wrong)  # type: ignore[arg-type]
 
 
-def test_agreement_with_gravity_adds_to_the_trust_and_takes_nothing() -> None:
+def test_agreement_with_gravity_only_adds_to_the_trust() -> None:
     """As much as its chance is small, and less than if nothing but chance made poses wrong."""
     doubtful = Evidence(-60.0, 40, 60, 200, 0.2, 2.0, 1.0, 0.1)
     trusts = [trust_of(doubtful, OPTIONS, log10_chance) for log10_chance in (0.0, -1.0, -3.0)]

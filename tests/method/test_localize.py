@@ -150,7 +150,7 @@ def test_refinement_makes_a_rough_pose_fine() -> None:
     assert max(errors[Variant.FULL][1], errors[Variant.BEST][1]) < 0.5 * errors[Variant.COARSE][1]
 
 
-def test_our_form_is_better_than_the_papers_where_reference_poses_are_noisy() -> None:
+def test_our_form_beats_the_papers_under_noisy_reference_poses() -> None:
     errors: dict[Variant, list[float]] = {Variant.FULL: [], Variant.BEST: []}
     for seed in range(6):
         scene = make_scene(random_for("average", seed), SceneOptions(point_count=300))
@@ -228,7 +228,7 @@ def test_the_covariance_tells_how_large_errors_are() -> None:
 # Wide correspondences
 
 
-def test_a_weak_answer_is_computed_again_from_wide_correspondences(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_weak_answer_is_recomputed_from_wide_correspondences(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[bool] = []
     correspond = Matcher.correspond
 
@@ -438,7 +438,7 @@ def test_gate(seed: int) -> None:
     ],
     ids=["more inliers", "as many", "a claim as wide as a room", "instead of none", "none"],
 )
-def test_the_wide_answer_is_given_for_more_inliers_at_a_similar_claim(
+def test_the_wide_answer_wins_with_more_inliers_at_equal_claim(
     strict: tuple[int, float] | None,
     wide: tuple[int, float] | None,
     wide_wins: bool,
@@ -540,7 +540,7 @@ def test_queries_of_one_batch_are_answered_as_alone(backend: str, weak_inliers: 
         assert same_bits(refine(part), answer_of(pipeline, option, query))
 
 
-def test_a_coarse_answer_is_the_pose_of_the_coarse_form_and_says_why() -> None:
+def test_a_coarse_answer_is_the_coarse_pose_and_says_why() -> None:
     for backend in ("geometric", "network", "device"):
         offset = np.full(3, 1e5)
         far = [replace(r, world_from_camera=r.world_from_camera.shifted(offset)) for r in SCENE.references]
@@ -561,7 +561,7 @@ def test_a_coarse_answer_is_the_pose_of_the_coarse_form_and_says_why() -> None:
         assert list(answer.stage_seconds)[:2] == ["correspond", "coarse"]
 
 
-def test_where_the_reconstruction_gives_no_pose_only_refining_may() -> None:
+def test_without_a_reconstructed_pose_only_refining_may_answer() -> None:
     pipeline = Pipeline(ChangedNetwork(FakeNetwork(SCENE), blinded), MATCHER)
     hopeful, settled = reconstruct(
         [prepared_of(pipeline, LocalizeOptions(variant)) for variant in (Variant.BEST, Variant.FULL)]

@@ -95,7 +95,7 @@ def test_the_majority_wins() -> None:
     assert not found.guided.any()
 
 
-def test_a_point_takes_the_keypoint_that_most_references_give_it() -> None:
+def test_a_point_takes_the_keypoint_of_most_references() -> None:
     structure = small_structure([[(0, 0), (1, 0), (2, 0)]])
     assert pairs_of(vote(structure, [1, 1, 1], query_matches([(3, 0)], [(4, 0)], [(4, 0)]))) == {(0, 4)}
 
@@ -171,7 +171,7 @@ def test_the_search_is_that_of_loops(options: MatchOptions, off_m: float) -> Non
         assert not set(found.keypoint) & set(known.keypoint)
 
 
-def test_the_papers_search_finds_planted_pairs_within_its_radius() -> None:
+def test_the_papers_search_finds_planted_pairs_in_its_radius() -> None:
     scene = make_scene(random_for("paper"), SceneOptions(noise_px=0.3))
     structure, true = true_structure(scene)
     near = about(scene.world_from_query, 0.03, 0.3)  # about 10 px

@@ -319,7 +319,7 @@ def test_one_requests_fault_is_its_own() -> None:
 # Out of memory
 
 
-def test_what_does_not_fit_is_tried_again_when_tokens_have_made_room() -> None:
+def test_what_does_not_fit_is_retried_when_tokens_are_freed() -> None:
     runner = GreyRunner(failing_batches=1)
     backend = grey_backend(runner)
     outcomes = backend.reconstruct_many([Request(*grey_request(i, 50, 100)) for i in range(4)])

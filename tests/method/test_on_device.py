@@ -150,7 +150,7 @@ def arguments_of(case: Case, variant: str) -> tuple[DeviceReconstruction, Inputs
 
 
 @pytest.mark.parametrize("variant", ["coarse", "full", "best"])
-def test_computing_looks_at_no_value_and_leaves_the_device_at_no_step(variant: str) -> None:
+def test_computing_stays_on_the_device_and_reads_no_value(variant: str) -> None:
     reconstruction, inputs, options = arguments_of(CASES["noise"], variant)
     meta = torch.device("meta")
     there = replace(

@@ -39,7 +39,7 @@ def error_in_world(pose: RigidTransform) -> Array:
 
 
 @EVERY_WAY
-def test_the_jacobian_is_the_derivative_of_the_error_in_the_world(perturbation: Perturbation) -> None:
+def test_the_jacobian_is_the_derivative_of_the_world_error(perturbation: Perturbation) -> None:
     assert_jacobian(
         world_jacobian(POSE, perturbation),
         lambda error: error_in_world(perturbed(perturbation, error)),

@@ -154,7 +154,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
 # The adapter
 
 
-def test_the_version_of_poselib_is_the_one_whose_signature_is_known() -> None:
+def test_the_version_of_poselib_is_the_known_one() -> None:
     assert version("poselib") == "2.0.5"
 
 

@@ -77,7 +77,7 @@ KINDS = ("position", "gravity", "heading", "pose")
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_jacobian_is_the_derivative_by_an_error_about_fixed_world_axes(kind: str) -> None:
+def test_the_jacobian_is_the_derivative_about_fixed_world_axes(kind: str) -> None:
     rng = random_for("jacobian", kind)
     for _ in range(5):
         prior = planted(kind, POSE, rng)
@@ -91,7 +91,7 @@ def test_the_jacobian_is_the_derivative_by_an_error_about_fixed_world_axes(kind:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradient_and_information_are_half_the_cost_s_derivatives(kind: str) -> None:
+def test_gradient_and_information_are_half_the_derivatives(kind: str) -> None:
     prior = planted(kind, POSE, random_for("gradient", kind))
     at = moved(POSE, np.full(6, 0.02))
     gradient, information = Priors(**{kind: prior}).gradient_and_information(at)  # type: ignore[arg-type]
@@ -112,7 +112,7 @@ def test_the_rotation_vector_is_the_inverse_of_rodrigues(angle: float) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_squared_distances_of_consistent_priors_follow_chi_square(kind: str) -> None:
+def test_squared_distances_of_consistent_priors_are_chi_square(kind: str) -> None:
     """Monte Carlo over both uncertainties: the pose found is off by its covariance, the prior by its own."""
     rng = random_for("chi square", kind)
     covariance = random_covariance(rng, 0.05, 0.1, 0.2, 0.02, 0.01, 0.03)
@@ -141,7 +141,7 @@ def test_a_certain_pose_makes_the_distance_the_prior_s_own() -> None:
 
 
 @pytest.mark.parametrize("sigma_deg", [0.5, 1.0, 5.0, 20.0])
-def test_gravity_of_the_wrong_sign_is_a_conflict_however_uncertain_the_pose(sigma_deg: float) -> None:
+def test_gravity_of_the_wrong_sign_is_always_a_conflict(sigma_deg: float) -> None:
     prior = gravity_at(POSE, sigma_deg)
     flipped = GravityPrior(-prior.in_camera, DOWN, sigma_deg)
     (check,) = Priors(gravity=flipped).check(POSE, np.diag([1.0, 1.0, 1.0, 2.0, 2.0, 2.0]) ** 2)
@@ -156,7 +156,7 @@ def test_a_prior_that_adds_next_to_nothing_is_not_used() -> None:
         assert (check.conflict, check.used) == (False, used)
 
 
-def test_the_covariance_with_priors_is_the_inverse_of_summed_informations() -> None:
+def test_the_covariance_is_the_inverse_of_summed_informations() -> None:
     rng = random_for("sharpened")
     covariance = random_covariance(rng, 0.1, 0.2, 0.3, 0.02, 0.03, 0.01)
     priors = Priors(planted("position", POSE, rng), gravity=gravity_at(POSE))  # type: ignore[arg-type]
@@ -166,7 +166,7 @@ def test_the_covariance_with_priors_is_the_inverse_of_summed_informations() -> N
     np.testing.assert_array_equal(NO_PRIORS.sharpened(covariance, POSE), covariance)
 
 
-def test_a_prior_weighs_against_a_candidate_no_more_than_a_conflict() -> None:
+def test_a_prior_weighs_no_more_than_a_conflict() -> None:
     near, far = gravity_at(moved(POSE, np.array([0, 0, 0, 0.01, 0, 0]))), gravity_at(moved(POSE, np.full(6, 1.0)))
     assert Priors(gravity=near).penalty(POSE) == pytest.approx(Priors(gravity=near).cost(POSE))
     assert Priors(gravity=far).penalty(POSE) == conflict_threshold(2)
@@ -227,7 +227,7 @@ def test_senseless_covariances_are_refused(covariance: Array) -> None:
         PositionPrior(np.zeros(3), covariance)
 
 
-def test_a_covariance_may_mix_centimetres_with_an_unknown_height() -> None:
+def test_a_covariance_may_mix_centimetres_and_unknown_height() -> None:
     covariance = np.diag([0.01, 0.01, 1000.0]) ** 2
     assert PositionPrior(np.zeros(3), covariance).term(POSE).cost == pytest.approx(40**2 + 20**2, rel=1e-3)
 

@@ -96,7 +96,7 @@ def test_the_same_image_twice_is_no_second_measurement() -> None:
     np.testing.assert_allclose(sigma_twice, sigma_once, rtol=0.1)
 
 
-def test_wrong_extrinsics_leave_the_other_cameras_without_support() -> None:
+def test_wrong_extrinsics_leave_other_cameras_unsupported() -> None:
     """All cameras are said to be one: only one of them can be right."""
     images = images_of(random_for("wrong"), CAMERAS)
     outcome = solve_rig(images, [RIG_FROM_CAMERA[0]] * 3, OPTIONS)

@@ -231,7 +231,7 @@ def test_a_wrong_second_stage_loses_by_its_deviation() -> None:
     assert (both.stage, both.metres_per_unit) == (ScaleStage.TRIANGULATION, first.metres_per_unit)
 
 
-def test_the_gate_adopts_the_first_stage_although_the_second_fits_better() -> None:
+def test_the_gate_adopts_stage_one_despite_a_better_second() -> None:
     scene = make_scene(random_for("gate"))
     network = FakeNetwork(scene, 10, FakeNetworkOptions(bad_depth_share=1.0, bad_depth_factors=(1.03, 1.03)))
     both = scale_of(scene, network)

@@ -55,7 +55,7 @@ def test_every_frame_is_found_in_the_callers_world(alone: bool, scale: float, is
         (0.30, 1.0),
     ],
 )
-def test_drift_does_not_make_the_last_pose_worse_than_it_is_alone(share: float, deg: float) -> None:
+def test_drift_makes_the_last_pose_no_worse_than_alone(share: float, deg: float) -> None:
     """Over several sequences, whatever the device loses, and however much more that is than it should be."""
     together, alone = [], []
     for case in range(5):

@@ -112,7 +112,7 @@ def test_jacobians() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
-def test_soft_l1_is_square_then_linear_and_its_weight_the_derivative(scale: float) -> None:
+def test_soft_l1_is_square_then_linear_and_matches_its_weight(scale: float) -> None:
     for squared in (0.0, 1e-3, 0.7, 10.0, 1e4):
         assert_jacobian(
             np.array([soft_l1_weight(np.array(squared), scale)]),
@@ -278,7 +278,7 @@ def test_the_part_of_size_is_taken_off() -> None:
     assert noise.slope == 0.05
 
 
-def test_no_noise_is_the_least_level_and_few_points_teach_nothing() -> None:
+def test_no_noise_and_few_points_give_the_least_level() -> None:
     guess = KeypointNoise(0.4, 0.01)
     _, observations, truth = planted("noiseless", SceneOptions(noise_px=0.0), guess)
     assert estimate_noise(observations, truth, guess).level_px == pytest.approx(MIN_NOISE_LEVEL_PX)
@@ -355,7 +355,7 @@ def test_predictions_are_scaled_depths_of_the_first_keypoint() -> None:
     assert np.quantile(error_m, 0.9) < 1e-3
 
 
-def test_without_optimization_points_stay_where_they_were_predicted() -> None:
+def test_without_optimization_points_stay_as_predicted() -> None:
     scene = make_scene(random_for("stay"), SceneOptions(point_count=200))
     options = replace(PAPER_STRUCTURE, optimize=False)
     structure, shown = build(scene, options, FakeNetworkOptions(depth_noise_m=0.1))
@@ -380,7 +380,7 @@ def test_the_stage_finds_the_points(options: StructureOptions) -> None:
     assert np.isfinite(structure.x_in_world).all()
 
 
-def test_the_papers_tracks_all_begin_in_the_first_reference_and_ours_are_better() -> None:
+def test_paper_tracks_begin_in_one_view_and_ours_are_better() -> None:
     scene = make_scene(random_for("better"), SceneOptions(noise_px=1.0, reference_count=8))
     paper, _ = build(scene, PAPER_STRUCTURE)
     assert (paper.tracks.view[paper.tracks.starts] == 0).all()

@@ -87,7 +87,7 @@ def test_noise_of_reference_poses(references: int) -> None:
     assert 0.75 < rotation < 1.4
 
 
-def test_what_photographs_need_claims_more_than_planted_noise_does() -> None:
+def test_the_photographs_level_claims_more_than_planted_noise() -> None:
     position, rotation = adjusted_poses(8, 1.0, UncertaintyOptions(), seeds=15)
     assert 0.1 < position < 0.8
     assert 0.1 < rotation < 0.8
@@ -120,7 +120,7 @@ def test_noise_of_the_scale() -> None:
     assert position == pytest.approx(1, abs=0.4)
 
 
-def test_the_scale_moves_the_camera_along_the_arm_and_turns_nothing() -> None:
+def test_scale_moves_the_camera_along_the_arm_only() -> None:
     pose = RigidTransform(np.eye(3), np.array([3.0, 4.0, 0.0]))
     covariance = scale_covariance(pose, np.zeros(3), 0.01)
     np.testing.assert_allclose(covariance[:3, :3], 1e-4 * np.outer([3, 4, 0], [3, 4, 0]))

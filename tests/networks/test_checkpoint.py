@@ -58,7 +58,7 @@ def load(tensors: Tensors, file: Path, network: Network | None = None, **options
     return network, load_strictly(network, file, **options)
 
 
-def test_what_the_library_wrote_is_loaded_as_the_library_reads_it(tensors: Tensors, file: Path) -> None:
+def test_files_of_the_library_load_as_the_library_reads_them(tensors: Tensors, file: Path) -> None:
     network, identity = load(tensors, file)
     state, read = network.state_dict(), library.load_file(file)
     assert list(state) == list(expected_tensors(Network()))
@@ -70,7 +70,7 @@ def test_what_the_library_wrote_is_loaded_as_the_library_reads_it(tensors: Tenso
     assert all(parameter.requires_grad for parameter in network.parameters())
 
 
-def test_a_module_on_a_device_is_filled_too_and_keeps_its_other_buffers(tensors: Tensors, file: Path) -> None:
+def test_a_module_on_a_device_is_filled_and_keeps_its_buffers(tensors: Tensors, file: Path) -> None:
     network, _ = load(tensors, file, Network())
     assert torch.equal(network.scale, tensors["scale"])
     assert network.table.tolist() == [7.0, 7.0]
@@ -129,7 +129,7 @@ def with_(**others: Any) -> Callable[[Tensors], Tensors]:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_other_tensors_are_refused_and_the_module_is_left_as_it_was(
+def test_wrong_tensors_are_refused_and_the_module_is_unchanged(
     tensors: Tensors, file: Path, change: Callable[[Tensors], Tensors], words: str
 ) -> None:
     network = Network()
@@ -174,7 +174,7 @@ def test_files_of_another_kind_are_refused_unopened(tensors: Tensors, file: Path
 
 
 @pytest.mark.parametrize("name", ["pi3", "pi3x"])
-def test_the_official_file_has_the_size_of_exactly_our_networks_tensors(name: str) -> None:
+def test_the_official_file_has_the_size_of_exactly_our_tensors(name: str) -> None:
     """The header of a float32 file without metadata, as the library writes it, and its data, to the byte."""
     (weights,) = [weights for weights in CATALOGUE if weights.name == name]
     module, class_name = weights.network.split(":")

@@ -74,7 +74,7 @@ def test_a_small_network_answers_as_the_published_code(size: tuple[int, int]) ->
     np.testing.assert_allclose(descriptors[:, ::12].flatten(), PUBLISHED[size], rtol=0, atol=1e-6)
 
 
-def test_the_official_file_has_the_size_of_exactly_our_networks_tensors() -> None:
+def test_the_official_file_has_the_size_of_our_tensors() -> None:
     """The header of a float32 file without metadata, as the library writes it, and its data, to the byte."""
     with torch.device("meta"):
         state = MegaLoc().state_dict()
@@ -87,7 +87,7 @@ def test_the_official_file_has_the_size_of_exactly_our_networks_tensors() -> Non
 
 
 @pytest.mark.parametrize("grid", [(5, 7), (23, 23), (40, 3)])
-def test_positions_are_cubic_samples_of_the_learned_grid_at_the_published_places(grid: tuple[int, int]) -> None:
+def test_positions_are_cubic_samples_at_the_published_places(grid: tuple[int, int]) -> None:
     backbone = Backbone(width=4, heads=1, depth=0)
     learned = np.asarray(weights("pos_embed", (1 + 37 * 37, 4)))
     backbone.pos_embed.data = torch.from_numpy(learned)[None]

@@ -48,9 +48,7 @@ def test_a_small_network_answers_as_the_official_one(case: str, small_networks: 
 
 
 @pytest.mark.parametrize("case", SMALL_CASES)
-def test_a_small_network_answers_as_the_official_one_at_every_pixel(
-    case: str, small_networks: dict[str, Network]
-) -> None:
+def test_a_small_network_equals_the_official_at_every_pixel(case: str, small_networks: dict[str, Network]) -> None:
     check(small_networks[network_of(case)], fixture(BESIDE, case))
 
 
@@ -61,7 +59,7 @@ def test_small_networks_have_the_official_entries(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["pi3", "pi3x"])
-def test_full_networks_have_the_official_entries_and_the_rule_is_the_same_here(name: str) -> None:
+def test_full_networks_have_the_official_entries_and_rule(name: str) -> None:
     entries = json.loads(existing(BESIDE / f"{name}_state_dict.json").read_text())["keys"]
     state = network_without_weights(name, small=False).state_dict()
     assert {key: list(value.shape) for key, value in state.items()} == {k: e["shape"] for k, e in entries.items()}

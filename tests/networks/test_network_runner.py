@@ -73,7 +73,7 @@ def test_it_answers_as_the_network_does() -> None:
     runner.close()
 
 
-def test_compiled_it_answers_the_same_and_compiles_nothing_after_warming_up(name: str) -> None:
+def test_compiled_it_answers_the_same_without_compiling_again(name: str) -> None:
     """That it compiles as a whole also shows that nothing in it waits for the device: that would break the graph."""
     plain = NetworkRunner(shallow_network(name), name, "sha")
     compiled = NetworkRunner(shallow_network(name), name, "sha", options=RunnerOptions(compile_backend="eager"))
@@ -90,7 +90,7 @@ def test_compiled_it_answers_the_same_and_compiles_nothing_after_warming_up(name
     compiled.close()
 
 
-def test_tokens_are_rounded_to_the_compute_type_whether_kept_or_not() -> None:
+def test_tokens_are_rounded_to_the_compute_type_always() -> None:
     runner = NetworkRunner(ruled_network("pi3"), "pi3", "sha", options=RunnerOptions(dtype=torch.bfloat16))
     tokens = runner.encode(some_images(3))
     assert tokens.dtype is torch.bfloat16
@@ -137,7 +137,7 @@ def test_a_single_posed_view_counts_as_none() -> None:
     runner.close()
 
 
-def test_scenes_with_different_numbers_of_posed_views_are_misuse() -> None:
+def test_scenes_with_unequal_posed_view_counts_are_misuse() -> None:
     runner = NetworkRunner(ruled_network("pi3x"), "pi3x", "sha")
     tokens = runner.encode(some_images(3), intrinsics(3)).expand(2, -1, -1, -1)
     posed = torch.tensor([[True, True, False], [True, True, True]])

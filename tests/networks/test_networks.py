@@ -89,7 +89,7 @@ def test_sides_that_are_no_multiples_of_a_patch_are_refused() -> None:
         patch_grid(torch.zeros(1, 3, 57, 70))
 
 
-def test_in_low_precision_the_main_residual_stream_stays_float32_and_that_of_head_decoders_does_not() -> None:
+def test_in_low_precision_only_the_main_residual_stays_float32() -> None:
     network = ruled_network("pi3")
     network.set_compute_type(torch.bfloat16)
     seen: dict[str, torch.dtype] = {}
@@ -112,7 +112,7 @@ def test_in_low_precision_the_main_residual_stream_stays_float32_and_that_of_hea
     assert 1e-5 < (low.local_points - high.local_points).norm() / high.local_points.norm() < 0.05
 
 
-def test_rotary_positions_turn_products_by_the_difference_of_positions_alone() -> None:
+def test_rotary_positions_act_by_their_difference_alone() -> None:
     rope = rope_table(torch.tensor([[0, 0], [1, 0], [3, 5], [4, 5]]), 16)
     vectors = torch.from_numpy(images("rope", (2, 16)))
     q, k = (rope.rotate(v.expand(4, -1)) for v in vectors)
@@ -126,7 +126,7 @@ def random_matrices(count: int) -> Tensor:
     return torch.from_numpy(np.random.default_rng(0).normal(size=(count, 3, 3)))
 
 
-def test_the_nearest_rotation_is_that_of_the_singular_value_decomposition() -> None:
+def test_the_nearest_rotation_equals_the_svd_one() -> None:
     matrices = random_matrices(2000)
     u, s, vt = torch.linalg.svd(matrices)
     sign = torch.det(u @ vt)
@@ -136,7 +136,7 @@ def test_the_nearest_rotation_is_that_of_the_singular_value_decomposition() -> N
     torch.testing.assert_close(nearest_rotation(matrices)[unique], expected[unique], rtol=0, atol=1e-9)
 
 
-def test_a_rotation_is_its_own_nearest_one_and_scale_does_not_matter() -> None:
+def test_a_rotation_is_its_own_nearest_at_any_scale() -> None:
     rotations = nearest_rotation(random_matrices(100))
     torch.testing.assert_close(torch.det(rotations), torch.ones(100, dtype=torch.float64))
     torch.testing.assert_close(nearest_rotation(7.5 * rotations), rotations)
@@ -162,7 +162,7 @@ def test_normalized_poses_do_not_depend_on_frame_or_unit() -> None:
     torch.testing.assert_close(expected[0, 1:, :3, 3].norm(dim=-1).mean(), torch.tensor(1.0))
 
 
-def test_what_stands_in_for_an_unknown_pose_counts_for_the_scale() -> None:
+def test_stand_ins_for_unknown_poses_count_for_the_scale() -> None:
     known = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
     alone = normalize_poses(known, *NO_DEPTH)
 
@@ -201,7 +201,7 @@ def test_a_rigid_change_of_all_poses_changes_nothing() -> None:
     assert (without.camera_poses - plain.camera_poses).abs().max() > 1e-2
 
 
-def test_the_pose_of_an_unposed_view_is_not_looked_at_beyond_the_scale() -> None:
+def test_the_pose_of_an_unposed_view_only_affects_the_scale() -> None:
     network = ruled_network("pi3x")
     assert isinstance(network, Pi3X)
     layout = network.layout(GRID)
@@ -214,7 +214,7 @@ def test_the_pose_of_an_unposed_view_is_not_looked_at_beyond_the_scale() -> None
     torch.testing.assert_close(first.camera_poses, second.camera_poses, rtol=0, atol=0)
 
 
-def test_without_what_is_there_for_depths_the_rest_answers_the_same() -> None:
+def test_without_depth_parts_the_rest_answers_the_same() -> None:
     whole, lean = ruled_network("pi3x"), ruled_network("pi3x")
     assert isinstance(lean, Pi3X)
     lean.forget_depths()

@@ -150,7 +150,7 @@ def test_what_is_no_safetensors_file_is_refused_with_what_it_is(content: bytes, 
 
 
 @given(position=st.integers(0, len(CONTENT) - 1), byte=st.integers(0, 255), length=st.integers(0, len(CONTENT)))
-def test_a_damaged_file_is_read_or_refused_and_never_anything_else(position: int, byte: int, length: int) -> None:
+def test_a_damaged_file_is_read_or_refused_cleanly(position: int, byte: int, length: int) -> None:
     content = (CONTENT[:position] + bytes([byte]) + CONTENT[position + 1 :])[:length]
     stream = io.BytesIO(content)
     try:
@@ -212,7 +212,7 @@ def test_weights_that_are_there_are_found_and_nothing_else_is(tmp_path: Path) ->
     assert find_weights("pi3", tmp_path) == path
 
 
-def test_a_folder_in_place_of_a_file_is_said_before_anything_else(
+def test_a_folder_in_place_of_a_file_is_reported_first(
     monkeypatch: pytest.MonkeyPatch, weights: Weights, file: Path, folder: Path
 ) -> None:
     monkeypatch.setattr(sources, "download_from_hub", None)
@@ -273,7 +273,7 @@ def test_a_linked_file_stays_where_it_is(weights: Weights, file: Path, folder: P
     assert look_up(weights, folder).status is Status.OFFICIAL
 
 
-def test_another_file_than_the_official_one_is_taken_only_if_meant(folder: Path, file: Path) -> None:
+def test_an_unofficial_file_is_taken_only_if_intended(folder: Path, file: Path) -> None:
     weights = entry_of(b"another")
     with pytest.raises(CheckpointError, match=r"not the official file of net: its SHA-256 is .*--unofficial"):
         add(weights, file, folder)
@@ -296,7 +296,7 @@ def test_a_pickle_under_another_name_is_not_added(weights: Weights, folder: Path
     assert not folder.exists()
 
 
-def test_a_check_tells_damage_and_records_what_was_put_there_by_hand(weights: Weights, folder: Path) -> None:
+def test_a_check_reports_damage_and_records_files_added_by_hand(weights: Weights, folder: Path) -> None:
     with pytest.raises(WeightsMissing):
         check(weights, folder)
     folder.mkdir()

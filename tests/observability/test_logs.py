@@ -187,7 +187,7 @@ def filtered(kept: RepeatFilter, count: int, **record: Any) -> list[logging.LogR
     return [it for it in records if kept.filter(it)]
 
 
-def test_a_repeated_warning_passes_a_few_times_and_is_counted_then() -> None:
+def test_a_repeated_warning_passes_few_times_then_is_counted() -> None:
     now_s = [0.0]
     kept = RepeatFilter(burst=3, period_s=60, clock=lambda: now_s[0])
     assert len(filtered(kept, 10, levelno=logging.WARNING)) == 3
@@ -207,7 +207,7 @@ def test_what_is_no_warning_always_passes() -> None:
     assert len(filtered(kept, 50, levelno=logging.INFO)) == 50
 
 
-def test_another_place_and_another_exception_are_another_warning() -> None:
+def test_another_place_or_exception_is_another_warning() -> None:
     kept = RepeatFilter(burst=1)
     records = []
     for line in (1, 2):

@@ -215,7 +215,7 @@ def test_an_answer_is_counted_under_its_outcome(metrics: Metrics, outcome: str) 
     assert changed(before, samples_of(metrics)) == {key: 1}
 
 
-def test_how_long_somebody_watches_is_counted_as_a_call_and_as_no_latency(metrics: Metrics) -> None:
+def test_watching_is_counted_as_a_call_without_latency(metrics: Metrics) -> None:
     before, watch = samples_of(metrics), "/mapless.v1.LocalizationService/WatchQueries"
     metrics.call_started(watch)
     metrics.call_handled(watch, "CANCELLED", 3600.0, "ab" * 16)
@@ -229,7 +229,7 @@ def test_how_long_somebody_watches_is_counted_as_a_call_and_as_no_latency(metric
     assert not watched
 
 
-def test_a_stream_that_ends_by_itself_has_a_latency_and_its_first_answer_another(metrics: Metrics) -> None:
+def test_a_stream_has_a_latency_and_a_first_answer_latency(metrics: Metrics) -> None:
     before, method = samples_of(metrics), "/mapless.v1.LocalizationService/LocalizeProgressively"
     metrics.answered_coarsely(0.25)
     metrics.call_handled(method, "OK", 0.5, "")
@@ -400,9 +400,7 @@ def ask(port: int, path: str) -> tuple[int, str]:
             return error.code, error.read().decode()
 
 
-def test_the_port_is_ready_while_health_says_serving_and_at_no_other_time(
-    metrics: Metrics, server: MetricsServer
-) -> None:
+def test_the_port_is_ready_exactly_while_health_says_serving(metrics: Metrics, server: MetricsServer) -> None:
     assert ask(server.port, "/ready") == (503, "not serving\n")  # starting
     metrics.set_serving(True)
     assert ask(server.port, "/ready") == (200, "serving\n")
@@ -415,7 +413,7 @@ def test_the_port_is_ready_while_health_says_serving_and_at_no_other_time(
 @pytest.mark.parametrize(
     ("silent_s", "ready", "live"), [(None, 200, 200), (0, 200, 200), (6, 503, 200), (50, 503, 200), (61, 503, 503)]
 )
-def test_a_server_whose_heart_stands_still_is_not_ready_and_after_a_minute_not_alive(
+def test_a_stalled_server_is_not_ready_and_later_not_alive(
     metrics: Metrics, server: MetricsServer, silent_s: float | None, ready: int, live: int
 ) -> None:
     metrics.set_serving(True)
@@ -454,7 +452,7 @@ def test_a_port_that_is_taken_is_an_error(metrics: Metrics, server: MetricsServe
         MetricsServer(metrics.registry, "no-such-host.invalid", 0, metrics)
 
 
-def test_closing_frees_the_port_and_ends_the_threads_even_of_open_connections(metrics: Metrics) -> None:
+def test_closing_frees_the_port_and_ends_connection_threads(metrics: Metrics) -> None:
     before = set(threading.enumerate())
     server = MetricsServer(metrics.registry, "127.0.0.1", 0, metrics)
     with socket.create_connection(("127.0.0.1", server.port), 10) as idle:

@@ -110,7 +110,7 @@ def test_only_faults_of_the_server_are_errors(code: str, is_fault: bool) -> None
     assert (span.attributes or {}).get("error.type") == (code if is_fault else None)
 
 
-def test_steps_are_children_at_their_own_times_and_parts_follow_each_other() -> None:
+def test_steps_are_children_and_parts_follow_each_other() -> None:
     start_s = time.monotonic() - 100
     steps = [
         Step("queue prepare", start_s, start_s + 1),
@@ -249,7 +249,7 @@ def test_a_collector_that_is_away_hurts_no_call_and_no_end(nobody: str, caplog: 
     assert not tracing_threads() - before
 
 
-def test_a_collector_that_never_answers_delays_the_end_by_the_limit(
+def test_a_silent_collector_delays_the_end_by_the_limit(
     collector: tuple[Collector, str], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.CRITICAL, "opentelemetry")

@@ -66,7 +66,7 @@ async def called(server: Any, method: str) -> Any:
 
 
 @pytest.mark.parametrize("service", SERVICE_NAMES)
-def test_where_there_is_no_replica_every_method_says_when_to_come_back(service: str) -> None:
+def test_without_a_replica_every_method_says_when_to_retry(service: str) -> None:
     (found,) = [it for it in ingress._SERVICES if it.full_name == service]
 
     async def run() -> list[Any]:
@@ -171,7 +171,7 @@ def test_the_limit_of_messages_is_that_of_the_settings(tmp_path: Path) -> None:
         check_environment(larger, variables())
 
 
-def test_each_replica_of_a_machine_claims_a_port_of_its_own_for_metrics(settings: Settings) -> None:
+def test_each_replica_of_a_machine_claims_its_own_metrics_port(settings: Settings) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -190,7 +190,7 @@ def test_each_replica_of_a_machine_claims_a_port_of_its_own_for_metrics(settings
 # The sample config
 
 
-def test_the_sample_config_is_one_of_serves_and_names_what_there_is() -> None:
+def test_the_sample_config_is_valid_for_serve() -> None:
     config = yaml.safe_load((RAY / "serve.yaml").read_text())
     parsed = ServeDeploySchema.model_validate(config)
     (application,) = parsed.applications

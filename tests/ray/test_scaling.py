@@ -182,9 +182,7 @@ CONFIG = AutoscalingConfig(min_replicas=2, max_replicas=40, upscale_delay_s=10, 
 
 
 @pytest.mark.parametrize("load", [1.0, 5.6, 12.0])
-def test_under_a_constant_load_it_settles_where_there_is_time_to_spare(
-    load: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_under_constant_load_it_settles_with_time_to_spare(load: float, monkeypatch: pytest.MonkeyPatch) -> None:
     targets = Fleet(CONFIG).run(poisson(load, 2400), monkeypatch)
     settled = targets[900:]
     needed = max(math.ceil(load / TARGET_BUSY), 2)

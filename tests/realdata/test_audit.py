@@ -145,7 +145,7 @@ def test_swapped_photographs_name_each_other_and_nothing_else(
     assert [(a.reference, a.message) for a in found.values() if a.verdict is not Verdict.CONSISTENT] == []
 
 
-def test_coverage_is_foretold_where_photographs_were_taken_and_not_where_none_looks(photographs: Photographs) -> None:
+def test_coverage_is_predicted_where_photographs_were_taken(photographs: Photographs) -> None:
     """From every other reference, of the ones between: all of these are localized by the method."""
     views = load(photographs, KITCHEN)
     around = surroundings_of(views[::2])

@@ -14,7 +14,7 @@ from mapless_tools.dataset import Dataset
 
 
 @pytest.mark.slow
-def test_the_coarse_pose_is_near_the_refined_one_and_a_little_worse(
+def test_the_coarse_pose_is_near_the_refined_and_a_little_worse(
     photographs: Callable[[str], Dataset], tmp_path: Path
 ) -> None:
     """And another place's photograph has none: the geometric backend finds no pose to be refined."""

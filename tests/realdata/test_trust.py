@@ -53,7 +53,7 @@ def test_right_answers_are_trusted_and_another_place_is_not(photographs: Photogr
     assert not [it.answer.outcome for it in strangers if isinstance(it.answer.outcome, Localization)]
 
 
-def test_a_photograph_with_the_focal_length_of_another_size_is_told_its_own(photographs: Photographs) -> None:
+def test_a_wrong_focal_length_is_reported_with_the_right_one(photographs: Photographs) -> None:
     """15 percent off, of which the answer would be as far from what it sees: next to all of it is found again."""
     photographs(FOUNTAIN)
     place = fountain()
@@ -71,7 +71,7 @@ def test_a_photograph_with_the_focal_length_of_another_size_is_told_its_own(phot
         assert it.answer.outcome.hint.advice is Advice.CHECK_CALIBRATION
 
 
-def test_a_scene_of_which_half_the_references_stand_elsewhere_is_ambiguous(photographs: Photographs) -> None:
+def test_a_scene_with_half_its_references_moved_is_ambiguous(photographs: Photographs) -> None:
     """The known poses of every second reference are moved by five metres: both places are told."""
     photographs(FOUNTAIN)
     place = fountain()
@@ -91,7 +91,7 @@ def test_a_scene_of_which_half_the_references_stand_elsewhere_is_ambiguous(photo
 
 @pytest.mark.thorough
 @pytest.mark.timeout(3600)
-def test_at_95_percent_coverage_one_percent_is_wrong_and_no_other_place_is_accepted(photographs: Photographs) -> None:
+def test_at_95_percent_coverage_one_percent_is_wrong(photographs: Photographs) -> None:
     """All metric scenes with 10, 5, 3 and 2 references; and 588 pairs of a query and references of another place."""
     names = [*dict.fromkeys(name for name, _ in METRIC), *OTHERS]
     for name in names:

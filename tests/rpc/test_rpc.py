@@ -200,7 +200,7 @@ def test_an_answer_that_cannot_be_written_is_internal(counted: Counted) -> None:
 
 
 @pytest.mark.parametrize("stubborn", [False, True])
-def test_a_caller_who_goes_is_cancelled_and_the_servicer_hears_it(counted: Counted, stubborn: bool) -> None:
+def test_a_leaving_caller_cancels_the_servicer(counted: Counted, stubborn: bool) -> None:
     begun, ended = asyncio.Event(), asyncio.Event()
 
     async def slow(request: Any, call: Call) -> Any:
@@ -227,7 +227,7 @@ def test_a_caller_who_goes_is_cancelled_and_the_servicer_hears_it(counted: Count
     assert counted.codes == ["CANCELLED"]
 
 
-def test_the_answer_to_a_passed_deadline_does_not_wait_for_the_servicer(
+def test_a_passed_deadline_is_answered_before_the_servicer_ends(
     counted: Counted, caplog: pytest.LogCaptureFixture
 ) -> None:
     answered = asyncio.Event()
@@ -387,9 +387,7 @@ async def check_health(channel: Channel) -> None:
     assert answer.status == health_pb2.HealthCheckResponse.SERVING
 
 
-def test_streams_that_anybody_may_open_are_few_and_keep_no_probe_out(
-    counted: Counted, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_public_streams_are_few_and_keep_no_probe_out(counted: Counted, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(receiving, "MAX_OPEN_STREAMS", 2)
 
     async def run() -> None:
@@ -439,7 +437,7 @@ class Unread:
         self.seen.append(message.status)
 
 
-def test_who_does_not_read_how_the_server_is_keeps_nobody_from_changing_it() -> None:
+def test_a_health_watcher_that_reads_nothing_blocks_no_change() -> None:
     """Health's servicer holds a lock while it writes; a server that stops says so first."""
     status = health_pb2.HealthCheckResponse
 
@@ -499,7 +497,7 @@ def test_a_fault_in_authentication_admits_nobody(counted: Counted) -> None:
 
 
 @pytest.mark.parametrize("given", ["a b", "x" * 65, "", "a%0a", 'id="1"'])
-def test_everybody_is_admitted_by_default_and_told_apart_by_address(counted: Counted, given: str) -> None:
+def test_every_caller_is_admitted_by_default_by_address(counted: Counted, given: str) -> None:
     seen: list[Call] = []
 
     async def answer(request: Any, call: Call) -> Any:
@@ -556,7 +554,7 @@ def test_a_call_of_many_steps_adds_them_up_and_keeps_the_first() -> None:
     assert len(call.trail.steps) == MAX_STEPS
 
 
-def test_what_servicers_wait_for_being_cancelled_is_no_cancelled_call(counted: Counted) -> None:
+def test_cancellation_inside_a_servicer_is_no_cancelled_call(counted: Counted) -> None:
     async def answer(request: Any, call: Call) -> Any:
         dropped: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         dropped.cancel()
@@ -570,7 +568,7 @@ def test_what_servicers_wait_for_being_cancelled_is_no_cancelled_call(counted: C
     assert counted.codes == ["UNAVAILABLE"]
 
 
-def test_a_thousand_calls_that_end_in_every_way_are_counted_once_each(counted: Counted) -> None:
+def test_a_thousand_calls_that_end_in_any_way_are_counted_once(counted: Counted) -> None:
     arrived: set[str] = set()
 
     async def answer(request: Any, call: Call) -> Any:

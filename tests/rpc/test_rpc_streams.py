@@ -198,9 +198,7 @@ class Photographs(Numbers):
 
 
 @pytest.mark.parametrize("how", ["cancels", "closes its channel", "reaches its deadline"])
-def test_a_watcher_who_leaves_while_a_photograph_is_sent_is_no_fault_of_the_server(
-    how: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_watcher_leaving_during_a_photo_is_no_server_fault(how: str, caplog: pytest.LogCaptureFixture) -> None:
     async def run() -> None:
         counted, numbers = Counted(), Photographs(10**9)
         async with serving(numbers, counted) as (channel, _):
@@ -220,7 +218,7 @@ def test_a_watcher_who_leaves_while_a_photograph_is_sent_is_no_fault_of_the_serv
     assert not caplog.records
 
 
-def test_it_lasts_beyond_the_deadline_of_other_calls_and_ends_at_its_own() -> None:
+def test_it_outlasts_other_deadlines_and_ends_at_its_own() -> None:
     async def run() -> None:
         counted, numbers = Counted(), Numbers(0, "wait")
         async with serving(numbers, counted, default_deadline_s=0.2, max_deadline_s=0.3) as (channel, _):
@@ -238,7 +236,7 @@ def test_it_lasts_beyond_the_deadline_of_other_calls_and_ends_at_its_own() -> No
     asyncio.run(run())
 
 
-def test_whose_message_does_not_come_is_told_so_without_a_deadline_too() -> None:
+def test_a_missing_message_is_reported_without_a_deadline_too() -> None:
     async def run() -> None:
         counted = Counted()
         async with serving(Numbers(0), counted, default_deadline_s=0.2) as (channel, _):
@@ -351,7 +349,7 @@ class TestStreamsThatComeToAnEnd:
 
         asyncio.run(run())
 
-    def test_what_was_made_in_time_waits_for_a_reader_who_takes_longer(self, caplog: pytest.LogCaptureFixture) -> None:
+    def test_what_was_made_in_time_waits_for_a_slow_reader(self, caplog: pytest.LogCaptureFixture) -> None:
         """The servicer is through with it long before, and the caller is told no other end later."""
 
         async def run() -> None:
@@ -389,7 +387,7 @@ class TestStreamsThatComeToAnEnd:
 
         asyncio.run(run())
 
-    def test_one_whose_time_is_over_before_it_begins_leaves_nothing_behind(self) -> None:
+    def test_one_that_expired_before_it_began_leaves_nothing(self) -> None:
         def authenticate(*_: Any) -> Principal:
             time.sleep(0.15)  # at the door, and with the message
             return Principal()
@@ -439,7 +437,7 @@ class TestWhoReadsTooSlowly:
     """No deadline ends it: its messages were made in time, and the caller gave none."""
 
     @pytest.mark.parametrize("read_before", [0, 1])
-    def test_is_told_so_when_it_reads_again_and_has_no_call_meanwhile(self, method: str, read_before: int) -> None:
+    def test_is_told_when_it_reads_again_and_holds_no_call(self, method: str, read_before: int) -> None:
         async def run() -> None:
             counted, numbers = Counted(), Large(8)
             async with serving(numbers, counted) as (channel, guard):

@@ -82,7 +82,7 @@ def verdicts(examiner: SceneExaminer, ids: list[str]) -> list[Verdict | None]:
 
 
 @pytest.mark.parametrize("what", ["features", "descriptor", "pose"])
-def test_a_damaged_reference_is_said_to_be_and_its_neighbours_are_judged(store: Store, what: str) -> None:
+def test_a_damaged_reference_is_named_and_neighbours_are_judged(store: Store, what: str) -> None:
     damage(store, KEY, "r2", what)
     examiner = SceneExaminer(tools_of(store), KEY)
     ids = [f"r{i}" for i in range(len(REFERENCES))]
@@ -97,7 +97,7 @@ def test_a_damaged_reference_is_said_to_be_and_its_neighbours_are_judged(store: 
     assert "scenes/s/references/r2" not in coverage.references
 
 
-def test_a_neighbour_that_is_deleted_during_an_audit_costs_nobody_the_answer(store: Store) -> None:
+def test_a_neighbour_deleted_during_an_audit_loses_no_answer(store: Store) -> None:
     """Once before anything was loaded, once when it had been looked at."""
     examiner = SceneExaminer(tools_of(store), KEY)
     examiner._read()
@@ -152,7 +152,7 @@ def test_a_scene_that_never_holds_still_is_unavailable(store: Store, monkeypatch
     assert len(readings) == 3
 
 
-def test_a_page_of_a_large_scene_makes_no_pose_for_each_reference(store: Store) -> None:
+def test_a_page_of_a_large_scene_makes_no_pose_per_reference(store: Store) -> None:
     """Poses are made for the few that are looked at, not for the scene."""
     tools = tools_of(store)
     view = REFERENCES[0].view

@@ -130,7 +130,7 @@ class TestPhotographs:
         with pytest.raises(DataLoss, match="'r0'"):
             reference.view.photograph.read()
 
-    def test_what_no_decoder_reads_is_data_loss_and_no_fault_of_the_caller(self, store: CountingStore) -> None:
+    def test_undecodable_references_are_data_loss_and_no_misuse(self, store: CountingStore) -> None:
         view = OLD.extract(PIXELS["r0"], CAMERA)
         store.add_references(SCENE, [NewReference("odd", b"no image", CAMERA, pose(0.0), {"old": view})])
         _, (reference,) = ReferenceLibrary(store).load(SCENE, ["odd"], OLD, turn())
@@ -145,7 +145,7 @@ class TestPhotographs:
 
 
 class TestDescribing:
-    def test_a_store_filled_under_other_features_describes_each_reference_once(self, store: CountingStore) -> None:
+    def test_a_store_with_other_features_describes_references_once(self, store: CountingStore) -> None:
         """Whatever calls ask for, in whatever order, and however often."""
         new, generation = StandInExtractor("new"), store.get_scene(SCENE).generation
         expected = {it: new.extract(PIXELS[it], CAMERA).features.keypoints for it in IDS}
@@ -162,7 +162,7 @@ class TestDescribing:
         assert call.stage_seconds == {}, "nothing is described when everything is"
         assert "describe" not in call.stage_seconds
 
-    def test_who_does_not_wait_is_told_and_one_damaged_photograph_does_not_hold_up_the_others(
+    def test_one_damaged_photograph_does_not_delay_the_others(
         self, store: CountingStore, caplog: pytest.LogCaptureFixture
     ) -> None:
         class Picky(StandInExtractor):

@@ -149,7 +149,7 @@ def test_entries_stay_as_they_were() -> None:
     assert now.reference(now.rows({"id-7"})[0])[1] == "key-1000"
 
 
-def test_an_id_that_is_used_again_is_the_new_reference_now_and_the_old_one_in_older_entries() -> None:
+def test_an_id_used_again_is_the_old_one_in_older_entries() -> None:
     index = SceneIndex(DIMENSION)
     index.apply(whole(*(reference(i) for i in range(10))))
     before = index.entries()
@@ -159,7 +159,7 @@ def test_an_id_that_is_used_again_is_the_new_reference_now_and_the_old_one_in_ol
     assert len(index.entries()) == 10
 
 
-def test_readers_see_one_generation_whole_while_changes_are_applied() -> None:
+def test_readers_see_one_generation_whole_during_changes() -> None:
     """Of every generation there are ten references that stand at x = generation; never some of them."""
     index = SceneIndex(DIMENSION)
     torn: list[str] = []
@@ -211,7 +211,7 @@ def test_a_blank_photograph_resembles_nothing_and_is_described() -> None:
     assert entries.undescribed() == []
 
 
-def test_a_descriptor_of_another_length_is_refused_and_changes_nothing() -> None:
+def test_a_descriptor_of_another_length_is_refused_unchanged() -> None:
     index = SceneIndex(DIMENSION)
     index.apply(whole(reference(0, described=False)))
     wrong = IndexedReference("b", "b", pose(1), np.ones(3, np.float32))

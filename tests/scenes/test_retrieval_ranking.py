@@ -71,7 +71,7 @@ class TestOrder:
     def test_an_empty_scene_has_none(self) -> None:
         assert rank_references(planted([]), QUERY, 10) == []
 
-    def test_those_without_descriptor_come_last_the_nearest_to_the_prior_first(self) -> None:
+    def test_those_without_descriptor_come_last_nearest_first(self) -> None:
         entries = planted([None, -0.9, None, None], x_m=[9.0, 0.0, 1.0, 4.0])
         near = Narrowing(Sphere(np.zeros(3), 1.0))
         ranked = rank_references(entries, QUERY, 4, near)
@@ -83,7 +83,7 @@ class TestOrder:
         assert ids(rank_references(entries, None, 3, Narrowing(Sphere(np.zeros(3), 1.0)))) == "1 2 0"
         assert ids(rank_references(entries, None, 3)) == "0 1 2"
 
-    def test_only_named_references_are_ranked_and_unknown_names_passed_over(self) -> None:
+    def test_only_named_references_are_ranked_unknown_ones_skipped(self) -> None:
         entries = planted([0.2, 0.9, -0.1, 0.5])
         assert ids(rank_references(entries, QUERY, 10, among=["0", "3", "elsewhere"])) == "3 0"
         assert rank_references(entries, QUERY, 10, among=[]) == []
@@ -99,7 +99,7 @@ class TestOrder:
 
 
 class TestNarrowing:
-    def test_a_position_prior_keeps_what_is_within_radius_and_margin(self) -> None:
+    def test_a_position_prior_keeps_what_is_in_radius_and_margin(self) -> None:
         entries = planted([0.1, 0.2, 0.3, 0.4], x_m=[0.0, 11.9, 12.1, 50.0])
         prior = Narrowing(Sphere(np.zeros(3), 2.0), margin_m=10.0)
         assert ids(rank_references(entries, QUERY, 10, prior)) == "1 0"
@@ -147,7 +147,7 @@ class TestThinning:
         assert ids(rank_references(entries, QUERY, 2)) == "0 2"
         assert ids(rank_references(entries, QUERY, 2, options=UNTHINNED)) == "0 1"
 
-    def test_of_a_camera_that_stood_still_few_are_chosen_before_others(self) -> None:
+    def test_few_references_of_a_standing_camera_are_chosen(self) -> None:
         """Three hundred alike, more than are looked at first; then those that are less so, the better first."""
         similarities: list[float | None] = [*[0.99] * 300, 0.5, 0.7, 0.6, *[0.1] * 400]
         places = [0.0001 * i for i in range(300)] + [1.0, 2.0, 3.0] + [10.0 + i for i in range(400)]

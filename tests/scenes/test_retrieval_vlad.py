@@ -65,7 +65,7 @@ class TestDescriptor:
         assert vocabulary is not None
         np.testing.assert_allclose(descriptor.describe(view_of(found)), slow_vlad(found, vocabulary), atol=1e-4)
 
-    def test_what_shares_features_is_more_similar_than_what_does_not(self, descriptor: VladDescriptor) -> None:
+    def test_shared_features_mean_more_similarity(self, descriptor: VladDescriptor) -> None:
         found, others = descriptors("a", 400), descriptors("b", 400)
         query = descriptor.describe(view_of(found))
         similar = [

@@ -64,7 +64,7 @@ class TestDamage:
         assert sum("describing" in it.getMessage() for it in caplog.records) == 1
 
     @pytest.mark.parametrize("what", ["descriptor", "pose"])
-    def test_one_that_is_left_out_is_told_from_one_that_is_not_there(self, store: Store, what: str) -> None:
+    def test_one_left_out_differs_from_one_that_is_absent(self, store: Store, what: str) -> None:
         store.add_references(SCENE, [new(i, is_described=True) for i in range(3)])
         damage(store, SCENE, "r1", what)
         indexes = indexes_of(store)
@@ -72,7 +72,7 @@ class TestDamage:
         assert [it in entries for it in ("r0", "r1", "r2")] == [True, False, True]
         assert [indexes.is_damaged(SCENE, it) for it in ("r0", "r1", "r2", "nobody")] == [False, True, False, False]
 
-    def test_one_that_is_deleted_is_not_damaged_any_more_and_may_be_added_again(self, store: Store) -> None:
+    def test_a_deleted_one_is_no_longer_damaged_and_may_return(self, store: Store) -> None:
         store.add_references(SCENE, [new(i, is_described=True) for i in range(3)])
         damage(store, SCENE, "r1", "descriptor")
         indexes = indexes_of(store)
@@ -85,7 +85,7 @@ class TestDamage:
 
 
 class TestMemory:
-    def test_what_is_held_is_what_the_scenes_take_whatever_became_of_them(self, store: Store) -> None:
+    def test_what_is_held_is_what_the_scenes_take(self, store: Store) -> None:
         """The running total is the sum, after scenes grew, were forgotten and were deleted."""
         keys = [SceneKey(f"many-{i}") for i in range(4)]
         indexes = indexes_of(store)
@@ -135,7 +135,7 @@ class TestMemory:
         indexes.tell_damaged(SCENE, "r0", DataLoss("lost"))
         assert (indexes.size_bytes, dict(indexes._held)) == (0, {})
 
-    def test_scenes_used_longest_ago_make_room_and_the_last_one_stays(self, store: Store) -> None:
+    def test_least_recently_used_scenes_make_room_the_last_stays(self, store: Store) -> None:
         keys = [SceneKey(f"many-{i}") for i in range(4)]
         for key in keys:
             store.create_scene(key)

@@ -30,7 +30,7 @@ def test_one_caller_is_served_in_order() -> None:
         queue.pop()
 
 
-def test_a_hundred_requests_of_one_do_not_delay_the_one_of_another() -> None:
+def test_a_hundred_requests_of_one_do_not_delay_another() -> None:
     queue: FairQueue[str] = FairQueue(QUANTUM_S)
     for i in range(100):
         queue.push(f"many {i}", Flow("t", "many"), 1.0)
@@ -52,9 +52,7 @@ def test_tenants_share_equally_however_many_clients_they_have() -> None:
     st.dictionaries(st.integers(0, 4), st.lists(COSTS, min_size=1, max_size=30), min_size=2, max_size=5),
     st.integers(1, 60),
 )
-def test_what_two_waiting_callers_get_differs_by_a_quantum_and_two_jobs(
-    costs: dict[int, list[float]], count: int
-) -> None:
+def test_two_waiting_callers_differ_by_a_quantum_and_two_jobs(costs: dict[int, list[float]], count: int) -> None:
     queue: FairQueue[tuple[int, int]] = FairQueue(QUANTUM_S)
     for flow, of_flow in costs.items():
         for i, cost_s in enumerate(of_flow):
@@ -70,9 +68,7 @@ def test_what_two_waiting_callers_get_differs_by_a_quantum_and_two_jobs(
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 2), COSTS), max_size=40), st.data())
-def test_everything_comes_out_once_whatever_is_taken_along_or_removed(
-    pushed: list[tuple[int, int, float]], data: st.DataObject
-) -> None:
+def test_everything_comes_out_exactly_once(pushed: list[tuple[int, int, float]], data: st.DataObject) -> None:
     queue: FairQueue[int] = FairQueue(QUANTUM_S)
     for job, (tenant, client, cost_s) in enumerate(pushed):
         queue.push(job, Flow(str(tenant), str(client)), cost_s)

@@ -144,7 +144,7 @@ def run_through(toy: Toy, most_batches: int = 1000) -> list[tuple[str, int]]:
 
 
 class TestAdmission:
-    def test_a_queue_is_bounded_by_predicted_time_and_always_has_room_for_another_caller(self) -> None:
+    def test_a_queue_is_bounded_by_time_with_room_for_a_new_caller(self) -> None:
         toy = Toy()
         for _ in range(5):
             toy.admit(client="greedy")
@@ -188,7 +188,7 @@ class TestAdmission:
         """Else a prediction that is wrong once would be wrong for ever."""
         Toy().admit(deadline_s=0.01)
 
-    def test_a_light_caller_is_not_refused_for_what_a_heavy_one_has_waiting(self) -> None:
+    def test_a_light_caller_is_not_refused_for_a_heavy_ones_queue(self) -> None:
         toy = Toy()
         for _ in range(5):
             toy.admit(client="heavy")
@@ -232,7 +232,7 @@ class TestAdmission:
 
 
 class TestOrder:
-    def test_what_is_begun_is_finished_first_but_the_others_are_not_forgotten(self) -> None:
+    def test_begun_jobs_finish_first_without_starving_others(self) -> None:
         toy = Toy(ScheduleOptions(max_queued_s=1000))
         for _ in range(12):
             toy.admit(stage="refine")
@@ -286,7 +286,7 @@ class TestTime:
         assert toy.schedule.take("host", 5.0) is None
         assert not toy.schedule.jobs
 
-    def test_and_while_it_is_computed_and_what_comes_of_it_is_dropped(self) -> None:
+    def test_while_it_is_computed_its_result_is_dropped(self) -> None:
         toy = Toy()
         job = toy.admit(deadline_s=5.0)
         batch = toy.take("host")
@@ -298,7 +298,7 @@ class TestTime:
         assert toy.schedule.take("device", toy.now_s) is None
         assert not toy.schedule.jobs
 
-    def test_what_has_ended_is_let_go_whenever_it_would_have_been_due(self) -> None:
+    def test_what_has_ended_is_released_whenever_it_was_due(self) -> None:
         """A job holds photographs; a deadline may be minutes away, and another's nearer."""
         toy = Toy()
         toy.admit(deadline_s=1e4)
@@ -381,7 +381,7 @@ class TestTime:
         ((predicted_s, actual_s),) = settled
         assert actual_s == predicted_s > 0
 
-    def test_more_than_was_admitted_is_computed_only_where_there_is_room(self) -> None:
+    def test_more_than_admitted_is_computed_only_where_room_is(self) -> None:
         """As when stronger features are to be tried."""
         for others, expected in ((0, None), (6, Ending.OK)):
             toy = Toy()

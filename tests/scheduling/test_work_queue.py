@@ -230,7 +230,7 @@ class TestResults:
 
         run(test())
 
-    def test_all_that_a_batch_sends_on_is_taken_up_at_once_by_as_many_threads(self) -> None:
+    def test_a_batchs_output_is_taken_up_by_as_many_threads_at_once(self) -> None:
         """One piece of news, work for two."""
         both = threading.Barrier(2, timeout=LIMIT_S)
 
@@ -250,7 +250,7 @@ class TestResults:
 
         run(test())
 
-    def test_a_light_caller_does_not_wait_for_all_that_a_heavy_one_sent(self) -> None:
+    def test_a_light_caller_does_not_wait_for_a_heavy_ones_jobs(self) -> None:
         async def test() -> None:
             shop = Shop()
             async with shop.open() as queue:
@@ -317,7 +317,7 @@ class TestFailure:
 
         run(test())
 
-    def test_a_job_that_is_given_an_exception_fails_alone_and_is_not_computed_again(self) -> None:
+    def test_a_job_given_an_exception_fails_alone_and_once(self) -> None:
         def compute(jobs: Sequence[Job]) -> list[Verdict]:
             return [Guilty() if job.step.payload == 1 else Done(job.step.payload) for job in jobs]
 
@@ -352,7 +352,7 @@ class TestFailure:
         run(test())
 
     @pytest.mark.parametrize("surplus", [-1, 1])
-    def test_a_stage_that_gives_the_wrong_number_of_verdicts_fails_every_job(self, surplus: int) -> None:
+    def test_a_stage_with_the_wrong_number_of_results_fails_all(self, surplus: int) -> None:
         def compute(jobs: Sequence[Job]) -> list[Verdict]:
             if "right" in [job.step.payload for job in jobs]:
                 return [Done("right")]
@@ -371,7 +371,7 @@ class TestFailure:
         run(test())
 
     @pytest.mark.parametrize("fits", [1, 2, 3, 5])
-    def test_out_of_memory_halves_the_batch_and_what_did_not_fit_is_not_tried_again(self, fits: int) -> None:
+    def test_out_of_memory_halves_the_batch_for_good(self, fits: int) -> None:
         def compute(jobs: Sequence[Job]) -> list[Verdict]:
             if len(jobs) > fits and jobs[0].step.bucket == "large":
                 raise MemoryError
@@ -396,7 +396,7 @@ class TestFailure:
 
         run(test())
 
-    def test_what_a_failed_attempt_held_is_free_when_its_halves_are_computed(self) -> None:
+    def test_memory_of_a_failed_attempt_is_free_for_its_halves(self) -> None:
         """An exception that is still handled holds the frames that it came through, and the tensors in them."""
         held: list[weakref.ref[Any]] = []
 
@@ -565,7 +565,7 @@ class TestEndOfAll:
 
         run(test())
 
-    def test_a_long_stage_that_asks_between_its_steps_does_not_hang_until_a_step_does(self) -> None:
+    def test_a_long_stage_that_checks_between_steps_does_not_hang(self) -> None:
         steps_s, limit_s = 2.0, 1.0
         shop = Shop(options=WorkQueueOptions(ROOMY, stall_limit_s=limit_s, heartbeat_s=0.05))
 
@@ -588,7 +588,7 @@ class TestEndOfAll:
 
         run(test())
 
-    def test_closing_tells_those_who_wait_and_waits_for_those_who_compute(self) -> None:
+    def test_closing_notifies_the_waiting_and_awaits_the_computing(self) -> None:
         async def test() -> None:
             shop = Shop()
             async with shop.open() as queue:
@@ -617,7 +617,7 @@ class TestEndOfAll:
         assert "toy-device" in said
         assert "left behind" in said
 
-    def test_a_queue_that_never_began_can_be_closed_and_takes_nothing_then(self) -> None:
+    def test_a_queue_that_never_began_can_be_closed(self) -> None:
         async def test() -> None:
             async with Shop().open() as queue:
                 await queue.close()
@@ -695,7 +695,7 @@ class TestCallersWhoLeave:
 
         run(test())
 
-    def test_one_who_waits_is_told_at_its_deadline_though_no_thread_is_free(self) -> None:
+    def test_a_waiting_call_ends_at_its_deadline_without_a_thread(self) -> None:
         async def test() -> None:
             shop = Shop()
             async with shop.open() as queue:

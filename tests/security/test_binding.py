@@ -51,9 +51,7 @@ def advice_for(host: str, flags: str) -> Advice:
 @pytest.mark.parametrize("tokens", ["", "tokens"])
 @pytest.mark.parametrize("insecure", ["", "insecure"])
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
-def test_refused_is_what_is_open_to_strangers_unless_the_operator_wants_it(
-    host: str, tls: str, tokens: str, insecure: str
-) -> None:
+def test_what_strangers_could_reach_is_refused_unless_wanted(host: str, tls: str, tokens: str, insecure: str) -> None:
     refused = host == "0.0.0.0" and not (tls or tokens or insecure)
     assert (advice_for(host, f"{tls} {tokens} {insecure}").verdict is Verdict.REFUSED) == refused
 

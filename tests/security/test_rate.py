@@ -15,7 +15,7 @@ jobs = st.lists(st.tuples(st.floats(0, 5), st.floats(0, 60)), min_size=1, max_si
 
 
 @given(rate=rates, burst_s=bursts, jobs=jobs)
-def test_what_is_admitted_in_any_window_is_the_rate_and_the_burst_and_at_most_one_job_more(
+def test_any_window_admits_rate_and_burst_and_one_job_more(
     rate: float, burst_s: float, jobs: list[tuple[float, float]]
 ) -> None:
     limiter = RateLimiter(rate, burst_s)
@@ -34,7 +34,7 @@ def test_what_is_admitted_in_any_window_is_the_rate_and_the_burst_and_at_most_on
 
 
 @given(rate=rates, burst_s=bursts, jobs=jobs)
-def test_who_waits_as_long_as_told_is_admitted_and_not_long_before(
+def test_waiting_as_long_as_told_is_enough_and_needed(
     rate: float, burst_s: float, jobs: list[tuple[float, float]]
 ) -> None:
     limiter = RateLimiter(rate, burst_s)
@@ -48,7 +48,7 @@ def test_who_waits_as_long_as_told_is_admitted_and_not_long_before(
             assert limiter.charge("t", cost_s, now_s) == pytest.approx(0, abs=1e-6)  # rounding
 
 
-def test_a_job_larger_than_the_burst_waits_for_a_full_bucket_and_leaves_a_debt() -> None:
+def test_a_job_above_the_burst_waits_for_a_full_bucket_and_owes() -> None:
     limiter = RateLimiter(0.5, 2.0)
     assert limiter.charge("t", 12.0, 0.0) == 0
     assert limiter.charge("t", 1.0, 0.0) == pytest.approx(22.0)  # 10 s of debt and 1 s, at half a second a second
@@ -69,7 +69,7 @@ def test_settling_leaves_what_charging_the_true_cost_would_have(
     assert settled.charge("t", 20.0, later_s) == pytest.approx(charged.charge("t", 20.0, later_s))
 
 
-def test_what_a_job_took_more_than_predicted_is_owed_even_if_the_bucket_was_full_again() -> None:
+def test_time_beyond_the_prediction_is_owed() -> None:
     limiter = RateLimiter(1.0, 2.0)
     assert limiter.charge("t", 1.0, 0.0) == 0
     limiter.settle("t", 1.0, 31.0, 100.0)

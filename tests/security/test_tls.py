@@ -170,7 +170,7 @@ class TestWhoGetsIn:
         with serving(files) as server:
             refused(lambda: server.who_am_i(server.options()))
 
-    def test_with_client_certificates_those_of_the_authority_and_by_their_name(self, mutual: TlsFiles) -> None:
+    def test_client_certificates_are_checked_and_name_the_caller(self, mutual: TlsFiles) -> None:
         with serving(mutual) as server:
             assert server.who_am_i(server.options(signed(AUTHORITY, "robot-7"))) == "robot-7"
             assert server.is_serving(server.options(signed(AUTHORITY, "robot-7")))
@@ -191,7 +191,7 @@ class TestWhoGetsIn:
 
 
 class TestChanges:
-    def test_new_connections_see_the_new_certificate_and_old_ones_go_on(self, files: TlsFiles) -> None:
+    def test_a_new_certificate_is_for_new_connections_only(self, files: TlsFiles) -> None:
         with serving(files) as server, server.options().channel(f"localhost:{server.port}") as channel:
             states: list[grpc.ChannelConnectivity] = []
             call = channel.unary_unary(CALL)
@@ -391,7 +391,7 @@ class TestCommand:
         assert server.health_metadata["authorization"] == "Bearer mapless_x"
         assert server.health_metadata["x-client-id"] == "r7"
 
-    def test_the_token_may_come_from_the_environment_and_a_file_wins(
+    def test_the_token_may_be_in_the_environment_and_a_file_wins(
         self, server: Serving, flags: dict[str, str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("MAPLESS_TOKEN", "mapless_environment")

@@ -94,9 +94,7 @@ def test_nothing_is_copied_to_the_host_twice() -> None:
 @pytest.mark.parametrize(
     ("device_count", "host_count", "kept"), [(0, 0, 0), (3, 0, 3), (0, 3, 3), (2, 3, 5), (9, 9, 8)]
 )
-def test_the_last_views_are_held_and_no_more_than_there_is_room_for(
-    device_count: int, host_count: int, kept: int
-) -> None:
+def test_the_last_views_are_held_within_the_limit(device_count: int, host_count: int, kept: int) -> None:
     for i in range(8):
         cache = cache_of(device_count, host_count)
         for j in range(8):

@@ -65,7 +65,7 @@ class TestFile:
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert os.listdir(path.parent) == [path.name]
 
-    def test_tokens_differ_and_a_revoked_one_is_gone_while_the_others_stay(self, path: Path) -> None:
+    def test_tokens_differ_and_revoking_one_keeps_the_others(self, path: Path) -> None:
         made = {name: create_token(path, name, DEFAULT_TENANT, "read", None) for name in "abc"}
         revoke_token(path, "b")
         found = {name: read_tokens(path).find(token) for name, token in made.items()}
@@ -193,7 +193,7 @@ class TestReloading:
         assert [it.name for it in source.value.tokens] == ["a"]
 
     @pytest.mark.parametrize("broken", ["{", None])
-    def test_a_file_that_breaks_or_goes_leaves_the_old_tokens_and_is_logged_once(
+    def test_a_broken_file_leaves_the_old_tokens_and_logs_once(
         self, path: Path, broken: str | None, caplog: pytest.LogCaptureFixture
     ) -> None:
         token = create_token(path, "a", "t", "read", None)
@@ -211,7 +211,7 @@ class TestReloading:
         assert source.refresh()
         assert source.value.find(token) == source.value.tokens[0]
 
-    def test_a_file_that_could_not_be_read_for_a_moment_is_tried_again(self, path: Path) -> None:
+    def test_a_file_unreadable_for_a_moment_is_read_again(self, path: Path) -> None:
         path.write_text("{}")
         failing = [False]
 
@@ -269,7 +269,7 @@ class TestWhoMayCallWhat:
         assert methods == OPEN_METHODS
         assert not OPEN_METHODS & set(METHOD_ROLES)
 
-    def test_what_changes_something_computes_for_long_or_shows_what_others_ask_takes_the_role_write(self) -> None:
+    def test_changing_long_computing_or_watching_takes_write(self) -> None:
         for method, role in METHOD_ROLES.items():
             name = method.rpartition("/")[2]
             takes_much = re.match(r"Create|BatchCreate|Delete|Update|AuditScene|WatchQueries", name) is not None
@@ -317,7 +317,7 @@ class TestWhoMayCallWhat:
         assert (caught.value.reason, caught.value.code) == (reason, "UNAUTHENTICATED")
         assert "secret" not in str(caught.value).lower()
 
-    def test_a_revoked_token_and_one_that_never_was_get_the_same_answer(self, path: Path) -> None:
+    def test_a_revoked_token_and_an_unknown_one_look_the_same(self, path: Path) -> None:
         revoked = create_token(path, "a", "t", "read", None)
         revoke_token(path, "a")
         caller = Authenticator(lambda: read_tokens(path))
@@ -346,7 +346,7 @@ class TestWhoMayCallWhat:
         caller = authenticator(entry())
         assert caller.authenticate((("authorization", "bEaReR secret"),), READ).tenant == "acme"
 
-    def test_without_tokens_everybody_is_the_default_tenant_named_by_the_certificate(self) -> None:
+    def test_without_tokens_all_are_the_default_tenant(self) -> None:
         caller = Authenticator(None)
         assert caller.authenticate((), READ) == Principal(DEFAULT_TENANT, Role.WRITE, "")
         context = {"x509_common_name": [b"robot-7"], "x509_subject_alternative_name": [b"r7.example"]}
@@ -398,9 +398,7 @@ class TestCommand:
         assert (found_code, printed, said.count("\n")) == (code, "", 1)
         assert complaint in said
 
-    def test_the_clients_token_in_the_environment_is_not_the_servers_business(
-        self, path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_the_server_ignores_the_clients_token_variable(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("MAPLESS_TOKEN", "mapless_x")
         create_token(path, "a", "t", "read", None)
         assert self.run("list", path=path)[0] == 0

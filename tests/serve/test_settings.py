@@ -37,7 +37,7 @@ def test_precedence_and_origins(config: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("origin", ["file", "environment"])
-def test_a_folder_given_by_hand_stands_above_a_database_of_elsewhere(
+def test_a_folder_given_by_hand_overrides_a_set_database(
     origin: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config, url = tmp_path / "mapless.toml", "postgresql://u:secret@h/db"

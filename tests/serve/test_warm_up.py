@@ -56,7 +56,7 @@ TRUTH = np.array([0.25, 0.025, 0.0])
 """Where the rendered photograph was taken, from what `warm_up` says of it."""
 
 
-def test_the_rendered_scene_is_localized_within_centimetres_by_what_is_real(tmp_path: Path) -> None:
+def test_the_real_method_localizes_the_rendered_scene(tmp_path: Path) -> None:
     results: list[Result] = []
 
     async def test() -> None:
@@ -116,9 +116,7 @@ def engine_of(localize: Callable[..., Answer], begin: Callable[[], object] = lam
     return make
 
 
-def test_the_queue_expects_what_the_last_round_took_and_not_what_the_first_did(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_queue_expects_the_duration_of_the_last_round(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Kernels are compiled and pages are read in the first."""
     seen: list[tuple[str, str, float]] = []
     observe = Costs.observe

@@ -78,7 +78,7 @@ def test_what_is_wrong_with_an_audit_is_named(client: Client) -> None:
 
 
 @pytest.mark.parametrize("what", ["features", "descriptor", "pose"])
-def test_a_damaged_reference_is_named_on_its_page_and_by_its_name(tmp_path: Path, what: str) -> None:
+def test_a_damaged_reference_is_reported_by_page_and_by_name(tmp_path: Path, what: str) -> None:
     settings = Settings(host="127.0.0.1", port=0, data_dir=tmp_path, workers=2, metrics=False, warm_up=False)
     store = Store.open(tmp_path)
     with listening(settings, store, make_engine) as (running, _), Client(running.address) as client:

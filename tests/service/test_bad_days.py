@@ -121,7 +121,7 @@ def faults_of(folder: Path) -> tuple[str, ...]:
 
 
 class TestDisk:
-    def test_one_that_is_full_costs_changes_alone_and_works_again_when_there_is_room(self, tmp_path: Path) -> None:
+    def test_a_full_disk_costs_changes_only_until_there_is_room(self, tmp_path: Path) -> None:
         with small_disk(tmp_path / "disk", 4) as disk:
             with served(disk / "data") as client:
                 fill(client, 1)
@@ -144,9 +144,7 @@ class TestDisk:
                 assert {it.reference_id for it in client.list_references("s")} == stored | {"late"}
             assert faults_of(disk / "data") == ()
 
-    def test_a_scene_is_deleted_where_there_is_room_for_one_of_its_references_and_else_the_rest_of_it_later(
-        self, tmp_path: Path
-    ) -> None:
+    def test_a_scene_is_deleted_in_the_room_of_one_reference(self, tmp_path: Path) -> None:
         def leave(room_bytes: int) -> None:
             free = os.statvfs(disk)
             (disk / "filler").write_bytes(bytes(free.f_bavail * free.f_frsize - room_bytes))
@@ -178,9 +176,7 @@ class TestDisk:
                 assert count_left() == 0
             assert large_photo(7)[1000:1016] not in (disk / "data" / DATABASE_FILE).read_bytes()
 
-    def test_one_that_is_full_from_the_start_serves_queries_after_a_kill_and_says_what_it_lacks_after_an_orderly_stop(
-        self, tmp_path: Path
-    ) -> None:
+    def test_a_disk_full_from_the_start_serves_queries(self, tmp_path: Path) -> None:
         with small_disk(tmp_path / "disk", 8) as disk:
             with served(disk / "stopped") as client:
                 fill(client, 2)
@@ -202,7 +198,7 @@ class TestDisk:
                 wait_until(lambda: health_of(client) == (True, True, True))
                 client.create_scene("t")
 
-    def test_one_that_can_only_be_read_from_the_start_serves_queries(self, tmp_path: Path) -> None:
+    def test_a_disk_read_only_from_the_start_serves_queries(self, tmp_path: Path) -> None:
         with small_disk(tmp_path / "disk", 16) as disk:
             with served(disk / "data") as client:
                 fill(client)
@@ -243,7 +239,7 @@ class TestDisk:
             assert error is not None
             assert (error.code, error.reason) == ("FAILED_PRECONDITION", "STORE_READ_ONLY")
 
-    def test_one_that_can_only_be_read_and_was_not_closed_in_order_is_refused(self, tmp_path: Path) -> None:
+    def test_a_read_only_store_not_closed_in_order_is_refused(self, tmp_path: Path) -> None:
         with small_disk(tmp_path / "disk", 16) as disk:
             with served(disk / "data") as client:
                 fill(client, 1)
@@ -253,7 +249,7 @@ class TestDisk:
                 pass
 
     @pytest.mark.slow
-    def test_one_that_fails_under_a_running_server_serves_what_it_can(self, tmp_path: Path) -> None:
+    def test_a_disk_that_fails_meanwhile_leaves_what_can_be_served(self, tmp_path: Path) -> None:
         with failing_disk(tmp_path / "disk", 32) as disk, served(disk / "data") as client:
             fill(client)
             fail(disk)
@@ -266,9 +262,7 @@ class TestDisk:
             assert is_answered(client)
             assert client.get_reference("s", "r0", include_image=True).image == large_photo(0)
 
-    def test_one_that_is_slow_holds_up_nobody_whose_answer_is_in_memory(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_slow_disk_delays_no_answer_from_memory(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         slow, meets = threading.Event(), threading.Event()
         real_read = SqliteDatabase.read
 
@@ -306,9 +300,7 @@ class TestDamagedPages:
             file.seek(at // PAGE_BYTES * PAGE_BYTES)
             file.write(bytes(PAGE_BYTES))
 
-    def test_one_costs_the_reference_that_lies_there_which_is_named_and_can_be_stored_anew(
-        self, tmp_path: Path
-    ) -> None:
+    def test_a_bad_sector_costs_the_reference_stored_there(self, tmp_path: Path) -> None:
         with served(tmp_path) as client:
             fill(client)
         self.damage(tmp_path, large_photo(1))
@@ -341,7 +333,7 @@ class TestDamagedPages:
             assert client.get_reference("s", "r1", include_image=True).image == large_photo(1)
             client.delete_scene("s")
 
-    def test_those_of_the_schema_keep_a_server_from_starting_which_says_what_helps(self, tmp_path: Path) -> None:
+    def test_bad_sectors_of_the_schema_stop_the_start_with_advice(self, tmp_path: Path) -> None:
         with served(tmp_path) as client:
             fill(client, 1)
         with (tmp_path / DATABASE_FILE).open("r+b") as file:
@@ -370,7 +362,7 @@ class TestTwoServers:
         command = [sys.executable, "-c", code, *map(str, folders)]
         return subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout.splitlines()
 
-    def test_the_second_is_refused_under_every_name_until_the_first_has_gone(self, tmp_path: Path) -> None:
+    def test_a_second_server_is_refused_until_the_first_has_gone(self, tmp_path: Path) -> None:
         data = tmp_path / "data"
         link, soft, hard = (tmp_path / name for name in ("link", "soft", "hard"))
         link.symlink_to(data)
@@ -389,7 +381,7 @@ class TestTwoServers:
             assert "in use by another server" in told
         assert self.opened_by_another(data) == [""]
 
-    def test_a_lock_file_that_is_left_of_a_server_that_was_killed_keeps_nobody_out(self, tmp_path: Path) -> None:
+    def test_a_lock_file_of_a_killed_server_blocks_no_start(self, tmp_path: Path) -> None:
         code = """if True:
             import os, sys
             from pathlib import Path
@@ -406,7 +398,7 @@ class TestTwoServers:
 
 class TestScenesThatGo:
     @pytest.mark.slow
-    def test_one_deleted_and_made_anew_while_it_is_asked_gives_no_mixed_answer(
+    def test_a_scene_made_anew_during_calls_gives_no_mixed_answer(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """In its n-th life all its references, which are called the same in all lives, stand at x = n."""

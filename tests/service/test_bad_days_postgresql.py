@@ -50,7 +50,7 @@ def database() -> Iterator[Cluster]:
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGQUIT])
-def test_killed_under_load_it_costs_those_who_try_again_time_alone(
+def test_killed_under_load_it_costs_retrying_callers_time_only(
     tmp_path: Path, database: Cluster, how: signal.Signals
 ) -> None:
     stop, acknowledged = threading.Event(), [list[str]() for _ in range(3)]
@@ -94,7 +94,7 @@ def test_killed_under_load_it_costs_those_who_try_again_time_alone(
     assert {name for names in acknowledged for name in names} <= stored
 
 
-def test_without_a_connection_left_callers_are_told_to_come_back(tmp_path: Path, database: Cluster) -> None:
+def test_without_a_free_connection_callers_are_told_to_retry(tmp_path: Path, database: Cluster) -> None:
     store = Store.connect(database.fresh_url())
     with serving(tmp_path, store=store) as server, Client(server.address, ONCE) as client, ExitStack() as stack:
         client.create_scene("s")
@@ -134,7 +134,7 @@ def test_without_room_for_its_tables_changes_alone_are_refused(tmp_path: Path) -
         assert {it.reference_id for it in client.list_references("s")} == stored
 
 
-def test_without_room_for_its_write_ahead_log_it_ends_and_comes_back_with_all_that_was_acknowledged(
+def test_a_full_log_disk_loses_nothing_acknowledged(
     tmp_path: Path,
 ) -> None:
     with _filled(tmp_path, lambda disk: Cluster(log_on=disk)) as (client, database, stored, refusal):

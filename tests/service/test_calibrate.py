@@ -106,7 +106,7 @@ def answer_to(client: Client, scene: str) -> LocalizationResult:
     return answer
 
 
-def test_stores_the_planted_factors_and_answers_are_multiplied_by_them(
+def test_planted_factors_are_stored_and_multiply_answers(
     server: RunningServer, client: Client, planted: str, folder: Path, tmp_path: Path
 ) -> None:
     before = answer_to(client, planted)

@@ -227,7 +227,7 @@ class Unready(grpc.GenericRpcHandler):
 
 
 @pytest.mark.parametrize(("failures", "tries"), [(2, 3), (9, 4)])
-def test_the_client_retries_whole_photographs_while_a_server_starts(
+def test_the_client_resends_photographs_while_a_server_starts(
     pool: futures.ThreadPoolExecutor, failures: int, tries: int
 ) -> None:
     unready = Unready(failures)

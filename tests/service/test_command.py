@@ -107,7 +107,7 @@ def lines_of(printed: str) -> list[Any]:
 
 
 @pytest.mark.parametrize("parallel", ["1", "3"])
-def test_a_folder_is_a_line_of_json_for_each_photograph_in_their_order(
+def test_a_folder_gives_one_json_line_per_photograph_in_order(
     server: RunningServer, capsys: pytest.CaptureFixture[str], scene: str, folder: Path, parallel: str
 ) -> None:
     code, printed, told = run(server, capsys, "localize", scene, str(folder), "--parallel", parallel)
@@ -142,7 +142,7 @@ def test_a_call_that_fails_does_not_end_the_others(
     assert run(server, capsys, "localize", scene, str(folder / "images"), "--camera", FOUR_NUMBERS)[0] == 0
 
 
-def test_photographs_of_a_folder_that_are_not_localized_end_with_3(
+def test_a_folder_with_unlocalized_photographs_ends_with_3(
     server: RunningServer, capsys: pytest.CaptureFixture[str], folder: Path
 ) -> None:
     assert run(server, capsys, "scene", "create", "bare")[0] == 0
@@ -230,7 +230,7 @@ class TestOnATerminal:
         assert printed.startswith("not localized: NO_USABLE_REFERENCES\n  ")
 
 
-def test_drawings_are_a_page_each_and_debug_is_what_was_asked_for_by_name(
+def test_drawings_are_one_page_each_and_debug_goes_by_name(
     server: RunningServer, capsys: pytest.CaptureFixture[str], scene: str, folder: Path, tmp_path: Path
 ) -> None:
     pages = tmp_path / "pages"
@@ -309,7 +309,7 @@ def test_an_interruption_while_the_command_is_loaded_is_quiet(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("command", [["health"], ["scene", "list"]])
-def test_how_to_connect_may_be_said_before_and_after_the_command(
+def test_connection_flags_may_stand_before_or_after_the_command(
     server: RunningServer, capsys: pytest.CaptureFixture[str], command: list[str]
 ) -> None:
     for arguments in (
@@ -323,7 +323,7 @@ def test_how_to_connect_may_be_said_before_and_after_the_command(
         assert caught.value.code == 0, capsys.readouterr().err
 
 
-def test_the_connection_flags_of_a_command_leave_those_before_it() -> None:
+def test_connection_flags_after_the_command_keep_those_before() -> None:
     first = make_parser().parse_args(["--timeout", "3", "--tls", "--client-id", "a", "health", "--client-id", "b"])
     assert (first.timeout, first.tls, first.client_id, first.ca) == (3.0, True, "b", None)
     last = make_parser().parse_args(["localize", "s", "p.jpg", "--ca", "x.crt", "--camera", "c.json"])

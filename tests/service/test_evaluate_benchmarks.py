@@ -100,7 +100,7 @@ def _same_code_and_no_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MAPLESS_WARM_UP", "false")
 
 
-def test_a_scene_that_fails_takes_no_other_along_and_mended_it_alone_is_measured(chess: Path, tmp_path: Path) -> None:
+def test_a_failed_scene_stops_no_other_and_is_measured_later(chess: Path, tmp_path: Path) -> None:
     """A photograph is torn behind its header, so that only the server finds out."""
     output = tmp_path / "out"
     for name in ("chess", "fire"):

@@ -125,9 +125,7 @@ def test_a_folder_with_something_in_it_is_not_written_to(
     assert [file.name for file in tmp_path.iterdir()] == ["mine"]
 
 
-def test_scenes_that_are_not_there_or_empty_and_layouts_that_are_not_written(
-    server: RunningServer, client: Client, tmp_path: Path
-) -> None:
+def test_absent_or_empty_scenes_and_unwritable_layouts(server: RunningServer, client: Client, tmp_path: Path) -> None:
     done = run(server, "export", "no-such-scene", tmp_path / "a")
     assert done.exit_code == 1
     assert "no-such-scene" in done.stderr
@@ -141,7 +139,7 @@ def test_scenes_that_are_not_there_or_empty_and_layouts_that_are_not_written(
 
 
 @pytest.mark.parametrize("what", ["image", "pose"])
-def test_damaged_references_are_named_and_the_others_are_a_whole_export(tmp_path: Path, what: str) -> None:
+def test_damaged_references_are_named_and_the_rest_exported(tmp_path: Path, what: str) -> None:
     store = Store.open(tmp_path / "data")
     with serving(tmp_path / "data", store=store) as server, Client(server.address) as client:
         client.create_scene("s")
@@ -160,7 +158,7 @@ def test_damaged_references_are_named_and_the_others_are_a_whole_export(tmp_path
         assert [it.reference_id for it in client.list_references("copy")] == ["r0", "r2"]
 
 
-def test_where_all_are_damaged_nothing_is_left_that_keeps_the_next_export_out(tmp_path: Path) -> None:
+def test_where_all_are_damaged_no_folder_is_left_behind(tmp_path: Path) -> None:
     store = Store.open(tmp_path / "data")
     with serving(tmp_path / "data", store=store) as server, Client(server.address) as client:
         client.create_scene("s")

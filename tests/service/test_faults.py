@@ -256,7 +256,7 @@ class TestMethods:
                 client.localize(PHOTO, CAMERA, "s")
             assert client.is_serving()
 
-    def test_one_that_hangs_ends_the_process_and_every_caller_is_told(self, tmp_path: Path) -> None:
+    def test_one_that_hangs_ends_the_process_and_every_call(self, tmp_path: Path) -> None:
         with (
             gated(tmp_path / "server", "hangs", workers=1, stall_limit_s=2.5) as server,
             Client(server.address, ONCE) as client,
@@ -280,7 +280,7 @@ class TestMethods:
             with pytest.raises(grpc.RpcError, match="UNAVAILABLE"):
                 next(watch)
 
-    def test_one_that_hangs_while_the_server_drains_is_a_failure_as_well(self, tmp_path: Path) -> None:
+    def test_one_that_hangs_during_the_drain_is_a_failure_too(self, tmp_path: Path) -> None:
         with (
             gated(tmp_path / "server", "hangs", workers=1, stall_limit_s=2.5, drain_grace_s=50) as server,
             Client(server.address, ONCE) as client,
@@ -344,7 +344,7 @@ def code_of(call: Callable[[], object]) -> str:
 
 
 class TestProcess:
-    def test_killed_under_load_and_started_again_nothing_acknowledged_is_lost(self, tmp_path: Path) -> None:
+    def test_a_kill_under_load_loses_nothing_acknowledged(self, tmp_path: Path) -> None:
         """Clients go on as if nothing had happened: the service config of each tries again."""
         port = free_port()
         stop, acknowledged = threading.Event(), [list[str]() for _ in range(3)]

@@ -264,7 +264,7 @@ def test_bad_sequences_are_refused_by_field(stubs: Stubs, scene: str, name: str)
     assert (error.code, error.field) == ("INVALID_ARGUMENT", field), error
 
 
-def test_photographs_of_all_that_together_are_more_than_may_be_held_are_refused(tmp_path: Path) -> None:
+def test_a_group_with_too_many_bytes_is_refused(tmp_path: Path) -> None:
     noise = np.random.default_rng(3).integers(0, 255, (400, 500, 3), np.uint8)
     camera = Camera(500, 400, 400.0, 400.0, 250.0, 200.0)
     png_bytes = encode(".png", noise)

@@ -73,7 +73,7 @@ def stored(client: Client, scene: str) -> list[str]:
     return [reference.reference_id for reference in client.list_references(scene)]
 
 
-def test_a_folder_becomes_a_scene_and_a_second_run_changes_nothing(
+def test_a_folder_becomes_a_scene_and_again_changes_nothing(
     server: RunningServer, client: Client, scene: str, folder: Path, tmp_path: Path
 ) -> None:
     done = run_import(server, folder, scene, "--report", tmp_path / "report.json")

@@ -205,7 +205,7 @@ def test_a_taken_port_is_not_shared(server: RunningServer, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("environment", "threads"), [({}, 1), ({"OPENBLAS_NUM_THREADS": "2"}, 2)])
-def test_a_product_is_computed_by_one_thread_unless_told_otherwise(environment: dict[str, str], threads: int) -> None:
+def test_a_product_uses_one_thread_unless_set_otherwise(environment: dict[str, str], threads: int) -> None:
     """The libraries read the environment when they are imported, so the command line must not import them."""
     program = """if True:
         import sys

@@ -131,7 +131,7 @@ def test_a_pose_outside_the_prior_is_rejected(client: Client, scene: str) -> Non
     assert "0.10 m outside" in answer.message
 
 
-def test_a_prior_narrows_the_choice_to_its_radius_and_ten_metres(client: Client) -> None:
+def test_a_prior_narrows_the_choice_to_radius_and_ten_metres(client: Client) -> None:
     client.create_scene("street")
     client.add_references("street", [NewReference(f"x{x}", PHOTO, CAMERA, pose(float(x))) for x in (0, 8, 16, 40)])
     prior = PositionPrior(pose(4.0).translation, 3.0)

@@ -122,7 +122,7 @@ def make_scene(client: Client, calls: int = 0) -> None:
         client.localize(PHOTO, CAMERA, "s")
 
 
-def test_three_times_as_many_as_fit_are_answered_or_refused_and_all_are_counted(tmp_path: Path) -> None:
+def test_triple_load_is_answered_or_refused_and_counted(tmp_path: Path) -> None:
     sent, rate = 300, 3 * WORKERS / COST_S
     request = localize_request("s")
     with overloaded(tmp_path, slow(COST_S), max_queued_s=1.0) as server, ExitStack() as stack:
@@ -229,7 +229,7 @@ class Refining:
         return replace(answer, outcome=replace(found, pose_stage=PoseStage.COARSE, covariance=None, inlier_count=0))
 
 
-def test_the_coarse_pose_is_answered_where_there_is_no_time_to_refine_it_if_that_is_allowed(tmp_path: Path) -> None:
+def test_the_coarse_pose_is_answered_if_refining_has_no_time(tmp_path: Path) -> None:
     refining = Refining(60.0)
     with overloaded(tmp_path, refining.method()) as server, Client(server.address) as client:
         make_scene(client)
@@ -257,7 +257,7 @@ def test_what_is_foreseen_to_come_too_late_is_not_even_begun(tmp_path: Path) -> 
         assert refining.began == 1
 
 
-def test_what_waits_for_a_network_is_one_batch_and_its_references_are_encoded_once(tmp_path: Path) -> None:
+def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch", reason="the networks' extra is not installed")
     pytest.importorskip("PIL", reason="the networks' extra is not installed")
     from support.small_networks import GRIDS, small_network

@@ -184,7 +184,7 @@ def sample(server: Serving, name: str, **labels: str) -> float:
     return server.metrics.registry.get_sample_value(name, labels) or 0.0
 
 
-def test_the_coarse_pose_comes_first_and_says_no_more_than_is_known(server: Serving) -> None:
+def test_the_coarse_pose_comes_first_with_only_what_is_known(server: Serving) -> None:
     session = wire.transform_to_message(pose(3.0))
     asked: dict[str, Any] = {"session_from_camera": session, "options": pb.LocalizeOptions(axes=pb.AXES_UNITY)}
     call = asking(server, **asked, metadata=(("x-request-id", "mine"),))
@@ -278,7 +278,7 @@ def test_the_last_message_is_what_localize_answers_bit_for_bit(
         assert np.linalg.norm(found.translation - truth.translation) < 0.02
 
 
-def test_what_cannot_be_localized_is_rejected_once_as_localize_does(corner: LocalizationServiceStub) -> None:
+def test_what_cannot_be_localized_is_rejected_once(corner: LocalizationServiceStub) -> None:
     request = corner_request(corner_pose(0))
     request.image = PHOTO
     request.intrinsics.CopyFrom(wire.camera_to_message(CAMERA))
@@ -298,9 +298,7 @@ def test_a_coarse_pose_may_turn_out_to_be_none(server: Serving) -> None:
 
 
 @pytest.mark.parametrize("coarse", [None, RigidTransform(np.eye(3), np.full(3, np.nan))], ids=["none", "not finite"])
-def test_there_is_nothing_before_the_answer_where_nothing_is_known_before(
-    server: Serving, coarse: RigidTransform | None
-) -> None:
+def test_without_early_knowledge_only_the_answer_is_sent(server: Serving, coarse: RigidTransform | None) -> None:
     server.method.coarse = coarse
     server.method.gate.set()
     (only,) = asking(server)
@@ -315,7 +313,7 @@ def test_a_coarse_pose_outside_a_hard_limit_is_not_told(server: Serving) -> None
     assert only.answer.WhichOneof("outcome") == "localization"
 
 
-def test_who_has_seen_enough_frees_the_place_and_ends_the_refinement(server: Serving) -> None:
+def test_a_cancelled_stream_frees_its_place_and_ends_refining(server: Serving) -> None:
     before = sample(server, "mapless_jobs_terminated_total", outcome="cancelled", stage="refine")
     call = asking(server)
     next(call)
@@ -328,7 +326,7 @@ def test_who_has_seen_enough_frees_the_place_and_ends_the_refinement(server: Ser
     assert len(list(asking(server))) == 2
 
 
-def test_a_deadline_after_the_coarse_answer_is_an_error_with_details(server: Serving) -> None:
+def test_a_deadline_after_the_coarse_pose_is_a_detailed_error(server: Serving) -> None:
     call = asking(server, timeout=1.0)
     assert not next(call).is_final
     failure = ending(call)
@@ -337,7 +335,7 @@ def test_a_deadline_after_the_coarse_answer_is_an_error_with_details(server: Ser
     assert server.method.given_up.acquire(timeout=LIMIT_S)
 
 
-def test_where_a_coarse_pose_will_do_the_deadline_makes_it_final(server: Serving) -> None:
+def test_where_a_coarse_pose_suffices_the_deadline_ends_it(server: Serving) -> None:
     first, last = asking(server, timeout=1.0, options=pb.LocalizeOptions(allow_coarse=True))
     assert (first.is_final, last.is_final) == (False, True)
     assert last.answer.localization == first.answer.localization
@@ -351,7 +349,7 @@ def test_who_names_no_deadline_has_the_servers(tmp_path: Path) -> None:
         assert ending(call).code == "DEADLINE_EXCEEDED"
 
 
-def test_a_full_server_refuses_before_anything_is_computed_and_says_when_to_come_back(tmp_path: Path) -> None:
+def test_a_full_server_refuses_before_computing_anything(tmp_path: Path) -> None:
     with serving(tmp_path, max_queued_s=0.001) as full:
         first = asking(full)
         next(first)
@@ -362,7 +360,7 @@ def test_a_full_server_refuses_before_anything_is_computed_and_says_when_to_come
         assert next(first).is_final
 
 
-def test_what_is_wrong_with_a_request_is_told_as_localize_tells_it(server: Serving) -> None:
+def test_misuse_is_reported_as_by_localize(server: Serving) -> None:
     def both(request: pb.LocalizeRequest) -> tuple[MaplessError, MaplessError]:
         with pytest.raises(grpc.RpcError) as caught:
             server.stub.Localize(request, timeout=LIMIT_S)
@@ -441,7 +439,7 @@ def test_watchers_see_the_answer_once_and_it_counts_once(server: Serving) -> Non
     seen.cancel()
 
 
-def test_of_two_kinds_of_features_the_first_gives_the_coarse_pose_and_the_better_one_the_answer(tmp_path: Path) -> None:
+def test_of_two_tiers_the_better_gives_the_final_answer(tmp_path: Path) -> None:
     with serving(tmp_path, features=("cheap", "strong")) as both:
         both.method.trust = 0.01  # doubtful, so the stronger features try again
         both.method.gate.set()

@@ -168,7 +168,7 @@ BROKEN, FULL = status("UNAVAILABLE"), status("RESOURCE_EXHAUSTED", retry_after_s
     ],
     ids=["none is coarse", "before the first", "after it", "after it and again", "when all is said"],
 )
-def test_a_call_that_breaks_is_made_again_and_tells_a_coarse_answer_once(
+def test_a_broken_call_is_retried_with_one_coarse_answer(
     kind: Any, attempts: list[Attempt], expected_m: list[float]
 ) -> None:
     with playing(*attempts) as (address, played):

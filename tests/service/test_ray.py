@@ -264,9 +264,7 @@ FAILING: dict[str, tuple[type[MaplessError], Callable[[Client], Any]]] = {
 }
 
 
-def test_errors_are_those_of_the_plain_server_with_all_their_details(
-    url: str, guarded: Guarded, tmp_path: Path
-) -> None:
+def test_errors_are_those_of_the_plain_server_with_details(url: str, guarded: Guarded, tmp_path: Path) -> None:
     with (
         serving(tmp_path, store=Store.connect(url), tokens_file=guarded.tokens_file) as plain,
         Client(plain.address, guarded.options()) as direct,
@@ -300,7 +298,7 @@ def test_a_request_id_is_taken_over(guarded: Guarded) -> None:
     assert dict(call.trailing_metadata())["x-request-id"] == "mine"
 
 
-def test_callers_without_a_good_token_and_of_other_tenants_are_kept_out(guarded: Guarded) -> None:
+def test_invalid_tokens_and_other_tenants_are_kept_out(guarded: Guarded) -> None:
     with Client(guarded.cluster.address) as nobody, pytest.raises(MaplessError) as caught:
         nobody.get_scene(SCENES[0])
     assert caught.value.code == "UNAUTHENTICATED"
@@ -367,7 +365,7 @@ def test_health_and_reflection_are_the_standard_ones(guarded: Guarded) -> None:
 # Which replica answers
 
 
-def test_calls_of_a_scene_come_to_one_replica_and_scenes_to_both(guarded: Guarded, client: Client) -> None:
+def test_calls_of_a_scene_reach_one_replica_and_scenes_both(guarded: Guarded, client: Client) -> None:
     at = {scene: who(client, scene) for scene in SCENES}
     assert set(at.values()) == {replica.process_id for replica in guarded.cluster.replicas()}
     with guarded.client() as another:
@@ -382,7 +380,7 @@ def test_calls_that_name_no_scene_come_to_both_by_turns(guarded: Guarded) -> Non
     assert min(counts.count(replica.process_id) for replica in guarded.cluster.replicas()) >= 8
 
 
-def test_what_is_added_through_one_replica_the_other_uses_at_once(guarded: Guarded) -> None:
+def test_additions_through_one_replica_are_used_by_the_other(guarded: Guarded) -> None:
     with ExitStack() as stack:
         one, other = (
             stack.enter_context(Client(replica.address, guarded.options())) for replica in guarded.cluster.replicas()
@@ -448,7 +446,7 @@ def test_a_replica_whose_queue_hangs_ends_and_is_replaced(guarded: Guarded, clie
     assert not Path(f"/proc/{victim.process_id}").exists()
 
 
-def test_a_redeploy_costs_no_call_and_ends_streams_that_have_no_end(guarded: Guarded) -> None:
+def test_a_redeploy_costs_no_call_and_ends_endless_streams(guarded: Guarded) -> None:
     """Not even a retry: calls that run are finished, and new ones come to the replicas that are left."""
     before = set(guarded.cluster.replicas())
     ended: list[str] = []

@@ -68,7 +68,7 @@ def test_a_deleted_scene_takes_no_memory(client: Client, server: RunningServer) 
 
 
 @pytest.mark.parametrize("ends", ["late", "full"])
-def test_nor_does_one_whose_deletion_takes_too_long_or_fails_late(tmp_path: Path, ends: str) -> None:
+def test_a_scene_whose_deletion_is_slow_takes_no_memory(tmp_path: Path, ends: str) -> None:
     """The scene is gone by then."""
     store, is_over = Store.open(tmp_path), threading.Event()
 
@@ -268,7 +268,7 @@ def test_a_page_is_made_off_the_event_loop(client: Client, scene: str, monkeypat
     assert all(name.startswith("asyncio_") for name in threads)  # the loop's default executor
 
 
-def test_what_a_localization_asks_of_the_store_is_in_the_metrics(tmp_path: Path) -> None:
+def test_the_metrics_count_store_reads_of_a_localization(tmp_path: Path) -> None:
     with serving(tmp_path, metrics=True, metrics_port=0) as server, Client(server.address) as client:
         client.create_scene("s")
         client.add_reference("s", NewReference("r", PHOTO, CAMERA, pose(0)))

@@ -223,7 +223,7 @@ def test_damage_is_named_and_nothing_is_said_to_be_identical(captured: Path, tmp
     assert "No such file" in told[0] if damage == "blob" else "cut" in told[0]
 
 
-def test_features_of_an_unknown_form_are_found_anew_and_it_is_said(captured: Path, tmp_path: Path) -> None:
+def test_features_of_an_unknown_form_are_extracted_anew(captured: Path, tmp_path: Path) -> None:
     """Of another version, whose features are alike; so the answer is, too."""
     path, call = only(captured, tmp_path / "copy", is_named)
     (part,) = call.parts
@@ -239,7 +239,7 @@ def test_features_of_an_unknown_form_are_found_anew_and_it_is_said(captured: Pat
     assert (code, replayed["verdict"], replayed["found_anew"]) == (0, "identical", 1)
 
 
-def test_a_call_that_cannot_be_computed_is_a_row_and_the_others_are_told(captured: Path, tmp_path: Path) -> None:
+def test_a_call_that_cannot_be_computed_is_one_row(captured: Path, tmp_path: Path) -> None:
     """A method of another version, and a request that is no message; a third one is as it was."""
     path, call = only(captured, tmp_path / "copy", is_named)
     for name, planted in {

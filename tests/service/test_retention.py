@@ -315,7 +315,7 @@ def capture_one(server: Program, captured: Path, search: Search) -> Path:
     return next(calls_of(captured))
 
 
-def test_what_is_captured_goes_when_its_time_is_over_though_nobody_calls(tmp_path: Path, search: Search) -> None:
+def test_expired_captures_are_deleted_without_any_call(tmp_path: Path, search: Search) -> None:
     captured = tmp_path / "captured"
     with served(tmp_path / "server", capture_dir=captured, capture_hours=4 / 3600) as server:
         capture_one(server, captured, search)
@@ -324,7 +324,7 @@ def test_what_is_captured_goes_when_its_time_is_over_though_nobody_calls(tmp_pat
 
 
 @pytest.mark.slow
-def test_what_was_to_go_while_the_server_was_down_is_gone_when_it_listens(tmp_path: Path, search: Search) -> None:
+def test_captures_that_expired_during_a_stop_are_gone_at_start(tmp_path: Path, search: Search) -> None:
     captured = tmp_path / "captured"
     with served(tmp_path / "first", capture_dir=captured) as server:
         written_s = capture_one(server, captured, search).stat().st_mtime

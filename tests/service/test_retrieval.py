@@ -78,7 +78,7 @@ def test_localize_uses_what_retrieval_finds(client: Client) -> None:
     assert answer.diagnostics.retrieval == "patches"
 
 
-def test_named_references_are_used_as_they_come_unless_reranking_is_asked_for(client: Client) -> None:
+def test_named_references_keep_their_order_unless_reranked(client: Client) -> None:
     names = [f"r{i:02}" for i in range(COUNT)]
     plain = client.localize(PHOTOS[9], CAMERA, "hall", names, reference_count=3)
     assert ids([use.name for use in plain.diagnostics.references]) == names
@@ -112,7 +112,7 @@ def test_a_heading_prior_narrows_to_its_angle_and_sixty_degrees(client: Client) 
     assert 0 < len(expected) < COUNT
 
 
-def test_a_pose_that_looks_elsewhere_than_the_heading_prior_is_rejected(client: Client) -> None:
+def test_a_pose_against_the_heading_prior_is_rejected(client: Client) -> None:
     axis = pose(0.0).rotation[:, 2]
     ahead, behind = (Priors(heading=HeadingPrior(sign * axis, 5.0)) for sign in (1, -1))
     assert isinstance(client.localize(PHOTOS[0], CAMERA, "hall", ["r00"], priors=ahead), LocalizationResult)
@@ -122,7 +122,7 @@ def test_a_pose_that_looks_elsewhere_than_the_heading_prior_is_rejected(client: 
     assert "175.0 degrees outside" in answer.message
 
 
-def test_what_is_added_and_deleted_is_found_and_not_found_at_once(client: Client) -> None:
+def test_additions_and_deletions_change_the_choice_at_once(client: Client) -> None:
     photo = encode(".png", textured(seed=99))
     client.add_reference("hall", NewReference("late", photo, CAMERA, pose(-50.0)))
     assert ids([client.retrieve_references(photo, CAMERA, "hall", 1)[0].name]) == ["late"]
@@ -137,7 +137,7 @@ def test_an_empty_scene_has_nothing_to_find(client: Client) -> None:
     assert client.retrieve_references(PHOTOS[0], CAMERA, "empty") == []
 
 
-def test_a_store_without_descriptors_is_described_by_the_first_call(tmp_path: Path) -> None:
+def test_a_store_without_descriptors_is_described_on_first_use(tmp_path: Path) -> None:
     """One that was filled before there was retrieval."""
     with serving(tmp_path) as server, Client(server.address) as client:
         client.create_scene("s")
@@ -170,7 +170,7 @@ def test_a_damaged_reference_costs_itself_unless_it_is_named(tmp_path: Path, wha
                 client.localize(PHOTOS[0], CAMERA, "s", ["r1", "r0"], rerank_references=is_reranked)
 
 
-def test_a_damaged_reference_without_a_descriptor_does_not_keep_the_others_from_being_found(tmp_path: Path) -> None:
+def test_a_damaged_reference_without_descriptor_hides_no_other(tmp_path: Path) -> None:
     with serving(tmp_path) as server, Client(server.address) as client:
         client.create_scene("s")
         client.add_references("s", [NewReference(f"r{i}", PHOTOS[i], CAMERA, pose(float(i))) for i in range(3)])

@@ -201,7 +201,7 @@ def test_health_and_the_interface_are_open(guarded: Guarded) -> None:
         assert "mapless.v1.ReferenceService" in {it.name for it in answer.list_services_response.service}
 
 
-def test_malformed_messages_and_unknown_methods_tell_strangers_nothing(guarded: Guarded) -> None:
+def test_malformed_messages_and_methods_reveal_nothing(guarded: Guarded) -> None:
     with grpc.insecure_channel(guarded.server.address) as channel:
         failure = failure_of(channel.unary_unary("/mapless.v1.ReferenceService/GetScene"), b"\xff\xff")
         assert failure.code == "UNAUTHENTICATED"
@@ -222,7 +222,7 @@ def test_a_scene_of_another_tenant_is_not_there_in_any_method(guarded: Guarded, 
         assert client.get_scene("secret").reference_count == 1
 
 
-def test_each_tenant_lists_and_localizes_in_its_own_scene_under_its_plain_name(guarded: Guarded) -> None:
+def test_each_tenant_has_its_own_scene_under_the_same_name(guarded: Guarded) -> None:
     theirs = (("writer", 1.0, ["secret", "shared"]), ("stranger", 2.0, ["shared"]), ("local", 3.0, ["shared"]))
     for caller, x_m, scenes in theirs:
         with guarded.client(caller) as client:
@@ -271,7 +271,7 @@ def test_the_log_names_who_called_and_never_shows_a_token(guarded: Guarded, capl
     assert "mapless_wrong" not in told
 
 
-def test_a_tenant_over_its_rate_is_told_when_to_come_back_and_the_others_are_not_delayed(tmp_path: Path) -> None:
+def test_a_tenant_over_its_rate_waits_and_others_do_not(tmp_path: Path) -> None:
     tokens_file = tmp_path / "tokens.json"
     tokens_file.write_text('{"tenants": {"acme": {"rate_ms": 0.001}}}')
     tokens = {tenant: create_token(tokens_file, tenant, tenant, "write", None) for tenant in ("acme", "other")}
@@ -307,7 +307,7 @@ class TestEncryption:
             token=token,
         )
 
-    def test_the_server_follows_its_files_and_needs_both_certificate_and_token(self, tmp_path: Path) -> None:
+    def test_the_server_reloads_its_files_and_needs_both_proofs(self, tmp_path: Path) -> None:
         root, new_root = authority(), authority("new")
         paths: dict[str, Any] = {
             name: tmp_path / name for name in ("tls_certificate", "tls_key", "tls_client_ca", "tokens_file")
@@ -342,7 +342,7 @@ class TestEncryption:
             with pytest.raises(Unavailable):
                 attempt(self.options(root, robot, token))
 
-    def test_without_tokens_callers_are_the_default_tenant_under_the_name_of_their_certificate(
+    def test_without_tokens_certificates_name_the_caller(
         self, tmp_path: Path, caplog: pytest.LogCaptureFixture
     ) -> None:
         root = authority()
@@ -357,7 +357,7 @@ class TestEncryption:
 
 class TestStart:
     @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1"])
-    def test_a_server_that_nothing_protects_does_not_listen_beyond_this_machine(self, host: str) -> None:
+    def test_an_unprotected_server_listens_on_this_machine_only(self, host: str) -> None:
         with pytest.raises(SecurityError, match="neither TLS nor tokens"):
             Protection.of(Settings(host=host))
 

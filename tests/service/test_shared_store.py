@@ -72,7 +72,7 @@ def test_what_is_deleted_through_one_is_gone_for_the_other(two: tuple[Client, Cl
 
 
 @pytest.mark.timeout(120)
-def test_a_database_that_goes_and_comes_back_costs_errors_and_no_restart(tmp_path: Path) -> None:
+def test_a_database_that_goes_and_returns_needs_no_restart(tmp_path: Path) -> None:
     require()
     database = Cluster(survives_power_failure=True)
     try:
@@ -101,7 +101,7 @@ def test_a_database_that_goes_and_comes_back_costs_errors_and_no_restart(tmp_pat
         database.remove()
 
 
-def test_a_server_without_its_database_does_not_start_and_says_why() -> None:
+def test_a_server_without_its_database_does_not_start() -> None:
     require()
     database = Cluster()
     url = database.fresh_url()

@@ -46,7 +46,7 @@ def test_one_line_is_enough_where_there_is_one_scene(
         shortcut._close()
 
 
-def test_one_connection_serves_all_calls_and_ends_with_the_program(
+def test_one_connection_serves_all_calls_of_the_program(
     server: RunningServer, scene: str, photo: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for _ in range(2):

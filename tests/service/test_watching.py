@@ -58,7 +58,7 @@ def ending(call: Any) -> Any:
     return from_rpc_error(caught.value)
 
 
-def test_answers_are_seen_as_they_come_and_those_of_other_scenes_are_not(
+def test_answers_of_the_watched_scene_alone_arrive_at_once(
     server: RunningServer, stub: LocalizationServiceStub
 ) -> None:
     seen = watching(stub)
@@ -142,7 +142,7 @@ def test_the_end_of_the_server_ends_it_at_once(tmp_path: Path) -> None:
     assert (failure.code, failure.reason) == ("UNAVAILABLE", "DRAINING")
 
 
-def test_a_watcher_that_reads_nothing_does_not_keep_the_server_from_ending(tmp_path: Path) -> None:
+def test_a_watcher_that_reads_nothing_delays_no_stop(tmp_path: Path) -> None:
     """Leaving `serving` waits for the server's end, and for less than its calls would be given."""
     with ExitStack() as stack:
         leaving = stack.enter_context(serving(tmp_path, allow_watching=True, drain_grace_s=60))

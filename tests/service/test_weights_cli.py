@@ -176,7 +176,7 @@ def test_complaints_are_one_line(folder: Path, file: Path, tmp_path: Path, monke
     assert "MAPLESS_WEIGHT_DIR is not a setting" in complaint(run("list"), 2)
 
 
-def test_a_file_that_does_not_fit_the_network_is_refused_whatever_its_digest(folder: Path, file: Path) -> None:
+def test_a_file_that_does_not_fit_the_network_is_refused(folder: Path, file: Path) -> None:
     pytest.importorskip("torch")
     pytest.importorskip("mapless_server.networks.pi3")
     refused = complaint(run("add", "pi3", file, "--unofficial"), 1)

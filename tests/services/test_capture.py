@@ -115,7 +115,7 @@ def test_a_call_with_a_bit_changed_is_damaged() -> None:
             decode_call(bytes(changed))
 
 
-def test_references_are_kept_once_and_go_with_the_last_call_that_needs_them(tmp_path: Path) -> None:
+def test_references_are_kept_once_until_no_call_needs_them(tmp_path: Path) -> None:
     folder = opened(tmp_path / "c")
     for number, references in enumerate([(0, 1), (1, 2), (1, 2)]):
         call = a_call(number, references)
@@ -169,7 +169,7 @@ def test_the_limit_of_size_holds_at_every_moment(tmp_path: Path, monkeypatch: py
     folder.close()
 
 
-def test_what_is_too_old_goes_while_nothing_comes_and_at_the_start(tmp_path: Path) -> None:
+def test_what_is_too_old_goes_at_the_start_and_while_idle(tmp_path: Path) -> None:
     now_s = [NOW_S]
     folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
     for number in range(3):
@@ -214,7 +214,7 @@ def test_what_is_too_old_goes_though_the_clock_is_set_meanwhile(
     folder.close()
 
 
-def test_what_a_crash_left_and_what_is_damaged_is_deleted_at_the_start(tmp_path: Path) -> None:
+def test_leftovers_of_a_crash_and_damage_go_at_the_start(tmp_path: Path) -> None:
     """Unfinished files, blobs without a call, calls without a blob, and calls that are cut; but no foreign files."""
     folder = opened(tmp_path / "c")
     for number in range(3):
@@ -334,9 +334,7 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.M
     folder.close()
 
 
-def test_what_cannot_be_deleted_never_makes_it_more_than_the_limit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_undeletable_entries_never_exceed_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Others go in place of a call that cannot be deleted; where that is not enough nothing is written."""
     limit, random = 100_000, np.random.default_rng(3)
     folder = opened(tmp_path / "c", Retention(3600.0, limit))
@@ -358,7 +356,7 @@ def test_what_cannot_be_deleted_never_makes_it_more_than_the_limit(
 
 
 @pytest.mark.parametrize("left", ["lock", "marker, half", "marker, empty", "calls", "nothing"])
-def test_a_folder_that_a_killed_server_or_a_deletion_by_hand_left_is_opened(tmp_path: Path, left: str) -> None:
+def test_a_folder_left_by_a_kill_or_a_deletion_is_opened(tmp_path: Path, left: str) -> None:
     """And its limits hold again."""
     path = tmp_path / "c"
     folder = opened(path)
@@ -378,9 +376,7 @@ def test_a_folder_that_a_killed_server_or_a_deletion_by_hand_left_is_opened(tmp_
     folder.close()
 
 
-def test_a_folder_for_which_the_disk_was_full_is_opened_when_it_is_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_the_full_disk_left_out_is_opened_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, data: bytes) -> None:
         raise OSError(28, "No space left on device")
 
@@ -391,7 +387,7 @@ def test_a_folder_for_which_the_disk_was_full_is_opened_when_it_is_not(
     opened(tmp_path / "c").close()
 
 
-def test_a_folder_that_is_deleted_by_hand_is_made_anew_by_its_server_alone(tmp_path: Path) -> None:
+def test_a_folder_deleted_by_hand_is_made_by_its_server_alone(tmp_path: Path) -> None:
     path = tmp_path / "c"
     folder = opened(path)
     folder.add(a_call(), blobs_of(a_call()))
@@ -442,7 +438,7 @@ def set_at(place: tuple[Any, ...], value: Any, content: Any) -> None:
     content[place[-1]] = value
 
 
-def test_nothing_that_a_header_says_keeps_a_call_beyond_its_time(tmp_path: Path) -> None:
+def test_no_header_keeps_a_call_beyond_its_time(tmp_path: Path) -> None:
     """Any value of it, changed to anything, by somebody who can make digests: the call goes at once, or on time."""
     now_s, kept = [NOW_S], 0
     path = tmp_path / "c"
@@ -489,7 +485,7 @@ def test_a_call_of_another_scene_than_its_place_says_is_deleted(tmp_path: Path) 
     folder.close()
 
 
-def test_calls_of_the_same_moment_do_not_take_one_anothers_place(tmp_path: Path) -> None:
+def test_calls_of_the_same_moment_do_not_replace_each_other(tmp_path: Path) -> None:
     """As of two servers, one after the other, with the same process id, when the clock is set back between."""
     for count in (1, 2, 3):
         folder = opened(tmp_path / "c")

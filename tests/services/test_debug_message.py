@@ -69,7 +69,7 @@ def points_m(debug: pb.Debug) -> Array:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_points_fall_on_the_pixels_of_the_photograph_as_it_was_sent(lens: str) -> None:
+def test_points_fall_on_pixels_of_the_photograph_as_sent(lens: str) -> None:
     scene = make_scene(random_for("debug", lens), SceneOptions(noise_px=0.0))
     camera = replace(SENT, distortion=LENSES[lens])
     debug = debug_to_message(support_of(scene, camera, scene.world_from_query))
@@ -87,7 +87,7 @@ def test_points_fall_on_the_pixels_of_the_photograph_as_it_was_sent(lens: str) -
         np.testing.assert_allclose(camera.project(pose.inverse().apply(points_m(debug)[rows])), shown[rows], atol=2e-3)
 
 
-def test_the_error_that_is_told_is_the_distance_in_the_reduced_photograph() -> None:
+def test_the_reported_error_is_that_in_the_reduced_photograph() -> None:
     scene = make_scene(random_for("debug errors"), SceneOptions(noise_px=0.8))
     debug = debug_to_message(support_of(scene, SENT, scene.world_from_query, wrong_count=100))
     projected = SENT.project(scene.world_from_query.shifted(ORIGIN).inverse().apply(points_m(debug)))

@@ -56,7 +56,7 @@ def test_a_position_may_be_limited_and_likely() -> None:
     np.testing.assert_array_equal(priors.position.covariance, np.diag([4.0, 9, 16]))
 
 
-def test_a_radius_alone_is_no_soft_prior_and_a_covariance_alone_no_limit() -> None:
+def test_a_radius_is_no_soft_prior_and_a_covariance_no_limit() -> None:
     narrowing, priors = priors_from_message(
         request(positionPrior={"positionM": vector(0, 0, 0), "radiusM": 2}), NOTHING
     )
@@ -84,7 +84,7 @@ def test_directions_are_brought_to_unit_length() -> None:
     assert narrowing.heading.max_angle_deg == 30
 
 
-def test_down_in_the_world_is_the_scene_s_if_the_request_says_none() -> None:
+def test_down_in_the_world_is_the_scenes_by_default() -> None:
     sent = request(gravityPrior={"downInCamera": vector(0, 1, 0), "sigmaDeg": 1})
     assert needs_attributes(sent)
     for attributes, down in ((SceneAttributes(down_in_world=(0.0, 1.0, 0.0)), [0, 1, 0]), (ON_EARTH, [0, 0, -1])):

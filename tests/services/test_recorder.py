@@ -245,7 +245,7 @@ def test_a_fault_that_nobody_thought_of_is_told_of_once(
     assert [it.request_id for it in caplog.records if hasattr(it, "request_id")] == ["id"]
 
 
-def test_what_still_waits_when_the_time_for_the_end_is_over_is_counted(
+def test_what_still_waits_at_the_closing_limit_is_counted(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A disk so slow that it has written one call by then; the log tells of the others."""
@@ -327,7 +327,7 @@ def test_what_the_store_cannot_say_is_counted(
 
 
 @pytest.mark.parametrize("stuck", ["call", "blob"])
-def test_one_file_that_cannot_be_deleted_keeps_nothing_of_other_deleted_scenes(
+def test_an_undeletable_file_keeps_nothing_of_other_scenes(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, stuck: str
 ) -> None:
     """A folder stands in its place, as an operator may have it."""
@@ -412,7 +412,7 @@ def test_a_fault_of_the_store_ends_no_check(
     assert caplog.text.count("captured calls cannot be compared with the store: no such table") == 1
 
 
-def test_the_start_waits_for_no_store_and_a_store_that_is_away_is_asked_once_a_round(
+def test_the_start_waits_for_no_store_and_retries_each_round(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked, let_go = [0], threading.Event()
@@ -449,7 +449,7 @@ class CountingStore:
         return {it: self.keys[it] for it in reference_ids if it in self.keys}
 
 
-def test_a_scene_that_does_not_change_is_asked_for_its_references_once(tmp_path: Path) -> None:
+def test_an_unchanged_scene_is_asked_for_references_once(tmp_path: Path) -> None:
     """However many calls come and go; and what is not there is found out all the same."""
     folder, counting = CaptureFolder(tmp_path / "c", Retention(3600.0, 2**24)), CountingStore({"r0": "k0", "r1": "k1"})
     staleness = Staleness(cast(Store, counting))
@@ -489,9 +489,7 @@ def test_what_is_wrong_with_one_scene_keeps_nothing_of_another(tmp_path: Path, f
     folder.close()
 
 
-def test_what_the_folder_has_is_not_read_again_and_queries_keep_their_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stored_data_is_not_read_again_and_queries_keep_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Features of each of two extractors are read once for all calls, and neither hits nor misses are counted."""
     read, features = Counter[str](), reading._features
 

@@ -35,7 +35,7 @@ def inliers_of(message: pb.WatchQueriesResponse) -> int:
     return int(message.answer.localization.inlier_count)
 
 
-def test_an_answer_reaches_those_who_watch_its_scene_with_the_photograph_and_the_matches() -> None:
+def test_an_answer_reaches_watchers_with_photo_and_matches() -> None:
     async def run() -> None:
         watchers = Watchers(True)
         first, second, elsewhere = watchers.watch(HALL), watchers.watch(HALL), watchers.watch(OTHER)
@@ -52,7 +52,7 @@ def test_an_answer_reaches_those_who_watch_its_scene_with_the_photograph_and_the
     asyncio.run(run())
 
 
-def test_what_waits_for_a_watcher_keeps_nothing_else_of_the_request() -> None:
+def test_what_waits_for_a_watcher_keeps_no_more_of_the_request() -> None:
     """A part of a message keeps the whole message, so that each photograph would be held twice."""
 
     async def run() -> None:
@@ -67,7 +67,7 @@ def test_what_waits_for_a_watcher_keeps_nothing_else_of_the_request() -> None:
     asyncio.run(run())
 
 
-def test_a_photograph_as_large_as_a_message_may_be_is_left_out_and_the_answer_is_told() -> None:
+def test_an_oversized_photograph_is_left_out_of_the_event() -> None:
     async def run() -> None:
         watchers = Watchers(True, 2000)
         watch = watchers.watch(HALL)
@@ -96,7 +96,7 @@ def test_the_callers_own_answer_stays_as_it_was() -> None:
     assert not response.HasField("debug")
 
 
-def test_who_reads_too_slowly_misses_the_oldest_and_is_told_how_many() -> None:
+def test_a_slow_reader_misses_the_oldest_and_learns_how_many() -> None:
     async def run() -> None:
         watchers = Watchers(True)
         watch = watchers.watch(HALL)
@@ -129,7 +129,7 @@ def test_nothing_is_kept_when_nobody_watches() -> None:
     asyncio.run(run())
 
 
-def test_it_ends_when_the_server_stops_whether_something_waits_or_not() -> None:
+def test_it_ends_when_the_server_stops_in_any_state() -> None:
     async def run() -> None:
         watchers = Watchers(True)
         idle, late = watchers.watch(HALL), watchers.watch(HALL)

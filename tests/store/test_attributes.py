@@ -50,7 +50,7 @@ def known_of(store: Store, key: SceneKey) -> SceneAttributes:
     return scene.attributes
 
 
-def test_nothing_is_known_of_a_scene_that_nobody_has_said_anything_of(store: Store) -> None:
+def test_a_new_scene_has_no_attributes(store: Store) -> None:
     assert store.create_scene(OFFICE).attributes == known_of(store, OFFICE) == SceneAttributes()
 
 
@@ -63,7 +63,7 @@ def test_what_is_said_at_its_creation_is_kept_exactly(place: Place) -> None:
         assert known_of(store, OFFICE) == said
 
 
-def test_each_is_changed_and_forgotten_alone_and_every_change_raises_the_generation(store: Store) -> None:
+def test_each_change_is_alone_and_raises_the_generation(store: Store) -> None:
     store.create_scene(OFFICE)
     expected, generation = SceneAttributes(), 1
     changes: list[dict[str, Any]] = [
@@ -91,7 +91,7 @@ def test_each_is_changed_and_forgotten_alone_and_every_change_raises_the_generat
     assert expected == SceneAttributes()
 
 
-def test_who_has_the_references_in_memory_need_not_read_them_again(store: Store) -> None:
+def test_references_in_memory_are_not_read_again(store: Store) -> None:
     store.create_scene(OFFICE)
     store.add_references(OFFICE, [make_reference("a")])
     store.update_scene(OFFICE, datum=DATUM)
@@ -109,7 +109,7 @@ def test_other_changes_leave_it_alone(store: Store) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 3])
-def test_a_scene_that_is_deleted_and_created_again_has_forgotten(
+def test_a_scene_deleted_and_created_again_has_forgotten(
     store: Store, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
     """Whether it is deleted in one portion, or in several."""
@@ -132,7 +132,7 @@ def test_a_scene_that_is_not_there_has_none(store: Store) -> None:
         assert caught.value.field == "scene"
 
 
-def test_a_datum_for_another_world_than_the_downs_is_refused_and_nothing_changes(store: Store) -> None:
+def test_a_datum_that_contradicts_down_is_refused_unchanged(store: Store) -> None:
     """The world's y is up, and the datum, which says nothing of turning, takes its z for it."""
     before = store.create_scene(OFFICE, SceneAttributes(down_in_world=(0.0, -1.0, 0.0)))
     with pytest.raises(ContradictingDown, match="90 degrees off"):
@@ -144,7 +144,7 @@ def test_a_datum_for_another_world_than_the_downs_is_refused_and_nothing_changes
         store.update_scene(OFFICE, down_in_world=unit_vector(0, -1, np.tan(np.radians(11))))
 
 
-def test_down_is_what_was_said_or_what_the_datum_says_or_unknown() -> None:
+def test_down_is_the_given_one_or_the_datums_or_unknown() -> None:
     datum = Datum(0, 0, 0, enu_from_y_up(0))
     said = unit_vector(0.05, -1.0, 0.0)
     assert SceneAttributes().down() is None
@@ -169,7 +169,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_damage_is_told_and_can_be_mended_and_references_are_served(place: Place, damage: str) -> None:
+def test_damage_is_reported_and_repairable_while_serving(place: Place, damage: str) -> None:
     with place.open() as store:
         store.create_scene(OFFICE, SceneAttributes(DATUM))
         store.create_scene(HALL, SceneAttributes(down_in_world=DOWN))

@@ -140,7 +140,7 @@ def test_each_change_is_told_once(store: Store) -> None:
     assert b.key in {it.key for it in store.list_changes(OFFICE, None, NAME).added}
 
 
-def test_a_descriptor_found_later_is_a_change_and_the_first_one_stays(store: Store) -> None:
+def test_a_descriptor_found_later_is_a_change_once(store: Store) -> None:
     store.create_scene(OFFICE)
     a, _ = store.add_references(OFFICE, [make_reference("a"), make_reference("b")])
     first, second = (make_descriptor(np.random.default_rng(seed), 16) for seed in (1, 2))

@@ -134,7 +134,7 @@ def wait_for_thread(store: Store) -> None:
     store._leftovers._thread.join(30)
 
 
-def test_a_crash_in_the_middle_leaves_what_nobody_sees_and_the_next_delete_removes(
+def test_a_crash_midway_leaves_what_the_next_delete_removes(
     place: Place, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     keys = leave_some(place, monkeypatch)
@@ -177,9 +177,7 @@ def test_what_is_left_is_deleted_by_who_deletes_the_scene_again(place: Place, mo
     assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
 
 
-def test_what_is_left_is_deleted_when_the_store_is_opened_again_and_nobody_waits_for_it(
-    place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_remains_are_deleted_in_the_background_after_opening(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     leave_some(place, monkeypatch)
     opened = threading.Event()
     with monkeypatch.context() as patch:
@@ -197,9 +195,7 @@ def assert_true(it: bool) -> None:
     assert it
 
 
-def test_closing_ends_it_after_a_portion_and_the_next_start_goes_on(
-    place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_closing_ends_it_after_a_portion_and_a_start_goes_on(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     leave_some(place, monkeypatch)
     monkeypatch.setattr(leftovers, "PAUSE_S", 30.0)
     with place.open():
@@ -212,7 +208,7 @@ def test_closing_ends_it_after_a_portion_and_the_next_start_goes_on(
 
 
 @pytest.mark.parametrize("broken", ["is_left", "next_portion"])
-def test_where_that_fails_the_store_is_opened_all_the_same_and_the_log_tells(
+def test_where_that_fails_the_store_opens_and_logs_it(
     place: Place, broken: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     leave_some(place, monkeypatch)

@@ -104,7 +104,7 @@ def test_a_store_of_the_first_release_keeps_every_byte(place: Place) -> None:
         assert place.fetch("SELECT schema_version FROM store_version") == [(SCHEMA_VERSION,)]
 
 
-def test_a_store_of_the_second_release_has_scenes_of_which_nothing_is_known(place: Place, tmp_path: Path) -> None:
+def test_a_store_of_the_second_release_has_no_attributes(place: Place, tmp_path: Path) -> None:
     """Its servers may still be there, too, and go on creating scenes."""
     create = "INSERT INTO scene (scene_id, create_time_us, first_generation) VALUES (?, 5, 1)"
     with Raw(place) as connection:
@@ -153,7 +153,7 @@ def test_a_newer_schema_is_refused(place: Place) -> None:
     assert place.fetch("SELECT schema_version FROM store_version") == [(SCHEMA_VERSION + 1,)]
 
 
-def test_the_database_of_another_program_is_refused_and_left_alone(place: Place) -> None:
+def test_the_database_of_another_program_is_refused(place: Place) -> None:
     with Raw(place) as connection:
         connection.execute(text("CREATE TABLE scene (name TEXT)"))
     with pytest.raises(StoreError, match="another program"):

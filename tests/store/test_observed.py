@@ -59,7 +59,7 @@ def test_no_operation_is_unheard() -> None:
     assert methods - heard_of == {"open", "connect", "close", "uncached"}
 
 
-def test_each_is_heard_of_once_and_a_callers_mistake_is_no_failure(store: Store, heard: Heard) -> None:
+def test_each_is_heard_of_once_and_misuse_is_no_failure(store: Store, heard: Heard) -> None:
     store.create_scene(HALL)
     store.add_references(HALL, [reference("a")])
     store.load_references(HALL, ["a"], "sift")

@@ -55,7 +55,7 @@ def faults_of(folder: Path) -> tuple[str, ...]:
         return verify(connection).faults
 
 
-def test_features_that_are_lost_name_their_reference_and_the_others_load(folder: Path) -> None:
+def test_lost_features_name_their_reference_and_others_load(folder: Path) -> None:
     lose(folder, "features", "b")
     with Store.open(folder) as store:
         for asked in (IDS, ["b"], ["c", "b"], None):
@@ -76,7 +76,7 @@ def test_an_image_that_is_lost_names_its_reference(folder: Path) -> None:
         assert store.read_image(SCENE, "a") == MADE["a"].image
 
 
-def test_a_descriptor_that_is_lost_leaves_its_reference_out_of_the_index_alone(folder: Path) -> None:
+def test_a_lost_descriptor_leaves_its_reference_unindexed(folder: Path) -> None:
     lose(folder, "descriptor", "b")
     with Store.open(folder) as store:
         changes = store.list_changes(SCENE, None, "vlad")
@@ -85,7 +85,7 @@ def test_a_descriptor_that_is_lost_leaves_its_reference_out_of_the_index_alone(f
 
 
 @pytest.mark.parametrize("what", ["image", "features", "descriptor"])
-def test_whatever_is_lost_the_store_says_so_and_the_reference_can_be_stored_anew(folder: Path, what: str) -> None:
+def test_any_loss_is_reported_and_the_reference_can_be_replaced(folder: Path, what: str) -> None:
     lose(folder, what, "b")
     named = [fault for fault in faults_of(folder) if "reference" in fault]
     assert named
@@ -105,9 +105,7 @@ def test_whatever_is_lost_the_store_says_so_and_the_reference_can_be_stored_anew
 
 
 @pytest.mark.parametrize("at_a_time", [1, 2, 100])
-def test_a_scene_with_lost_pages_is_deleted_and_so_is_what_else_is_deleted_later(
-    folder: Path, at_a_time: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scene_with_lost_pages_can_be_deleted(folder: Path, at_a_time: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", at_a_time)
     lose(folder, "features", "b")
     lose(folder, "features", "c")
@@ -125,7 +123,7 @@ def test_a_scene_with_lost_pages_is_deleted_and_so_is_what_else_is_deleted_later
     assert left == 2, "of those that cannot be deleted"
 
 
-def test_a_lost_table_of_references_is_nobodys_fault_in_particular(folder: Path) -> None:
+def test_a_lost_table_of_references_names_no_reference(folder: Path) -> None:
     with Store.open(folder) as store:
         key = store.get_reference(SCENE, "a").key
     lose_page_with(folder, f"{key}office".encode())

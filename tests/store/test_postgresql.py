@@ -47,7 +47,7 @@ class TestSharing:
             changes = reader.list_changes(OFFICE, snapshot.generation - 1, NAME)
             assert [it.key for it in changes.added] == [record.key]
 
-    def test_what_is_in_memory_is_not_believed_after_the_other_changed_it(self, both: tuple[Store, Store]) -> None:
+    def test_the_cache_is_not_used_after_another_servers_change(self, both: tuple[Store, Store]) -> None:
         one, other = both
         one.create_scene(OFFICE)
         one.add_references(OFFICE, [make_reference("a", 1), make_reference("b", 2)])
@@ -104,7 +104,7 @@ class TestSharing:
             assert sum(pool.map(create, range(16))) == 1
         assert both[0].get_scene(OFFICE).generation == 1
 
-    def test_changers_of_one_scene_wait_for_one_another_and_nothing_is_lost(self, both: tuple[Store, Store]) -> None:
+    def test_writers_of_one_scene_wait_and_nothing_is_lost(self, both: tuple[Store, Store]) -> None:
         both[0].create_scene(OFFICE)
 
         def change(number: int) -> None:
@@ -136,7 +136,7 @@ class TestSharing:
         with ThreadPoolExecutor(8) as pool:
             assert sum(pool.map(describe, range(16))) == 1
 
-    def test_a_scene_deleted_while_others_add_to_it_is_gone_or_whole(self, both: tuple[Store, Store]) -> None:
+    def test_a_scene_deleted_during_additions_is_gone_or_whole(self, both: tuple[Store, Store]) -> None:
         one, other = both
         one.create_scene(OFFICE)
 

@@ -270,7 +270,7 @@ class TestReferences:
             assert_same_view(snapshot.references[0].view, expected)
             assert not snapshot.undescribed
 
-    def test_those_without_features_are_told_apart_in_the_order_asked(self, store: Store) -> None:
+    def test_those_without_features_are_named_in_order(self, store: Store) -> None:
         store.create_scene(OFFICE)
         both = {"cheap": view_of(make_reference("x")), "strong": view_of(make_reference("x", 1))}
         news = [replace(make_reference(it, count=1), views=both) for it in "ac"]
@@ -280,9 +280,7 @@ class TestReferences:
             assert [it.record.reference_id for it in snapshot.references] == ["c", "a"]
             assert [it.reference_id for it in snapshot.undescribed] == ["b"]
 
-    def test_features_of_all_extractors_are_stored_with_the_reference_or_not_at_all(
-        self, store: Store, place: Place, database: str
-    ) -> None:
+    def test_features_of_all_extractors_are_stored_or_none(self, store: Store, place: Place, database: str) -> None:
         store.create_scene(OFFICE)
         good, other = make_reference("a", 1), make_reference("a", 2, count=7)
         double = replace(view_of(other).features, sizes_px=np.ones(7))  # type: ignore[arg-type]

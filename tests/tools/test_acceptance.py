@@ -56,7 +56,7 @@ def test_the_threshold_keeps_the_share_that_is_asked_for() -> None:
     assert threshold_of(PLANTED[3:], as_planted) is None
 
 
-def test_whatever_is_answered_with_references_of_another_place_is_wrong() -> None:
+def test_any_answer_from_references_of_another_place_is_wrong() -> None:
     elsewhere = [measured((np.inf, np.inf), 0.3), measured(None, -1.0)]
     lines = cross_table(elsewhere, as_planted, 0.2)
     assert lines[0] == "2 pairs of a query and references of another scene: 0 accepted"

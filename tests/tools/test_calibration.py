@@ -61,7 +61,7 @@ def planted(count: int, times: float, case: str) -> Sample:
 
 
 class TestClaims:
-    def test_radii_are_the_stated_ones_and_those_of_the_distribution_between(self) -> None:
+    def test_radii_are_the_stated_ones_and_interpolate_between(self) -> None:
         it = claim(1.0, 2.0)
         for p in (0.05, 0.5, 0.68, 0.9, 0.95, 0.99):
             just = 2 * length(p)

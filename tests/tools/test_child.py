@@ -53,9 +53,7 @@ def test_a_child_s_store_is_the_one_it_is_given(monkeypatch: pytest.MonkeyPatch,
     assert other_environment["MAPLESS_DATABASE_URL"] == "postgresql://u:secret@ours/db"
 
 
-def test_a_log_in_a_file_has_what_a_child_that_does_not_start_says(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_log_file_has_the_output_of_a_child_that_failed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     log = tmp_path / "server.log"
     with (
         pytest.raises(child.ServerFailed, match=rf"is in {re.escape(str(log))}$"),

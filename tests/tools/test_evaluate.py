@@ -78,7 +78,7 @@ class TestSplit:
         references=st.integers(2, 60),
         queries=st.integers(1, 80),
     )
-    def test_gives_frames_that_exist_and_no_query_that_is_a_reference(
+    def test_gives_existing_frames_and_no_query_among_references(
         self, frames: int, references: int, queries: int
     ) -> None:
         try:
@@ -107,7 +107,7 @@ class TestSplit:
         with pytest.raises(ValueError, match=words):
             split_frames(frames, options)
 
-    def test_takes_queries_to_the_ends_where_the_margin_does_not_fit(self) -> None:
+    def test_takes_queries_to_the_ends_where_no_margin_fits(self) -> None:
         assert split_frames(5, EvaluationOptions(2)) == Split((0, 4), (1, 2, 3))
 
 

@@ -132,7 +132,7 @@ class TestProtocol:
         with pytest.raises(UsageError, match="--sparse"):
             SuiteOptions().settings(ScenePlace("own", Path("own"), "cameras"))
 
-    def test_every_variant_has_the_first_scale_and_the_papers_variant_has_all(self) -> None:
+    def test_every_variant_has_scale_one_and_the_papers_has_all(self) -> None:
         options = SuiteOptions(variants=("best", "full"), scales=("two_stage", "trajectory"))
         assert options.methods() == (
             Method("best", "two_stage"),
@@ -374,7 +374,7 @@ class TestAverages:
         assert math.isinf(average.median_translation_m)
         assert average.localized == 9
 
-    def test_scenes_that_the_paper_leaves_out_are_not_in_its_average(self) -> None:
+    def test_scenes_left_out_by_the_paper_are_not_averaged(self) -> None:
         names = dict.fromkeys(BENCHMARKS["cambridge"].scenes, 0.1)
         (group,) = groups_of(suite({**names, "GreatCourt": 9.0}, layout="cambridge"))
         average = group.average(DENSE, Method("best", "two_stage"))

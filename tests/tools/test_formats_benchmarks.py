@@ -38,7 +38,7 @@ def pgt_line(image: str, pose: RigidTransform, focal_px: float) -> str:
     return " ".join([image, *(f"{number:.9f}" for number in numbers), f"{focal_px}"]) + "\n"
 
 
-def test_seven_scenes_gives_poses_intrinsics_and_the_official_split(tmp_path: Path) -> None:
+def test_seven_scenes_has_poses_intrinsics_and_official_split(tmp_path: Path) -> None:
     dataset = read_dataset(write_seven_scenes(tmp_path / "chess"))
     assert_reads(dataset, TRUTH)
     assert [frame.name for frame in dataset.frames] == [
@@ -80,7 +80,7 @@ def test_a_sequence_that_is_still_packed_is_named(tmp_path: Path) -> None:
     assert "still packed" in reasons(dataset)["seq-02"]
 
 
-def test_splits_that_contradict_or_make_no_sense_end_the_reading(tmp_path: Path) -> None:
+def test_contradictory_or_invalid_splits_end_the_reading(tmp_path: Path) -> None:
     scene = write_seven_scenes(tmp_path / "chess")
     (scene / "TestSplit.txt").write_text("sequence1\n")
     with pytest.raises(ValueError, match=r"TestSplit\.txt: seq-01 is in both"):
@@ -134,7 +134,7 @@ def write_twelve_scenes(room: Path) -> Path:
     return room
 
 
-def test_twelve_scenes_reads_info_and_takes_the_first_sequence_for_queries(tmp_path: Path) -> None:
+def test_twelve_scenes_takes_the_first_sequence_for_queries(tmp_path: Path) -> None:
     dataset = read_dataset(write_twelve_scenes(tmp_path / "apt1" / "kitchen"))
     assert_reads(dataset, replace(TRUTH, camera=Camera(96, 64, 572.0, 573.0, 47.25, 30.75)))
     assert [frame.split for frame in dataset.frames] == ["test", "train", "train", "train"]
@@ -194,7 +194,7 @@ def write_cambridge(scene: Path) -> Path:
     return scene
 
 
-def test_cambridge_gives_centres_rotations_split_and_each_images_focal_length(tmp_path: Path) -> None:
+def test_cambridge_has_centres_rotations_split_and_focals(tmp_path: Path) -> None:
     dataset = read_dataset(write_cambridge(tmp_path / "ShopFacade"))
     assert dataset.refused == ()
     assert [frame.split for frame in dataset.frames] == ["train", "train", "test", "test"]

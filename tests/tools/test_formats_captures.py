@@ -71,7 +71,7 @@ def test_an_applied_transform_and_scale_are_undone(tmp_path: Path) -> None:
     assert any("0.25" in note for note in dataset.notes)
 
 
-def test_intrinsics_may_stand_in_a_frame_and_endings_may_be_missing(tmp_path: Path) -> None:
+def test_intrinsics_may_be_per_frame_and_endings_missing(tmp_path: Path) -> None:
     folder = write_transforms(tmp_path)
 
     def change(content: Any) -> None:
@@ -84,7 +84,7 @@ def test_intrinsics_may_stand_in_a_frame_and_endings_may_be_missing(tmp_path: Pa
     assert_reads(read_dataset(folder), TRUTH)
 
 
-def test_an_angle_of_view_stands_for_the_focal_length_and_the_file_for_its_size(tmp_path: Path) -> None:
+def test_an_angle_of_view_and_the_file_size_give_the_focal(tmp_path: Path) -> None:
     """instant-ngp's and Blender's: the whole width is seen under the angle."""
     folder = write_transforms(tmp_path)
 
@@ -121,7 +121,7 @@ def test_fisheye_lenses(tmp_path: Path, about: dict[str, Any]) -> None:
     assert read_dataset(folder).frames[0].camera.distortion == Fisheye(0.1, 0.2, 0.3, 0.4)
 
 
-def test_frames_of_transforms_that_are_wrong_are_refused_by_name(tmp_path: Path) -> None:
+def test_wrong_frames_of_transforms_are_refused_by_name(tmp_path: Path) -> None:
     folder = write_transforms(tmp_path)
 
     def change(content: Any) -> None:

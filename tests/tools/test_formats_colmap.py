@@ -163,7 +163,7 @@ def test_camera_models_that_are_cameras_of_ours(model: str, parameters: tuple[fl
     ("model", "count"),
     [("FOV", 5), ("THIN_PRISM_FISHEYE", 12), ("RAD_TAN_THIN_PRISM_FISHEYE", 16), ("DIVISION", 5), ("EUCM", 6)],
 )
-def test_camera_models_without_a_counterpart_are_refused_by_name(model: str, count: int) -> None:
+def test_unknown_camera_models_are_refused_by_name(model: str, count: int) -> None:
     with pytest.raises(ValueError, match=model):
         ColmapCamera(3, model, 96, 64, (80.0,) * count).camera()
 

@@ -111,7 +111,7 @@ def refusals(report: ImportReport) -> dict[str, str]:
     return {item.frame: item.reason for item in report.refused}
 
 
-def test_all_are_stored_in_bounded_messages_with_bounded_many_in_flight(tmp_path: Path) -> None:
+def test_messages_are_bounded_and_few_are_in_flight(tmp_path: Path) -> None:
     frames = frames_in(tmp_path)
     server = Server()
     report = upload(server, frames)
@@ -142,7 +142,7 @@ def test_a_second_run_stores_nothing_and_says_so(tmp_path: Path) -> None:
     assert (len(report.skipped), report.added, len(server.messages)) == (20, [], messages)
 
 
-def test_what_differs_from_what_is_there_is_refused_with_the_difference(tmp_path: Path) -> None:
+def test_a_difference_to_what_is_stored_is_refused_with_detail(tmp_path: Path) -> None:
     frames = frames_in(tmp_path, 4)
     server = Server()
     upload(server, frames)
@@ -162,7 +162,7 @@ def test_what_differs_from_what_is_there_is_refused_with_the_difference(tmp_path
     ("moved_m", "turned_deg", "is_same"),
     [(9e-4, 0.0, True), (0.0, 9e-3, True), (1.1e-3, 0.0, False), (0, 0.011, False)],
 )
-def test_the_same_photograph_with_almost_the_same_pose_is_skipped(
+def test_the_same_photo_with_almost_the_same_pose_is_skipped(
     tmp_path: Path, moved_m: float, turned_deg: float, is_same: bool
 ) -> None:
     (frame,) = frames_in(tmp_path, 1)
@@ -194,7 +194,7 @@ def test_the_same_image_under_another_id_is_the_same_reference(tmp_path: Path) -
     assert "as r001" in refusals(report)["elsewhere"]
 
 
-def test_a_photograph_that_the_server_refuses_is_taken_out_alone(tmp_path: Path) -> None:
+def test_a_photograph_refused_by_the_server_is_taken_out_alone(tmp_path: Path) -> None:
     """It names which of the message it is."""
 
     def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
@@ -217,7 +217,7 @@ def test_a_photograph_that_the_server_refuses_is_taken_out_alone(tmp_path: Path)
         Internal("INTERNAL", "internal error", request_id="abc"),
     ],
 )
-def test_what_the_server_does_not_name_is_found_by_sending_parts(tmp_path: Path, error: MaplessError) -> None:
+def test_an_unnamed_refusal_is_located_by_sending_parts(tmp_path: Path, error: MaplessError) -> None:
     def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
         return error if any(reference.reference_id == "r006" for reference in message) else None
 
@@ -246,9 +246,7 @@ def test_a_server_that_goes_away_is_waited_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [Unavailable, DeadlineExceeded])
-def test_a_message_that_was_stored_although_its_answer_was_lost_counts_as_added(
-    tmp_path: Path, kind: type[MaplessError]
-) -> None:
+def test_a_message_stored_despite_a_lost_answer_is_added(tmp_path: Path, kind: type[MaplessError]) -> None:
     server = Server()
 
     def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
@@ -262,7 +260,7 @@ def test_a_message_that_was_stored_although_its_answer_was_lost_counts_as_added(
     assert (sorted(report.added), report.skipped) == (["r000", "r001", "r002", "r003"], [])
 
 
-def test_references_that_somebody_else_adds_meanwhile_are_skipped(tmp_path: Path) -> None:
+def test_references_added_by_another_caller_are_skipped(tmp_path: Path) -> None:
     frames = frames_in(tmp_path, 4)
     server = Server()
 
@@ -319,7 +317,7 @@ def test_an_interruption_ends_it_soon_and_keeps_what_is_in(tmp_path: Path) -> No
     assert (server.is_closed, len(server.messages)) == (True, 1)
 
 
-def test_files_that_are_not_what_the_camera_took_are_refused_before_they_are_sent(tmp_path: Path) -> None:
+def test_files_unlike_the_camera_are_refused_before_sending(tmp_path: Path) -> None:
     frames = frames_in(tmp_path, 4)
     write_image(frames[0].image_path, 0, 48, 32)
     frames[1].image_path.write_bytes(b"GIF89a")

@@ -59,7 +59,7 @@ def record(fate: Fate = Fate.ANSWERED, at_s: float = 0.0, took_s: float = 0.1, s
 # Arrivals
 
 
-def test_arrivals_have_the_rate_and_the_independence_of_a_poisson_process() -> None:
+def test_arrivals_are_a_poisson_process_of_the_rate() -> None:
     rate, duration_s = 50.0, 400.0
     times = poisson_times(rate, duration_s, np.random.default_rng(7))
     assert (np.diff(times) >= 0).all()
@@ -76,7 +76,7 @@ def test_arrivals_have_the_rate_and_the_independence_of_a_poisson_process() -> N
     assert abs(np.corrcoef(counts[:-1], counts[1:])[0, 1]) < 0.2
 
 
-def test_clients_together_make_the_rate_in_order_of_time_with_the_mix_asked_for() -> None:
+def test_clients_together_make_the_rate_and_the_mix() -> None:
     mix = Mix(cancelled_share=0.1, bad_share=0.2, cancel_within_s=0.5)
     plan = plan_calls(100.0, 100.0, 8, REQUESTS, mix, seed=3)
     assert [call.at_s for call in plan] == sorted(call.at_s for call in plan)
@@ -93,7 +93,7 @@ def test_clients_together_make_the_rate_in_order_of_time_with_the_mix_asked_for(
         assert call.cancel_after_s is None or 0 <= call.cancel_after_s <= 0.5
 
 
-def test_the_same_seed_plans_the_same_calls_and_another_one_others() -> None:
+def test_equal_seeds_plan_equal_calls_and_others_differ() -> None:
     def times(seed: int) -> list[float]:
         return [call.at_s for call in plan_calls(20.0, 10.0, 2, REQUESTS, Mix(), seed)]
 
@@ -122,7 +122,7 @@ def test_senseless_arguments_are_refused(make: Callable[[], object]) -> None:
 
 
 @given(st.lists(st.floats(0, 1e6), min_size=1), st.floats(0.001, 1))
-def test_a_percentile_is_the_smallest_value_that_so_many_do_not_exceed(values: list[float], share: float) -> None:
+def test_a_percentile_is_the_least_value_with_so_many_below(values: list[float], share: float) -> None:
     found = percentile(values, share)
     assert found in values
     assert sum(value <= found for value in values) >= share * len(values) * (1 - 1e-9)
@@ -164,7 +164,7 @@ def test_how_a_call_ended_for_its_caller(code: str, detail: str, kind: Kind, too
 
 
 @given(st.lists(st.tuples(st.sampled_from(Fate), st.floats(0, 9.99), st.floats(0, 3)), max_size=40))
-def test_every_call_is_in_the_account_once_and_no_rate_exceeds_what_was_offered(
+def test_every_call_is_counted_once_within_the_offered_rate(
     calls: list[tuple[Fate, float, float]],
 ) -> None:
     records = [record(fate, at_s, took_s) for fate, at_s, took_s in calls]
@@ -176,7 +176,7 @@ def test_every_call_is_in_the_account_once_and_no_rate_exceeds_what_was_offered(
     assert account.answers.count + account.refusals.count <= account.offered_per_s * 8 + 1e-9
 
 
-def test_rates_leave_out_the_beginning_and_answers_that_come_too_late() -> None:
+def test_rates_leave_out_the_beginning_and_late_answers() -> None:
     records = [
         record(at_s=1.0),  # before it has settled
         record(at_s=3.0),
@@ -220,7 +220,7 @@ async def abort(context: Any, code: grpc.StatusCode, reason: str) -> bytes:
     raise AssertionError("abort raises")
 
 
-def test_every_call_of_a_server_that_refuses_some_and_never_answers_others_is_accounted_for_once() -> None:
+def test_calls_to_a_refusing_and_silent_server_are_counted_once() -> None:
     number = 0
 
     async def handler(request: bytes, context: Any) -> bytes:
@@ -259,7 +259,7 @@ def test_every_call_of_a_server_that_refuses_some_and_never_answers_others_is_ac
         assert r.at_s <= r.sent_s <= r.ended_s
 
 
-def test_a_server_that_stalls_shows_in_the_latency_of_every_call_that_was_to_be_made_meanwhile() -> None:
+def test_a_stalled_server_shows_in_every_latency_meanwhile() -> None:
     released_s = math.inf
 
     async def run() -> tuple[list[CallRecord], float]:
@@ -286,7 +286,7 @@ def test_a_server_that_stalls_shows_in_the_latency_of_every_call_that_was_to_be_
         assert r.latency_s >= released_s - begin_s - r.at_s - 1e-9
 
 
-def test_a_generator_that_comes_late_itself_counts_from_when_it_should_have_come() -> None:
+def test_a_late_generator_counts_from_the_planned_time() -> None:
     async def handler(_: bytes, __: Any) -> bytes:
         return b"localized"
 
@@ -303,7 +303,7 @@ def test_a_generator_that_comes_late_itself_counts_from_when_it_should_have_come
     assert lag.max_ms >= 5000
 
 
-def test_a_closed_loop_keeps_so_many_calls_in_progress_and_goes_round_the_requests() -> None:
+def test_a_closed_loop_keeps_so_many_calls_in_progress() -> None:
     running = most = 0
     seen: Counter[bytes] = Counter()
 
@@ -325,7 +325,7 @@ def test_a_closed_loop_keeps_so_many_calls_in_progress_and_goes_round_the_reques
     assert max(seen.values()) - min(seen.values()) <= 1
 
 
-def test_who_is_refused_in_a_closed_loop_comes_back_when_the_server_asks_for_it() -> None:
+def test_a_refused_closed_loop_caller_returns_when_told() -> None:
     came_s: list[float] = []
 
     async def handler(_: bytes, context: Any) -> bytes:
@@ -353,7 +353,7 @@ def test_who_is_refused_in_a_closed_loop_comes_back_when_the_server_asks_for_it(
 # The server's process and its own account
 
 
-def test_a_process_is_read_and_its_threads_and_files_are_counted() -> None:
+def test_a_process_is_read_with_its_threads_and_files() -> None:
     before = read_process(os.getpid(), 0.0)
     opened = [os.open(os.devnull, os.O_RDONLY) for _ in range(5)]
     try:
@@ -367,7 +367,7 @@ def test_a_process_is_read_and_its_threads_and_files_are_counted() -> None:
     assert after.cpu_s >= before.cpu_s
 
 
-def test_the_generator_goes_before_the_server_while_it_measures_and_not_after() -> None:
+def test_the_generator_has_priority_while_it_measures_only() -> None:
     def niceness(process_id: int) -> int:
         return os.getpriority(os.PRIO_PROCESS, process_id)
 
@@ -379,7 +379,7 @@ def test_the_generator_goes_before_the_server_while_it_measures_and_not_after() 
         server.communicate(b"\n")
 
 
-def test_a_trend_finds_the_planted_slope_and_doubts_one_that_is_only_noise() -> None:
+def test_a_trend_finds_the_planted_slope_and_doubts_noise() -> None:
     random = np.random.default_rng(11)
     times = np.arange(0.0, 600.0, 2.0)
     noise = random.normal(0.0, 1.0, len(times))
@@ -455,7 +455,7 @@ def test_the_padded_photo_is_an_image_of_the_size_asked_for() -> None:
         assert pixels.shape == (CAMERA.height_px, CAMERA.width_px, 3)
 
 
-def test_a_request_holds_the_photograph_and_the_names_of_references() -> None:
+def test_a_request_holds_the_photo_and_reference_names() -> None:
     message = pb.LocalizeRequest.FromString(photo_request(b"photo", CAMERA, ["a", "b"]))
     assert message.image == b"photo"
     assert list(message.references) == ["scenes/load/references/a", "scenes/load/references/b"]
@@ -502,7 +502,7 @@ def planted_result(slowest_refusal_s: float = 0.004) -> PipelineResult:
     return PipelineResult("a planted place", options, unloaded, ramp, 8.0, steps)
 
 
-def test_bars_are_met_by_a_good_server_and_a_slow_refusal_misses_its_own() -> None:
+def test_a_good_server_meets_bars_and_slow_refusals_miss_one() -> None:
     def by_figure(result: PipelineResult) -> dict[str, bool | None]:
         return {check.figure: check.met for check in pipeline_checks(result)}
 
@@ -520,7 +520,7 @@ def test_the_picture_is_a_png_of_the_stated_size_and_not_blank() -> None:
     assert len(np.unique(picture.astype(np.uint32) @ np.array([1, 256, 65536], np.uint32))) > 50
 
 
-def test_a_step_without_a_single_answer_can_be_drawn_and_reported() -> None:
+def test_a_step_without_any_answer_can_be_reported() -> None:
     result = planted_result()
     refused = [record(Fate.REFUSED, at_s=0.1 * i, took_s=0.003) for i in range(50)]
     result = replace(result, steps=[*result.steps[:2], step("300 %", 24.0, refused)])
@@ -530,7 +530,7 @@ def test_a_step_without_a_single_answer_can_be_drawn_and_reported() -> None:
     assert goodput.met is False
 
 
-def test_the_file_of_figures_keeps_the_parts_that_were_measured_before(tmp_path: Path) -> None:
+def test_the_file_of_figures_keeps_earlier_parts(tmp_path: Path) -> None:
     result = planted_result()
     file = tmp_path / "load.json"
     update_json(file, "pipeline", pipeline_json(result), pipeline_checks(result))
@@ -543,7 +543,7 @@ def test_the_file_of_figures_keeps_the_parts_that_were_measured_before(tmp_path:
     assert len(verdicts) == len(content["pipeline"]["checks"])
 
 
-def test_a_step_watches_the_process_and_takes_the_servers_account_of_that_time_only(
+def test_a_step_uses_the_servers_account_of_its_time_only(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pages = iter([Scrape(10, {"OK": 10}, {}, {}), Scrape(13, {"OK": 13}, {}, {})])
@@ -562,7 +562,7 @@ def test_a_step_watches_the_process_and_takes_the_servers_account_of_that_time_o
     assert [s.at_s for s in measured.samples] == sorted(s.at_s for s in measured.samples)
 
 
-def test_the_machine_is_blamed_for_a_missed_bar_where_more_wanted_to_run_than_it_has_cores_and_only_there() -> None:
+def test_only_an_overcommitted_machine_excuses_a_missed_bar() -> None:
     met, missed = (Check("overdue", "", "0", it) for it in (True, False))
     assert "6.3 threads wanted to run on 2 cores" in machine_lines([met, missed], 6.3, 2)[0]
     assert machine_lines([met, missed], 1.9, 2) == []

@@ -47,7 +47,7 @@ def test_a_leak_of_a_mebibyte_a_minute_is_found(alike: float) -> None:
     assert leak.verdict == "grows"
 
 
-def test_a_descriptor_that_is_left_open_every_ten_minutes_is_found() -> None:
+def test_a_descriptor_leaked_every_ten_minutes_is_found() -> None:
     steps = found(np.floor(TIMES_S / 600))
     assert steps.grows
     assert steps.low < 6 < steps.high + 2
@@ -99,7 +99,7 @@ def state(at_s: float, **held: float) -> ServerState:
     return replace(ServerState(at_s, 500.0, 400.0, 5e5, 20.0, 30.0, 15.0, 40.0, 0.0, 1.0, at_s), **held)
 
 
-def test_slopes_leave_out_the_settling_and_say_nothing_of_too_short_a_time() -> None:
+def test_slopes_skip_the_settling_and_need_enough_time() -> None:
     climbing = [state(at, resident_mib=min(500.0, at)) for at in np.arange(0.0, 3600.0, EVERY_S).tolist()]
     slopes = slopes_of(climbing, 1200)
     assert set(slopes) == set(UNITS)
@@ -108,7 +108,7 @@ def test_slopes_leave_out_the_settling_and_say_nothing_of_too_short_a_time() -> 
 
 
 @pytest.mark.parametrize("options", [SoakOptions(), SoakOptions(settle_share=0.0), SoakOptions(sample_every_s=60.0)])
-def test_the_least_minutes_give_slopes_and_three_fewer_give_none(options: SoakOptions) -> None:
+def test_the_minimum_of_minutes_gives_slopes_and_less_none(options: SoakOptions) -> None:
     def looked_at(minutes: float) -> dict[str, Slope]:
         # The first look comes at once, the last before the end.
         times = np.arange(0.0, 60 * minutes, options.sample_every_s).tolist()
@@ -119,9 +119,7 @@ def test_the_least_minutes_give_slopes_and_three_fewer_give_none(options: SoakOp
     assert looked_at(least - 3) == {}
 
 
-def test_a_process_is_looked_at_with_its_files_sockets_and_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_is_read_with_its_files_sockets_and_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pages = [
         Series({"mapless_event_loop_lag_seconds_sum": s, "mapless_event_loop_lag_seconds_count": n})
         for s, n in ((1.0, 100.0), (1.5, 200.0))
@@ -150,7 +148,7 @@ def test_the_picture_is_an_svg_with_a_panel_for_each_figure() -> None:
 # What is called
 
 
-def test_calls_in_a_hurry_have_a_deadline_of_their_own_and_are_no_failures() -> None:
+def test_calls_with_a_short_deadline_may_fail() -> None:
     mix = Mix(cancelled_share=0.1, bad_share=0.1, hurried_share=0.3, hurry_s=0.4)
     plan = plan_calls(50.0, 20.0, 2, Requests((b"good",), (b"bad",)), mix, seed=0)
     hurried = [call for call in plan if call.kind is Kind.HURRIED]
