@@ -18,7 +18,7 @@ help:  ## List the targets
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check $(TORCH)
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[server,networks,otel,postgres,ray,view,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[server,tools,networks,otel,postgres,ray,view,dev]'
 	touch $@
 
 setup: $(VENV)/.installed  ## Create .venv with everything

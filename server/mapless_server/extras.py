@@ -1,10 +1,14 @@
-"""Which extra of mapless brings a Python package that is missing. Imports nothing."""
+"""Which extra of mapless brings a Python package that is missing. Imports no package."""
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 _EXTRA_OF = {
     "huggingface_hub": "networks",
+    "jinja2": "tools",
     "kornia": "networks",
+    "matplotlib": "tools",
     "opentelemetry": "otel",
     "PIL": "networks",
     "safetensors": "networks",
@@ -12,14 +16,19 @@ _EXTRA_OF = {
     "transformers": "superpoint",
     "viser": "view",
 }
-"""By the name under which a package is imported; what is not here, the server needs always."""
+"""By the name under which a package is imported; what is not here belongs to `server`."""
 
 
 def install_hint(error: ImportError) -> str:
-    """What is not there, or too old, and what to run, for the operator."""
+    """What is missing, or too old, and what to run, for the operator."""
     if not error.name:  # a shared library, say: no package of ours brings it
         return str(error)
     package = error.name.partition(".")[0]
     is_absent = isinstance(error, ModuleNotFoundError) and error.name == package
     what = f"the Python package {package} is not installed" if is_absent else str(error)
     return f"{what}: pip install 'mapless[{_EXTRA_OF.get(package, 'server')}]'"
+
+
+def missing_package(extra: str) -> str:
+    """The first package of an extra that is not installed; empty if all are. Imports none of them."""
+    return next((package for package, it in _EXTRA_OF.items() if it == extra and find_spec(package) is None), "")

@@ -6,7 +6,7 @@ from mapless_server.extras import install_hint
 
 
 def main() -> None:
-    """Run the command line; without what the server needs beyond the client, say how to get it."""
+    """Runs the command line; if a package is missing, says how to install it."""
     try:
         from mapless_tools.cli.app import app
 

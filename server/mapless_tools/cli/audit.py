@@ -8,10 +8,11 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mapless_server.serve.command import fail
 from mapless_tools.ingest.command import Address, Ca, Cert, ClientId, Key, Scene, Tls, TokenFile
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def audit_command(
                 examined.audits.append(found)
                 progress("audit", len(examined.audits), examined.total)
     except (ValueError, ConfigError) as error:
-        _fail(str(error), code=2)
+        fail(str(error), code=2)
     except (MaplessError, ServerFailed) as error:
         examined.stopped = str(error)
         print(f"mapless-server: {error}", file=sys.stderr)
@@ -213,8 +214,3 @@ def to_html(examined: Examined) -> str:
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
         f"<h1>{title}</h1><p>{escape(summary_of(examined))}</p><table><tr>{head}</tr>{''.join(rows)}</table></html>\n"
     )
-
-
-def _fail(message: str, code: int) -> NoReturn:
-    print(f"mapless-server: {message}", file=sys.stderr)
-    raise typer.Exit(code)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from mapless_server.serve.command import fail
 
 if TYPE_CHECKING:
     from mapless_server.store.database import Database
@@ -119,9 +121,9 @@ def _faults_said() -> Iterator[None]:
     try:
         yield
     except ConfigError as error:
-        _fail(str(error), code=2)
+        fail(str(error), code=2)
     except (StoreError, RequestError, ValueError) as error:
-        _fail(str(error), code=1)
+        fail(str(error), code=1)
 
 
 @contextmanager
@@ -152,8 +154,3 @@ def _report(found: Verification, verdict: str) -> None:
             print("the file itself is damaged: restore a backup, or export each scene and import it into a new store")
         raise typer.Exit(1)
     print(verdict)
-
-
-def _fail(message: str, code: int) -> NoReturn:
-    typer.echo(f"mapless-server: {message}", err=True)
-    raise typer.Exit(code)

