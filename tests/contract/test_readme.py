@@ -23,7 +23,7 @@ from mapless_server import errors
 from mapless_server.method.localize import Variant
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability.metrics import Metrics
-from mapless_server.scheduling.observer import Refusal
+from mapless_server.scheduling import Refusal
 from mapless_server.settings import Settings
 from mapless_tools.cli.app import app
 

@@ -30,10 +30,7 @@ from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.scenes.retrieval.narrowing import Narrowing, Sphere
-from mapless_server.scheduling.costs import Costs
-from mapless_server.scheduling.fair import Flow
-from mapless_server.scheduling.jobs import Job, Over
-from mapless_server.scheduling.observer import Ending
+from mapless_server.scheduling import Abandoned, CostModel, Ending, Flow, Job
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import NewReference, Store
 
@@ -353,7 +350,7 @@ class TestDescribingReferences:
         self, setting: Setting, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         seen: list[tuple[str, float]] = []
-        monkeypatch.setattr(Costs, "observe", lambda _, stage, __, seconds: seen.append((stage, seconds)))
+        monkeypatch.setattr(CostModel, "observe", lambda _, stage, __, seconds: seen.append((stage, seconds)))
         setting.replies["cheap"] = localized(SURE_INLIERS)
         add_undescribed(setting, 2)
         extract = setting.extractors["cheap"].extract
@@ -384,7 +381,7 @@ class TestDescribingReferences:
 
         monkeypatch.setattr(setting.extractors["cheap"], "extract", extract)
         (verdict,) = stages.prepare([job])
-        assert isinstance(verdict, Over)
+        assert isinstance(verdict, Abandoned)
         assert job.unusual_s >= self.STEP_S
 
 

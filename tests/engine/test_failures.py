@@ -9,8 +9,7 @@ import pytest
 
 from mapless_server import errors
 from mapless_server.engine.failures import failure_of
-from mapless_server.scheduling.jobs import Over
-from mapless_server.scheduling.work_queue import Failure
+from mapless_server.scheduling import Abandoned, Failure
 
 LOST = [
     "CUDA error: an illegal memory access was encountered\nCUDA kernel errors might be asynchronously reported",
@@ -42,25 +41,25 @@ def caught(raises: Callable[[], object]) -> BaseException:
 
 @pytest.mark.parametrize("message", LOST)
 def test_a_poisoned_context_is_the_end_of_the_device(message: str) -> None:
-    assert failure_of(RuntimeError(message)) is Failure.OF_DEVICE
+    assert failure_of(RuntimeError(message)) is Failure.DEVICE_LOST
 
 
 @pytest.mark.parametrize("message", FULL)
 def test_a_full_device_is_not(message: str) -> None:
     """The same words, "CUDA error", and after it everything works again."""
-    assert failure_of(RuntimeError(message)) is Failure.OF_MEMORY
+    assert failure_of(RuntimeError(message)) is Failure.OUT_OF_MEMORY
 
 
 @pytest.mark.parametrize("message", HARMLESS)
 def test_a_fault_in_our_own_arithmetic_is_of_the_item(message: str) -> None:
-    assert failure_of(RuntimeError(message)) is Failure.OF_ITEM
+    assert failure_of(RuntimeError(message)) is Failure.JOB_FAILED
 
 
 @pytest.mark.parametrize("message", [*LOST, *FULL])
 def test_the_text_alone_does_nothing_in_another_exception_type(message: str) -> None:
     """A caller may send a scene of that name."""
-    assert failure_of(ValueError(message)) is Failure.OF_ITEM
-    assert failure_of(errors.InvalidArgument(message)) is Failure.OF_REQUEST
+    assert failure_of(ValueError(message)) is Failure.JOB_FAILED
+    assert failure_of(errors.InvalidArgument(message)) is Failure.BAD_INPUT
 
 
 @pytest.mark.parametrize(
@@ -69,19 +68,20 @@ def test_the_text_alone_does_nothing_in_another_exception_type(message: str) -> 
 def test_only_what_the_caller_can_mend_is_of_the_request(kind: type[errors.RequestError]) -> None:
     """Stored bytes that are damaged, or a scene that is being emptied, are told to the caller, who has done nothing."""
     of_server = kind.__name__ in ("RequestError", "Overloaded", "DeadlineExceeded", "Unavailable", "DataLoss")
-    assert failure_of(kind("text")) is (Failure.OF_ITEM if of_server else Failure.OF_REQUEST)
+    assert failure_of(kind("text")) is (Failure.JOB_FAILED if of_server else Failure.BAD_INPUT)
 
 
 def test_memory_of_the_host() -> None:
-    assert failure_of(MemoryError()) is Failure.OF_MEMORY
-    assert failure_of(caught(lambda: np.zeros(2**56, np.uint8))) is Failure.OF_MEMORY  # a kind of its own
+    assert failure_of(MemoryError()) is Failure.OUT_OF_MEMORY
+    assert failure_of(caught(lambda: np.zeros(2**56, np.uint8))) is Failure.OUT_OF_MEMORY  # a kind of its own
 
 
 @pytest.mark.parametrize(
-    "error", [Over(), ValueError("x"), KeyError("x"), ArithmeticError("NaN"), OSError(28, "no space"), StopIteration()]
+    "error",
+    [Abandoned(), ValueError("x"), KeyError("x"), ArithmeticError("NaN"), OSError(28, "no space"), StopIteration()],
 )
 def test_everything_else_is_of_the_item(error: Exception) -> None:
-    assert failure_of(error) is Failure.OF_ITEM
+    assert failure_of(error) is Failure.JOB_FAILED
 
 
 def test_an_earlier_handled_failure_does_not_affect_this_one() -> None:
@@ -91,7 +91,7 @@ def test_an_earlier_handled_failure_does_not_affect_this_one() -> None:
         except RuntimeError as lost:
             raise errors.InvalidArgument("another matter") from lost
 
-    assert failure_of(caught(handle)) is Failure.OF_REQUEST
+    assert failure_of(caught(handle)) is Failure.BAD_INPUT
 
 
 class TestTorch:
@@ -99,22 +99,22 @@ class TestTorch:
 
     def test_out_of_memory(self) -> None:
         torch = pytest.importorskip("torch", reason="the networks' extra is not installed")
-        assert failure_of(torch.OutOfMemoryError("CUDA out of memory. Tried to allocate")) is Failure.OF_MEMORY
-        assert failure_of(torch.cuda.OutOfMemoryError("whatever it says")) is Failure.OF_MEMORY
+        assert failure_of(torch.OutOfMemoryError("CUDA out of memory. Tried to allocate")) is Failure.OUT_OF_MEMORY
+        assert failure_of(torch.cuda.OutOfMemoryError("whatever it says")) is Failure.OUT_OF_MEMORY
 
     def test_an_accelerator_error(self) -> None:
         torch = pytest.importorskip("torch", reason="the networks' extra is not installed")
         if not hasattr(torch, "AcceleratorError"):
             pytest.skip("torch is too old")
-        assert failure_of(torch.AcceleratorError(LOST[0])) is Failure.OF_DEVICE
-        assert failure_of(torch.AcceleratorError("a text of a later version")) is Failure.OF_DEVICE
-        assert failure_of(torch.AcceleratorError("CUDA error: out of memory")) is Failure.OF_MEMORY
+        assert failure_of(torch.AcceleratorError(LOST[0])) is Failure.DEVICE_LOST
+        assert failure_of(torch.AcceleratorError("a text of a later version")) is Failure.DEVICE_LOST
+        assert failure_of(torch.AcceleratorError("CUDA error: out of memory")) is Failure.OUT_OF_MEMORY
 
     def test_shapes_that_do_not_fit(self) -> None:
         torch = pytest.importorskip("torch", reason="the networks' extra is not installed")
-        assert failure_of(caught(lambda: torch.ones(2, 3) @ torch.ones(2, 3))) is Failure.OF_ITEM
+        assert failure_of(caught(lambda: torch.ones(2, 3) @ torch.ones(2, 3))) is Failure.JOB_FAILED
 
     def test_memory_of_the_host(self) -> None:
         """Torch says it with a RuntimeError of its own words."""
         torch = pytest.importorskip("torch", reason="the networks' extra is not installed")
-        assert failure_of(caught(lambda: torch.empty(2**60))) is Failure.OF_MEMORY
+        assert failure_of(caught(lambda: torch.empty(2**60))) is Failure.OUT_OF_MEMORY

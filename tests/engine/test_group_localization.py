@@ -23,12 +23,17 @@ from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError
 from mapless_server.method.localize import LocalizeOptions
 from mapless_server.rpc.call import Call
 from mapless_server.scenes.retrieval.narrowing import Narrowing
-from mapless_server.scheduling.admission import ScheduleOptions
-from mapless_server.scheduling.fair import Flow
-from mapless_server.scheduling.items import Items, work_off
-from mapless_server.scheduling.jobs import Stage, Step, Visit
-from mapless_server.scheduling.observer import Observer
-from mapless_server.scheduling.work_queue import Lane, WorkQueue, WorkQueueOptions
+from mapless_server.scheduling import (
+    Flow,
+    ItemList,
+    Observer,
+    Stage,
+    StageRecord,
+    Step,
+    WorkQueue,
+    WorkQueueOptions,
+    compute_items,
+)
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.services.groups import _localize_each
 
@@ -45,25 +50,25 @@ class Toy(Engine):
     def __init__(self, seconds: float = 0.002, max_queued_s: float = 2.0) -> None:
         self.options = EngineOptions(workers=2, max_batch=1)
         self.seconds, self.fails_at, self._numbers = seconds, -1, itertools.count(1)
-        schedule = ScheduleOptions(max_queued_s=max_queued_s, max_bytes=MAX_BYTES)
-        stages = {Stage(PREPARE, "host"): work_off, Stage(JOIN, "host"): work_off}
-        self.queue = WorkQueue(stages, [Lane("host", 2)], WorkQueueOptions(schedule), Observer())
+        options = WorkQueueOptions(max_queued_s=max_queued_s, max_bytes=MAX_BYTES)
+        stages = {Stage(PREPARE, "host"): compute_items, Stage(JOIN, "host"): compute_items}
+        self.queue = WorkQueue(stages, {"host": 2}, options, Observer())
 
     async def localize(
         self,
         query: Query,
         caller: Caller,
         source: object = None,
-        visits: list[Visit] | None = None,
+        visits: list[StageRecord] | None = None,
         tell_coarse: object = None,
-    ) -> tuple[Result, Sequence[Visit]]:
+    ) -> tuple[Result, Sequence[StageRecord]]:
         def compute(_: None, check: object) -> None:
             number = next(self._numbers)
             time.sleep(self.seconds)
             if number == self.fails_at:
                 raise RuntimeError("planted")
 
-        step = Step(PREPARE, "p", "p", Items([None], compute))
+        step = Step(PREPARE, "p", "p", ItemList([None], compute))
         size_bytes = 0 if query.is_part else len(query.photo.image)
         try:
             await self.queue.submit(caller.flow, step, caller.deadline_s, size_bytes, visits)
@@ -214,7 +219,7 @@ def test_the_stages_of_a_group_that_fails_are_told_too() -> None:
     engine.fails_at = 3
 
     async def work() -> None:
-        visits: list[list[Visit]] = [[] for _ in range(4)]
+        visits: list[list[StageRecord]] = [[] for _ in range(4)]
         with pytest.raises(RuntimeError, match="planted"):
             await localize_each(engine, [PART] * 4, caller("rig"), "images", visits)
         seen = [len(it) for it in visits]

@@ -53,11 +53,7 @@ from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.runner import NetworkRunner
 from mapless_server.networks.weights import CheckpointError, WeightsMissing
-from mapless_server.scheduling.admission import ScheduleOptions
-from mapless_server.scheduling.fair import Flow
-from mapless_server.scheduling.jobs import Done, Job, Stage, Step, Verdict
-from mapless_server.scheduling.observer import Observer
-from mapless_server.scheduling.work_queue import Lane, WorkQueue, WorkQueueOptions
+from mapless_server.scheduling import Done, Flow, Job, Observer, Stage, StageResult, Step, WorkQueue, WorkQueueOptions
 
 OPTIONS = NetworkOptions(grids=GRIDS)
 UNCACHED = NetworkOptions(grids=GRIDS, cache=TokenCacheOptions(0, 0))
@@ -341,7 +337,7 @@ def test_the_queue_splits_it_counts_it_and_keeps_to_what_fits() -> None:
     runner = GreyRunner(most_scenes=2)
     backend, observer, gate = grey_backend(runner), CountingObserver(), threading.Event()
 
-    def compute(jobs: Sequence[Job]) -> list[Verdict]:
+    def compute(jobs: Sequence[Job]) -> list[StageResult]:
         if jobs[0].step.bucket == "plug":
             assert gate.wait(20)
             return [Done(None)]
@@ -349,9 +345,9 @@ def test_the_queue_splits_it_counts_it_and_keeps_to_what_fits() -> None:
         return [it if isinstance(it, Exception) else Done(it) for it in made]
 
     async def test() -> None:
-        options = WorkQueueOptions(ScheduleOptions(max_queued_s=1e6))
+        options = WorkQueueOptions(max_queued_s=1e6)
         stages = {Stage("coarse", "toy-device", max_batch=4): compute}
-        queue = WorkQueue(stages, [Lane("toy-device", 1)], options, observer, failure_of)
+        queue = WorkQueue(stages, {"toy-device": 1}, options, observer, failure_of)
 
         def submit(bucket: str, payload: Request | None = None) -> asyncio.Task[Any]:
             step = Step("coarse", "toy", bucket, payload)

@@ -25,7 +25,7 @@ from mapless_server.observability.event_loop import LoopObserver, watch_event_lo
 from mapless_server.observability.exporter import MAX_CONNECTIONS, MetricsServer
 from mapless_server.observability.metrics import LOCALIZED, STAGES, Metrics
 from mapless_server.rpc.guard import CallObserver
-from mapless_server.scheduling.observer import Ending, Observer, Refusal
+from mapless_server.scheduling import Ending, Observer, Refusal
 
 LOCALIZE = "/mapless.v1.LocalizationService/Localize"
 

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapless_server.scheduling.fair import FairQueue, Flow
+from mapless_server.scheduling import Flow
+from mapless_server.scheduling.fair_queue import FairQueue
 
 QUANTUM_S = 1.0
 COSTS = st.floats(0.01, 3.0)

@@ -14,24 +14,40 @@ import weakref
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapless_server.scheduling.admission import ScheduleOptions
-from mapless_server.scheduling.fair import Flow
-from mapless_server.scheduling.jobs import Done, Expired, Fallback, Job, Next, Over, Refused, Stage, Step, Verdict
-from mapless_server.scheduling.observer import Ending, Observer, Refusal
-from mapless_server.scheduling.work_queue import Compute, Failure, Fatal, Lane, WorkQueue, WorkQueueOptions
+from mapless_server.scheduling import (
+    Abandoned,
+    Done,
+    Ending,
+    Expired,
+    Failure,
+    Fallback,
+    Fatal,
+    Flow,
+    Job,
+    Next,
+    Observer,
+    Refusal,
+    Refused,
+    Stage,
+    StageResult,
+    Step,
+    WorkQueue,
+    WorkQueueOptions,
+)
+from mapless_server.scheduling.work_queue import ComputeBatch
 
-ROOMY = ScheduleOptions(max_queued_s=1e6)
+ROOMY = WorkQueueOptions(max_queued_s=1e6, heartbeat_s=0.05)
 LIMIT_S = 20.0
 FAR_S = 600.0
 MAX_BATCH = 8
-LANES = [Lane("toy-host", 2), Lane("toy-device", 1)]
+LANES = {"toy-host": 2, "toy-device": 1}
 
 
 class Guilty(Exception):
@@ -44,8 +60,8 @@ class Lost(Exception):
 
 def failure_of(error: Exception) -> Failure:
     if isinstance(error, Lost):
-        return Failure.OF_DEVICE
-    return Failure.OF_MEMORY if isinstance(error, MemoryError) else Failure.OF_ITEM
+        return Failure.DEVICE_LOST
+    return Failure.OUT_OF_MEMORY if isinstance(error, MemoryError) else Failure.JOB_FAILED
 
 
 class Account(Observer):
@@ -95,9 +111,9 @@ class Shop:
         fatals: told to the owner.
     """
 
-    compute: Compute = lambda jobs: [Done(job.step.payload) for job in jobs]
+    compute: ComputeBatch = lambda jobs: [Done(job.step.payload) for job in jobs]
     observer: Observer = field(default_factory=Account)
-    options: WorkQueueOptions = field(default_factory=lambda: WorkQueueOptions(ROOMY, heartbeat_s=0.05))
+    options: WorkQueueOptions = ROOMY
     gate: threading.Event = field(default_factory=threading.Event)
     plugged: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
     seen: list[list[Any]] = field(default_factory=list)
@@ -126,7 +142,7 @@ class Shop:
             assert not [it.name for it in threading.enumerate() if it.name.startswith("toy-")]
             assert queue.job_count == 0
 
-    def _serve(self, jobs: Sequence[Job]) -> Sequence[Verdict]:
+    def _serve(self, jobs: Sequence[Job]) -> Sequence[StageResult]:
         payloads = [job.step.payload for job in jobs]
         if payloads == ["plug"]:
             self.plugged.release()
@@ -199,7 +215,7 @@ class TestResults:
     def test_a_job_goes_through_its_stages_and_its_visits_tell_when(self) -> None:
         marks: dict[str, tuple[float, float]] = {}
 
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             stage = jobs[0].step.stage
             start_s = time.monotonic()
             time.sleep(0.01)
@@ -234,7 +250,7 @@ class TestResults:
         """One piece of news, work for two."""
         both = threading.Barrier(2, timeout=LIMIT_S)
 
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             if jobs[0].step.stage == "then":
                 time.sleep(0.05)  # until both have heard that there is nothing to do
                 return [Next(Step("first", "toy", "b", job.step.payload)) for job in jobs]
@@ -269,7 +285,7 @@ class TestResults:
     def test_nor_where_only_what_follows_costs_anything(self) -> None:
         """A turn is measured by all that it brings about, not by its first stage alone."""
 
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             if jobs[0].step.stage == "first":
                 return [Next(Step("then", "toy", "b", job.step.payload)) for job in jobs]
             time.sleep(0.1)
@@ -297,7 +313,7 @@ class TestFailure:
     @settings(max_examples=25, deadline=None)
     @given(st.lists(st.booleans(), min_size=1, max_size=3 * MAX_BATCH))
     def test_the_guilty_jobs_of_a_batch_fail_alone(self, guilty: list[bool]) -> None:
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             for job in jobs:
                 if guilty[job.step.payload]:
                     raise Guilty(job.step.payload)
@@ -318,7 +334,7 @@ class TestFailure:
         run(test())
 
     def test_a_job_given_an_exception_fails_alone_and_once(self) -> None:
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             return [Guilty() if job.step.payload == 1 else Done(job.step.payload) for job in jobs]
 
         async def test() -> None:
@@ -336,7 +352,7 @@ class TestFailure:
     def test_any_exception_is_the_jobs_alone(self, error: Exception) -> None:
         """Some of them mean something to futures and coroutines."""
 
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             if jobs[0].step.payload == "bad":
                 raise error
             return [Done("good")]
@@ -353,7 +369,7 @@ class TestFailure:
 
     @pytest.mark.parametrize("surplus", [-1, 1])
     def test_a_stage_with_the_wrong_number_of_results_fails_all(self, surplus: int) -> None:
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             if "right" in [job.step.payload for job in jobs]:
                 return [Done("right")]
             return [Done("of whom?")] * (len(jobs) + surplus)
@@ -365,14 +381,14 @@ class TestFailure:
                 shop.gate.set()
                 for outcome in await outcomes(calls):
                     assert isinstance(outcome, RuntimeError)
-                    assert "verdicts" in str(outcome)
+                    assert "results" in str(outcome)
                 assert await submit(queue, "right") == "right"
 
         run(test())
 
     @pytest.mark.parametrize("fits", [1, 2, 3, 5])
     def test_out_of_memory_halves_the_batch_for_good(self, fits: int) -> None:
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             if len(jobs) > fits and jobs[0].step.bucket == "large":
                 raise MemoryError
             return [Done(job.step.payload) for job in jobs]
@@ -400,7 +416,7 @@ class TestFailure:
         """An exception that is still handled holds the frames that it came through, and the tensors in them."""
         held: list[weakref.ref[Any]] = []
 
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             assert not any(it() for it in held)
             tensor = {len(jobs)} - {1}
             if tensor:
@@ -422,7 +438,7 @@ class TestFailure:
         """Though a later half of the same batch would have allowed more."""
         tried: list[int] = []
 
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             tried.append(len(jobs))
             if len(jobs) > (1 if 0 in [job.step.payload for job in jobs] else 2):
                 raise MemoryError
@@ -444,7 +460,7 @@ class TestFailure:
         run(test())
 
     def test_one_job_that_is_too_large_alone_is_told_so(self) -> None:
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             raise MemoryError
 
         async def test() -> None:
@@ -474,7 +490,7 @@ class TestEndOfAll:
 
     @pytest.mark.parametrize("way", ["raised", "returned"])
     def test_a_lost_device_ends_the_queue(self, way: str, caplog: pytest.LogCaptureFixture) -> None:
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             if "lost" not in [job.step.payload for job in jobs]:
                 return [Done("garbage") for _ in jobs]
             if way == "raised":
@@ -505,7 +521,7 @@ class TestEndOfAll:
     def test_two_threads_that_lose_it_at_once_are_one_end(self) -> None:
         both = threading.Barrier(2, timeout=LIMIT_S)
 
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             both.wait()
             raise Lost
 
@@ -544,7 +560,7 @@ class TestEndOfAll:
 
     @pytest.mark.parametrize("error", [SystemExit(3), KeyboardInterrupt()])
     def test_a_stage_that_wants_to_end_the_program_ends_the_queue(self, error: BaseException) -> None:
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             raise error
 
         async def test() -> None:
@@ -556,7 +572,7 @@ class TestEndOfAll:
 
     def test_a_stage_that_hangs_ends_the_queue(self) -> None:
         async def test() -> None:
-            shop = Shop(options=WorkQueueOptions(ROOMY, stall_limit_s=0.2, heartbeat_s=0.05))
+            shop = Shop(options=replace(ROOMY, stall_limit_s=0.2))
             async with shop.open() as queue:
                 plugs = await shop.plug(queue)
                 await self._ends(shop, queue, [*plugs, submit(queue, "waits")])
@@ -567,9 +583,9 @@ class TestEndOfAll:
 
     def test_a_long_stage_that_checks_between_steps_does_not_hang(self) -> None:
         steps_s, limit_s = 2.0, 1.0
-        shop = Shop(options=WorkQueueOptions(ROOMY, stall_limit_s=limit_s, heartbeat_s=0.05))
+        shop = Shop(options=replace(ROOMY, stall_limit_s=limit_s))
 
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             until_s = time.monotonic() + (steps_s if jobs[0].step.payload == "long" else 0.1)
             while time.monotonic() < until_s:
                 jobs[-1].check()
@@ -663,7 +679,7 @@ class TestCallersWhoLeave:
         """The caller is told at once; the thread is not interrupted, but it asks."""
         began, asks, noticed = threading.Event(), threading.Event(), threading.Event()
 
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             if jobs[0].step.payload == "next":
                 return [Done("next")]
             jobs[0].check()
@@ -671,7 +687,7 @@ class TestCallersWhoLeave:
             assert asks.wait(LIMIT_S)
             try:
                 jobs[0].check()
-            except Over:
+            except Abandoned:
                 noticed.set()
                 raise
             return [Done("nobody reads this")]
@@ -711,7 +727,7 @@ class TestCallersWhoLeave:
     def test_what_is_at_hand_is_given_when_time_runs_out(self) -> None:
         shop = Shop()
 
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
             if jobs[0].step.stage == "then":
                 return [Done("quick")]
             fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), time.monotonic() + 0.4)
@@ -733,8 +749,8 @@ class TestCallersWhoLeave:
         """Callers come, leave at any moment, run out of time, fail and go through one stage or two."""
         fates = random.Random(seed)
 
-        def compute(jobs: Sequence[Job]) -> list[Verdict]:
-            verdicts: list[Verdict] = []
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+            verdicts: list[StageResult] = []
             for job in jobs:
                 if job.step.payload % 7 == 0:
                     raise Guilty

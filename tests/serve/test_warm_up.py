@@ -44,7 +44,7 @@ from mapless_server.method.localize import Answer, Localization, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.observability.metrics import Metrics
-from mapless_server.scheduling.costs import Costs
+from mapless_server.scheduling import CostModel
 from mapless_server.security.rate import RateLimiter
 from mapless_server.serve.assembly import MakeEngine, StartupError, engine_options, make_tiers
 from mapless_server.serve.warm_up import ROUNDS, warm_up
@@ -119,13 +119,13 @@ def engine_of(localize: Callable[..., Answer], begin: Callable[[], object] = lam
 def test_the_queue_expects_the_duration_of_the_last_round(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Kernels are compiled and pages are read in the first."""
     seen: list[tuple[str, str, float]] = []
-    observe = Costs.observe
+    observe = CostModel.observe
 
-    def watched(costs: Costs, stage: str, kind: str, seconds: float) -> None:
+    def watched(costs: CostModel, stage: str, kind: str, seconds: float) -> None:
         seen.append((stage, kind, seconds))
         observe(costs, stage, kind, seconds)
 
-    monkeypatch.setattr(Costs, "observe", watched)
+    monkeypatch.setattr(CostModel, "observe", watched)
 
     def localize(*_: Any) -> Answer:
         time.sleep(0.0 if any(stage == "refine" for stage, _, _ in seen) else 0.3)
@@ -141,7 +141,7 @@ def test_the_queue_expects_the_duration_of_the_last_round(tmp_path: Path, monkey
                 await engine.close()
             assert [stage for stage, _, _ in seen] == ["prepare", "coarse", "refine"] * ROUNDS
             for stage, kind, seconds in seen[-3:]:
-                assert engine.queue._schedule.costs.predict(stage, kind) == pytest.approx(seconds)
+                assert engine.queue._scheduler.costs.predict(stage, kind) == pytest.approx(seconds)
 
     asyncio.run(test())
 

@@ -42,7 +42,7 @@ from mapless_server.method.localize import Answer, Localization, Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.observability.metrics import Metrics
-from mapless_server.scheduling.jobs import Over
+from mapless_server.scheduling import Abandoned
 from mapless_server.security.rate import RateLimiter
 from mapless_server.security.tokens import create_token
 from mapless_server.serve.assembly import engine_options, make_engine
@@ -94,7 +94,7 @@ class Staged:
         try:
             while not self.gate.wait(0.005):
                 asked[-1]()
-        except Over:
+        except Abandoned:
             self.given_up.release()
             raise
         self._stand_in.trust = self.trust

@@ -21,11 +21,23 @@ from mapless_server.scenes.retrieval.chosen import Choice
 from mapless_server.scenes.retrieval.descriptor import GlobalDescriptor
 from mapless_server.scenes.retrieval.narrowing import Narrowing
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
-from mapless_server.scheduling.items import Compute, Item, Items, Outcome, work_off
-from mapless_server.scheduling.jobs import Expired, Refused, Stage, Step, Visit
-from mapless_server.scheduling.observer import Observer, Refusal
-from mapless_server.scheduling.schedule import Quota
-from mapless_server.scheduling.work_queue import Failure, Fatal, Lane, WorkQueue, WorkQueueOptions
+from mapless_server.scheduling import (
+    ComputeItem,
+    Expired,
+    Failure,
+    Fatal,
+    ItemList,
+    Observer,
+    Quota,
+    Refusal,
+    Refused,
+    Stage,
+    StageRecord,
+    Step,
+    WorkQueue,
+    WorkQueueOptions,
+    compute_items,
+)
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import Store
 
@@ -37,7 +49,9 @@ from .stages import COARSE, PREPARE, REFINE, Method, QueryStages, ReferenceSourc
 from .tiers import EscalationOptions, Tier
 from .views import QueryViews
 
+ItemT = TypeVar("ItemT")
 Joined = TypeVar("Joined")
+ResultT = TypeVar("ResultT")
 
 HOST, DEVICE = "host", "device"
 """The lanes: threads for what the CPU does, and the one that has a network's device."""
@@ -127,12 +141,12 @@ class Engine:
         coarse = Stage(COARSE, HOST, REFINE) if on_cpu else Stage(COARSE, DEVICE, REFINE, options.max_batch)
         self.queue = WorkQueue(
             {
-                **{Stage(name, HOST): work_off for name in (DESCRIBE, RETRIEVE, AUDIT, COVERAGE, JOIN)},
+                **{Stage(name, HOST): compute_items for name in (DESCRIBE, RETRIEVE, AUDIT, COVERAGE, JOIN)},
                 Stage(PREPARE, HOST, COARSE): self._stages.prepare,
                 coarse: self._stages.coarse,
                 Stage(REFINE, HOST): self._stages.refine,
             },
-            [Lane(HOST, options.workers), *([] if on_cpu else [Lane(DEVICE, 1)])],
+            {HOST: options.workers} if on_cpu else {HOST: options.workers, DEVICE: 1},
             options.queue,
             observer or Observer(),
             failure_of,
@@ -144,9 +158,9 @@ class Engine:
         query: Query,
         caller: Caller,
         source: ReferenceSource | None = None,
-        visits: list[Visit] | None = None,
+        visits: list[StageRecord] | None = None,
         tell_coarse: Callable[[Result], None] | None = None,
-    ) -> tuple[Result, Sequence[Visit]]:
+    ) -> tuple[Result, Sequence[StageRecord]]:
         """Localizes a photograph.
 
         Args:
@@ -262,15 +276,15 @@ class Engine:
     async def _each(
         self,
         stage: str,
-        items: Sequence[Item],
-        compute: Compute[Item, Outcome],
+        items: Sequence[ItemT],
+        compute: ComputeItem[ItemT, ResultT],
         caller: Caller,
         size_bytes: int,
         jobs: int | None = None,
         continues: bool = False,
-    ) -> list[Outcome]:
+    ) -> list[ResultT]:
         """Computes items by several jobs, or else as many as there are threads; others have their turn in between."""
-        work = Items(items, compute)
+        work = ItemList(items, compute)
         jobs = min(jobs or self.options.workers, len(items))
         step = Step(stage, stage, stage, work)
         submissions = [
@@ -351,7 +365,7 @@ def _as_request_errors() -> Iterator[None]:
             "the server has failed and is about to end", reason="SERVER_FAILED", retry_after_s=1.0
         ) from fatal
     except Exception as error:
-        if failure_of(error) is Failure.OF_MEMORY:
+        if failure_of(error) is Failure.OUT_OF_MEMORY:
             message = "there is too little memory for this call"
             raise Unavailable(message, reason="OUT_OF_MEMORY", retry_after_s=1.0) from error
         raise

@@ -12,7 +12,7 @@ from mapless_server.errors import (
     PermissionDenied,
     Unauthenticated,
 )
-from mapless_server.scheduling.work_queue import Failure
+from mapless_server.scheduling import Failure
 
 _CALLERS = (InvalidArgument, Unauthenticated, PermissionDenied, NotFound, AlreadyExists, FailedPrecondition)
 """What the caller has to mend. The other errors of requests are told to callers, too, but are the server's."""
@@ -26,14 +26,14 @@ _FULL = re.compile(r"CUDA out of memory|_STATUS_ALLOC_FAILED|CUDA error: out of 
 def failure_of(error: BaseException) -> Failure:
     """Whose fault it is, and what is left."""
     if isinstance(error, _CALLERS):
-        return Failure.OF_REQUEST
+        return Failure.BAD_INPUT
     names = {kind.__name__ for kind in type(error).__mro__}
     if "OutOfMemoryError" in names or isinstance(error, MemoryError):
-        return Failure.OF_MEMORY
+        return Failure.OUT_OF_MEMORY
     if isinstance(error, RuntimeError):
         message = str(error)
         if _FULL.search(message):
-            return Failure.OF_MEMORY
+            return Failure.OUT_OF_MEMORY
         if "AcceleratorError" in names or _LOST.search(message):
-            return Failure.OF_DEVICE
-    return Failure.OF_ITEM
+            return Failure.DEVICE_LOST
+    return Failure.JOB_FAILED

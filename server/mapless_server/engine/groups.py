@@ -18,7 +18,7 @@ from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOpti
 from mapless_server.method.groups.sightings import GroupImage
 from mapless_server.method.localize import LocalizeOptions
 from mapless_server.method.rejection import Rejection
-from mapless_server.scheduling.jobs import Visit
+from mapless_server.scheduling import StageRecord
 
 from .engine import Engine
 from .query import Caller, Query, Result
@@ -41,7 +41,7 @@ class GroupResult:
     """
 
     results: tuple[Result, ...]
-    visits: tuple[tuple[Visit, ...], ...]
+    visits: tuple[tuple[StageRecord, ...], ...]
     seconds: tuple[float, ...]
 
     def images(self) -> list[GroupImage]:
@@ -94,7 +94,7 @@ async def localize_each(
     queries: Sequence[Query],
     caller: Caller,
     list_name: str,
-    visits: Sequence[list[Visit]] | None = None,
+    visits: Sequence[list[StageRecord]] | None = None,
 ) -> GroupResult:
     """Localizes photographs, as many at a time as the engine computes.
 
@@ -130,7 +130,7 @@ class _Group:
     queries: Sequence[Query]
     caller: Caller
     list_name: str
-    visits: Sequence[list[Visit]]
+    visits: Sequence[list[StageRecord]]
     done: dict[int, tuple[Result, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -175,7 +175,7 @@ class _Group:
         return GroupResult(results, tuple(map(tuple, self.visits)), seconds)
 
 
-def queued_s(visits: Sequence[Visit]) -> float:
+def queued_s(visits: Sequence[StageRecord]) -> float:
     """How long a photograph waited before anything was computed for it."""
     return visits[0].start_s - visits[0].queued_s if visits else 0.0
 

@@ -8,7 +8,7 @@ from mapless.geometry import Camera
 from mapless_server.method.localize import LocalizeOptions
 from mapless_server.method.priors.known import NO_PRIORS, Priors
 from mapless_server.scenes.retrieval.narrowing import Narrowing
-from mapless_server.scheduling.fair import Flow
+from mapless_server.scheduling import Flow
 from mapless_server.security.tenancy import SceneKey
 
 from .tiers import Attempt

@@ -29,9 +29,7 @@ from mapless_server.scenes.library import Loaded, NotDescribedYet, load_usable
 from mapless_server.scenes.retrieval.chosen import Choice
 from mapless_server.scenes.retrieval.narrowing import Narrowing
 from mapless_server.scenes.retrieval.ranking import RankOptions
-from mapless_server.scheduling.jobs import Done, Fallback, Job, Next, Over, Step, Verdict
-from mapless_server.scheduling.observer import Ending
-from mapless_server.scheduling.work_queue import Failure
+from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Job, Next, StageResult, Step
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import SceneAttributes
 
@@ -204,26 +202,26 @@ class QueryStages:
         """What a query needs first in its tier."""
         return Step(PREPARE, work.kind, work.kind, work)
 
-    def prepare(self, jobs: Sequence[Job]) -> list[Verdict]:
+    def prepare(self, jobs: Sequence[Job]) -> list[StageResult]:
         """References, features and correspondences."""
         return [self._verdict(job.step.payload, self._prepare, job.step.payload, job) for job in jobs]
 
-    def coarse(self, jobs: Sequence[Job]) -> list[Verdict]:
+    def coarse(self, jobs: Sequence[Job]) -> list[StageResult]:
         """The reconstruction and its metric scale, of many queries in one go."""
         batch: list[Underway[Prepared]] = [job.step.payload for job in jobs]
         parts = self._method.reconstruct([it.part for it in batch], [job.check for job in jobs])
         return [self._verdict(it.work, self._after_coarse, it, part) for it, part in zip(batch, parts, strict=True)]
 
-    def refine(self, jobs: Sequence[Job]) -> list[Verdict]:
+    def refine(self, jobs: Sequence[Job]) -> list[StageResult]:
         """Structure, matches, pose."""
         return [self._verdict(job.step.payload.work, self._refine, job.step.payload, job) for job in jobs]
 
-    def _verdict(self, work: Work, compute: Callable[..., Verdict], *arguments: Any) -> Verdict:
+    def _verdict(self, work: Work, compute: Callable[..., StageResult], *arguments: Any) -> StageResult:
         """What is computed, or what its failure means for a query that may have an answer already."""
         try:
             return compute(*arguments)
         except Exception as error:
-            if isinstance(error, Over) or failure_of(error) is Failure.OF_DEVICE:
+            if isinstance(error, Abandoned) or failure_of(error) is Failure.DEVICE_LOST:
                 return error
             # One that was deleted since it was listed was not the caller's choice: the next list is without it.
             is_outdated = isinstance(error, NotFound) and error.field != "scene" and not work.query.reference_ids
@@ -237,7 +235,7 @@ class QueryStages:
                 log.warning("%s failed; the first answer is given", name, exc_info=error)
             return self._unfinished(work)
 
-    def _prepare(self, work: Work, job: Job) -> Verdict:
+    def _prepare(self, work: Work, job: Job) -> StageResult:
         tier = self._tiers[work.tier]
         turn = Turn(job.check)
         try:
@@ -308,7 +306,7 @@ class QueryStages:
         waits = work.best is None
         return work.source.load(work.query.scene_key, reference_ids, tier.extractor, turn, waits=waits)
 
-    def _after_coarse(self, underway: Underway[Prepared], part: Coarse | Answer | Exception) -> Verdict:
+    def _after_coarse(self, underway: Underway[Prepared], part: Coarse | Answer | Exception) -> StageResult:
         if isinstance(part, Exception):
             raise part
         work, found = underway.work, underway.found
@@ -334,14 +332,14 @@ class QueryStages:
             return None
         return self._result(work, self._attempt(work, found, coarse), found, coarse)
 
-    def _refine(self, underway: Underway[Coarse], job: Job) -> Verdict:
+    def _refine(self, underway: Underway[Coarse], job: Job) -> StageResult:
         answer = self._method.refine(underway.part, job.check)
         if underway.work.query.is_part and answer.support is None:
             support = self._method.tracked_support(underway.part.prepared, job.check)
             answer = replace(answer, support=support)
         return self._conclude(underway.work, underway.found, answer)
 
-    def _conclude(self, work: Work, found: Found, answer: Answer) -> Verdict:
+    def _conclude(self, work: Work, found: Found, answer: Answer) -> StageResult:
         """A tier has its answer: the better one is given, or tried to be bettered once more."""
         attempt = self._attempt(work, found, answer)
         best = attempt if work.best is None else better_of(work.best, attempt, self._escalation)

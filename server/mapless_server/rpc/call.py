@@ -13,7 +13,7 @@ from urllib.parse import unquote
 from mapless_server.engine.query import Caller
 from mapless_server.observability.tracing import Metadata
 from mapless_server.observability.trail import Trail
-from mapless_server.scheduling.fair import Flow
+from mapless_server.scheduling import Flow
 from mapless_server.security.principal import Principal
 
 from .receiving import Context

@@ -1,1 +1,69 @@
-"""The worker queue: who computes what when. It knows nothing of photographs, grpc or metrics."""
+"""The work queue: which job is computed when, and by which thread. Imports the standard library only.
+
+In the order in which a job meets them:
+
+job         A call's work (`jobs`). It goes through stages, such as "prepare", "coarse" and "refine"; its current `Step`
+            names the stage and carries the input. What a stage returns (`StageResult`) ends the job or gives the next
+            step.
+admission   A job is admitted if its predicted computing time and its memory fit within the bounds and it can end before
+            its deadline (`admission`); otherwise it is refused at once. Predictions are averages of earlier jobs of the
+            same kind (`costs`).
+lane        A group of threads, such as "host" or "device". Each stage is computed by one lane.
+fairness    Of the jobs that wait for a stage, the next one is chosen by deficit round robin over tenants and their
+            clients (`fair_queue`).
+batch       Waiting jobs of the same stage and bucket are computed together, up to the stage's `max_batch`.
+deadline    A job ends at its deadline wherever it is, and with its fallback, if it has one, shortly before. The thread
+            that computes it notices at its next `Job.check`.
+
+`Scheduler` decides all of this; it has no threads and no clock, so it is tested on a virtual one. `WorkQueue` executes:
+threads that compute what the scheduler selects, and callers that wait on an event loop.
+"""
+
+from .costs import CostModel
+from .jobs import (
+    Abandoned,
+    Done,
+    Ending,
+    Expired,
+    Fallback,
+    Flow,
+    Job,
+    Next,
+    Refusal,
+    Refused,
+    Stage,
+    StageRecord,
+    StageResult,
+    Step,
+)
+from .observer import Observer
+from .options import WorkQueueOptions
+from .scheduler import Quota
+from .work_queue import ComputeItem, Failure, Fatal, ItemList, WorkQueue, compute_items
+
+__all__ = [
+    "Abandoned",
+    "ComputeItem",
+    "CostModel",
+    "Done",
+    "Ending",
+    "Expired",
+    "Failure",
+    "Fallback",
+    "Fatal",
+    "Flow",
+    "ItemList",
+    "Job",
+    "Next",
+    "Observer",
+    "Quota",
+    "Refusal",
+    "Refused",
+    "Stage",
+    "StageRecord",
+    "StageResult",
+    "Step",
+    "WorkQueue",
+    "WorkQueueOptions",
+    "compute_items",
+]

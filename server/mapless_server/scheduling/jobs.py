@@ -1,4 +1,4 @@
-"""What the queue handles: jobs, the steps that they need, and what a stage says of a job it has computed."""
+"""The types of the work queue: jobs, their steps, what stages return, and how jobs end."""
 
 from __future__ import annotations
 
@@ -8,14 +8,46 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
-
-from .fair import Flow
-from .observer import Ending, Refusal
+from enum import Enum
+from typing import Any, NamedTuple
 
 
-class Over(Exception):
-    """Nobody wants the result of this job any more; raised within a stage, by `Job.check`, to end its computation."""
+class Flow(NamedTuple):
+    """Whose a job is. Tenants get equal shares, and so do the clients of a tenant."""
+
+    tenant: str
+    client: str
+
+
+class Refusal(str, Enum):
+    """Why a job is not admitted."""
+
+    QUEUE_FULL = "queue_full"
+    TOO_MUCH_MEMORY = "too_much_memory"
+    DEADLINE_INFEASIBLE = "deadline_infeasible"
+    TENANT_QUOTA = "tenant_quota"
+    DRAINING = "draining"
+    TOO_LARGE = "too_large"
+
+
+class Ending(str, Enum):
+    """How an admitted job ends; each ends exactly once."""
+
+    OK = "ok"
+    LOW_CONFIDENCE = "low_confidence"
+    """There is an answer: that no result is good enough."""
+    DEGRADED = "degraded"
+    """A preliminary result was given, because the rest could not be computed in time."""
+    EXPIRED = "expired"
+    CANCELLED = "cancelled"
+    OUT_OF_MEMORY = "oom"
+    REFUSED_INPUT = "bad_input"
+    """The input turned out to be invalid: the caller's error."""
+    FAILED = "backend_error"
+
+
+class Abandoned(Exception):
+    """The job has ended and its result is not needed any more; raised in a stage, by `Job.check`, to stop computing."""
 
 
 class Refused(Exception):
@@ -23,7 +55,7 @@ class Refused(Exception):
 
     Attributes:
         reason: why.
-        retry_after_s: when another try may succeed, seconds; None if the same job never will.
+        retry_after_s: when another attempt may succeed, seconds; None if the same job never will.
     """
 
     def __init__(self, reason: Refusal, message: str, retry_after_s: float | None = None) -> None:
@@ -41,10 +73,10 @@ class Stage:
     """One kind of computation.
 
     Attributes:
-        name: of the stage.
+        name: unique.
         lane: the threads that compute it.
         then: the stage that usually follows; None for the last.
-        max_batch: jobs that are computed together at the most.
+        max_batch: largest number of jobs that are computed together.
     """
 
     name: str
@@ -58,10 +90,10 @@ class Step:
     """What a job needs next.
 
     Attributes:
-        stage: which computation.
-        kind: jobs of one kind cost about the same there.
+        stage: name of the stage that computes it.
+        kind: jobs of one kind take about the same time there.
         bucket: jobs of one bucket can be computed together.
-        payload: what the stage computes with.
+        payload: the stage's input.
     """
 
     stage: str
@@ -72,7 +104,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Done:
-    """The job has ended well; `value` is its result."""
+    """The job is complete; `value` is its result."""
 
     value: Any
     ending: Ending = Ending.OK
@@ -80,31 +112,35 @@ class Done:
 
 @dataclass(frozen=True, eq=False)
 class Fallback:
-    """What is given if nothing better is there by `at_s` of the queue's clock."""
+    """Makes the result that is given if there is no better one at `at_s`, by the queue's clock."""
 
-    give: Callable[[], Done]
+    make: Callable[[], Done]
     at_s: float
 
 
 @dataclass(frozen=True, eq=False)
 class Next:
-    """The job needs another step. From now on the fallback, if any, stands for expiry."""
+    """The job needs another step. From now on it ends with the fallback, if there is one, instead of expiring."""
 
     step: Step
     fallback: Fallback | None = None
 
 
+StageResult = Next | Done | Exception
+"""What a stage returns for one job."""
+
+
 @dataclass(frozen=True)
-class Visit:
+class StageRecord:
     """A job's time in a stage, by the queue's clock.
 
     Attributes:
-        stage: which.
-        queued_s: when it began to wait.
-        start_s: when it began to be computed, or its waiting ended for good.
-        end_s: when that ended.
-        batch: number of the batch; 0 if it was not computed.
-        jobs: in it.
+        stage: name of the stage.
+        queued_s: when the job began to wait.
+        start_s: when it began to be computed, or stopped waiting without that.
+        end_s: when it left the stage.
+        batch: number of its batch; 0 if it was not computed.
+        jobs: size of its batch; 0 if it was not computed.
     """
 
     stage: str
@@ -122,20 +158,20 @@ class Job:
     Attributes:
         flow: whose it is.
         step: what it needs now.
-        deadline_s: when its result is of no use any more, by the queue's clock.
+        deadline_s: when its result becomes useless, by the queue's clock.
         size_bytes: memory that it holds.
-        on_end: told how it ended and with what: the result, or the exception.
-        visits: the stages that it has been through.
-        continues: whether it completes what other jobs of its call have computed; then it is always let in.
-        used_s: computing time it has had so far.
-        fallback: what stands for expiry.
+        on_end: called once, with how it ended and its result or exception.
+        records: the stages that it has been through.
+        continues: whether it completes what other jobs of its call have computed; then it is always admitted.
+        used_s: computing time so far.
+        fallback: replaces expiry.
         waits_since_s: when it began to wait for the step, by the queue's clock.
-        booked_s: computing time that is still predicted for it, by lane.
-        charged_s: computing time that its tenant was charged at admission.
-        unusual_s: computing time of the batch at hand that tells nothing of the jobs to come; its stage says so.
-        is_computed: whether it is in a batch.
-        checked_s: when a stage last called `check`, `time.monotonic`: a sign of life of the thread that computes it.
-        timer_s: the `due_s` that the schedule has noted.
+        booked_s: computing time still predicted for it, by lane.
+        charged_s: computing time charged to its tenant at admission.
+        unusual_s: part of the current batch's computing time that says nothing about later jobs; set by its stage.
+        is_computed: whether it is in a batch now.
+        checked_s: when a stage last called `check`, `time.monotonic`: a sign of life of the computing thread.
+        timer_s: the `due_s` that the scheduler has set a timer for.
     """
 
     flow: Flow
@@ -143,7 +179,7 @@ class Job:
     deadline_s: float
     size_bytes: int
     on_end: Callable[[Ending, Any], None]
-    visits: list[Visit] = field(default_factory=list)
+    records: list[StageRecord] = field(default_factory=list)
     continues: bool = False
     used_s: float = 0.0
     fallback: Fallback | None = None
@@ -158,22 +194,22 @@ class Job:
 
     @property
     def is_over(self) -> bool:
-        """Whether it has ended; a stage may still be at it."""
+        """Whether it has ended; a thread may still be computing it."""
         return self._over.is_set()
 
     @property
     def due_s(self) -> float:
-        """When it is ended, whatever it is at."""
+        """When it ends at the latest, by the queue's clock."""
         return self.deadline_s if self.fallback is None else min(self.fallback.at_s, self.deadline_s)
 
     def check(self) -> None:
-        """For stages, between their steps, from any thread: raises Over if nobody wants the result any more."""
+        """Raises Abandoned if the job has ended. Stages call it between their steps, from any thread."""
         self.checked_s = time.monotonic()
         if self._over.is_set():
-            raise Over
+            raise Abandoned
 
     def end(self, ending: Ending, value: Any) -> None:
-        """For the schedule alone."""
+        """Ends the job; called by the scheduler only."""
         assert not self._over.is_set()
         self._over.set()
         self.on_end(ending, value)
@@ -181,20 +217,16 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Jobs that are computed together, of one stage and bucket.
+    """Jobs of one stage and bucket that are computed together.
 
     Attributes:
-        stage: which.
-        jobs: one at least.
+        stage: of all.
+        jobs: at least one.
         start_s: when it began, by the queue's clock.
-        number: of the batch since the start.
+        number: counts the batches from 1.
     """
 
     stage: Stage
     jobs: tuple[Job, ...]
     start_s: float
     number: int
-
-
-Verdict = Next | Done | Exception
-"""What a stage says of one job."""

@@ -1,4 +1,4 @@
-"""The worker queue's hands: threads that compute what the schedule says, and callers who wait on the event loop."""
+"""The executor: threads that compute what the scheduler selects, and callers that wait on the event loop."""
 
 from __future__ import annotations
 
@@ -7,158 +7,131 @@ import logging
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from .admission import ScheduleOptions
-from .fair import Flow
-from .jobs import Batch, Job, Stage, Step, Verdict, Visit
-from .observer import Ending, Observer
-from .schedule import Quota, Schedule
+from .jobs import Batch, Done, Ending, Flow, Job, Next, Stage, StageRecord, StageResult, Step
+from .observer import Observer
+from .options import WorkQueueOptions
+from .scheduler import Quota, Scheduler
 
 log = logging.getLogger(__name__)
 
-Compute = Callable[[Sequence[Job]], Sequence[Verdict]]
-"""Computes the step of jobs of one stage and bucket: a verdict for each, in their order. An exception that it raises
-instead is put down to the guilty job alone, by computing them again in halves."""
+ItemT = TypeVar("ItemT")
+ResultT = TypeVar("ResultT")
+
+ComputeBatch = Callable[[Sequence[Job]], Sequence[StageResult]]
+"""Computes a step of jobs of one stage and bucket: a result for each, in order. If it raises instead, the batch is
+computed again in halves, so that only the job that causes the exception fails."""
+
+ComputeItem = Callable[[ItemT, Callable[[], None]], ResultT]
+"""Computes one item of an `ItemList`; calls the given function between its steps, which raises if the job has ended."""
 
 
 class Failure(Enum):
-    """What an exception of a stage means."""
+    """What an exception of a stage means; its value is how the job ends."""
 
-    OF_REQUEST = Ending.REFUSED_INPUT
-    """The caller's mistake."""
-    OF_ITEM = Ending.FAILED
-    """Ours, with this job; others may fare better."""
-    OF_MEMORY = Ending.OUT_OF_MEMORY
-    """Too much at a time."""
-    OF_DEVICE = None
-    """Nothing that is computed from now on is to be trusted."""
+    BAD_INPUT = Ending.REFUSED_INPUT
+    """The caller's error."""
+    JOB_FAILED = Ending.FAILED
+    """A server error with this job; other jobs may succeed."""
+    OUT_OF_MEMORY = Ending.OUT_OF_MEMORY
+    DEVICE_LOST = None
+    """Nothing computed from now on can be trusted; the queue ends."""
 
 
 class Fatal(Exception):
-    """The queue cannot go on; the message is one sentence for the operator."""
-
-
-@dataclass(frozen=True)
-class Lane:
-    """Threads that compute some of the stages.
-
-    Attributes:
-        name: of the threads, too.
-        threads: how many.
-    """
-
-    name: str
-    threads: int
-
-
-@dataclass(frozen=True)
-class WorkQueueOptions:
-    """Options of the work queue.
-
-    Attributes:
-        stall_limit_s: a batch of which nothing is heard for longer, neither its end nor a job's `check`, hangs: its
-            thread is lost, and so, in the end, is the server.
-        heartbeat_s: the queue looks after itself at least so often.
-    """
-
-    schedule: ScheduleOptions = field(default_factory=ScheduleOptions)
-    stall_limit_s: float = 120.0
-    heartbeat_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not (self.stall_limit_s > 0 and self.heartbeat_s > 0):
-            raise ValueError(f"senseless options: {self}")
+    """The queue cannot continue; the message is one sentence for the operator."""
 
 
 class WorkQueue:
-    """Computes jobs. Its methods are called on one event loop, but for those that say otherwise.
+    """Computes jobs. Methods must be called on one event loop, unless stated otherwise.
 
-    The threads take what they compute from the schedule themselves, one at a time: going through the event loop for
-    every step would cost as much as a small step does, and leave threads idle whenever the loop is busy.
+    The threads take batches from the scheduler themselves: passing every step through the event loop would cost as much
+    as a small step takes, and leave threads idle whenever the loop is busy.
+
+    Attributes:
+        on_fatal: called on the event loop when the queue cannot continue.
+        heartbeat_s: when the queue last checked itself, `time.monotonic`.
     """
 
     def __init__(
         self,
-        stages: Mapping[Stage, Compute],
-        lanes: Sequence[Lane],
+        stages: Mapping[Stage, ComputeBatch],
+        lanes: Mapping[str, int],
         options: WorkQueueOptions,
         observer: Observer,
-        failure_of: Callable[[Exception], Failure] = lambda _: Failure.OF_ITEM,
+        failure_of: Callable[[Exception], Failure] = lambda _: Failure.JOB_FAILED,
         quota: Quota | None = None,
     ) -> None:
-        """An idle queue; it begins to compute with `start`.
+        """An idle queue.
 
         Args:
             stages: in the order in which jobs go through them.
-            lanes: those that the stages name.
+            lanes: number of threads of each lane.
             options: see there.
-            observer: is told what happens.
-            failure_of: what exceptions mean.
-            quota: of tenants, if they have one.
+            observer: receives the events.
+            failure_of: classifies exceptions of stages.
+            quota: of tenants, if they are limited.
         """
         self._options = options
         self._observer = observer
         self._failure_of = failure_of
         self._compute = {stage.name: compute for stage, compute in stages.items()}
-        self._lanes = tuple(lanes)
-        self._schedule = Schedule(
-            list(stages),
-            {lane.name: lane.threads for lane in lanes},
-            options.schedule,
-            observer,
-            lambda error: failure_of(error).value or Ending.FAILED,
-            quota,
-        )
-        # Whoever touches the schedule holds it, for microseconds; each lane's idle threads wait for news.
+        self._threads_of_lane = dict(lanes)
+
+        def ending_of(error: Exception) -> Ending:
+            return failure_of(error).value or Ending.FAILED
+
+        self._scheduler = Scheduler(list(stages), lanes, options, observer, ending_of, quota)
+        # Guards the scheduler; held for microseconds. Each lane's idle threads wait on a condition of it.
         self._lock = threading.Lock()
-        self._news = {lane.name: threading.Condition(self._lock) for lane in lanes}
+        self._wakes_threads = {lane: threading.Condition(self._lock) for lane in lanes}
         self._computing: set[Batch] = set()
         self._threads: list[threading.Thread] = []
         self._is_closed = False
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._task: asyncio.Task[None] | None = None
-        self._wake = asyncio.Event()
-        self._wakes_at_s = math.inf
+        self._timer_task: asyncio.Task[None] | None = None
+        self._wakes_timer = asyncio.Event()
+        self._timer_at_s = math.inf
         self.on_fatal: Callable[[Fatal], None] = lambda _: None
         self.heartbeat_s = time.monotonic()
 
     @property
     def job_count(self) -> int:
-        """Those that are admitted and have not ended."""
+        """Number of jobs that are admitted and have not ended."""
         with self._lock:
-            return len(self._schedule.jobs)
+            return len(self._scheduler.jobs)
 
     @property
     def backlog_s(self) -> float:
-        """Computing time predicted for what is admitted and has not ended, of the lane that has most of it a thread."""
+        """Computing time predicted for the admitted jobs, per thread, of the lane with the most of it."""
         with self._lock:
-            return self._schedule.backlog_s
+            return self._scheduler.backlog_s
 
     @property
     def busy_s(self) -> float:
-        """Seconds of computing so far, of the lane that has computed most a thread."""
+        """Computing time so far, per thread, of the lane with the most of it."""
         with self._lock:
-            return self._schedule.busy_s
+            return self._scheduler.busy_s
 
     def is_alive_within(self, limit_s: float) -> bool:
-        """Whether what is admitted will be computed, as far as was seen in so many seconds."""
-        runs = self._task is not None and not self._task.done() and not self._is_closed
+        """Whether the queue runs and has checked itself within the last `limit_s` seconds."""
+        runs = self._timer_task is not None and not self._timer_task.done() and not self._is_closed
         return runs and time.monotonic() - self.heartbeat_s < limit_s
 
     def start(self) -> None:
-        """Begins to compute; the first job does so, too."""
-        if self._task is None:
+        """Starts the threads; the first job does so, too."""
+        if self._timer_task is None:
             self._loop = asyncio.get_running_loop()
-            self._task = self._loop.create_task(self._keep_time(), name="work queue")
+            self._timer_task = self._loop.create_task(self._run_timer(), name="work queue")
             self._threads = [
-                threading.Thread(target=self._work, args=(lane.name,), name=f"{lane.name}_{i}", daemon=True)
-                for lane in self._lanes
-                for i in range(lane.threads)
+                threading.Thread(target=self._run_thread, args=(lane,), name=f"{lane}_{i}", daemon=True)
+                for lane, count in self._threads_of_lane.items()
+                for i in range(count)
             ]
             for thread in self._threads:
                 thread.start()
@@ -169,20 +142,20 @@ class WorkQueue:
         step: Step,
         deadline_s: float,
         size_bytes: int,
-        visits: list[Visit] | None = None,
+        records: list[StageRecord] | None = None,
         *,
         continues: bool = False,
-    ) -> tuple[Any, Sequence[Visit]]:
-        """Lets a job in, and waits for it; whoever is cancelled while waiting gives up the job's place.
+    ) -> tuple[Any, Sequence[StageRecord]]:
+        """Submits a job and waits for its result; cancelling the wait cancels the job.
 
         Args:
             flow: whose job it is.
             step: its first.
-            deadline_s: when its result is of no use any more, `time.monotonic`.
+            deadline_s: when its result becomes useless, `time.monotonic`.
             size_bytes: memory that it holds.
-            visits: gets the stages that it goes through, for who wants to know how far it came if it fails.
-            continues: whether it completes what other jobs of the same call have computed: then it is let in however
-                full the queue is, and while the server drains, since else all that was in vain.
+            records: receives the stages that it goes through, also if it fails.
+            continues: whether it completes what other jobs of the same call have computed: then it is admitted however
+                full the queue is, and while the server drains, since their work would otherwise be lost.
 
         Returns:
             Its result, and the stages that it went through.
@@ -191,7 +164,7 @@ class WorkQueue:
             Refused: there is no room for it.
             Expired: its deadline passed.
             Fatal: the queue has ended.
-            Exception: whatever its stage gave for it.
+            Exception: its stage failed with it.
         """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[Any] = loop.create_future()
@@ -199,59 +172,59 @@ class WorkQueue:
         def on_end(_: Ending, value: Any) -> None:  # in whatever thread ends the job
             loop.call_soon_threadsafe(_resolve, future, value)
 
-        job = Job(flow, step, deadline_s, size_bytes, on_end, [] if visits is None else visits, continues)
+        job = Job(flow, step, deadline_s, size_bytes, on_end, [] if records is None else records, continues)
         with self._lock:
             if continues and self._is_closed:
                 raise Fatal("the server has stopped")
-            self._schedule.admit(job, time.monotonic())
-            self._spread_news()
+            self._scheduler.admit(job, time.monotonic())
+            self._notify()
         self.start()
         try:
-            return await future, job.visits
+            return await future, job.records
         finally:
             if not job.is_over:
                 with self._lock:
-                    self._schedule.cancel(job, time.monotonic())
+                    self._scheduler.cancel(job, time.monotonic())
 
     @contextmanager
     def hold(self, flow: Flow, size_bytes: int) -> Iterator[None]:
-        """Books memory that a call of several jobs holds all the while, which its jobs then need not say.
+        """Books memory that a call of several jobs holds during the block; their own sizes then exclude it.
 
         Raises:
             Refused: there is no room for it.
         """
         with self._lock:
-            self._schedule.hold(flow, size_bytes)
+            self._scheduler.hold(flow, size_bytes)
         try:
             yield
         finally:
             with self._lock:
-                self._schedule.release(flow, size_bytes)
+                self._scheduler.release(flow, size_bytes)
 
     def check_room(self, step: Step) -> None:
-        """Raises Refused if nobody would be admitted who began with a step like this."""
+        """Raises Refused if no caller would be admitted with this first step."""
         with self._lock:
-            self._schedule.check_room(step)
+            self._scheduler.check_room(step)
 
     def forget_costs(self) -> None:
-        """What was computed up to now tells nothing of what is to come."""
+        """Forgets how long jobs took, because later ones will differ."""
         with self._lock:
-            self._schedule.costs.forget()
+            self._scheduler.costs.forget()
 
     def drain(self) -> None:
-        """Lets nobody in any more."""
+        """Refuses every job from now on; those admitted are computed."""
         with self._lock:
-            self._schedule.drain()
+            self._scheduler.drain()
 
     async def close(self, limit_s: float = 30.0) -> None:
-        """Ends everything; returns when the threads are through with the step that they are at.
+        """Ends every job and waits until the threads have finished their current step.
 
-        A thread that is not by then is left behind: it ends with the process.
+        A thread that takes longer than `limit_s` is abandoned: it ends with the process.
         """
         self._end_all(Fatal("the server has stopped"))
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
+        if self._timer_task is not None:
+            self._timer_task.cancel()
+            await asyncio.gather(self._timer_task, return_exceptions=True)
         await asyncio.to_thread(self._join, time.monotonic() + limit_s)
 
     def _join(self, until_s: float) -> None:
@@ -264,112 +237,112 @@ class WorkQueue:
         with self._lock:
             self._is_closed = True
             try:
-                self._schedule.fail_all(error, time.monotonic())
-            finally:  # it may be the schedule that is broken
-                for news in self._news.values():
-                    news.notify_all()
+                self._scheduler.fail_all(error, time.monotonic())
+            finally:  # even if the scheduler fails
+                for condition in self._wakes_threads.values():
+                    condition.notify_all()
 
-    async def _keep_time(self) -> None:
-        """Ends what is due and looks for threads that hang, as long as the queue lives."""
+    async def _run_timer(self) -> None:
+        """Ends jobs that are due and detects threads that hang, until the queue is closed."""
         try:
             while True:
-                self._wake.clear()
+                self._wakes_timer.clear()
                 with self._lock:
                     now_s = self.heartbeat_s = time.monotonic()
-                    self._schedule.expire(now_s)
-                    self._look_for_stalls(now_s)
-                    due_s = self._schedule.next_due_s
-                    self._wakes_at_s = min(math.inf if due_s is None else due_s, now_s + self._options.heartbeat_s)
-                timer = asyncio.get_running_loop().call_later(max(0.0, self._wakes_at_s - now_s), self._wake.set)
-                await self._wake.wait()
+                    self._scheduler.expire(now_s)
+                    self._check_for_stalls(now_s)
+                    due_s = self._scheduler.next_due_s
+                    self._timer_at_s = min(math.inf if due_s is None else due_s, now_s + self._options.heartbeat_s)
+                timer = asyncio.get_running_loop().call_later(max(0.0, self._timer_at_s - now_s), self._wakes_timer.set)
+                await self._wakes_timer.wait()
                 timer.cancel()
         except Exception as error:
-            self._die(error)
+            self._fail(error)
 
-    def _spread_news(self) -> None:
-        """With the lock held, after the schedule has changed: wakes who has something to do now."""
-        for news in self._news.values():
-            news.notify()
-        due_s = self._schedule.next_due_s
-        if due_s is not None and due_s < self._wakes_at_s and self._loop is not None:
-            self._wakes_at_s = due_s
-            self._loop.call_soon_threadsafe(self._wake.set)
+    def _notify(self) -> None:
+        """Wakes threads and timer after the scheduler has changed; with the lock held."""
+        for condition in self._wakes_threads.values():
+            condition.notify()
+        due_s = self._scheduler.next_due_s
+        if due_s is not None and due_s < self._timer_at_s and self._loop is not None:
+            self._timer_at_s = due_s
+            self._loop.call_soon_threadsafe(self._wakes_timer.set)
 
-    def _look_for_stalls(self, now_s: float) -> None:
+    def _check_for_stalls(self, now_s: float) -> None:
         for batch in self._computing:
             silent_s = now_s - max(batch.start_s, *(job.checked_s for job in batch.jobs))
             if silent_s > self._options.stall_limit_s:
                 raise Fatal(f"the stage {batch.stage.name} has computed for {silent_s:.0f} s in one step: it hangs")
 
-    def _die(self, error: BaseException) -> None:
-        """Nothing will be computed any more: everybody is told, and so is the owner."""
+    def _fail(self, error: BaseException) -> None:
+        """Ends the queue: every job fails, and the owner is notified once."""
         if self._is_closed:
             return
         fatal = error if isinstance(error, Fatal) else Fatal(f"the work queue failed: {error!r}")
         log.critical("%s", fatal, exc_info=error)
-        if self._task is not None:
-            self._task.cancel()
+        if self._timer_task is not None:
+            self._timer_task.cancel()
         try:
             self._end_all(fatal)
         finally:
             self.on_fatal(fatal)
 
-    def _work(self, lane: str) -> None:
-        """A lane's thread."""
+    def _run_thread(self, lane: str) -> None:
         assert self._loop is not None
         try:
             while (batch := self._next_batch(lane)) is not None:
-                verdicts = self._verdicts(batch.stage, batch.jobs)
+                results = self._compute_batch(batch.stage, batch.jobs)
                 with self._lock:
                     self._computing.discard(batch)
-                    self._schedule.finish(batch, verdicts, time.monotonic())
-                    self._spread_news()
-                # What a thread that waits for news still holds is not freed.
-                del batch, verdicts
-        except BaseException as error:  # whatever it is, it must be heard of
-            self._loop.call_soon_threadsafe(self._die, error)
+                    self._scheduler.finish(batch, results, time.monotonic())
+                    self._notify()
+                # An idle thread must not keep photographs and tensors alive.
+                del batch, results
+        except BaseException as error:  # SystemExit too: the queue must not go on without this thread
+            self._loop.call_soon_threadsafe(self._fail, error)
 
     def _next_batch(self, lane: str) -> Batch | None:
-        """What is to be computed next, as soon as there is something; None if there will be nothing any more."""
+        """Waits for the next batch; None when the queue is closed."""
         with self._lock:
             while not self._is_closed:
-                batch = self._schedule.take(lane, time.monotonic())
+                batch = self._scheduler.take(lane, time.monotonic())
                 if batch is not None:
                     self._computing.add(batch)
-                    self._news[lane].notify()  # one piece of news may be work for several
+                    self._wakes_threads[lane].notify()  # there may be work for another thread
                     return batch
-                self._news[lane].wait()
+                self._wakes_threads[lane].wait()
         return None
 
-    def _verdicts(self, stage: Stage, jobs: Sequence[Job]) -> list[Verdict]:
-        """What the stage says of each job."""
+    def _compute_batch(self, stage: Stage, jobs: Sequence[Job]) -> list[StageResult]:
+        """The stage's result for each job; if the stage raises, by computing halves."""
         try:
-            verdicts = list(self._compute[stage.name](jobs))
-            if len(verdicts) != len(jobs):
-                raise RuntimeError(f"the stage {stage.name} gave {len(verdicts)} verdicts for {len(jobs)} jobs")
+            results = list(self._compute[stage.name](jobs))
+            if len(results) != len(jobs):
+                raise RuntimeError(f"the stage {stage.name} returned {len(results)} results for {len(jobs)} jobs")
         except Exception as error:
-            failure = self._checked(error)
+            failure = self._classify(error)
             if len(jobs) == 1:
                 return [error]
-            log.warning("%s: %d jobs at a time failed, trying them in halves: %s", stage.name, len(jobs), repr(error))
+            # As text, since log records may be kept, and with the exception its tensors.
+            log.warning("%s: %d jobs together failed, trying them in halves: %s", stage.name, len(jobs), repr(error))
         else:
-            for verdict in verdicts:
-                if isinstance(verdict, Exception):
-                    self._checked(verdict)
-            return verdicts
-        # Out here the exception is gone, and with it what the failed attempt held of the device's memory.
+            for result in results:
+                if isinstance(result, Exception):
+                    self._classify(result)
+            return results
+        # Outside of the handler the exception is freed, and with it the failed attempt's tensors.
         half = len(jobs) // 2
-        if failure is Failure.OF_MEMORY:
+        if failure is Failure.OUT_OF_MEMORY:
             with self._lock:
-                self._schedule.limit_batch(stage.name, jobs[0].step.bucket, half)
-        return self._verdicts(stage, jobs[:half]) + self._verdicts(stage, jobs[half:])
+                self._scheduler.limit_batch(stage.name, jobs[0].step.bucket, half)
+        return self._compute_batch(stage, jobs[:half]) + self._compute_batch(stage, jobs[half:])
 
-    def _checked(self, error: Exception) -> Failure:
-        """What the exception means; Fatal if nothing is to be trusted any more."""
+    def _classify(self, error: Exception) -> Failure:
+        """What the exception means. Raises Fatal if the device is lost."""
         failure = self._failure_of(error)
-        if failure is Failure.OF_MEMORY:
+        if failure is Failure.OUT_OF_MEMORY:
             self._observer.ran_out_of_memory()
-        if failure is Failure.OF_DEVICE:
+        if failure is Failure.DEVICE_LOST:
             raise Fatal(f"the device is lost: {error}") from error
         return failure
 
@@ -377,9 +350,38 @@ class WorkQueue:
 def _resolve(future: asyncio.Future[Any], value: Any) -> None:
     if future.done():
         return
-    if isinstance(value, StopIteration):  # which a future takes for its own
+    if isinstance(value, StopIteration):  # which a future does not accept
         value = RuntimeError(f"the stage raised {value!r}")
     if isinstance(value, Exception):
         future.set_exception(value)
     else:
         future.set_result(value)
+
+
+class ItemList(Generic[ItemT, ResultT]):
+    """Items that several jobs compute together, one item per step, so that jobs of other callers run in between.
+
+    If the queue admits only one of the jobs, it computes all items.
+
+    Attributes:
+        results: in the order of the items; complete when all jobs have ended.
+    """
+
+    def __init__(self, items: Sequence[ItemT], compute: ComputeItem[ItemT, ResultT]) -> None:
+        self._remaining = deque(enumerate(items))
+        self._compute = compute
+        self.results: list[ResultT] = [None] * len(items)  # type: ignore[list-item]  # each is set before it is read
+
+    def compute_next(self, job: Job) -> StageResult:
+        """Computes one item; done when none is left."""
+        try:
+            index, item = self._remaining.popleft()
+        except IndexError:
+            return Done(None)
+        self.results[index] = self._compute(item, job.check)
+        return Next(job.step)
+
+
+def compute_items(jobs: Sequence[Job]) -> list[StageResult]:
+    """Computes the next item of each job; the `ComputeBatch` of stages whose payload is an `ItemList`."""
+    return [job.step.payload.compute_next(job) for job in jobs]

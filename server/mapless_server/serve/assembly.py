@@ -21,8 +21,7 @@ from mapless_server.networks.weights import CATALOGUE, WeightsError, WeightsMiss
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes.retrieval.descriptor import GlobalDescriptor
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
-from mapless_server.scheduling.admission import ScheduleOptions
-from mapless_server.scheduling.work_queue import WorkQueueOptions
+from mapless_server.scheduling import WorkQueueOptions
 from mapless_server.security.rate import RateLimiter
 from mapless_server.settings import Settings, available_cores
 from mapless_server.store import Store, StoreError
@@ -63,7 +62,8 @@ def engine_options(settings: Settings) -> EngineOptions:
         image_limits=image_limits(settings),
         coverage=settings.coverage,
         queue=WorkQueueOptions(
-            ScheduleOptions(max_queued_s=settings.max_queued_s, max_bytes=settings.max_queued_mib * 2**20),
+            max_queued_s=settings.max_queued_s,
+            max_bytes=settings.max_queued_mib * 2**20,
             stall_limit_s=settings.stall_limit_s,
         ),
     )

@@ -18,7 +18,7 @@ from mapless_server.observability.event_loop import watch_event_loop
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
 from mapless_server.observability.tracing import Tracer, make_tracer
-from mapless_server.scheduling.work_queue import Fatal
+from mapless_server.scheduling import Fatal
 from mapless_server.security.errors import SecurityError
 from mapless_server.security.protection import Protection
 from mapless_server.security.reloading import keep_fresh

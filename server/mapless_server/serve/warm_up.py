@@ -24,7 +24,7 @@ from mapless_server.method.localize import Localization, LocalizeOptions
 from mapless_server.method.turns import Turn
 from mapless_server.method.views import Photograph, PosedView
 from mapless_server.scenes.retrieval.narrowing import Narrowing
-from mapless_server.scheduling.fair import Flow
+from mapless_server.scheduling import Flow
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import SceneAttributes
 

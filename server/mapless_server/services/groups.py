@@ -20,7 +20,7 @@ from mapless_server.engine.query import Query
 from mapless_server.method.rejection import Rejection
 from mapless_server.observability.metrics import LOCALIZED, Metrics
 from mapless_server.rpc.call import Call
-from mapless_server.scheduling.jobs import Visit
+from mapless_server.scheduling import StageRecord
 
 from .capture.recorder import Recorder
 from .messages.groups import (
@@ -73,7 +73,7 @@ async def answer_sequence(
 
 async def _localize_each(engine: Engine, queries: Sequence[Query], call: Call, list_name: str) -> GroupResult:
     call.note(scene=queries[0].scene_key, images=len(queries))
-    visits: list[list[Visit]] = [[] for _ in queries]
+    visits: list[list[StageRecord]] = [[] for _ in queries]
     try:
         return await localize_each(engine, queries, call.caller, list_name, visits)
     finally:

@@ -17,7 +17,7 @@ from mapless_server.engine.query import Query, Result
 from mapless_server.method.localize import Localization
 from mapless_server.observability.metrics import LOCALIZED, Metrics
 from mapless_server.rpc.call import Call
-from mapless_server.scheduling.jobs import Visit
+from mapless_server.scheduling import StageRecord
 from mapless_server.security.tenancy import key_of
 from mapless_server.store import SceneAttributes, Store
 
@@ -45,7 +45,7 @@ class _Asked:
     request: pb.LocalizeRequest
     query: Query
     addressee: Addressee
-    visits: list[Visit] = field(default_factory=list)
+    visits: list[StageRecord] = field(default_factory=list)
 
     @property
     def queued_s(self) -> float:

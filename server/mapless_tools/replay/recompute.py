@@ -23,8 +23,7 @@ from mapless_server.engine.views import QueryViews
 from mapless_server.method.localize import Answer, Coarse, coarse_answer, refine
 from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc.call import Call
-from mapless_server.scheduling.fair import Flow
-from mapless_server.scheduling.jobs import Done, Job, Visit
+from mapless_server.scheduling import Done, Flow, Job, StageRecord
 from mapless_server.security.principal import Principal
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.services.capture.calls import CapturedCall
@@ -114,9 +113,9 @@ class _Recomputing:
         query: Query,
         caller: Caller,
         source: object = None,
-        visits: list[Visit] | None = None,
+        visits: list[StageRecord] | None = None,
         tell_coarse: object = None,
-    ) -> tuple[Result, Sequence[Visit]]:
+    ) -> tuple[Result, Sequence[StageRecord]]:
         part = self._parts[query.photo.field]
         given_up = self._unfinished[query.photo.field]
         tried = [tier for tier in self._tiers if tier.extractor.name not in given_up]

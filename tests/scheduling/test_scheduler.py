@@ -13,23 +13,25 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from mapless_server.scheduling.admission import ScheduleOptions
-from mapless_server.scheduling.fair import Flow
-from mapless_server.scheduling.jobs import (
-    Batch,
+from mapless_server.scheduling import (
+    Abandoned,
     Done,
+    Ending,
     Expired,
     Fallback,
+    Flow,
     Job,
     Next,
-    Over,
+    Observer,
+    Refusal,
     Refused,
     Stage,
+    StageResult,
     Step,
-    Verdict,
+    WorkQueueOptions,
 )
-from mapless_server.scheduling.observer import Ending, Observer, Refusal
-from mapless_server.scheduling.schedule import Schedule
+from mapless_server.scheduling.jobs import Batch
+from mapless_server.scheduling.scheduler import Scheduler
 
 STAGES = [
     Stage("describe", "host"),
@@ -39,7 +41,7 @@ STAGES = [
 ]
 LANES = {"host": 2, "device": 1}
 COST_S = {"describe": 0.5, "prepare": 0.1, "coarse": 0.3, "refine": 0.2}
-OPTIONS = ScheduleOptions(max_queued_s=2.0, max_bytes=1000, quantum_s=0.2)
+OPTIONS = WorkQueueOptions(max_queued_s=2.0, max_bytes=1000, quantum_s=0.2)
 FAR_S = 1e6
 
 
@@ -72,11 +74,11 @@ class Counting(Observer):
 class Toy:
     """A schedule that knows what its stages cost, and the jobs that were put to it."""
 
-    def __init__(self, options: ScheduleOptions = OPTIONS, quota: Any = None) -> None:
+    def __init__(self, options: WorkQueueOptions = OPTIONS, quota: Any = None) -> None:
         self.observer = Counting()
-        self.schedule = Schedule(STAGES, LANES, options, self.observer, quota=quota)
+        self.scheduler = Scheduler(STAGES, LANES, options, self.observer, quota=quota)
         for stage, cost_s in COST_S.items():
-            self.schedule.costs.observe(stage, "toy", cost_s)
+            self.scheduler.costs.observe(stage, "toy", cost_s)
         self.ends: dict[int, list[tuple[Ending, Any]]] = {}
         self.jobs: list[Job] = []
         self.now_s = 0.0
@@ -98,7 +100,7 @@ class Toy:
 
     def admit(self, **what: Any) -> Job:
         job = self.job(**what)
-        self.schedule.admit(job, self.now_s)
+        self.scheduler.admit(job, self.now_s)
         return job
 
     def ending_of(self, job: Job) -> Ending | None:
@@ -107,14 +109,14 @@ class Toy:
         return ends[0][0] if ends else None
 
     def take(self, lane: str) -> Batch:
-        batch = self.schedule.take(lane, self.now_s)
+        batch = self.scheduler.take(lane, self.now_s)
         assert batch is not None
         return batch
 
-    def finish(self, batch: Batch, *verdicts: Verdict, seconds: float | None = None) -> None:
+    def finish(self, batch: Batch, *verdicts: StageResult, seconds: float | None = None) -> None:
         cost_s = COST_S[batch.stage.name] * len(batch.jobs)  # so that predictions stay what they are
         self.now_s = max(self.now_s, batch.start_s + (cost_s if seconds is None else seconds))
-        self.schedule.finish(batch, verdicts, self.now_s)
+        self.scheduler.finish(batch, verdicts, self.now_s)
 
     def refusal(self, **what: Any) -> Refused:
         with pytest.raises(Refused) as caught:
@@ -122,7 +124,7 @@ class Toy:
         return caught.value
 
 
-def onward(job: Job, fallback: Fallback | None = None) -> Verdict:
+def onward(job: Job, fallback: Fallback | None = None) -> StageResult:
     """To the stage that usually follows."""
     stage = next(it for it in STAGES if it.name == job.step.stage)
     if stage.then is None:
@@ -134,7 +136,7 @@ def run_through(toy: Toy, most_batches: int = 1000) -> list[tuple[str, int]]:
     """Computes until nothing waits; stage and payload of what was computed, in order."""
     done: list[tuple[str, int]] = []
     for _ in range(most_batches):
-        batches = [batch for lane in LANES if (batch := toy.schedule.take(lane, toy.now_s)) is not None]
+        batches = [batch for lane in LANES if (batch := toy.scheduler.take(lane, toy.now_s)) is not None]
         if not batches:
             return done
         for batch in batches:
@@ -160,7 +162,7 @@ class TestAdmission:
         job = toy.admit()
         toy.finish(toy.take("host"), onward(job))
         for _ in range(100):
-            toy.schedule.costs.observe("refine", "toy", 9.0)
+            toy.scheduler.costs.observe("refine", "toy", 9.0)
         toy.finish(toy.take("device"), onward(job))
         assert job.booked_s["host"] == pytest.approx(COST_S["refine"])
 
@@ -198,7 +200,7 @@ class TestAdmission:
     def test_nobody_is_admitted_any_more_when_it_drains(self) -> None:
         toy = Toy()
         before = toy.admit()
-        toy.schedule.drain()
+        toy.scheduler.drain()
         assert toy.refusal().reason is Refusal.DRAINING
         run_through(toy)
         assert toy.ending_of(before) is Ending.OK
@@ -222,18 +224,18 @@ class TestAdmission:
         cancelled = toy.admit()
         refused = toy.refusal()
         assert (refused.reason, refused.retry_after_s) == (Refusal.TENANT_QUOTA, 7.0)
-        toy.schedule.cancel(cancelled, toy.now_s)
+        toy.scheduler.cancel(cancelled, toy.now_s)
         run_through(toy)
         own = toy.job()
         own.flow = Flow("", "the server's own")
-        toy.schedule.admit(own, toy.now_s)
+        toy.scheduler.admit(own, toy.now_s)
         run_through(toy)
         np.testing.assert_allclose(quota.settled, [(0.6, 0.0), (0.6, 0.6)])
 
 
 class TestOrder:
     def test_begun_jobs_finish_first_without_starving_others(self) -> None:
-        toy = Toy(ScheduleOptions(max_queued_s=1000))
+        toy = Toy(WorkQueueOptions(max_queued_s=1000))
         for _ in range(12):
             toy.admit(stage="refine")
             toy.admit(stage="prepare")
@@ -245,11 +247,11 @@ class TestOrder:
         assert order == ["refine", "refine", "refine", "prepare"] * 3
 
     def test_a_batch_is_of_one_bucket_and_as_large_as_what_waits(self) -> None:
-        toy = Toy(ScheduleOptions(max_queued_s=1000))
+        toy = Toy(WorkQueueOptions(max_queued_s=1000))
         for i in range(8):
             toy.admit(stage="coarse", bucket="ab"[i % 2], client=str(i))
         sizes = []
-        while (batch := toy.schedule.take("device", toy.now_s)) is not None:
+        while (batch := toy.scheduler.take("device", toy.now_s)) is not None:
             assert len({job.step.bucket for job in batch.jobs}) == 1
             sizes.append(len(batch.jobs))
             toy.finish(batch, *(Done(None) for _ in batch.jobs))
@@ -257,18 +259,18 @@ class TestOrder:
         assert toy.observer.inflight["coarse"] == toy.observer.depth["coarse"] == 0
 
     def test_a_batch_that_did_not_fit_is_not_tried_again(self) -> None:
-        toy = Toy(ScheduleOptions(max_queued_s=1000))
-        toy.schedule.limit_batch("coarse", "b", 1)
+        toy = Toy(WorkQueueOptions(max_queued_s=1000))
+        toy.scheduler.limit_batch("coarse", "b", 1)
         for _ in range(3):
             toy.admit(stage="coarse")
         assert len(toy.take("device").jobs) == 1
 
     def test_a_lane_computes_as_much_at_a_time_as_it_has_threads(self) -> None:
-        toy = Toy(ScheduleOptions(max_queued_s=1000))
+        toy = Toy(WorkQueueOptions(max_queued_s=1000))
         for _ in range(3):
             toy.admit()
         first, _ = toy.take("host"), toy.take("host")
-        assert toy.schedule.take("host", toy.now_s) is None
+        assert toy.scheduler.take("host", toy.now_s) is None
         toy.finish(first, Done(None))
         toy.take("host")
 
@@ -277,26 +279,26 @@ class TestTime:
     def test_a_job_expires_at_its_deadline_where_it_waits(self) -> None:
         toy = Toy()
         job = toy.admit(deadline_s=5.0)
-        assert toy.schedule.next_due_s == 5.0
-        toy.schedule.expire(4.99)
+        assert toy.scheduler.next_due_s == 5.0
+        toy.scheduler.expire(4.99)
         assert toy.ending_of(job) is None
-        toy.schedule.expire(5.0)
+        toy.scheduler.expire(5.0)
         assert job.is_over
         assert isinstance(toy.ends[0][0][1], Expired)
-        assert toy.schedule.take("host", 5.0) is None
-        assert not toy.schedule.jobs
+        assert toy.scheduler.take("host", 5.0) is None
+        assert not toy.scheduler.jobs
 
     def test_while_it_is_computed_its_result_is_dropped(self) -> None:
         toy = Toy()
         job = toy.admit(deadline_s=5.0)
         batch = toy.take("host")
         job.check()
-        toy.schedule.expire(6.0)
+        toy.scheduler.expire(6.0)
         assert toy.ending_of(job) is Ending.EXPIRED
         assert job.is_over
         toy.finish(batch, onward(job), seconds=7.0)
-        assert toy.schedule.take("device", toy.now_s) is None
-        assert not toy.schedule.jobs
+        assert toy.scheduler.take("device", toy.now_s) is None
+        assert not toy.scheduler.jobs
 
     def test_what_has_ended_is_released_whenever_it_was_due(self) -> None:
         """A job holds photographs; a deadline may be minutes away, and another's nearer."""
@@ -306,7 +308,7 @@ class TestTime:
         for _ in range(10):
             job = toy.admit(stage="describe", deadline_s=1e5)
             ended.append(weakref.ref(job))
-            toy.schedule.cancel(job, toy.now_s)
+            toy.scheduler.cancel(job, toy.now_s)
         del job
         toy.jobs.clear()
         gc.collect()
@@ -317,16 +319,16 @@ class TestTime:
         """Else a server that is too slow for its callers would go on admitting them."""
         toy = Toy()
         toy.admit(stage="describe")
-        toy.finish(toy.take("host"), Over(), seconds=seconds)
-        predicted_s = toy.schedule.costs.predict("describe", "toy")
+        toy.finish(toy.take("host"), Abandoned(), seconds=seconds)
+        predicted_s = toy.scheduler.costs.predict("describe", "toy")
         assert predicted_s > COST_S["describe"] if learns else predicted_s == COST_S["describe"]
 
     def test_a_cancelled_job_frees_its_place(self) -> None:
         toy = Toy()
         jobs = [toy.admit() for _ in range(5)]
         assert toy.refusal().reason is Refusal.QUEUE_FULL
-        toy.schedule.cancel(jobs[2], toy.now_s)
-        toy.schedule.cancel(jobs[2], toy.now_s)  # nothing more happens
+        toy.scheduler.cancel(jobs[2], toy.now_s)
+        toy.scheduler.cancel(jobs[2], toy.now_s)  # nothing more happens
         toy.admit()
         assert toy.ending_of(jobs[2]) is Ending.CANCELLED
 
@@ -335,9 +337,9 @@ class TestTime:
         job = toy.admit(stage="coarse", deadline_s=5.0)
         fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), 4.5)
         toy.finish(toy.take("device"), onward(job, fallback))
-        assert toy.schedule.next_due_s == 4.5
+        assert toy.scheduler.next_due_s == 4.5
         toy.take("host")
-        toy.schedule.expire(4.5)
+        toy.scheduler.expire(4.5)
         assert toy.ends[0] == [(Ending.DEGRADED, "coarse")]
 
     def test_and_at_once_if_that_is_foreseen(self) -> None:
@@ -351,7 +353,7 @@ class TestTime:
         """What is not computed teaches nothing: so, now and then, what seems useless is computed all the same."""
         toy = Toy()
         for _ in range(20):
-            toy.schedule.costs.observe("refine", "toy", 30.0)
+            toy.scheduler.costs.observe("refine", "toy", 30.0)
         refined = 0
         for _ in range(300):
             job = toy.admit(stage="coarse", deadline_s=toy.now_s + 2.0)
@@ -377,7 +379,7 @@ class TestTime:
         toy = Toy(quota=Quota())
         toy.admit(deadline_s=5.0)
         toy.take("host")
-        toy.schedule.expire(5.0)
+        toy.scheduler.expire(5.0)
         ((predicted_s, actual_s),) = settled
         assert actual_s == predicted_s > 0
 
@@ -411,10 +413,10 @@ class Events(RuleBasedStateMachine):
         bucket=st.sampled_from(["x", "y"]),
     )
     def arrive(self, client: str, lasts_s: float, size_bytes: int, stage: str, bucket: str) -> None:
-        idle = not self.toy.schedule.jobs
+        idle = not self.toy.scheduler.jobs
         job = self.toy.job(client, self.toy.now_s + lasts_s, size_bytes, stage, bucket)
         try:
-            self.toy.schedule.admit(job, self.toy.now_s)
+            self.toy.scheduler.admit(job, self.toy.now_s)
         except Refused:
             assert not idle
             assert not job.is_over
@@ -423,16 +425,16 @@ class Events(RuleBasedStateMachine):
         self.admitted.append(job)
         if not idle:
             for lane, threads in LANES.items():
-                booked_s = sum(it.booked_s[lane] for it in self.toy.schedule.jobs)
+                booked_s = sum(it.booked_s[lane] for it in self.toy.scheduler.jobs)
                 assert booked_s <= OPTIONS.max_queued_s * threads + 0.9  # one that an idle server tried may be over
-            assert sum(it.size_bytes for it in self.toy.schedule.jobs) <= OPTIONS.max_bytes
+            assert sum(it.size_bytes for it in self.toy.scheduler.jobs) <= OPTIONS.max_bytes
 
     @rule(lane=st.sampled_from(sorted(LANES)))
     def compute(self, lane: str) -> None:
-        batch = self.toy.schedule.take(lane, self.toy.now_s)
+        batch = self.toy.scheduler.take(lane, self.toy.now_s)
         if batch is None:
             running = sum(it.stage.lane == lane for it in self.batches)
-            waiting = [job for job in self.toy.schedule.jobs if self._waits(job, lane)]
+            waiting = [job for job in self.toy.scheduler.jobs if self._waits(job, lane)]
             assert running == LANES[lane] or not waiting
             return
         assert len(batch.jobs) <= batch.stage.max_batch
@@ -445,27 +447,27 @@ class Events(RuleBasedStateMachine):
     @rule(data=st.data())
     def complete(self, data: st.DataObject) -> None:
         batch = self.batches.pop(data.draw(st.integers(0, len(self.batches) - 1)))
-        verdicts: list[Verdict] = []
+        verdicts: list[StageResult] = []
         for job in batch.jobs:
             fate = data.draw(st.sampled_from(["onward", "onward", "done", "fails", "fallback"]))
             due_s = self.toy.now_s + data.draw(st.floats(0.0, 3.0))
             fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), due_s) if fate == "fallback" else None
-            planted: dict[str, Verdict] = {"done": Done(None), "fails": ValueError("planted")}
+            planted: dict[str, StageResult] = {"done": Done(None), "fails": ValueError("planted")}
             verdicts.append(planted.get(fate) or onward(job, fallback))
-        self.toy.schedule.finish(batch, verdicts, self.toy.now_s)
+        self.toy.scheduler.finish(batch, verdicts, self.toy.now_s)
 
-    @precondition(lambda self: self.toy.schedule.jobs)
+    @precondition(lambda self: self.toy.scheduler.jobs)
     @rule(data=st.data())
     def cancel(self, data: st.DataObject) -> None:
-        jobs = sorted(self.toy.schedule.jobs, key=self.toy.jobs.index)
-        self.toy.schedule.cancel(data.draw(st.sampled_from(jobs)), self.toy.now_s)
+        jobs = sorted(self.toy.scheduler.jobs, key=self.toy.jobs.index)
+        self.toy.scheduler.cancel(data.draw(st.sampled_from(jobs)), self.toy.now_s)
 
     @rule(seconds=st.floats(0.0, 1.0), timer_is_late=st.booleans())
     def wait(self, seconds: float, timer_is_late: bool) -> None:
         self.toy.now_s += seconds
         if not timer_is_late:
-            self.toy.schedule.expire(self.toy.now_s)
-            assert all(self.toy.now_s < job.due_s for job in self.toy.schedule.jobs)
+            self.toy.scheduler.expire(self.toy.now_s)
+            assert all(self.toy.now_s < job.due_s for job in self.toy.scheduler.jobs)
 
     def _waits(self, job: Job, lane: str) -> bool:
         of_lane = {stage.name for stage in STAGES if stage.lane == lane}
@@ -473,7 +475,7 @@ class Events(RuleBasedStateMachine):
 
     @invariant()
     def every_admitted_job_has_ended_once_or_is_alive(self) -> None:
-        alive = self.toy.schedule.jobs
+        alive = self.toy.scheduler.jobs
         for job in self.admitted:
             ends = self.toy.ends[self.toy.jobs.index(job)]
             assert len(ends) == (job not in alive)
@@ -484,7 +486,7 @@ class Events(RuleBasedStateMachine):
     @invariant()
     def what_is_told_is_so(self) -> None:
         waiting = Counter(
-            job.step.stage for job in self.toy.schedule.jobs if not any(job in it.jobs for it in self.batches)
+            job.step.stage for job in self.toy.scheduler.jobs if not any(job in it.jobs for it in self.batches)
         )
         running = Counter(job_stage for it in self.batches for job_stage in [it.stage.name] * len(it.jobs))
         for stage in COST_S:
@@ -496,9 +498,9 @@ class Events(RuleBasedStateMachine):
         if not hasattr(self, "toy"):
             return
         for batch in self.batches:
-            self.toy.schedule.finish(batch, [onward(job) for job in batch.jobs], self.toy.now_s)
+            self.toy.scheduler.finish(batch, [onward(job) for job in batch.jobs], self.toy.now_s)
         run_through(self.toy)
-        assert not self.toy.schedule.jobs
+        assert not self.toy.scheduler.jobs
         assert all(job.is_over for job in self.admitted)
         assert not any(job.booked_s for job in self.admitted)
 
