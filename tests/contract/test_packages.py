@@ -1,0 +1,124 @@
+"""The package as others install it: built, put into empty environments, with each of its extras."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support.programs import LIMIT_S, Program
+
+ROOT = Path(__file__).parents[2]
+SOURCES = ("client", "server", "deploy/ray/mapless_ray", "pyproject.toml", "README.md", "LICENSE")
+BUILD_LIMIT_S = 170.0
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+def environment() -> dict[str, str]:
+    """The variables of this process without this checkout's paths and settings."""
+    return {name: it for name, it in os.environ.items() if not name.startswith(("MAPLESS_", "PYTHON"))}
+
+
+def run(*command: str | Path, code: int = 0) -> str:
+    """What a command prints, on both streams."""
+    done = subprocess.run(
+        list(map(str, command)), capture_output=True, text=True, env=environment(), timeout=BUILD_LIMIT_S, cwd="/"
+    )
+    assert done.returncode == code, f"{done.stdout}\n{done.stderr}"
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of what is built, since building writes beside it."""
+    folder = tmp_path_factory.mktemp("source")
+    for name in SOURCES:
+        copy = folder / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, copy, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(ROOT / name, copy)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(source: Path) -> Path:
+    """The wheel, built from the sdist."""
+    run(sys.executable, "-m", "build", "--installer", "uv", source)
+    (found,) = (source / "dist").glob("*.whl")
+    return found
+
+
+@pytest.fixture(scope="module")
+def install(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Makes an environment with the wheel and some of its extras; gives the folder of its programs."""
+
+    def install(extras: str) -> Path:
+        folder = tmp_path_factory.mktemp("environment")
+        run(sys.executable, "-m", "uv", "venv", "--clear", "--python", sys.executable, folder)
+        python = folder / "bin" / "python"
+        run(sys.executable, "-m", "uv", "pip", "install", "--python", python, f"mapless{extras} @ {wheel.as_uri()}")
+        return folder / "bin"
+
+    return install
+
+
+def test_the_wheel_holds_every_file_of_the_packages(source: Path, wheel: Path) -> None:
+    packaged = set(zipfile.ZipFile(wheel).namelist())
+    for place in ("client", "server", "deploy/ray"):
+        for package in (source / place).glob("mapless*"):
+            files = {it.relative_to(source / place).as_posix() for it in package.rglob("*") if it.is_file()}
+            assert files <= packaged, package.name
+
+
+def test_the_client_alone_needs_neither_server_nor_torch(install: Callable[[str], Path]) -> None:
+    programs = install("")
+    run(programs / "mapless", "--help")
+    installed = json.loads(run(sys.executable, "-m", "uv", "pip", "list", "-q", "--format=json", "-p", programs.parent))
+    assert {it["name"] for it in installed} == {
+        "googleapis-common-protos",
+        "grpcio",
+        "mapless",
+        "numpy",
+        "protobuf",
+        "typing-extensions",
+    }
+    message = run(programs / "mapless-server", "serve", code=1)
+    assert message == "mapless-server: the Python package typer is not installed: pip install 'mapless[server]'\n"
+
+
+def test_a_server_serves_and_says_what_its_tools_need(install: Callable[[str], Path], tmp_path: Path) -> None:
+    programs = install("[server]")
+    command = programs / "mapless-server"
+    for arguments in (["--help"], ["serve", "--help"], ["store", "--help"], ["token", "--help"], ["weights", "list"]):
+        run(command, *arguments)
+    message = run(command, "evaluate", "folder", code=2)
+    assert message == "mapless-server: evaluate needs the Python package jinja2: pip install 'mapless[tools]'\n"
+    flags = ["--port", "0", "--no-metrics", "--data-dir", str(tmp_path / "data")]
+    with (tmp_path / "log").open("w") as log:
+        process = subprocess.Popen(
+            [command, "serve", *flags], stdout=subprocess.PIPE, stderr=log, text=True, env=environment()
+        )
+    try:
+        address = Program(process, tmp_path).address
+        assert run(programs / "mapless", "--address", address, "health").startswith("SERVING\n")
+    finally:
+        process.kill()
+        process.communicate(timeout=LIMIT_S)
+
+
+def test_tools_run_with_their_extra(install: Callable[[str], Path], tmp_path: Path) -> None:
+    command = install("[server,tools]") / "mapless-server"
+    for name in ("import", "export", "audit", "evaluate", "calibrate", "replay", "load", "bench", "demo"):
+        run(command, name, "--help")
+    assert "is not a folder" in run(command, "import", tmp_path / "absent", "scene", code=2)
+    message = run(command, "view", "scene", code=2)
+    assert message == "mapless-server: view needs the Python package viser: pip install 'mapless[view]'\n"
