@@ -69,7 +69,7 @@ fuzz: setup  ## Fuzz what reads the inputs of strangers; TARGET="images names" f
 	PYTHONPATH=tests $(BIN)/python -m fuzz.campaign --output fuzz-output --runs $(RUNS) --targets $(TARGET) $(ARGS)
 
 load-ray: setup  ## Measure replicas on Ray Serve, on this machine: half an hour; PART=overhead, throughput, failover or redeploys
-	$(BIN)/python -m mapless_ray.trial $(or $(PART),all) $(if $(DATA),--data '$(DATA)') $(ARGS)
+	$(BIN)/python -m mapless_tools.load_ray $(or $(PART),all) $(if $(DATA),--data '$(DATA)') $(ARGS)
 
 clean:  ## Remove the environment and caches
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache build *.egg-info

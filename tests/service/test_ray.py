@@ -55,8 +55,8 @@ pytest.importorskip("ray.serve", reason="needs Ray Serve: the extra `ray`")
 
 from support.ray_app import FAILS, HANGS, SECRET
 
-from mapless_ray.trial.callers import Calls, Scenes, calling
-from mapless_ray.trial.cluster import Cluster, Replica, application, running_cluster
+from mapless_tools.load_ray.callers import Calls, Scenes, calling
+from mapless_tools.load_ray.cluster import Cluster, Replica, application, running_cluster
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

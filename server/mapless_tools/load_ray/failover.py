@@ -16,7 +16,7 @@ from .cluster import Cluster, Replica, application, running_cluster
 from .database import VARIABLE, database_url
 
 MAX_GAP_S = 2.0
-NO_OP = "mapless_ray.trial.no_op:build"
+NO_OP = "mapless_tools.load_ray.no_op:build"
 SETTLE_S = 3.0
 REPLACED_LIMIT_S = 120.0
 

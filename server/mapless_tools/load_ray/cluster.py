@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..environment import variables
+from mapless_ray.environment import variables
 
 START_LIMIT_S = 120.0
 END_LIMIT_S = 20.0
@@ -179,7 +179,7 @@ def running_cluster(
     options = {"folder": str(folder / "ray"), "cpus": cpus, "http_port": ports[0], "grpc_port": ports[1]}
     with (folder / "log").open("w") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "mapless_ray.trial.host", json.dumps(options)],
+            [sys.executable, "-m", "mapless_tools.load_ray.host", json.dumps(options)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,

@@ -69,7 +69,7 @@ def measure_overhead(options: OverheadOptions, progress: Progress) -> list[Way]:
     request = photo_request(photo, no_op.CAMERA, names)
     with database_url() as url, running_cluster({VARIABLE: url}) as cluster:
         cluster.deploy(application({"insecure": True, "workers": WORKERS}, 1, import_path=NO_OP))
-        with child_module("mapless_ray.trial.plain", str(WORKERS), environment={VARIABLE: url}) as plain:
+        with child_module("mapless_tools.load_ray.plain", str(WORKERS), environment={VARIABLE: url}) as plain:
             with Client(cluster.address) as client:
                 client.create_scene(SCENE)
                 client.add_references(SCENE, [Scenes(photo=photo).reference(name) for name in names])

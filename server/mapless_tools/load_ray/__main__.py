@@ -1,4 +1,4 @@
-"""`python -m mapless_ray.trial overhead|throughput|failover|redeploys|all`: tables on the screen, figures as JSON."""
+"""`python -m mapless_tools.load_ray overhead|throughput|failover|redeploys|all`: tables on the screen, figures as JSON."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ PARTS: dict[str, Callable[[argparse.Namespace, Progress], Part]] = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 1 if a bar was missed or a cluster did not come up."""
-    parser = argparse.ArgumentParser(prog="python -m mapless_ray.trial", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m mapless_tools.load_ray", description=__doc__)
     parser.add_argument("part", choices=[*PARTS, "all"])
     parser.add_argument("--count", type=int, help=f"kills or redeploys; default: {KILLS} and {REDEPLOYS}")
     parser.add_argument("--data", type=Path, help="folder with images/ and cameras.json; default: a rendered room")
@@ -86,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 update_json(given.output / "load-ray.json", name, figures, checks)
                 is_met &= all(check.met for check in checks)
     except (ClusterFailed, NoDatabase, ValueError) as error:
-        print(f"mapless_ray.trial: {error}", file=sys.stderr)
+        print(f"mapless_tools.load_ray: {error}", file=sys.stderr)
         return 1
     return 0 if is_met else 1
 
