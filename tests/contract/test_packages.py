@@ -71,8 +71,11 @@ def install(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[
     return install
 
 
-def test_the_wheel_holds_every_file_of_the_packages(source: Path, wheel: Path) -> None:
+def test_the_wheel_holds_every_file_of_the_packages_and_no_other(source: Path, wheel: Path) -> None:
     packaged = set(zipfile.ZipFile(wheel).namelist())
+    tops = {name.partition("/")[0] for name in packaged}
+    packages = {"mapless", "mapless_command", "mapless_ray", "mapless_server", "mapless_tools"}
+    assert {top for top in tops if not top.endswith(".dist-info")} == packages
     for place in ("client", "server", "deploy/ray"):
         for package in (source / place).glob("mapless*"):
             files = {it.relative_to(source / place).as_posix() for it in package.rglob("*") if it.is_file()}

@@ -1,4 +1,4 @@
-"""`python -m mapless_tools.load_ray overhead|throughput|failover|redeploys|all`: tables on the screen, figures as JSON."""
+"""`python -m mapless_tools.load_ray overhead|throughput|failover|redeploys|all`: prints tables, writes JSON."""
 
 from __future__ import annotations
 
