@@ -330,6 +330,9 @@ class TestFindings:
         html = page(report(find(self.outcomes(), RightRule())))
         assert html.count("<svg") == 5
         assert "few &lt;matches&gt;" in html
+        html = re.sub(
+            r'xmlns(:xlink)?="http[^"]*"|(?:href=|url\()"?#', "", html
+        )  # names, and places in the page itself
         assert re.findall(r"(?:src|href|url)\s*[=(]|<script|@import|https?://", html) == []
 
     def test_only_what_exceeds_its_claim_is_listed_as_such(self) -> None:

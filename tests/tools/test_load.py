@@ -25,8 +25,9 @@ from hypothesis import strategies as st
 
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_tools.charts import write_figure
 from mapless_tools.load.arrivals import Kind, Mix, PlannedCall, Requests, plan_calls, poisson_times
-from mapless_tools.load.chart import SIZE_PX, draw_load
+from mapless_tools.load.charts import LATENCIES, RATES, draw_load
 from mapless_tools.load.no_op import CAMERA, padded_photo
 from mapless_tools.load.pipeline import PipelineOptions, PipelineResult, pipeline_checks, pipeline_json
 from mapless_tools.load.records import CallRecord, Fate, account_of, latencies, percentile
@@ -35,7 +36,7 @@ from mapless_tools.load.requests import photo_request, read_answer
 from mapless_tools.load.scrape import Scrape, parse_metrics, reconcile
 from mapless_tools.load.sender import Target, connected, send_closed_loop, send_open_loop
 from mapless_tools.load.step import ServerUnderLoad, Step, run_step
-from mapless_tools.load.watch import ProcessSample, going_first, read_process, trend
+from mapless_tools.load.watch import ProcessSample, going_first, read_process
 
 METHOD = "/toy.Toy/Call"
 GOOD, BAD = b"good", b"bad"
@@ -379,23 +380,6 @@ def test_the_generator_has_priority_while_it_measures_only() -> None:
         server.communicate(b"\n")
 
 
-def test_a_trend_finds_the_planted_slope_and_doubts_noise() -> None:
-    random = np.random.default_rng(11)
-    times = np.arange(0.0, 600.0, 2.0)
-    noise = random.normal(0.0, 1.0, len(times))
-    growing = trend(times.tolist(), (100 + 0.5 * times / 60 + noise).tolist())
-    assert growing.low < 0.5 < growing.high
-    assert growing.grows
-    flat = trend(times.tolist(), (100 + noise).tolist())
-    assert flat.low < 0 < flat.high
-    assert not flat.grows
-    constant = trend([0.0, 1.0, 2.0], [7.0, 7.0, 7.0])
-    assert (constant.mean, constant.per_minute, constant.grows) == (7.0, 0.0, False)
-    # A step up and down again in long waves is not taken for hundreds of independent samples.
-    waves = trend(times.tolist(), (100 + np.sign(np.sin(times / 60))).tolist())
-    assert waves.high - waves.low > 3 * (flat.high - flat.low)
-
-
 PAGE = """
 grpc_server_started_total{grpc_service="s",grpc_method="Localize"} 12.0
 grpc_server_handled_total{grpc_service="s",grpc_method="Localize",grpc_code="OK"} 7.0
@@ -474,7 +458,7 @@ def test_what_an_answer_says() -> None:
 
 
 def step(name: str, asked_per_s: float | None, records: Sequence[CallRecord], told: Scrape | None = None) -> Step:
-    samples = [ProcessSample(float(i), 400.0 + (i % 2), 14, 25, 1.8 * i) for i in range(11)]
+    samples = [ProcessSample(i / 2, 400.0 + (i % 2), 14, 25, 0.9 * i) for i in range(21)]
     account = account_of(records, 10.0)
     codes = [r.code for r in records]
     return Step(name, asked_per_s, 10.0, account, codes, samples, 0.0, told, 0.1, 10.0)
@@ -513,18 +497,23 @@ def test_a_good_server_meets_bars_and_slow_refusals_miss_one() -> None:
     assert different == ["slowest of 161 refusals at 3 times saturation"]
 
 
-def test_the_picture_is_a_png_of_the_stated_size_and_not_blank() -> None:
-    picture = cv2.imdecode(np.frombuffer(draw_load(planted_result()), np.uint8), cv2.IMREAD_COLOR)
+def test_the_picture_has_a_curve_for_each_figure(tmp_path: Path) -> None:
+    write_figure(draw_load(planted_result()), tmp_path / "load.png")
+    picture = cv2.imread(str(tmp_path / "load.png"))
     assert picture is not None
-    assert picture.shape == (SIZE_PX[1], SIZE_PX[0], 3)
-    assert len(np.unique(picture.astype(np.uint32) @ np.array([1, 256, 65536], np.uint32))) > 50
+    assert picture.shape == (1080, 1500, 3)
+    upper, lower = draw_load(planted_result()).axes
+    for axes, names in ((upper, LATENCIES), (lower, RATES)):
+        drawn = [label.partition(":")[0] for label in axes.get_legend_handles_labels()[1]]
+        assert set(names) <= set(drawn)
+    assert "answered in time: 7.9/s" in lower.get_legend_handles_labels()[1]
 
 
 def test_a_step_without_any_answer_can_be_reported() -> None:
     result = planted_result()
     refused = [record(Fate.REFUSED, at_s=0.1 * i, took_s=0.003) for i in range(50)]
     result = replace(result, steps=[*result.steps[:2], step("300 %", 24.0, refused)])
-    assert draw_load(result)[:4] == b"\x89PNG"
+    assert draw_load(result).axes
     assert any("300 %" in line for line in step_lines(result.all_steps))
     goodput = next(check for check in pipeline_checks(result) if check.figure.startswith("goodput"))
     assert goodput.met is False

@@ -1,73 +1,71 @@
-"""What the report draws: reliability, errors beside claims, risk against coverage."""
+"""The report's charts: reliability, errors beside claims, risk against coverage."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import bdtr
+from matplotlib.figure import Figure
+from scipy.special import bdtrik
 
-from mapless_tools.evaluate.svg import Axis, Chart, Curve, log_range
+from mapless_tools.charts import figure_of, new_axes, plot, use_logarithms
 
 from .claims import Claim
 from .findings import DIAGRAM, Findings, reliability
 
 SMALLEST_CM, SMALLEST_DEG = 0.01, 0.001
-"""Errors below are not told apart: no ground truth is that good."""
+"""Smaller errors are drawn as these: no ground truth is that good."""
 
 
-def charts_of(found: Findings, unit: str) -> list[Chart]:
+def charts_of(found: Findings, unit: str) -> list[Figure]:
     """All charts of what was found; a length is in centimetres where `unit` is "m", else in the folder's unit."""
-    length = ("cm", 100.0) if unit == "m" else (unit, 1.0)
-    charts = []
-    for kind, (name, factor), smallest in (
-        ("position", length, SMALLEST_CM),
-        ("rotation", ("°", 1.0), SMALLEST_DEG),
+    length_unit, per_unit = ("cm", 100.0) if unit == "m" else (unit, 1.0)
+    figures = []
+    for kind, kind_unit, factor, smallest in (
+        ("position", length_unit, per_unit, SMALLEST_CM),
+        ("rotation", "°", 1.0, SMALLEST_DEG),
     ):
         claims = getattr(found.sample, kind)
         if claims:
-            after = getattr(found.after, kind) if found.after else ()
-            charts += [_reliability(kind, claims, after), _beside(kind, claims, name, factor, smallest)]
-    return charts + _risk(found)
+            calibrated = getattr(found.after, kind) if found.after else ()
+            figures += [
+                _reliability(kind, claims, calibrated),
+                _beside_claims(kind, claims, kind_unit, factor, smallest),
+            ]
+    return [*figures, _risk(found)] if found.trusted else figures
 
 
-def _reliability(kind: str, claims: Sequence[Claim], after: Sequence[Claim]) -> Chart:
-    curves = [Curve("as claimed", _per_cent(reliability(claims)))]
-    if after:
-        curves.append(Curve("with the factors of all others", _per_cent(reliability(after))))
-    curves.append(Curve("exactly right", ((0.0, 0.0), (100.0, 100.0)), from_paper=True))
-    for name, tail in (("by chance, at least", 0.025), ("by chance, at most", 0.975)):
-        shares = tuple((100 * p, 100 * _chance(len(claims), p, tail)) for p in DIAGRAM)
-        curves.append(Curve(name, shares, from_paper=True))
-    return Chart(
-        f"Reliability of the {kind}'s radii",
-        Axis("claimed: the truth is within, %", 0, 100),
-        Axis("it was, % of answers", 0, 100),
-        tuple(curves),
-    )
+def _reliability(kind: str, claims: Sequence[Claim], calibrated: Sequence[Claim]) -> Figure:
+    title = f"Reliability of the {kind}'s radii"
+    axes = new_axes(title, "claimed: the truth is within, %", "it was, % of answers")
+    axes.set(xlim=(0, 100), ylim=(0, 100))
+    for label, its in (("as claimed", claims), ("with the factors of all others", calibrated)):
+        if its:
+            plot(axes, label, *(100 * np.transpose(reliability(its))))
+    plot(axes, "exactly right", (0, 100), (0, 100), dotted=True)
+    probabilities, count = np.array(DIAGRAM), len(claims)
+    for label, tail in (("by chance, at least", 0.025), ("by chance, at most", 0.975)):
+        shares = np.ceil(bdtrik(tail, count, probabilities)) / count
+        plot(axes, label, (100 * probabilities).tolist(), (100 * shares).tolist(), dotted=True)
+    return figure_of(axes)
 
 
-def _chance(count: int, probability: float, tail: float) -> float:
-    """Quantile of the share of claims that hold if each does with a probability."""
-    return float(np.searchsorted(bdtr(np.arange(count + 1), count, probability), tail)) / count
+def _beside_claims(kind: str, claims: Sequence[Claim], unit: str, factor: float, smallest: float) -> Figure:
+    radii = [max(factor * claim.radius_95, smallest) for claim in claims]
+    errors = [max(factor * claim.error, smallest) for claim in claims]
+    title = f"Errors of the {kind} beside their claims"
+    axes = new_axes(title, f"claimed 95 % radius, {unit}", f"error, {unit}")
+    use_logarithms(axes.xaxis, axes.yaxis)
+    axes.scatter(radii, errors, s=12, label="answers")
+    ends = (min(*radii, *errors), max(*radii, *errors))
+    plot(axes, "equal: below it holds", ends, ends, dotted=True)
+    return figure_of(axes)
 
 
-def _beside(kind: str, claims: Sequence[Claim], unit: str, factor: float, smallest: float) -> Chart:
-    points = tuple((factor * claim.radius_95, max(factor * claim.error, smallest)) for claim in claims)
-    low, high = log_range([value for point in points for value in point], smallest)
-    axes = Axis(f"claimed 95 % radius, {unit}", low, high, True), Axis(f"error, {unit}", low, high, True)
-    exact = Curve("equal: below it holds", ((low, low), (high, high)), from_paper=True)
-    return Chart(f"Errors of the {kind} beside their claims", *axes, (exact, Curve("answers", points, joined=False)))
-
-
-def _risk(found: Findings) -> list[Chart]:
-    if not found.trusted:
-        return []
-    points = tuple((100 * point.coverage, 100 * point.risk) for point in found.trusted)
-    top = max(5.0, min(100.0, 1.2 * max(risk for _, risk in points)))
-    axes = Axis("right answers accepted, %", 0, 100), Axis("wrong ones among the accepted, %", 0, top)
-    return [Chart("Accepting answers from the highest trust down", *axes, (Curve("by trust", points, marked=True),))]
-
-
-def _per_cent(points: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-    return tuple((100 * x, 100 * y) for x, y in points)
+def _risk(found: Findings) -> Figure:
+    title = "Accepting answers from the highest trust down"
+    axes = new_axes(title, "right answers accepted, %", "wrong ones among the accepted, %")
+    coverage, risk = (100 * np.transpose([(point.coverage, point.risk) for point in found.trusted])).tolist()
+    axes.set(xlim=(0, 100), ylim=(0, max(5.0, min(100.0, 1.2 * max(risk)))))
+    plot(axes, "by trust", coverage, risk, marker="o")
+    return figure_of(axes)

@@ -56,6 +56,8 @@ def audit_command(
     from mapless_tools.output_files import check_writable
     from mapless_tools.progress import progress_bars
 
+    if html is not None:
+        import mapless_tools.pages  # noqa: F401  # what it lacks is said before the work, not after it
     examined = Examined(scene)
     try:
         for file in filter(None, (report, html)):
@@ -195,22 +197,16 @@ def to_json(examined: Examined) -> dict[str, Any]:
     }
 
 
-_STYLE = """body{font:14px sans-serif;margin:2em}table{border-collapse:collapse}td,th{padding:.3em .6em;
-border-bottom:1px solid #ccc;text-align:left}.alarm{background:#fdd}.note{background:#ffd}"""
-
-
 def to_html(examined: Examined) -> str:
     """The report as one page that needs nothing else."""
-    from html import escape
+    from mapless_tools.pages import render
 
-    rows = []
-    for audit in examined.audits:
-        kind = "alarm" if audit.verdict in ALARMS else "" if audit.verdict == "CONSISTENT" else "note"
-        cells = "".join(f"<td>{escape(cell)}</td>" for cell in cells_of(audit))
-        rows.append(f'<tr class="{kind}">{cells}</tr>')
-    head = "".join(f"<th>{escape(column)}</th>" for column in COLUMNS)
-    title = escape(f"Audit of scene {examined.scene}")
-    return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
-        f"<h1>{title}</h1><p>{escape(summary_of(examined))}</p><table><tr>{head}</tr>{''.join(rows)}</table></html>\n"
+    kinds = ["alarm" if a.verdict in ALARMS else "" if a.verdict == "CONSISTENT" else "note" for a in examined.audits]
+    return render(
+        "audit.html",
+        title=f"Audit of scene {examined.scene}",
+        summary=summary_of(examined),
+        columns=COLUMNS,
+        rows=map(cells_of, examined.audits),
+        kinds=kinds,
     )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from .benchmarks import BENCHMARKS, Benchmark
-from .metrics import RECALL_BARS, Summary, summarize
+from .metrics import RECALL_BARS, QueryResult, Summary, summarize
 from .protocol import Method
 from .suite import Run, Suite
 
@@ -66,6 +66,11 @@ class Group:
     def title(self) -> str:
         """Name of the benchmark, or what it is else."""
         return self.benchmark.title if self.benchmark else "Own photographs"
+
+    def results(self, scene: str, setting: int, method: Method) -> tuple[QueryResult, ...]:
+        """Of one run; empty if it could not be measured."""
+        run = self.runs.get((scene, setting, method))
+        return () if run is None else run.results
 
     def average(self, setting: int, method: Method) -> Average | None:
         """Over those measured scenes that the paper averages over, else over all; None if nothing was measured."""

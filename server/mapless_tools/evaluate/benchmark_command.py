@@ -18,7 +18,7 @@ from .averages import groups_of
 from .benchmarks import ScenePlace, find_scenes
 from .command import usage_errors
 from .figures import write_figures
-from .page import page, problems, told
+from .page import facts, page, problems
 from .pairs import chosen, pairs_file, read_pairs
 from .pictures import WorstQuery, worst_of
 from .plan import UsageError, check_images
@@ -155,6 +155,6 @@ def _print(suite: Suite) -> None:
             print(f"\n{group.title}. {table.title}")
             print("\n".join((*text_lines(table), *table.notes)))
     print()
-    for name, value in told(suite).items():
+    for name, value in facts(suite).items():
         print(f"{name}: {value}")
     print("\n".join(problems(suite)))

@@ -1,141 +1,144 @@
-"""What the report draws: cumulative errors, errors against sparsity, the ablation, errors along a sequence."""
+"""The report's charts: cumulative errors, errors against sparsity, the ablation, errors along a sequence."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mapless_tools.charts import figure_of, new_axes, plot, use_logarithms
 
 from .averages import Average, Group
-from .metrics import QueryResult, Summary
+from .metrics import QueryResult
 from .paper import DENSE
 from .protocol import Method, setting_name
-from .svg import Axis, Chart, Curve, log_range
 
-SMALLEST_CM, SMALLEST_DEG = 0.01, 0.001
-"""Errors below are not told apart: no ground truth is that good."""
 RIVALS = ("ACE", "ACE + GS-CPR", "L3")
 """Of the paper's figure of sparsity."""
 MAX_POINTS = 400
 """Of a curve along a sequence; beyond, each point is the worst of several queries."""
 
-Pick = Callable[[Summary | Average], float]
-_MEASURES: tuple[tuple[str, Callable[[QueryResult], float], float], ...] = (
-    ("translation error, cm", lambda result: 100 * result.translation_error, SMALLEST_CM),
-    ("rotation error, °", lambda result: result.rotation_error_deg, SMALLEST_DEG),
+
+@dataclass(frozen=True)
+class Measure:
+    """An error that is drawn.
+
+    Attributes:
+        name: "translation error" or "rotation error".
+        unit: of the values.
+        of_query, of_average: the error of one query, and the mean over scenes of the median error.
+        smallest: smaller values are drawn as this one: no ground truth is that good.
+        paper_index: of the value in the paper's medians.
+    """
+
+    name: str
+    unit: str
+    of_query: Callable[[QueryResult], float]
+    of_average: Callable[[Average], float]
+    smallest: float
+    paper_index: int
+
+    @property
+    def label(self) -> str:
+        """Of an axis."""
+        return f"{self.name}, {self.unit}"
+
+
+MEASURES = (
+    Measure(
+        "translation error",
+        "cm",
+        lambda it: 100 * it.translation_error,
+        lambda it: 100 * it.median_translation_m,
+        0.01,
+        0,
+    ),
+    Measure("rotation error", "°", lambda it: it.rotation_error_deg, lambda it: it.median_rotation_deg, 0.001, 1),
 )
 
 
-def cumulative(group: Group) -> list[Chart]:
+def cumulative(group: Group) -> list[Figure]:
     """For the densest and the sparsest setting: the share of all scenes' queries with at most an error."""
-    charts = []
+    figures = []
     for setting in dict.fromkeys((group.settings[0], group.settings[-1])):
-        pools = {method: _pooled(group, setting, method) for method in group.methods}
-        for label, error, smallest in _MEASURES:
-            values = [error(result) for results in pools.values() for result in results]
-            if values:
-                low, high = log_range(values, smallest)
-                curves = tuple(
-                    Curve(method.label, _shares([error(r) for r in results], low, high))
-                    for method, results in pools.items()
-                    if results
-                )
-                title = f"{setting_name(setting)}: queries within an error"
-                charts.append(Chart(title, Axis(label, low, high, True), Axis("queries, %", 0, 100), curves))
-    return charts
+        pools = {
+            method.label: [it for scene in group.scenes for it in group.results(scene, setting, method)]
+            for method in group.methods
+        }
+        for measure in MEASURES if any(pools.values()) else ():
+            axes = new_axes(f"{setting_name(setting)}: queries within an error", measure.label, "queries, %")
+            axes.set_ylim(0, 100)
+            use_logarithms(axes.xaxis)
+            for label, results in pools.items():
+                errors = np.sort([max(measure.of_query(it), measure.smallest) for it in results])
+                localized = errors[np.isfinite(errors)]
+                axes.step(localized, 100 * np.arange(1, len(localized) + 1) / len(errors), where="post", label=label)
+            figures.append(figure_of(axes))
+    return figures
 
 
-def sparsity(group: Group) -> list[Chart]:
+def sparsity(group: Group) -> list[Figure]:
     """Median error averaged over scenes against the number of references, with the paper's curves."""
     if len(group.settings) < 2:
         return []
-    methods = [method for method in group.methods if method.scale == group.methods[0].scale]
-    charts = []
-    for part, (label, _, smallest) in enumerate(_MEASURES):
-        curves = _by_setting(group, methods, part, lambda method: method.label)
+    methods = {method.label: method for method in group.methods if method.scale == group.methods[0].scale}
+    figures = []
+    for measure in MEASURES:
+        axes = _against_settings(group, measure, f"Sparsity: mean of the scenes' median {measure.name}", methods)
         for paper in group.benchmark.paper.methods if group.benchmark else ():
-            if paper.name in RIVALS:
-                medians = [(i, paper.average.get(s, (math.nan, math.nan))) for i, s in enumerate(group.settings)]
-                points = [(float(i), math.inf if m is None else float(m[part])) for i, m in medians]
-                known = tuple((x, y) for x, y in points if not math.isnan(y))
-                curves.append(Curve(f"{paper.name} (paper)", known, from_paper=True, marked=True))
-        charts.append(
-            _against_settings(
-                group, f"Sparsity: mean of the scenes' median {label.split(',')[0]}", label, curves, smallest
-            )
-        )
-    return charts
+            known = {i: paper.average[s] for i, s in enumerate(group.settings) if s in paper.average}
+            if paper.name in RIVALS and known:
+                medians = [math.inf if it is None else it[measure.paper_index] for it in known.values()]
+                plot(axes, f"{paper.name} (paper)", list(known), medians, marker="o", dotted=True)
+        figures.append(figure_of(axes))
+    return figures
 
 
-def ablation(group: Group) -> list[Chart]:
+def ablation(group: Group) -> list[Figure]:
     """The same for the strategies of the scale."""
     last = group.methods[-1].variant
-    methods = [method for method in group.methods if method.variant == last]
+    methods = {method.scale: method for method in group.methods if method.variant == last}
     if len(group.settings) < 2 or len(methods) < 2:
         return []
-    charts = []
-    for part, (label, _, smallest) in enumerate(_MEASURES):
-        curves = _by_setting(group, methods, part, lambda method: method.scale)
-        charts.append(
-            _against_settings(group, f"Scale, variant {last}: {label.split(',')[0]}", label, curves, smallest)
-        )
-    return charts
+    return [
+        figure_of(_against_settings(group, measure, f"Scale, variant {last}: {measure.name}", methods))
+        for measure in MEASURES
+    ]
 
 
-def along_sequence(group: Group, scene: str) -> list[Chart]:
+def along_sequence(group: Group, scene: str) -> list[Figure]:
     """Errors of the first method, query after query, for the densest and the sparsest setting."""
     method = group.methods[0]
     settings = dict.fromkeys((group.settings[0], group.settings[-1]))
-    runs = {setting: group.runs.get((scene, setting, method)) for setting in settings}
-    charts = []
-    for label, error, smallest in _MEASURES:
-        errors = {setting: [error(r) for r in run.results] for setting, run in runs.items() if run is not None}
-        if errors:
-            low, high = log_range([value for values in errors.values() for value in values], smallest)
-            curves = tuple(Curve(setting_name(setting), _worst(values)) for setting, values in errors.items())
-            longest = max(map(len, errors.values()))
-            x = Axis("query, in the order of the sequence" + _binned(longest), 0, max(longest - 1, 1))
-            charts.append(Chart(f"{scene}, {method.label}", x, Axis(label, low, high, True), curves))
-    return charts
+    runs = {s: results for s in settings if (results := group.results(scene, s, method))}
+    figures = []
+    for measure in MEASURES if runs else ():
+        stride = max(1, math.ceil(max(map(len, runs.values())) / MAX_POINTS))
+        thinned = f"; the worst of each {stride}" if stride > 1 else ""
+        x_label = f"query, in the order of the sequence{thinned}"
+        axes = new_axes(f"{scene}, {method.label}", x_label, measure.label)
+        use_logarithms(axes.yaxis)
+        for setting, results in runs.items():
+            errors = [max(measure.of_query(it), measure.smallest) for it in results]
+            starts = range(0, len(errors), stride)
+            plot(axes, setting_name(setting), starts, [max(errors[i : i + stride]) for i in starts])
+        figures.append(figure_of(axes))
+    return figures
 
 
-def _pooled(group: Group, setting: int, method: Method) -> list[QueryResult]:
-    keys = [(scene, setting, method) for scene in group.scenes]
-    return [result for key in keys if key in group.runs for result in group.runs[key].results]
-
-
-def _shares(errors: Sequence[float], low: float, high: float, steps: int = 120) -> tuple[tuple[float, float], ...]:
-    """Per cent of the errors at or below each of some values; what is infinite never counts."""
-    levels = [low * (high / low) ** (i / steps) for i in range(steps + 1)]
-    return tuple((level, 100 * sum(error <= level for error in errors) / len(errors)) for level in levels)
-
-
-def _by_setting(group: Group, methods: Sequence[Method], part: int, name: Callable[[Method], str]) -> list[Curve]:
-    curves = []
-    for method in methods:
-        averages = [(float(i), group.average(setting, method)) for i, setting in enumerate(group.settings)]
-        points = tuple(
-            (x, 100 * it.median_translation_m if part == 0 else it.median_rotation_deg) for x, it in averages if it
-        )
-        if points:
-            curves.append(Curve(name(method), points, marked=True))
-    return curves
-
-
-def _against_settings(group: Group, title: str, label: str, curves: Sequence[Curve], smallest: float) -> Chart:
-    low, high = log_range([y for curve in curves for _, y in curve.points], smallest)
-    names = tuple("all" if setting == DENSE else str(setting) for setting in group.settings)
-    x = Axis("references of the scene", -0.3, len(names) - 0.7, names=names)
-    return Chart(title, x, Axis(label, low, high, True), tuple(curves))
-
-
-def _stride(count: int) -> int:
-    return max(1, math.ceil(count / MAX_POINTS))
-
-
-def _binned(count: int) -> str:
-    return "" if _stride(count) == 1 else f"; the worst of each {_stride(count)}"
-
-
-def _worst(values: Sequence[float]) -> tuple[tuple[float, float], ...]:
-    stride = _stride(len(values))
-    return tuple((float(i), max(values[i : i + stride])) for i in range(0, len(values), stride))
+def _against_settings(group: Group, measure: Measure, title: str, methods: dict[str, Method]) -> Axes:
+    """A curve for each method, by its label: the mean of the medians, over the settings."""
+    axes = new_axes(title, "references of the scene", measure.label)
+    use_logarithms(axes.yaxis)
+    names = ["all" if setting == DENSE else str(setting) for setting in group.settings]
+    axes.set_xticks(range(len(names)), names)
+    for label, method in methods.items():
+        averages = {i: group.average(setting, method) for i, setting in enumerate(group.settings)}
+        known = {i: max(measure.of_average(it), measure.smallest) for i, it in averages.items() if it is not None}
+        if known:
+            plot(axes, label, list(known), list(known.values()), marker="o")
+    return axes

@@ -22,6 +22,7 @@ from mapless_server.method.views import View
 from mapless_tools.dataset import Frame
 
 from .metrics import QueryResult
+from .protocol import setting_name
 from .suite import Run
 
 HEIGHT_PX, GAP_PX = 260, 6
@@ -49,6 +50,26 @@ class WorstQuery:
     reference: str
     matches: int
     fitting: int
+
+    @property
+    def caption(self) -> str:
+        """The scene, the query, its errors or its rejection, and how many matches fit."""
+        run, result = self.run, self.result
+        name = f"{run.scene.place.name}, {setting_name(run.split.setting)}, {run.method.label}: {result.name}"
+        if result.localized:
+            outcome = (
+                f"{100 * result.translation_error:.1f} cm, {result.rotation_error_deg:.2f}° off; "
+                f"{result.inlier_count} inliers of {result.match_count} matches with all references"
+            )
+            if result.position_68 is not None:
+                outcome += f"; claimed within {100 * result.position_68:.1f} cm (68 %)"
+        else:
+            outcome = f"not localized, {result.rejection}: {result.message}"
+        if not self.reference:
+            return f"{name}. {outcome}"
+        return (
+            f"{name}. {outcome}. beside {self.reference}: {self.fitting} of {self.matches} matches fit the true poses"
+        )
 
 
 def worst_of(run: Run, count: int, extractor: FeatureExtractor, ratio: float, limits: ImageLimits) -> list[WorstQuery]:

@@ -25,10 +25,10 @@ METRIC_ALREADY = (
 
 @dataclass(frozen=True)
 class Row:
-    """A line: its cells, and whose figures they are."""
+    """A line of a table, and where its figures come from: `OURS`, `PAPERS` or `RIVAL`."""
 
     cells: tuple[str, ...]
-    whose: str
+    source: str
 
 
 @dataclass(frozen=True)

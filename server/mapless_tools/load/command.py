@@ -94,9 +94,10 @@ def _overhead(quick: bool, output: Path) -> list[Check]:
 
 def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
     from mapless_server.settings import available_cores
+    from mapless_tools.charts import write_figure
     from mapless_tools.evaluate.command import usage_errors
 
-    from .chart import draw_load
+    from .charts import draw_load
     from .pipeline import PipelineOptions, measure_pipeline, pipeline_checks, pipeline_json
     from .report import machine_lines, step_lines
     from .requests import place_of
@@ -109,7 +110,7 @@ def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> lis
         result = measure_pipeline(place, options, progress, log)
         load = os.getloadavg()[0]
     checks = pipeline_checks(result)
-    (output / "load.png").write_bytes(draw_load(result))
+    write_figure(draw_load(result), output / "load.png")
     lines = [f"{result.scene}:", "", *step_lines(result.all_steps), *machine_lines(checks, load, available_cores())]
     _report(output, "pipeline", lines, checks, pipeline_json(result), output / "load.png", log)
     return checks
@@ -117,12 +118,13 @@ def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> lis
 
 def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
     from mapless_server.settings import available_cores
+    from mapless_tools.charts import write_figure
     from mapless_tools.evaluate.command import usage_errors
 
+    from .charts import draw_soak
     from .report import machine_lines, step_lines
     from .requests import place_of
     from .soak import SoakOptions, least_minutes, measure_soak, soak_checks, soak_json, soak_lines
-    from .soak_chart import draw_soak
 
     brief = {"minutes": 0.25, "ramp_s": 4.0, "sample_every_s": 0.5, "churn": 4.0} if quick else {}
     with _measuring() as progress:
@@ -138,7 +140,7 @@ def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Ch
     checks = soak_checks(result)
     steps = step_lines([*result.before, result.soak])
     lines = [f"{result.scene}:", "", *steps, *soak_lines(result), *machine_lines(checks, load, available_cores())]
-    (output / "soak.svg").write_text(draw_soak(result.states, result.slopes), encoding="utf-8")
+    write_figure(draw_soak(result.states, result.slopes), output / "soak.svg")
     _report(output, "soak", lines, checks, soak_json(result), output / "soak.svg", log)
     return checks
 

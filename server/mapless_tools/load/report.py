@@ -15,8 +15,8 @@ from mapless_server.settings import available_cores
 from mapless_tools.output_files import write_json
 
 from .records import Fate
-from .step import Step
-from .watch import Trend
+from .slopes import Slope
+from .step import TREND_CONFIDENCE, Step
 
 
 @dataclass(frozen=True)
@@ -111,12 +111,13 @@ def machine_lines(checks: Sequence[Check], load: float, cores: int) -> list[str]
     ]
 
 
-def trend_check(figure: str, line: Trend | None, unit: str) -> Check:
+def trend_check(figure: str, found: Slope | None, unit: str) -> Check:
     """Whether something does not grow."""
-    if line is None:
+    if found is None:
         return Check(figure, "-", "no growth", None)
-    value = f"{line.per_minute:+.3f} ({line.low:+.3f} to {line.high:+.3f}) {unit}/min around {line.mean:.1f}"
-    return Check(figure, value, "no growth (95 %)", not line.grows)
+    per_minute, low, high = (value / 60 for value in (found.per_hour, found.low, found.high))
+    value = f"{per_minute:+.3f} ({low:+.3f} to {high:+.3f}) {unit}/min around {found.level:.1f}"
+    return Check(figure, value, f"no growth ({100 * TREND_CONFIDENCE:.0f} %)", not found.grows)
 
 
 def update_json(file: Path, part: str, figures: Mapping[str, Any], checks: Sequence[Check]) -> None:

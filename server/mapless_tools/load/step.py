@@ -6,13 +6,17 @@ import math
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from typing import Any
 
 from .records import Account, CallRecord, Fate, account_of
 from .scrape import Scrape, read_metrics
-from .watch import SAMPLE_EVERY_S, ProcessSample, Trend, trend, watched
+from .slopes import MIN_SAMPLES, Slope, slope
+from .watch import SAMPLE_EVERY_S, ProcessSample, watched
 
 Send = Callable[[], Awaitable[list[CallRecord]]]
+TREND_CONFIDENCE = 0.95
+TREND_FIELDS = ("resident_mib", "threads", "descriptors")
 
 
 @dataclass(frozen=True)
@@ -80,19 +84,30 @@ class Step:
         """Of one core, used by the generator itself."""
         return self.own_cpu_s / self.wall_s
 
-    def trend_of(self, field: str) -> Trend | None:
-        """How "resident_mib", "threads" or "descriptors" develop once settled; None if the step was too short."""
-        begin_s = self.samples[0].at_s + self.settle_s
-        # The last sample is taken when all is over, which is another state.
-        settled = [sample for sample in self.samples[:-1] if sample.at_s >= begin_s]
-        if len(settled) < 3:
+    def trend_of(self, field: str) -> Slope | None:
+        """The slope of "resident_mib", "threads" or "descriptors" once settled; None if the step was too short."""
+        settled = self._settled
+        if len(settled) < MIN_SAMPLES:
             return None
-        return trend([sample.at_s for sample in settled], [getattr(sample, field) for sample in settled])
+        values = [getattr(sample, field) for sample in settled]
+        return slope([sample.at_s for sample in settled], values, TREND_CONFIDENCE)
+
+    @property
+    def _settled(self) -> list[ProcessSample]:
+        """Samples after `settle_s`; the last sample is taken when all is over, which is another state."""
+        begin_s = self.samples[0].at_s + self.settle_s
+        return [sample for sample in self.samples[:-1] if sample.at_s >= begin_s]
+
+    def _trend_json(self, field: str) -> dict[str, float] | None:
+        found = self.trend_of(field)
+        if found is None:
+            return None
+        mean = fmean(getattr(sample, field) for sample in self._settled)
+        return {"mean": mean, "per_minute": found.per_hour / 60, "low": found.low / 60, "high": found.high / 60}
 
     def as_json(self) -> dict[str, Any]:
         """All figures, for programs."""
         longest_lag_s = None if self.told is None else self.told.longest_lag_s
-        trends = {name: self.trend_of(name) for name in ("resident_mib", "threads", "descriptors")}
         return {
             "name": self.name,
             "asked_per_s": self.asked_per_s,
@@ -103,7 +118,7 @@ class Step:
             "server_cpu_s_per_answer": self.cpu_s_per_answer if self.answers else None,
             "server_start": vars(self.samples[0]),
             "server_end": vars(self.samples[-1]),
-            "server_trends_per_minute": {name: None if line is None else vars(line) for name, line in trends.items()},
+            "server_trends_per_minute": {name: self._trend_json(name) for name in TREND_FIELDS},
             "event_loop_lag_below_s": _finite(longest_lag_s),
             "server_handled": None if self.told is None else dict(self.told.handled),
             "server_terminated": None if self.told is None else dict(self.told.terminated),

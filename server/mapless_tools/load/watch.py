@@ -1,21 +1,16 @@
-"""What the server's process holds and uses, from /proc, and whether it grows."""
+"""What the server's process holds and uses, from /proc."""
 
 from __future__ import annotations
 
 import asyncio
-import math
 import os
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from scipy.special import stdtrit
-
 SAMPLE_EVERY_S = 1.0
 NICENESS_STEP = 5
-CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
@@ -35,27 +30,6 @@ class ProcessSample:
     threads: int
     descriptors: int
     cpu_s: float
-
-
-@dataclass(frozen=True)
-class Trend:
-    """A straight line through samples.
-
-    Attributes:
-        mean: of the samples.
-        per_minute: its slope.
-        low, high: between which the true slope lies with 95 % confidence.
-    """
-
-    mean: float
-    per_minute: float
-    low: float
-    high: float
-
-    @property
-    def grows(self) -> bool:
-        """Whether that it grows is beyond doubt."""
-        return self.low > 0
 
 
 def read_process(process_id: int, at_s: float) -> ProcessSample:
@@ -118,30 +92,6 @@ async def watched(process_id: int, every_s: float = SAMPLE_EVERY_S) -> AsyncIter
         reading.cancel()
         await asyncio.gather(reading, return_exceptions=True)
     samples.append(read_process(process_id, loop.time()))
-
-
-def trend(times_s: Sequence[float], values: Sequence[float]) -> Trend:
-    """The line of least squares through at least three samples, with its confidence.
-
-    Neighbouring samples are alike, and count for less than independent ones: for n (1 - r) / (1 + r) of them, where r
-    is the correlation of each residual with the next.
-
-    Raises:
-        ValueError: too few samples, or all at one moment.
-    """
-    minutes, y = np.asarray(times_s, float) / 60, np.asarray(values, float)
-    if len(minutes) < 3 or np.ptp(minutes) == 0:
-        raise ValueError("a trend needs three samples and time between them")
-    centred = minutes - minutes.mean()
-    slope = float(centred @ y / (centred @ centred))
-    residuals = y - y.mean() - slope * centred
-    spread = float(residuals @ residuals)
-    if spread <= 1e-18 * max(1.0, float(y @ y)):
-        return Trend(float(y.mean()), slope, slope, slope)
-    alike = min(max(float(residuals[1:] @ residuals[:-1]) / spread, 0.0), 0.99)
-    freedom = max(len(y) * (1 - alike) / (1 + alike) - 2, 1.0)
-    margin = float(stdtrit(freedom, (1 + CONFIDENCE) / 2)) * math.sqrt(spread / freedom / float(centred @ centred))
-    return Trend(float(y.mean()), slope, slope - margin, slope + margin)
 
 
 def _set_niceness(process_id: int, niceness: int) -> None:
