@@ -1,14 +1,11 @@
-"""Charts and pages: failures are seen, colours fit any page, and a missing package is named before any work."""
+"""Charts: failures are seen, and colours fit any page."""
 
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from xml.etree import ElementTree
 
 import numpy as np
-import pytest
 
 from mapless_tools.charts import INK, figure_of, inline_svg, new_axes, plot, use_logarithms
 
@@ -36,32 +33,3 @@ def test_logarithmic_scales_have_plain_numbers() -> None:
     plot(axes, "curve", [0, 1], [0.03, 40.0])
     texts = set(ElementTree.fromstring(inline_svg(figure_of(axes))).itertext())
     assert {"0.1", "1", "10", "0.05", "0.5", "20"} <= texts
-
-
-WITHOUT = """
-import sys
-from mapless_tools.__main__ import main
-for arguments in {arguments}:
-    for name in [it for it in sys.modules if it.startswith(("{package}", "mapless_tools."))]:
-        del sys.modules[name]
-    sys.modules["{package}"] = None
-    sys.argv = ["mapless-server", *arguments]
-    try:
-        main()
-    except SystemExit as error:
-        print(error.code)
-"""
-
-
-@pytest.mark.parametrize(
-    ("package", "commands"),
-    [
-        ("matplotlib", ["evaluate nowhere --output nowhere", "calibrate nowhere", "load pipeline", "load soak"]),
-        ("jinja2", ["evaluate nowhere --output nowhere", "calibrate nowhere", "audit hall --html report.html"]),
-    ],
-)
-def test_a_missing_package_is_named_before_any_work(package: str, commands: list[str]) -> None:
-    program = WITHOUT.format(package=package, arguments=[command.split() for command in commands])
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    hint = f"mapless-server: the Python package {package} is not installed: pip install 'mapless[tools]'"
-    assert done.stdout.splitlines() == [hint] * len(commands)

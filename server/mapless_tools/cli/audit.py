@@ -56,8 +56,6 @@ def audit_command(
     from mapless_tools.output_files import check_writable
     from mapless_tools.progress import progress_bars
 
-    if html is not None:
-        import mapless_tools.pages  # noqa: F401  # what it lacks is said before the work, not after it
     examined = Examined(scene)
     try:
         for file in filter(None, (report, html)):
