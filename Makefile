@@ -10,37 +10,28 @@ TORCH  ?= torch==2.13.0
 PROTO_TOOLS := grpcio-tools==1.71.2 setuptools==80.9.0
 PROTO_VENV  := $(VENV)/proto-tools
 
-.PHONY: help setup test nightly weights lint format proto demo bench bench-gpu load load-ray fuzz clean
+.PHONY: help setup test thorough lint format proto demo bench bench-gpu load load-ray fuzz clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
-# uv installs in seconds what takes pip minutes.
-INSTALL = $(BIN)/python .ci/uv.py pip install --quiet
-
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check uv
-	$(INSTALL) $(TORCH)
-	$(INSTALL) --editable '.[server,tools,networks,otel,postgres,ray,view,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check $(TORCH)
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[server,tools,networks,otel,postgres,ray,view,dev]'
 	touch $@
 
 setup: $(VENV)/.installed  ## Create .venv with everything
 
 # The matrices are small: threads gain nothing, and wait for one another where cores are shared. Not so the full networks.
 THREADS ?= 1
-# Two processes, of which the one that has finished takes over tests of the other; WORKERS= for one process.
+# Two cores at once; WORKERS= for one after the other.
 WORKERS ?= -n 2 --dist loadfile
-test: setup $(PROTO_VENV)/.installed  ## Run the tests in at most five minutes; ARGS=... for pytest
+test: setup $(PROTO_VENV)/.installed  ## Run the tests; ARGS=... for pytest, ARGS="-m slow" THREADS=2 for the slow ones
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=$(THREADS) PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(WORKERS) $(ARGS)
 
-nightly: weights  ## Run the tests that are slow and not specific to a change; TENTH=0 to 9 for a tenth of them, as CI does
-	$(MAKE) test ARGS="-m nightly --timeout=600 $(if $(TENTH),--tenth=$(TENTH)) $(ARGS)"
-
-# Freely licensed, in the environment's own folder, where tests look for them.
-export TEST_WEIGHTS ?= $(abspath $(VENV))/weights
-weights: setup
-	MAPLESS_WEIGHTS_DIR=$(TEST_WEIGHTS) $(BIN)/mapless-server weights fetch aliked
+thorough:  ## Run the tests that repeat with many cases what others show with few: ten minutes
+	$(MAKE) test WORKERS= ARGS="-m thorough --timeout=600"
 
 lint: setup  ## Check style, types and protos
 	$(BIN)/ruff check .
@@ -53,8 +44,8 @@ format: setup  ## Format the code
 	$(BIN)/ruff format .
 
 $(PROTO_VENV)/.installed: Makefile $(VENV)/.installed
-	$(PYTHON) -m venv --without-pip $(PROTO_VENV)
-	$(INSTALL) --python $(PROTO_VENV)/bin/python $(PROTO_TOOLS)
+	$(PYTHON) -m venv $(PROTO_VENV)
+	$(PROTO_VENV)/bin/pip install --quiet --disable-pip-version-check $(PROTO_TOOLS)
 	touch $@
 
 proto: $(PROTO_VENV)/.installed  ## Regenerate client/mapless/v1 from proto/

@@ -20,7 +20,7 @@ import mapless_server
 from mapless import Client, NewReference, wire
 from mapless.axes import Axes
 from mapless.v1 import localization_service_pb2, reference_service_pb2
-from mapless_server.method.localize import Variant
+from mapless_server.method.answer import Variant
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.priors.known import PriorKind
 from mapless_server.method.rejection import Advice, RejectionReason

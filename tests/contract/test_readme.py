@@ -20,7 +20,7 @@ from mapless import Client, NewReference, RigidTransform
 from mapless import errors as client_errors
 from mapless.cli.arguments import make_parser
 from mapless_server import errors
-from mapless_server.method.localize import Variant
+from mapless_server.method.answer import Variant
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Refusal

@@ -17,21 +17,22 @@ from support.images import encode, textured
 from support.servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
 
 from mapless.geometry import RigidTransform
-from mapless_server.engine.describing import Description
-from mapless_server.engine.engine import Engine, EngineOptions
-from mapless_server.engine.query import Caller, Photo, Query, Result
-from mapless_server.engine.stages import MAX_LISTINGS, Work
-from mapless_server.engine.tiers import EscalationOptions, Tier
-from mapless_server.engine.views import QueryViews
+from mapless_server.engine.engine import EngineOptions
+from mapless_server.engine.query import Caller, Photo, Query, Result, Tier
+from mapless_server.engine.references import Description
+from mapless_server.engine.stages import MAX_LISTINGS, QueryStages
+from mapless_server.engine.tiers import EscalationOptions
 from mapless_server.errors import DeadlineExceeded, InvalidArgument, Unavailable
 from mapless_server.images.decode import ImageLimits, decode_image
-from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline
+from mapless_server.method.answer import Answer, Localization, LocalizeOptions
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.scenes.retrieval.narrowing import Narrowing, Sphere
 from mapless_server.scheduling import Abandoned, CostModel, Ending, Flow, Job
 from mapless_server.security.tenancy import SceneKey
+from mapless_server.serve.assembly import engine_over
 from mapless_server.store import NewReference, Store
 
 SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
@@ -82,7 +83,7 @@ class Setting:
             return reply(query, references, check) if callable(reply) else reply
 
         tiers = [Tier(extractor, pipelines[name]) for name, extractor in self.extractors.items()]
-        self.engine = Engine(
+        self.engine = engine_over(
             self.store, tiers, EngineOptions(escalation=ESCALATION), None, None, whole(method), DESCRIPTOR
         )
         self.loop = asyncio.new_event_loop()
@@ -98,8 +99,11 @@ class Setting:
         named: dict[str, Any] = {"reference_ids": ("r0", "r1"), "narrowing": Narrowing(), "reference_count": 2}
         values = named | changes
         query = Query(SCENE, photo=Photo(PHOTO, CAMERA, "image"), options=LocalizeOptions(), **values)
-        result, _ = self.loop.run_until_complete(self.engine.localize(query, caller(deadline_s)))
-        return result
+        return self.run(query, caller(deadline_s))[0]
+
+    def run(self, query: Query, caller: Caller) -> tuple[Result, Job]:
+        job = self.engine.query_job(query, caller)
+        return self.loop.run_until_complete(self.engine.run(job)), job
 
 
 @pytest.fixture
@@ -124,7 +128,7 @@ def setting(tmp_path: Path) -> Iterator[Setting]:
 
 def is_outcome(result: Result, planted: Answer) -> bool:
     """Whether an answer's outcome is given, to a rejection of which a hint is added."""
-    given = result.attempt.answer.outcome
+    given = result.answer.outcome
     if isinstance(given, Rejection):
         return replace(given, hint=None) == planted.outcome
     return given is planted.outcome
@@ -140,7 +144,7 @@ class TestTiers:
         assert setting.asked == ["cheap"]
         assert not setting.extractors["strong"].seen
         assert is_outcome(result, sure)
-        assert result.attempt.tier.extractor.name == "cheap"
+        assert result.tier.extractor.name == "cheap"
         assert list(result.stage_seconds) == ["decode", "features", *sure.stage_seconds]
 
     @pytest.mark.parametrize(
@@ -158,7 +162,7 @@ class TestTiers:
         setting.replies = {"cheap": first, "strong": second}
         result = setting.localize()
         assert setting.asked == ["cheap", "strong"]
-        assert result.attempt.tier.extractor.name == answered
+        assert result.tier.extractor.name == answered
         assert is_outcome(result, {"cheap": first, "strong": second}[answered])
 
     def test_the_time_of_both_is_told_apart(self, setting: Setting) -> None:
@@ -173,7 +177,7 @@ class TestTiers:
     def test_contradicting_poses_are_rejected_by_name(self, setting: Setting) -> None:
         near, far = localized(DOUBTFUL_INLIERS), localized(DOUBTFUL_INLIERS, at=pose(3.0))
         setting.replies = {"cheap": near, "strong": far}
-        outcome = setting.localize().attempt.answer.outcome
+        outcome = setting.localize().answer.outcome
         assert isinstance(outcome, Rejection)
         assert outcome.reason is RejectionReason.GATE
         assert outcome.message.startswith("the features disagree: the pose of cheap (5 inliers) and that of strong (5)")
@@ -182,7 +186,7 @@ class TestTiers:
         setting.replies = {"cheap": localized(SURE_INLIERS, at=pose(3.0)), "strong": localized(SURE_INLIERS)}
         near = Narrowing(Sphere(pose(0.0).translation, 0.5))
         result = setting.localize(narrowing=near)
-        assert isinstance(result.attempt.answer.outcome, Localization)
+        assert isinstance(result.answer.outcome, Localization)
         assert setting.asked == ["cheap", "strong"]
 
     def test_each_tier_uses_its_own_features_on_one_photograph(self, setting: Setting) -> None:
@@ -215,8 +219,8 @@ class TestTiers:
         setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": endless}
         result = setting.localize(deadline_s=0.8)
         answered.set()
-        assert result.attempt.tier.extractor.name == "cheap"
-        assert isinstance(result.attempt.answer.outcome, Localization)
+        assert result.tier.extractor.name == "cheap"
+        assert isinstance(result.answer.outcome, Localization)
         assert list(result.stage_seconds) == ["decode", "features", "coarse", "strong/unfinished"]
 
     def test_no_answer_is_lost_because_a_better_one_fails(
@@ -227,7 +231,7 @@ class TestTiers:
 
         setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": failing}
         result = setting.localize()
-        assert result.attempt.tier.extractor.name == "cheap"
+        assert result.tier.extractor.name == "cheap"
         assert list(result.stage_seconds)[-1] == "strong/unfinished"
         assert "strong failed" in caplog.text
         assert "out of memory, say" in caplog.text
@@ -242,7 +246,7 @@ class TestTiers:
         names = []
         for _ in range(200):
             result = setting.localize(reference_ids=("r0", "late"))
-            names.append(result.attempt.tier.extractor.name)
+            names.append(result.tier.extractor.name)
             if names[-1] == "strong":
                 break
             assert list(result.stage_seconds)[-1] == "strong/unfinished"
@@ -268,7 +272,7 @@ class TestTiers:
         same_matcher = Tier(strong.extractor, cheap.pipeline)
         for tiers in ([], [cheap, same_name], [cheap, same_matcher]):
             with pytest.raises(ValueError, match="each with an extractor and a matcher of its own"):
-                Engine(setting.store, tiers, EngineOptions())
+                engine_over(setting.store, tiers, EngineOptions())
 
 
 class TestMemory:
@@ -276,13 +280,13 @@ class TestMemory:
         self, setting: Setting, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         setting.replies["cheap"] = localized(SURE_INLIERS)
-        submit, sizes = setting.engine.queue.submit, list[int]()
+        run, sizes = setting.engine.queue.run, list[int]()
 
-        def noted(flow: Flow, step: Any, deadline_s: float, size_bytes: int, *others: Any) -> Any:
-            sizes.append(size_bytes)
-            return submit(flow, step, deadline_s, size_bytes, *others)
+        def noted(job: Job) -> Any:
+            sizes.append(job.size_bytes)
+            return run(job)
 
-        monkeypatch.setattr(setting.engine.queue, "submit", noted)
+        monkeypatch.setattr(setting.engine.queue, "run", noted)
         setting.localize()
         setting.localize(is_part=True)
         assert sizes == [len(PHOTO), 0]
@@ -315,7 +319,7 @@ class TestPhotograph:
         setting.replies["cheap"] = look
         result = setting.localize(reference_ids=(), reference_count=3)
         assert setting.asked == ["cheap", "cheap"]
-        assert len(result.attempt.references) == 2
+        assert len(result.references) == 2
         assert len(setting.extractors["cheap"].seen) == 1, "the photograph is described once"
 
     @pytest.mark.parametrize("tier", ["cheap", "strong"])
@@ -336,7 +340,7 @@ class TestPhotograph:
             assert caught.value.reason == "SCENE_CHANGED"
         else:
             result = setting.localize(reference_ids=())
-            assert result.attempt.tier.extractor.name == "cheap"
+            assert result.tier.extractor.name == "cheap"
             assert list(result.stage_seconds)[-1] == "strong/unfinished"
         assert setting.asked.count(tier) == MAX_LISTINGS
 
@@ -361,18 +365,16 @@ class TestDescribingReferences:
 
         monkeypatch.setattr(setting.extractors["cheap"], "extract", slow)
         query = query_of(("new0", "new1"))
-        _, visits = setting.loop.run_until_complete(setting.engine.localize(query, caller()))
+        _, job = setting.run(query, caller())
         (seconds,) = (it for stage, it in seen if stage == "prepare")
-        (took_s,) = (visit.end_s - visit.start_s for visit in visits if visit.stage == "prepare")
+        (took_s,) = (it.end_s - it.start_s for it in job.records if it.stage == "prepare")
         assert took_s - seconds >= 2 * self.STEP_S
         assert seconds >= self.STEP_S, "the photograph's own description is part of it"
 
     def test_nor_does_one_that_is_given_up(self, setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
         add_undescribed(setting, 2)
-        stages = setting.engine._stages
-        views = QueryViews(Photo(PHOTO, CAMERA, "image"), ImageLimits())
-        work = Work(query_of(("new0", "new1")), setting.engine._library, views, time.monotonic() + 60)
-        job = Job(Flow("t", "c"), stages.first_step(work), time.monotonic() + 60, 1, lambda *_: None)
+        stages = QueryStages(setting.engine.tiers, ESCALATION)
+        job = setting.engine.query_job(query_of(("new0", "new1")), caller())
 
         def extract(*_: Any) -> View:
             time.sleep(self.STEP_S)

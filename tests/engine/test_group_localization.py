@@ -20,15 +20,15 @@ from mapless_server.engine.groups import localize_each
 from mapless_server.engine.query import Caller, Photo, Query, Result
 from mapless_server.engine.stages import PREPARE
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError
-from mapless_server.method.localize import LocalizeOptions
+from mapless_server.method.answer import LocalizeOptions
 from mapless_server.rpc.call import Call
 from mapless_server.scenes.retrieval.narrowing import Narrowing
 from mapless_server.scheduling import (
     Flow,
     ItemList,
+    Job,
     Observer,
     Stage,
-    StageRecord,
     Step,
     WorkQueue,
     WorkQueueOptions,
@@ -54,14 +54,7 @@ class Toy(Engine):
         stages = {Stage(PREPARE, "host"): compute_items, Stage(JOIN, "host"): compute_items}
         self.queue = WorkQueue(stages, {"host": 2}, options, Observer())
 
-    async def localize(
-        self,
-        query: Query,
-        caller: Caller,
-        source: object = None,
-        visits: list[StageRecord] | None = None,
-        tell_coarse: object = None,
-    ) -> tuple[Result, Sequence[StageRecord]]:
+    def query_job(self, query: Query, caller: Caller, source: object = None, on_coarse: object = None) -> Job:
         def compute(_: None, check: object) -> None:
             number = next(self._numbers)
             time.sleep(self.seconds)
@@ -69,12 +62,14 @@ class Toy(Engine):
                 raise RuntimeError("planted")
 
         step = Step(PREPARE, "p", "p", ItemList([None], compute))
-        size_bytes = 0 if query.is_part else len(query.photo.image)
+        return Job(caller.flow, step, caller.deadline_s, 0 if query.is_part else len(query.photo.image))
+
+    async def run(self, job: Job) -> Result:
         try:
-            await self.queue.submit(caller.flow, step, caller.deadline_s, size_bytes, visits)
+            await self.queue.run(job)
         except Exception as error:
             raise error if str(error) == "planted" else Overloaded(str(error), retry_after_s=0.05) from error
-        return cast(Result, SimpleNamespace()), visits or []
+        return cast(Result, SimpleNamespace())
 
     async def close(self) -> None:
         await self.queue.close()
@@ -82,6 +77,10 @@ class Toy(Engine):
 
 def caller(name: str, lasts_s: float = LIMIT_S) -> Caller:
     return Caller(Flow("tenant", name), time.monotonic() + lasts_s)
+
+
+def jobs_of(engine: Toy, queries: Sequence[Query], caller: Caller) -> list[Job]:
+    return [engine.query_job(query, caller) for query in queries]
 
 
 def run(engine: Toy, work: Coroutine[Any, Any, None]) -> None:
@@ -106,7 +105,7 @@ def test_groups_in_progress_are_bounded_and_others_refused() -> None:
                 held += 300
                 most = max(most, held)
                 try:
-                    await localize_each(engine, queries, who, "images")
+                    await localize_each(engine, jobs_of(engine, queries, who), who, "images")
                     await engine.join(lambda: None, who)
                 finally:
                     held -= 300
@@ -135,12 +134,12 @@ def test_memory_of_a_group_is_reserved_until_it_ends() -> None:
             try:
                 with engine.hold([PART] * 6, caller("rig")):
                     with pytest.raises(Overloaded, match="memory"):
-                        await engine.localize(single, caller("other"))
+                        await engine.run(engine.query_job(single, caller("other")))
                     if error is not None:
                         raise error
             except ValueError:
                 pass
-            await engine.localize(single, caller("other"))
+            await engine.run(engine.query_job(single, caller("other")))
 
     run(engine, work())
 
@@ -180,7 +179,7 @@ def test_computed_photos_are_posed_together_in_a_full_queue() -> None:
         rig = caller("rig")
         for _ in range(3):  # the queue learns what a joint pose costs: two of them fill it
             await engine.join(lambda: time.sleep(0.25), rig)
-        await localize_each(engine, [PART] * 4, rig, "images")
+        await localize_each(engine, jobs_of(engine, [PART] * 4, rig), rig, "images")
         others = [asyncio.ensure_future(engine._each(JOIN, [None], held, caller(name), 0)) for name in "abcd"]
         try:
             await asyncio.sleep(0.05)
@@ -198,10 +197,10 @@ def test_computed_photos_are_posed_together_in_a_full_queue() -> None:
 
 
 def test_and_while_the_server_drains_but_not_after_its_end() -> None:
-    engine = Toy()
+    engine, rig = Toy(), caller("rig")
 
     async def work() -> None:
-        await localize_each(engine, [PART] * 2, caller("rig"), "images")
+        await localize_each(engine, jobs_of(engine, [PART] * 2, rig), rig, "images")
         engine.queue.drain()
         assert await engine.join(lambda: "pose", caller("rig")) == "pose"
         with pytest.raises(DeadlineExceeded):
@@ -219,12 +218,13 @@ def test_the_stages_of_a_group_that_fails_are_told_too() -> None:
     engine.fails_at = 3
 
     async def work() -> None:
-        visits: list[list[StageRecord]] = [[] for _ in range(4)]
+        rig = caller("rig")
+        jobs = jobs_of(engine, [PART] * 4, rig)
         with pytest.raises(RuntimeError, match="planted"):
-            await localize_each(engine, [PART] * 4, caller("rig"), "images", visits)
-        seen = [len(it) for it in visits]
+            await localize_each(engine, jobs, rig, "images")
+        seen = [len(job.records) for job in jobs]
         assert sum(seen) >= 2  # the one that failed, and the one that had to be through before it began
-        assert all(it.stage == PREPARE for of_one in visits for it in of_one)
+        assert all(it.stage == PREPARE for job in jobs for it in job.records)
         engine.fails_at = next(engine._numbers) + 3
         call = Call("id", time.monotonic(), time.monotonic() + LIMIT_S)
         with pytest.raises(RuntimeError, match="planted"):

@@ -10,8 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
-from mapless_server.engine.tiers import UNMENDABLE, Attempt, EscalationOptions, Tier, better_of, is_doubtful
-from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless_server.engine.query import Result, Tier
+from mapless_server.engine.tiers import UNRECOVERABLE, EscalationOptions, better_of, is_doubtful
+from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance, error_radius
@@ -46,15 +48,15 @@ def rejected(reason: RejectionReason = RejectionReason.TOO_FEW_MATCHES) -> Answe
     return Answer(Rejection(reason, "planted"))
 
 
-def better(cheap: Answer, strong: Answer) -> Attempt:
-    return better_of(Attempt(CHEAP, cheap, (), 1, CAMERA), Attempt(STRONG, strong, (), 1, CAMERA), OPTIONS)
+def better(cheap: Answer, strong: Answer) -> Result:
+    return better_of(Result(cheap, CHEAP, (), 1, CAMERA), Result(strong, STRONG, (), 1, CAMERA), OPTIONS)
 
 
 class TestDoubt:
     @pytest.mark.parametrize("reason", RejectionReason)
     def test_a_rejection_is_doubtful_unless_references_caused_it(self, reason: RejectionReason) -> None:
-        assert is_doubtful(rejected(reason), OPTIONS) is (reason not in UNMENDABLE)
-        assert {it.name for it in UNMENDABLE} == {"NO_USABLE_REFERENCES", "DEGENERATE_REFERENCES"}
+        assert is_doubtful(rejected(reason), OPTIONS) is (reason not in UNRECOVERABLE)
+        assert {it.name for it in UNRECOVERABLE} == {"NO_USABLE_REFERENCES", "DEGENERATE_REFERENCES"}
 
     @given(trust=st.floats(0, 1), sigma_m=st.floats(1e-4, 1.0))
     def test_doubt_is_little_trust_or_a_large_radius(self, trust: float, sigma_m: float) -> None:
@@ -117,5 +119,5 @@ class TestBetter:
     + [{"time_share": 1.5}, {"same_position_m": float("nan")}, {"same_rotation_deg": -1.0}],
 )
 def test_options_check_themselves(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="senseless"):
+    with pytest.raises(ValueError, match="must be"):
         EscalationOptions(**wrong)

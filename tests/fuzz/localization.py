@@ -25,7 +25,7 @@ from mapless_server.engine.query import Query
 from mapless_server.images.decode import image_size
 from mapless_server.method.priors.known import DirectionPrior, PosePrior, PositionPrior, Prior
 from mapless_server.security.tenancy import scene_id_of, tenant_of
-from mapless_server.services.messages.answers import addressee_of
+from mapless_server.services.messages.answers import answer_frames_of
 from mapless_server.services.messages.frames import MAX_SESSION_COORDINATE_M, framed_to_message, geo_pose_to_message
 from mapless_server.services.messages.groups import (
     poses_from_message,
@@ -63,7 +63,7 @@ def check(data: bytes) -> bool:
 
 
 def _check_localize(request: pb.LocalizeRequest) -> None:
-    addressee = addressee_of(request)
+    addressee = answer_frames_of(request)
     attributes = KNOWN if needs_attributes(request) else SceneAttributes()
     query = query_from_message(request, TENANT, ENGINE, attributes)
     _check_query(query, [request.scene])

@@ -29,7 +29,7 @@ from mapless.wire import MAX_SIDE_PX, MIN_SIDE_PX, FieldError
 from mapless_server.errors import InvalidArgument
 from mapless_server.images.decode import ImageLimits, decode_image, image_size
 from mapless_server.images.png_chunks import essential_png
-from mapless_server.services.messages.answers import addressee_of
+from mapless_server.services.messages.answers import answer_frames_of
 from mapless_server.services.messages.pages import Page
 from mapless_server.services.messages.queries import query_from_message
 from mapless_server.store import SceneAttributes, codec
@@ -127,7 +127,7 @@ def test_what_the_interface_allows_is_accepted_and_comes_back(camera: Camera, po
 
 def read(request: pb.LocalizeRequest) -> None:
     """As the service does, up to the values that the engine gets."""
-    addressee_of(request)
+    answer_frames_of(request)
     query_from_message(request, "acme", localization.ENGINE, SceneAttributes())
 
 

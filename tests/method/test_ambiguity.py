@@ -11,9 +11,11 @@ from support.compare import assert_pose_close
 from support.scenes import make_scene, random_for
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless_server.method.answer import Answer, Localization, LocalizeOptions
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import make_extractor
-from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline, localize
+from mapless_server.method.localize import localize
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.trust import ambiguity
 from mapless_server.method.trust.ambiguity import AmbiguityOptions

@@ -16,25 +16,14 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 import mapless_server.method.localize as method
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method import pnp
+from mapless_server.method.answer import Answer, Localization, LocalizeOptions, Variant
 from mapless_server.method.coarse import Bucket, Outcome, Reconstructor, Request
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.geometric import GeometricReconstructor
+from mapless_server.method.context import StageContext
 from mapless_server.method.correspond import Correspondences, Matcher
-from mapless_server.method.localize import (
-    MIN_FEATURES,
-    Answer,
-    Coarse,
-    Localization,
-    LocalizeOptions,
-    Pipeline,
-    Prepared,
-    Variant,
-    coarse_answer,
-    localize,
-    prepare,
-    reconstruct,
-    refine,
-)
+from mapless_server.method.localize import MIN_FEATURES, localize, prepare, refine
+from mapless_server.method.pipeline import Coarse, Pipeline, Prepared, coarse_answer, reconstruct
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.reconstruction import Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
@@ -272,7 +261,7 @@ def test_work_stops_at_the_next_step_when_nobody_waits(steps: int) -> None:
             raise NobodyWaits
 
     with pytest.raises(NobodyWaits):
-        localize(SCENE.query, SCENE.references, Pipeline(), LocalizeOptions(), check)
+        localize(SCENE.query, SCENE.references, Pipeline(), LocalizeOptions(), StageContext(check))
 
 
 @pytest.mark.parametrize("metres", [1e6, 1e7])
@@ -452,7 +441,7 @@ def test_the_wide_answer_wins_with_more_inliers_at_equal_claim(
 
     answers = {False: made(strict), True: made(wide)}
     poses = iter((answers[False], answers[True]))
-    monkeypatch.setattr(method, "_pose", lambda *_: next(poses))
+    monkeypatch.setattr(method, "_solve", lambda *_: next(poses))
     found = answer_of(pipeline_of("geometric"))
     expected = answers[wide_wins].outcome
     assert isinstance(expected, Localization)
@@ -497,8 +486,13 @@ def test_pnp_failed(monkeypatch: pytest.MonkeyPatch) -> None:
 # Many queries, in three parts
 
 
-def prepared_of(pipeline: Pipeline, options: LocalizeOptions | None = None, query: View | None = None) -> Prepared:
-    prepared = prepare(query or SCENE.query, SCENE.references, pipeline, options or LocalizeOptions())
+def prepared_of(
+    pipeline: Pipeline,
+    options: LocalizeOptions | None = None,
+    query: View | None = None,
+) -> Prepared:
+    context = StageContext()
+    prepared = prepare(query or SCENE.query, SCENE.references, pipeline, options or LocalizeOptions(), context)
     assert isinstance(prepared, Prepared), prepared
     return prepared
 
@@ -535,7 +529,7 @@ def test_queries_of_one_batch_are_answered_as_alone(backend: str, weak_inliers: 
     batch = [prepared_of(pipeline, o, q) for o, q in zip(options, queries, strict=True)]
     assert len({prepared.bucket for prepared in batch}) == 1
     parts = [coarse_of(result) for result in reconstruct(batch)]
-    assert len({part.stage_seconds["coarse"] for part in parts}) == 1
+    assert len({part.prepared.context.stage_seconds["coarse"] for part in parts}) == 1
     for part, option, query in zip(parts, options, queries, strict=True):
         assert same_bits(refine(part), answer_of(pipeline, option, query))
 
@@ -545,7 +539,7 @@ def test_a_coarse_answer_is_the_coarse_pose_and_says_why() -> None:
         offset = np.full(3, 1e5)
         far = [replace(r, world_from_camera=r.world_from_camera.shifted(offset)) for r in SCENE.references]
         pipeline = pipeline_of(backend, options=ROUGH)
-        prepared = prepare(SCENE.query, far, pipeline, LocalizeOptions())
+        prepared = prepare(SCENE.query, far, pipeline, LocalizeOptions(), StageContext())
         assert isinstance(prepared, Prepared)
         answer = coarse_answer(coarse_of(reconstruct([prepared])[0]))
         assert answer is not None
@@ -601,8 +595,9 @@ def test_one_query_s_exception_is_its_own() -> None:
         if len(later_calls) > 1:
             raise gone
 
-    batch = [prepared_of(pipeline) for _ in range(4)]
-    first, second, third, fourth = reconstruct(batch, [already, lambda: None, later, lambda: None])
+    checks = [already, lambda: None, later, lambda: None]
+    batch = [replace(prepared_of(pipeline), context=StageContext(check)) for check in checks]
+    first, second, third, fourth = reconstruct(batch)
     assert first is gone
     assert second is fault
     assert third is gone

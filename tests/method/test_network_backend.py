@@ -351,7 +351,7 @@ def test_the_queue_splits_it_counts_it_and_keeps_to_what_fits() -> None:
 
         def submit(bucket: str, payload: Request | None = None) -> asyncio.Task[Any]:
             step = Step("coarse", "toy", bucket, payload)
-            return asyncio.ensure_future(queue.submit(Flow("t", "c"), step, time.monotonic() + 600, 1))
+            return asyncio.ensure_future(queue.run(Job(Flow("t", "c"), step, time.monotonic() + 600, 1)))
 
         try:
             for expected in ([4, 4, 2, 2], [2, 2]):
@@ -363,7 +363,7 @@ def test_the_queue_splits_it_counts_it_and_keeps_to_what_fits() -> None:
                     await asyncio.sleep(0.002)
                 gate.set()
                 results = await asyncio.wait_for(asyncio.gather(*calls, plug), 20)
-                assert [greys_of(outcome) for outcome, _ in results[:4]] == [[i, 50] for i in range(4)]
+                assert [greys_of(outcome) for outcome in results[:4]] == [[i, 50] for i in range(4)]
                 assert runner.batches == expected
                 assert observer.out_of_memory == 1
         finally:

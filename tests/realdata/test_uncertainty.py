@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import bdtrik
 
-from mapless_server.method.localize import Localization, LocalizeOptions
+from mapless_server.method.answer import Localization, LocalizeOptions
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_tools.calibrate.pairs import answered, read_places, right_pairs
 from mapless_tools.dataset import Dataset

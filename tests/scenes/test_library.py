@@ -21,7 +21,7 @@ from support.servers import CAMERA, StandInExtractor, pose
 from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, RequestError
 from mapless_server.images.decode import ImageLimits
-from mapless_server.method.turns import Turn
+from mapless_server.method.context import StageContext
 from mapless_server.method.views import View
 from mapless_server.scenes import library as library_module
 from mapless_server.scenes.library import Loaded, NotDescribedYet, ReferenceLibrary, load_usable
@@ -73,14 +73,14 @@ class Abandoned(Exception):
     """Nobody wants the result any more."""
 
 
-def turn(seconds: float = 60.0, is_abandoned: Callable[[], bool] = lambda: False) -> Turn:
+def turn(seconds: float = 60.0, is_abandoned: Callable[[], bool] = lambda: False) -> StageContext:
     deadline_s = time.monotonic() + seconds
 
     def check() -> None:
         if is_abandoned() or time.monotonic() > deadline_s:
             raise Abandoned
 
-    return Turn(check)
+    return StageContext(check)
 
 
 def execute(data_dir: Path, statement: str) -> None:

@@ -14,7 +14,7 @@ from support.planted_damage import damage
 from support.servers import CAMERA, StandInDescriptor, StandInExtractor, pose
 
 from mapless_server.errors import DataLoss, NotFound
-from mapless_server.method.turns import Turn
+from mapless_server.method.context import StageContext
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.security.tenancy import SceneKey
@@ -42,8 +42,8 @@ def indexes_of(store: Store, capacity_bytes: int = 2**30) -> SceneIndexes:
     return SceneIndexes(store, ReferenceLibrary(store), DESCRIPTOR, EXTRACTOR, capacity_bytes)
 
 
-def turn() -> Turn:
-    return Turn(lambda: None)
+def turn() -> StageContext:
+    return StageContext(lambda: None)
 
 
 class TestDamage:

@@ -173,8 +173,7 @@ def submit(
     deadline_s = time.monotonic() + lasts_s
 
     async def call() -> Any:
-        value, _ = await queue.submit(Flow("t", client), Step(stage, "toy", bucket, payload), deadline_s, 1)
-        return value
+        return await queue.run(Job(Flow("t", client), Step(stage, "toy", bucket, payload), deadline_s, 1))
 
     return asyncio.ensure_future(call())
 
@@ -212,7 +211,7 @@ async def waiting(shop: Shop, queue: WorkQueue, payloads: Sequence[Any], **more:
 
 
 class TestResults:
-    def test_a_job_goes_through_its_stages_and_its_visits_tell_when(self) -> None:
+    def test_a_job_goes_through_its_stages_and_its_records_say_when(self) -> None:
         marks: dict[str, tuple[float, float]] = {}
 
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
@@ -229,14 +228,13 @@ class TestResults:
             async with shop.open() as queue:
                 others = await waiting(shop, queue, ["x", "y"])
                 before_s = time.monotonic()
-                job = asyncio.ensure_future(
-                    queue.submit(Flow("t", "c"), Step("first", "toy", "b", "z"), before_s + FAR_S, 1)
-                )
+                job = Job(Flow("t", "c"), Step("first", "toy", "b", "z"), before_s + FAR_S, 1)
+                running = asyncio.ensure_future(queue.run(job))
                 await until(lambda: shop.account.waiting["then"] == 3)
                 shop.gate.set()
-                value, visits = await job
+                value = await running
                 await outcomes(others)
-            first, then = visits
+            first, then = job.records
             assert (value, first.stage, then.stage, first.jobs, then.jobs) == ("z", "first", "then", 1, 3)
             for visit, (start_s, end_s) in ((first, marks["first"]), (then, marks["then"])):
                 assert visit.queued_s <= visit.start_s <= start_s < end_s <= visit.end_s

@@ -38,15 +38,15 @@ from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.engine.engine import Engine, EngineOptions
-from mapless_server.engine.query import Caller, Query, Result
-from mapless_server.engine.tiers import Tier
-from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless_server.engine.query import Result, Tier
+from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.observability.metrics import Metrics
-from mapless_server.scheduling import CostModel
+from mapless_server.scheduling import CostModel, Job
 from mapless_server.security.rate import RateLimiter
-from mapless_server.serve.assembly import MakeEngine, StartupError, engine_options, make_tiers
+from mapless_server.serve.assembly import MakeEngine, StartupError, engine_options, engine_over, make_tiers
 from mapless_server.serve.warm_up import ROUNDS, warm_up
 from mapless_server.settings import Settings
 from mapless_server.store import Store
@@ -61,15 +61,14 @@ def test_the_real_method_localizes_the_rendered_scene(tmp_path: Path) -> None:
 
     async def test() -> None:
         with Store.open(tmp_path) as store:
-            engine = Engine(store, make_tiers(Settings(data_dir=tmp_path)), EngineOptions())
-            localize = engine.localize
+            engine = engine_over(store, make_tiers(Settings(data_dir=tmp_path)), EngineOptions())
+            run = engine.run
 
-            async def watched(query: Query, caller: Caller, source: Any) -> Any:
-                result, visits = await localize(query, caller, source)
-                results.append(result)
-                return result, visits
+            async def watched(job: Job) -> Result:
+                results.append(await run(job))
+                return results[-1]
 
-            engine.localize = watched  # type: ignore[method-assign, assignment]
+            engine.run = watched  # type: ignore[method-assign]
             try:
                 await warm_up(engine)
             finally:
@@ -78,7 +77,7 @@ def test_the_real_method_localizes_the_rendered_scene(tmp_path: Path) -> None:
     asyncio.run(test())
     assert len(results) == ROUNDS
     for result in results:
-        found = result.attempt.answer.outcome
+        found = result.answer.outcome
         assert isinstance(found, Localization)
         assert np.linalg.norm(found.world_from_camera.translation - TRUTH) < 0.03
         assert found.inlier_count >= 50  # else stronger features would be tried, and be cold in the first call
@@ -92,7 +91,7 @@ def test_every_tier_is_asked_for_its_view_of_the_references(tmp_path: Path) -> N
     async def test() -> None:
         with Store.open(tmp_path) as store:
             tiers = [Tier(it, Pipeline(cast(Any, StandInReconstructor()))) for it in extractors]
-            engine = Engine(store, tiers, EngineOptions(), method=whole(lambda *_: answer_at(TRUTH)))
+            engine = engine_over(store, tiers, EngineOptions(), method=whole(lambda *_: answer_at(TRUTH)))
             try:
                 await warm_up(engine)
             finally:
@@ -111,7 +110,7 @@ def engine_of(localize: Callable[..., Answer], begin: Callable[[], object] = lam
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
         begin()
         tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
-        return Engine(store, tiers, engine_options(settings), metrics, quota, whole(localize))
+        return engine_over(store, tiers, engine_options(settings), metrics, quota, whole(localize))
 
     return make
 
@@ -134,7 +133,7 @@ def test_the_queue_expects_the_duration_of_the_last_round(tmp_path: Path, monkey
     async def test() -> None:
         with Store.open(tmp_path) as store:
             tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
-            engine = Engine(store, tiers, EngineOptions(), method=whole(localize))
+            engine = engine_over(store, tiers, EngineOptions(), method=whole(localize))
             try:
                 await warm_up(engine)
             finally:

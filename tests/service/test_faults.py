@@ -57,13 +57,14 @@ from mapless import (
 from mapless.geometry import Camera
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless_server.engine.engine import Engine
-from mapless_server.engine.tiers import Tier
-from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless_server.engine.query import Tier
+from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc import receiving
 from mapless_server.security.rate import RateLimiter
 from mapless_server.serve import listening as grpc_server
-from mapless_server.serve.assembly import engine_options
+from mapless_server.serve.assembly import engine_options, engine_over
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_tools.load.scrape import Scrape, read_metrics
@@ -327,7 +328,7 @@ def answering(data_dir: Path, change: Callable[[Answer], Answer]) -> Iterator[st
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
         tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
         method = whole(lambda *asked: change(stand_in(*asked)))
-        return Engine(store, tiers, engine_options(settings), metrics, quota, method)
+        return engine_over(store, tiers, engine_options(settings), metrics, quota, method)
 
     settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, workers=1, metrics=False, warm_up=False)
     with listening(settings, Store.open(data_dir), make) as (running, _):

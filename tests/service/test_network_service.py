@@ -21,15 +21,15 @@ from support.small_networks import GRIDS, small_network
 from mapless import Client, LocalizationResult, NewReference, Rejected
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.engine.engine import Engine
-from mapless_server.engine.tiers import Tier
+from mapless_server.engine.query import Tier
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.features import SiftExtractor
-from mapless_server.method.localize import Pipeline
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.networks.network import Network
 from mapless_server.networks.runner import NetworkRunner
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.rate import RateLimiter
-from mapless_server.serve.assembly import engine_options
+from mapless_server.serve.assembly import engine_options, engine_over
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 
@@ -58,7 +58,7 @@ def serving(data_dir: Path, network: Network, name: str) -> Iterator[tuple[Clien
     settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, workers=2, metrics=False, warm_up=False)
 
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
-        return Engine(store, [Tier(SiftExtractor(), Pipeline(backend))], engine_options(settings), metrics, quota)
+        return engine_over(store, [Tier(SiftExtractor(), Pipeline(backend))], engine_options(settings), metrics, quota)
 
     with (
         closing(backend),

@@ -46,13 +46,14 @@ from mapless.errors import from_rpc_error
 from mapless.geometry import Camera, RigidTransform
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.engine.engine import Engine
+from mapless_server.engine.query import Tier
 from mapless_server.engine.stages import Method
-from mapless_server.engine.tiers import Tier
-from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.rate import RateLimiter
-from mapless_server.serve.assembly import engine_options
+from mapless_server.serve.assembly import engine_options, engine_over
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 
@@ -83,7 +84,7 @@ def overloaded(data_dir: Path, method: Method, tier: Tier | None = None, **optio
 
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
         stand_in = Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))
-        return Engine(store, [tier or stand_in], engine_options(settings), metrics, quota, method)
+        return engine_over(store, [tier or stand_in], engine_options(settings), metrics, quota, method)
 
     with listening(settings, Store.open(data_dir), make) as (running, _):
         address = running.metrics_address
@@ -223,7 +224,7 @@ class Refining:
         return self._stand_in(*asked)
 
     def _coarse_answer(self, coarse: Any) -> Answer:
-        answer = whole(self._stand_in).refine(coarse, lambda: None)
+        answer = whole(self._stand_in).refine(coarse)
         found = answer.outcome
         assert isinstance(found, Localization)
         return replace(answer, outcome=replace(found, pose_stage=PoseStage.COARSE, covariance=None, inlier_count=0))
@@ -262,7 +263,7 @@ def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path) -> None:
     pytest.importorskip("PIL", reason="the networks' extra is not installed")
     from support.small_networks import GRIDS, small_network
 
-    from mapless_server.method import localize as real
+    from mapless_server.method import pipeline as real
     from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
     from mapless_server.method.features import SiftExtractor
     from mapless_server.networks.runner import NetworkRunner
@@ -278,11 +279,11 @@ def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path) -> None:
     sizes: list[int] = []
     entered, gate = threading.Semaphore(0), threading.Event()
 
-    def reconstruct(batch: Any, checks: Any) -> Any:
+    def reconstruct(batch: Any) -> Any:
         entered.release()
         assert gate.wait(60)
         sizes.append(len(batch))
-        return real.reconstruct(batch, checks)
+        return real.reconstruct(batch)
 
     with closing(
         NetworkReconstructor(NetworkRunner(small_network("pi3"), "pi3", "sha", "cpu"), NetworkOptions(grids=GRIDS))

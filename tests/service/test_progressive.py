@@ -36,16 +36,17 @@ from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.engine.engine import Engine
+from mapless_server.engine.query import Tier
 from mapless_server.engine.stages import Method
-from mapless_server.engine.tiers import Tier
-from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Abandoned
 from mapless_server.security.rate import RateLimiter
 from mapless_server.security.tokens import create_token
-from mapless_server.serve.assembly import engine_options, make_engine
+from mapless_server.serve.assembly import engine_options, engine_over, make_engine
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 
@@ -104,7 +105,7 @@ class Staged:
     def _coarse_answer(self, coarse: Any) -> Answer | None:
         if self.coarse is None:
             return None
-        answer = whole(self._stand_in).refine(coarse, lambda: None)
+        answer = whole(self._stand_in).refine(coarse)
         found = Localization(self.coarse, None, PoseStage.COARSE, 0, 0, 0.0)
         return replace(answer, outcome=found, stage_seconds={"coarse": 0.1})
 
@@ -133,7 +134,7 @@ def serving(
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
         known.append(metrics)
         tiers = [Tier(StandInExtractor(name), Pipeline(cast(Any, StandInReconstructor()))) for name in features]
-        return Engine(store, tiers, engine_options(settings), metrics, quota, staged.method(), StandInDescriptor())
+        return engine_over(store, tiers, engine_options(settings), metrics, quota, staged.method(), StandInDescriptor())
 
     with listening(settings, Store.open(data_dir), make) as (running, stop):
         with Client(running.address, ConnectOptions(token=token)) as client:

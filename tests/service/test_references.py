@@ -58,13 +58,13 @@ def test_the_life_of_a_scene(client: Client) -> None:
 
 
 def test_a_deleted_scene_takes_no_memory(client: Client, server: RunningServer) -> None:
-    before = server.engine.index_bytes
+    before = server.engine.references.index_bytes
     client.create_scene("chosen")
     client.add_references("chosen", [NewReference("r0", PHOTO, CAMERA, pose(0.0))])
     client.localize(PHOTO, CAMERA, "chosen")
-    assert server.engine.index_bytes > before
+    assert server.engine.references.index_bytes > before
     client.delete_scene("chosen")
-    assert server.engine.index_bytes == before
+    assert server.engine.references.index_bytes == before
 
 
 @pytest.mark.parametrize("ends", ["late", "full"])
@@ -80,7 +80,7 @@ def test_a_scene_whose_deletion_is_slow_takes_no_memory(tmp_path: Path, ends: st
         client.create_scene("s")
         client.add_references("s", [NewReference("r0", PHOTO, CAMERA, pose(0.0))])
         client.localize(PHOTO, CAMERA, "s")
-        assert server.engine.index_bytes > 0
+        assert server.engine.references.index_bytes > 0
         store._leftovers.delete = delete_what_is_left  # type: ignore[method-assign]
         if ends == "late":
             with pytest.raises(DeadlineExceeded):
@@ -90,7 +90,7 @@ def test_a_scene_whose_deletion_is_slow_takes_no_memory(tmp_path: Path, ends: st
             is_over.set()
             with pytest.raises(ResourceExhausted, match="full"):
                 client.delete_scene("s")
-        wait_until(lambda: server.engine.index_bytes == 0)
+        wait_until(lambda: server.engine.references.index_bytes == 0)
         with pytest.raises(NotFound):
             client.get_scene("s")
 

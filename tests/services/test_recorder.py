@@ -166,8 +166,8 @@ def answer(recorder: Recorder, tenant: str = "default", *references: PosedView) 
     """Of a call that was answered with these references."""
     call = Call("id", time.monotonic(), math.inf, Principal(tenant=tenant))
     query = SimpleNamespace(photo=SimpleNamespace(field="image"))
-    attempt = SimpleNamespace(choice=None, references=references, generation=1, attributes=SceneAttributes())
-    part = cast(Any, (query, SimpleNamespace(attempt=attempt)))
+    result = SimpleNamespace(choice=None, references=references, generation=1, attributes=SceneAttributes())
+    part = cast(Any, (query, result))
     response = pb.LocalizeResponse()
     recorder.answered("Localize", localize_request("s"), response, call, [part], ())
     return response

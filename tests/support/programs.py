@@ -21,12 +21,13 @@ from pathlib import Path
 from typing import Any, cast
 
 from mapless_server.engine.engine import Engine
-from mapless_server.engine.tiers import Tier
-from mapless_server.method.localize import Answer, Pipeline
+from mapless_server.engine.query import Tier
+from mapless_server.method.answer import Answer
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.observability.logs import configure_logging
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.rate import RateLimiter
-from mapless_server.serve.assembly import engine_options
+from mapless_server.serve.assembly import engine_options, engine_over
 from mapless_server.serve.run import serve
 from mapless_server.settings import Settings, load_settings
 from mapless_server.store import Store
@@ -159,7 +160,7 @@ def _main(folder: Path, kind: str, given: Sequence[str]) -> None:
 
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
         tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
-        return Engine(store, tiers, engine_options(settings), metrics, quota, whole(localize))
+        return engine_over(store, tiers, engine_options(settings), metrics, quota, whole(localize))
 
     asyncio.run(serve(settings, make))
 

@@ -18,13 +18,14 @@ from mapless.geometry import Similarity
 from mapless_ray.app import deployed
 from mapless_ray.replica import MaplessReplica
 from mapless_server.engine.engine import Engine
-from mapless_server.engine.tiers import Tier
-from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless_server.engine.query import Tier
+from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.scale import MetricScale, ScaleStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.rate import RateLimiter
-from mapless_server.serve.assembly import engine_options
+from mapless_server.serve.assembly import engine_options, engine_over
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from support.servers import COVARIANCE, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
@@ -56,7 +57,7 @@ def localize(*arguments: Any) -> Answer:
 
 def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
     tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
-    return Engine(store, tiers, engine_options(settings), metrics, quota, whole(localize), StandInDescriptor())
+    return engine_over(store, tiers, engine_options(settings), metrics, quota, whole(localize), StandInDescriptor())
 
 
 class StandInReplica(MaplessReplica):

@@ -24,15 +24,16 @@ from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.engine.engine import Engine
+from mapless_server.engine.query import Tier
 from mapless_server.engine.stages import Method
-from mapless_server.engine.tiers import Tier
-from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline
+from mapless_server.method.answer import Answer, Localization, LocalizeOptions
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.scale import MetricScale, ScaleStage
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.rate import RateLimiter
-from mapless_server.serve.assembly import MakeEngine, engine_options
+from mapless_server.serve.assembly import MakeEngine, engine_options, engine_over
 from mapless_server.serve.running import Running, running_server
 from mapless_server.settings import Settings
 from mapless_server.store import Store
@@ -159,17 +160,16 @@ def whole(localize: Callable[..., Answer]) -> Method:
     """A method whose work is all done in the last part, by `localize(query, references, pipeline, options, check)`."""
 
     def prepare(*arguments: Any) -> Any:
-        # Nobody asks, and neither what is matched already nor what is known beforehand matters.
-        *asked, _, _, _ = arguments
-        return SimpleNamespace(asked=asked, bucket="stand-in", prepared=None)
+        *asked, context, _, _ = arguments  # neither query matches nor priors matter
+        return SimpleNamespace(asked=asked, context=context, bucket="stand-in", prepared=None)
 
-    def refine(coarse: Any, check: Callable[[], None]) -> Answer:
-        return localize(*coarse.asked, check)
+    def refine(coarse: Any) -> Answer:
+        return localize(*coarse.asked, coarse.context.check)
 
     def nothing(*_: Any) -> None:
         """Neither a coarse answer nor what a photograph without a pose could give."""
 
-    return Method(prepare, lambda batch, checks: list(batch), cast(Any, refine), nothing, nothing)
+    return Method(prepare, cast(Any, list), cast(Any, refine), nothing, nothing)
 
 
 @dataclass
@@ -240,7 +240,7 @@ def serving(
 
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
         tiers = [Tier(extractor, Pipeline(cast(Any, StandInReconstructor()))) for extractor in extractors]
-        return Engine(
+        return engine_over(
             store, tiers, engine_options(settings), metrics, quota, whole(method), StandInDescriptor(descriptor_name)
         )
 

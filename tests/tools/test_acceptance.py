@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 from support.scenes import SceneOptions, make_scene, random_for
 
-from mapless_server.method.localize import Localization, LocalizeOptions
+from mapless_server.method.answer import Localization, LocalizeOptions
 from mapless_server.method.rejection import Rejection
 from mapless_tools.calibrate.acceptance import Verdict, cross_table, metric_table, own_verdict, threshold_of
 from mapless_tools.calibrate.pairs import Measured, Pair, answered, pose_of

@@ -1,4 +1,4 @@
-"""What the services ask for, through the work queue: localizing a photograph, and whatever else takes computing."""
+"""The engine: localizes photographs, describes and audits references, all through one work queue."""
 
 from __future__ import annotations
 
@@ -6,48 +6,40 @@ import asyncio
 from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError, Unavailable
 from mapless_server.images.decode import ImageLimits
-from mapless_server.method.turns import Turn
+from mapless_server.method.context import StageContext
 from mapless_server.scenes.audit.coverage import Coverage
-from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.verdict import ReferenceAudit
-from mapless_server.scenes.auditing import SceneExaminer, Tools, Viewpoint
-from mapless_server.scenes.indexes import SceneIndexes
-from mapless_server.scenes.library import ReferenceLibrary
+from mapless_server.scenes.auditing import Viewpoint
 from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.scenes.retrieval.descriptor import GlobalDescriptor
 from mapless_server.scenes.retrieval.narrowing import Narrowing
-from mapless_server.scenes.retrieval.vlad import VladDescriptor
 from mapless_server.scheduling import (
     ComputeItem,
     Expired,
     Failure,
     Fatal,
     ItemList,
+    Job,
     Observer,
     Quota,
     Refusal,
     Refused,
     Stage,
-    StageRecord,
     Step,
     WorkQueue,
     WorkQueueOptions,
     compute_items,
 )
 from mapless_server.security.tenancy import SceneKey
-from mapless_server.store import Store
 
-from .choosing import ReferenceChooser
-from .describing import Describer, Description
 from .failures import failure_of
-from .query import Caller, Photo, Query, Result
-from .stages import COARSE, PREPARE, REFINE, Method, QueryStages, ReferenceSource, Work
-from .tiers import EscalationOptions, Tier
-from .views import QueryViews
+from .query import Caller, Photo, Query, Result, Tier
+from .references import Description, QueryViews, References, ReferenceSource
+from .stages import COARSE, PREPARE, REFINE, Method, QueryRun, QueryStages
+from .tiers import EscalationOptions
 
 ItemT = TypeVar("ItemT")
 Joined = TypeVar("Joined")
@@ -61,9 +53,6 @@ DESCRIBE, RETRIEVE, AUDIT, COVERAGE = "describe", "retrieve", "audit", "coverage
 
 JOIN = "join"
 """What is computed of several photographs that were localized, together."""
-
-REMEMBERED_PAIRS = 2000
-"""Whose matches audits remember, about 10 KB a pair."""
 
 
 @dataclass(frozen=True)
@@ -89,62 +78,60 @@ class EngineOptions:
     queue: WorkQueueOptions = field(default_factory=WorkQueueOptions)
 
     def __post_init__(self) -> None:
-        if self.workers < 1 or self.max_batch < 1 or not 0 < self.coverage < 1:
-            raise ValueError(f"senseless options: {self}")
+        if self.workers < 1:
+            raise ValueError(f"workers must be at least 1, is {self.workers}")
+        if self.max_batch < 1:
+            raise ValueError(f"max_batch must be at least 1, is {self.max_batch}")
+        if not 0 < self.coverage < 1:
+            raise ValueError(f"coverage must be above 0 and below 1, is {self.coverage}")
 
 
 class Engine:
-    """Owns the tiers and the work queue. Its coroutines run on one event loop."""
+    """Computes for the services, through one work queue. Its coroutines run on one event loop.
+
+    Attributes:
+        tiers: features and what works on them, the cheapest first.
+        options: limits.
+        references: of all scenes.
+        queue: of the work.
+    """
 
     def __init__(
         self,
-        store: Store,
         tiers: Sequence[Tier],
+        references: References,
         options: EngineOptions,
         observer: Observer | None = None,
         quota: Quota | None = None,
         method: Method | None = None,
-        descriptor: GlobalDescriptor | None = None,
     ) -> None:
-        """The cheapest tier first; usually there is but one.
+        """An engine whose queue begins to compute with the first job.
 
         Args:
-            store: of the references.
-            tiers: features and what works on them, the cheapest first.
+            tiers: the cheapest first; usually there is one.
+            references: with features of every tier.
             options: limits.
-            observer: hears what the queue does.
-            quota: what each tenant may use.
-            method: stands in for the method's parts in tests.
-            descriptor: what references are chosen by; None makes one of the first tier's features.
+            observer: is notified of what the queue does.
+            quota: of computing time, for each tenant.
+            method: replaces the method's parts in tests.
 
         Raises:
             ValueError: no tier, or two with the same extractor or matcher.
         """
-        names = {tier.extractor.name for tier in tiers}
-        matchers = {id(tier.pipeline.matcher) for tier in tiers}
-        if not tiers or not len(names) == len(matchers) == len(tiers):
-            raise ValueError("tiers must be one or more, each with an extractor and a matcher of its own")
+        check_tiers(tiers)
         self.tiers = tuple(tiers)
         self.options = options
-        extractors = [tier.extractor for tier in self.tiers]
-        descriptor = descriptor or VladDescriptor.of(extractors[0])
-        self._library = ReferenceLibrary(store)
-        indexes = SceneIndexes(store, self._library, descriptor, extractors[0], options.index_cache_bytes)
-        self._describer = Describer(extractors, descriptor, options.image_limits)
-        self._chooser = ReferenceChooser(indexes, descriptor, extractors[0])
-        ratio = self.tiers[0].pipeline.matcher.options.reference_ratio
-        pairs = PairMatches(ratio, REMEMBERED_PAIRS)
-        self._tools = Tools(self._library, indexes, descriptor, extractors[0], pairs)
-        self._stages = QueryStages(self.tiers, self._chooser, options.escalation, method)
-        # A backend that lives on correspondences computes on the CPU, one query at a time.
+        self.references = references
+        stages = QueryStages(self.tiers, options.escalation, method)
+        # A backend that needs correspondences computes on the CPU, one query at a time.
         on_cpu = all(tier.pipeline.reconstructor.uses_correspondences for tier in tiers)
         coarse = Stage(COARSE, HOST, REFINE) if on_cpu else Stage(COARSE, DEVICE, REFINE, options.max_batch)
         self.queue = WorkQueue(
             {
                 **{Stage(name, HOST): compute_items for name in (DESCRIBE, RETRIEVE, AUDIT, COVERAGE, JOIN)},
-                Stage(PREPARE, HOST, COARSE): self._stages.prepare,
-                coarse: self._stages.coarse,
-                Stage(REFINE, HOST): self._stages.refine,
+                Stage(PREPARE, HOST, COARSE): stages.prepare,
+                coarse: stages.coarse,
+                Stage(REFINE, HOST): stages.refine,
             },
             {HOST: options.workers} if on_cpu else {HOST: options.workers, DEVICE: 1},
             options.queue,
@@ -153,39 +140,39 @@ class Engine:
             quota,
         )
 
-    async def localize(
+    def query_job(
         self,
         query: Query,
         caller: Caller,
         source: ReferenceSource | None = None,
-        visits: list[StageRecord] | None = None,
-        tell_coarse: Callable[[Result], None] | None = None,
-    ) -> tuple[Result, Sequence[StageRecord]]:
-        """Localizes a photograph.
+        on_coarse: Callable[[Result], None] | None = None,
+    ) -> Job:
+        """The job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
 
         Args:
             query: the photograph and what to compare it with.
-            caller: whose query it is.
-            source: of the references; None for the store.
-            visits: gets the stages that the query goes through, for who wants to know how far it came if it fails.
-            tell_coarse: told, on the event loop and before the answer, the pose that is known before it is refined,
+            caller: of the query.
+            source: of the references; None for those of the scene.
+            on_coarse: called on the event loop, before the answer, with the result that is known before it is refined,
                 where there is one: a localization of the first tier, checked by nothing. More than once if references
-                go while they are used. What is answered does not depend on whether somebody is told.
+                are deleted while they are used. The answer does not depend on it.
+        """
+        views = QueryViews(query.photo, self.options.image_limits)
+        run = QueryRun(query, source or self.references, views, caller.deadline_s)
+        if on_coarse is not None:
+            loop = asyncio.get_running_loop()
+            run = replace(run, on_coarse=lambda result: loop.call_soon_threadsafe(on_coarse, result))
+        size_bytes = 0 if query.is_part else len(query.photo.image)  # which `hold` counts
+        return Job(caller.flow, run.first_step, caller.deadline_s, size_bytes)
 
-        Returns:
-            The answer, and the stages that the query went through.
+    async def run(self, job: Job) -> Result:
+        """The result of a query's job; a job that was refused may be run again.
 
         Raises:
             RequestError: a bad image, unknown scene or reference, a full queue, a passed deadline.
         """
-        views = QueryViews(query.photo, self.options.image_limits)
-        work = Work(query, source or self._library, views, caller.deadline_s)
-        if tell_coarse is not None:
-            work = replace(work, tell_coarse=_on_this_loop(tell_coarse))
-        step = self._stages.first_step(work)
         with _as_request_errors():
-            size_bytes = 0 if query.is_part else len(query.photo.image)  # which `hold` counts
-            return await self.queue.submit(caller.flow, step, caller.deadline_s, size_bytes, visits)
+            return cast(Result, await self.queue.run(job))
 
     @contextmanager
     def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
@@ -212,7 +199,7 @@ class Engine:
             RequestError: a bad image, a full queue, a passed deadline.
         """
         size_bytes = sum(len(photo.image) for photo in photos)
-        return await self._each(DESCRIBE, photos, self._describer.describe, caller, size_bytes)
+        return await self._each(DESCRIBE, photos, self.references.describe, caller, size_bytes)
 
     async def retrieve(
         self, scene_key: SceneKey, photo: Photo, count: int, narrowing: Narrowing, caller: Caller
@@ -225,7 +212,7 @@ class Engine:
 
         def choose(photo: Photo, check: Callable[[], None]) -> Choice:
             views = QueryViews(photo, self.options.image_limits)
-            return self._chooser.choose(scene_key, views, count, narrowing, (), Turn(check))
+            return self.references.choose(scene_key, views, count, narrowing, (), StageContext(check))
 
         (choice,) = await self._each(RETRIEVE, [photo], choose, caller, len(photo.image))
         return choice
@@ -240,7 +227,7 @@ class Engine:
         Raises:
             RequestError: an unknown scene or named reference, a full queue, a passed deadline.
         """
-        examiner = SceneExaminer(self._tools, scene_key, () if are_listed else reference_ids)
+        examiner = self.references.examiner(scene_key, () if are_listed else reference_ids)
         audits = await self._each(AUDIT, reference_ids, examiner.audit, caller, 0, jobs=1)
         return examiner.generation, [audit for audit in audits if audit is not None]
 
@@ -250,7 +237,7 @@ class Engine:
         Raises:
             RequestError: an unknown scene, a full queue, a passed deadline.
         """
-        examiner = SceneExaminer(self._tools, scene_key)
+        examiner = self.references.examiner(scene_key)
         (coverage,) = await self._each(COVERAGE, [view], examiner.check_coverage, caller, 0)
         return examiner.generation, coverage
 
@@ -289,7 +276,7 @@ class Engine:
         step = Step(stage, stage, stage, work)
         submissions = [
             asyncio.ensure_future(
-                self.queue.submit(caller.flow, step, caller.deadline_s, size_bytes // jobs, continues=continues)
+                self.queue.run(Job(caller.flow, step, caller.deadline_s, size_bytes // jobs, continues=continues))
             )
             for _ in range(jobs)
         ]
@@ -306,18 +293,13 @@ class Engine:
         return work.results
 
     def forget_references(self, keys: Collection[str]) -> None:
-        """Takes no more memory for what was found out of references, which have been deleted."""
+        """Frees the memory of deleted references."""
         for tier in self.tiers:
             tier.pipeline.matcher.forget(keys)
 
     def forget_scene(self, scene_key: SceneKey) -> None:
-        """Takes no more memory for a scene, which has been deleted."""
-        self._chooser.indexes.forget(scene_key)
-
-    @property
-    def index_bytes(self) -> int:
-        """What the scenes that references are chosen from take in memory."""
-        return self._chooser.indexes.size_bytes
+        """Frees the memory of a deleted scene."""
+        self.references.forget_scene(scene_key)
 
     async def close(self) -> None:
         """Ends what is being computed at its next step, and drops what waits."""
@@ -325,7 +307,7 @@ class Engine:
         await asyncio.to_thread(self._close)
 
     def _close(self) -> None:
-        self._library.close()
+        self.references.close()
         for tier in self.tiers:
             tier.pipeline.matcher.close()
         shared = {id(tier.pipeline.reconstructor): tier.pipeline.reconstructor for tier in self.tiers}
@@ -333,14 +315,12 @@ class Engine:
             reconstructor.close()
 
 
-def _on_this_loop(tell: Callable[[Result], None]) -> Callable[[Result], None]:
-    """What may be called from any thread, and has it told on the running event loop."""
-    loop = asyncio.get_running_loop()
-
-    def told(result: Result) -> None:
-        loop.call_soon_threadsafe(tell, result)
-
-    return told
+def check_tiers(tiers: Sequence[Tier]) -> None:
+    """Raises ValueError if there is no tier, or two have the same extractor or matcher."""
+    names = {tier.extractor.name for tier in tiers}
+    matchers = {id(tier.pipeline.matcher) for tier in tiers}
+    if not tiers or not len(names) == len(matchers) == len(tiers):
+        raise ValueError("tiers must be one or more, each with an extractor and a matcher of its own")
 
 
 async def _unless_refused(submission: Awaitable[Any]) -> Refused | None:

@@ -11,17 +11,17 @@ from typing import TypeVar
 
 from mapless.geometry import RigidTransform
 from mapless_server.errors import Overloaded, RequestError
+from mapless_server.method.answer import LocalizeOptions
 from mapless_server.method.groups.checks import metric_as_said, mounted_as_said
 from mapless_server.method.groups.hints import hinted_group
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOptions, solve_sequence
 from mapless_server.method.groups.sightings import GroupImage
-from mapless_server.method.localize import LocalizeOptions
 from mapless_server.method.rejection import Rejection
-from mapless_server.scheduling import StageRecord
+from mapless_server.scheduling import Job
 
 from .engine import Engine
-from .query import Caller, Query, Result
+from .query import Caller, Result
 
 Joint = TypeVar("Joint", RigEstimate, SequenceEstimate)
 
@@ -32,16 +32,16 @@ MIN_FRAMES, MAX_FRAMES = 2, 16
 
 @dataclass(frozen=True, eq=False)
 class GroupResult:
-    """What is known of each photograph alone.
+    """The photographs of a group, each by itself.
 
     Attributes:
         results: in the order of the queries.
-        visits: of each, the stages that it went through.
+        queued_s: how long each waited before anything was computed for it.
         seconds: from when each began until it was done.
     """
 
     results: tuple[Result, ...]
-    visits: tuple[tuple[StageRecord, ...], ...]
+    queued_s: tuple[float, ...]
     seconds: tuple[float, ...]
 
     def images(self) -> list[GroupImage]:
@@ -49,10 +49,10 @@ class GroupResult:
         return [_image(result) for result in self.results]
 
     def hinted(self, outcome: Joint | Rejection) -> Joint | Rejection:
-        """What was computed of them together, with a hint if it is a rejection."""
+        """The joint outcome, with a hint if it is a rejection."""
         if not isinstance(outcome, Rejection):
             return outcome
-        return hinted_group(outcome, [(result.attempt.answer, result.attempt.references) for result in self.results])
+        return hinted_group(outcome, [(result.answer, result.references) for result in self.results])
 
 
 async def localize_rig(
@@ -66,7 +66,7 @@ async def localize_rig(
     images = group.images()
     found = await engine.join(lambda: solve_rig(images, rig_from_camera, RigOptions()), caller)
     if not isinstance(found, Rejection):
-        found = mounted_as_said(found, [result.attempt.answer for result in group.results])
+        found = mounted_as_said(found, [result.answer for result in group.results])
     return group.hinted(found)
 
 
@@ -89,13 +89,7 @@ async def localize_sequence(
     return group.hinted(found)
 
 
-async def localize_each(
-    engine: Engine,
-    queries: Sequence[Query],
-    caller: Caller,
-    list_name: str,
-    visits: Sequence[list[StageRecord]] | None = None,
-) -> GroupResult:
+async def localize_each(engine: Engine, jobs: Sequence[Job], caller: Caller, list_name: str) -> GroupResult:
     """Localizes photographs, as many at a time as the engine computes.
 
     All of them at once would be more than a caller may have waiting. A photograph that there is no room for waits until
@@ -103,16 +97,15 @@ async def localize_each(
 
     Args:
         engine: which computes.
-        queries: the photographs.
-        caller: whose they are.
-        list_name: the field of the request that holds them, for what is wrong with one.
-        visits: of each, gets the stages that it goes through, for who wants to know how far they came if one fails.
+        jobs: the photographs', of `Engine.query_job`.
+        caller: of them all.
+        list_name: the field of the request that holds them, for messages about one of them.
 
     Raises:
-        RequestError: as of `Engine.localize`, its field within the list.
+        RequestError: as of `Engine.run`, its field within the list.
     """
-    group = _Group(engine, queries, caller, list_name, visits or [[] for _ in queries])
-    workers = [asyncio.ensure_future(group.work()) for _ in range(min(len(queries), engine.parallel_queries))]
+    group = _Group(engine, jobs, caller, list_name)
+    workers = [asyncio.ensure_future(group.work()) for _ in range(min(len(jobs), engine.parallel_queries))]
     try:
         await asyncio.gather(*workers)
     finally:
@@ -124,38 +117,37 @@ async def localize_each(
 
 @dataclass(eq=False)
 class _Group:
-    """Photographs on their way; several workers take one after the other."""
+    """Photographs that are being localized; several workers take one after the other."""
 
     engine: Engine
-    queries: Sequence[Query]
+    jobs: Sequence[Job]
     caller: Caller
     list_name: str
-    visits: Sequence[list[StageRecord]]
     done: dict[int, tuple[Result, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._waiting = deque(range(len(self.queries)))
-        self._underway = 0
+        self._waiting = deque(range(len(self.jobs)))
+        self._running = 0
 
     async def work(self) -> None:
         """Localizes what waits, until nothing does or there is no room for as many at a time."""
         while self._waiting:
             index = self._waiting.popleft()
-            self._underway += 1
+            self._running += 1
             try:
                 await self._localize(index)
             except Overloaded as refused:
                 self._waiting.appendleft(index)
-                if self._underway > 1:
+                if self._running > 1:
                     return  # the others go on, and come to it
                 await self._wait(refused)
             finally:
-                self._underway -= 1
+                self._running -= 1
 
     async def _localize(self, index: int) -> None:
         start_s = time.monotonic()
         try:
-            result, _ = await self.engine.localize(self.queries[index], self.caller, visits=self.visits[index])
+            result = await self.engine.run(self.jobs[index])
         except RequestError as error:
             if error.field is not None and error.field.startswith("references"):
                 error.field = f"{self.list_name}[{index}].{error.field}"
@@ -163,7 +155,7 @@ class _Group:
         self.done[index] = result, time.monotonic() - start_s
 
     async def _wait(self, refused: Overloaded) -> None:
-        """Until there may be room; raises what there was no room by, if nothing was computed or there is no time."""
+        """Until there may be room; raises the refusal if nothing was computed or there is no time."""
         pause_s = refused.retry_after_s
         if not self.done or pause_s is None or time.monotonic() + pause_s > self.caller.deadline_s:
             raise refused
@@ -171,16 +163,12 @@ class _Group:
 
     def result(self) -> GroupResult:
         """Of all."""
-        results, seconds = zip(*(self.done[i] for i in range(len(self.queries))), strict=True)
-        return GroupResult(results, tuple(map(tuple, self.visits)), seconds)
-
-
-def queued_s(visits: Sequence[StageRecord]) -> float:
-    """How long a photograph waited before anything was computed for it."""
-    return visits[0].start_s - visits[0].queued_s if visits else 0.0
+        results, seconds = zip(*(self.done[i] for i in range(len(self.jobs))), strict=True)
+        first = (next(iter(job.records), None) for job in self.jobs)
+        queued_s = tuple(0.0 if it is None else it.start_s - it.queued_s for it in first)
+        return GroupResult(results, queued_s, seconds)
 
 
 def _image(result: Result) -> GroupImage:
-    attempt = result.attempt
-    similarity = attempt.tier.pipeline.matcher.options.guided_similarity
-    return GroupImage(attempt.answer, LocalizeOptions().match(similarity))
+    similarity = result.tier.pipeline.matcher.options.guided_similarity
+    return GroupImage(result.answer, LocalizeOptions().match(similarity))

@@ -1,32 +1,49 @@
-"""What is asked of the engine, and what it answers."""
+"""A query to the engine, and its result."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from mapless.geometry import Camera
-from mapless_server.method.localize import LocalizeOptions
+from mapless_server.method.answer import Answer, LocalizeOptions
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.priors.known import NO_PRIORS, Priors
+from mapless_server.method.views import PosedView
+from mapless_server.scenes.retrieval.chosen import Choice
 from mapless_server.scenes.retrieval.narrowing import Narrowing
 from mapless_server.scheduling import Flow
 from mapless_server.security.tenancy import SceneKey
-
-from .tiers import Attempt
+from mapless_server.store import SceneAttributes
 
 UNFINISHED = "/unfinished"
 """Ends the name of a stage: its tier came to no answer, see `Result`."""
 
 DEFAULT_REFERENCE_COUNT = 10
-"""References that are chosen where the caller does not say how many."""
+"""References that are chosen where the request does not say how many."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tier:
+    """Features, and what works on them.
+
+    Attributes:
+        extractor: finds them.
+        pipeline: its matcher remembers matches of these features, so no other tier may have the same one. Tiers may
+            share a reconstructor.
+    """
+
+    extractor: FeatureExtractor
+    pipeline: Pipeline
 
 
 @dataclass(frozen=True)
 class Caller:
-    """Who asks.
+    """The caller of the engine.
 
     Attributes:
         flow: with whom the queue shares its time fairly.
-        deadline_s: when the answer is of no use any more, `time.monotonic`.
+        deadline_s: after which the answer is useless, `time.monotonic`.
     """
 
     flow: Flow
@@ -35,7 +52,7 @@ class Caller:
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """An encoded image and its camera; `field` is its path in the request, for what is wrong with it."""
+    """An encoded image and its camera; `field` is its path in the request, for messages about it."""
 
     image: bytes
     camera: Camera
@@ -47,17 +64,17 @@ class Query:
     """A photograph to localize.
 
     Attributes:
-        scene_key: where.
-        reference_ids: what to compare it with; none means that `reference_count` of the scene's are to be chosen.
+        scene_key: the scene.
+        reference_ids: references to compare it with; if none, `reference_count` of the scene's are chosen.
         photo: the photograph.
-        narrowing: limits to where it was taken, which choose among references and judge the pose.
-        reference_count: see there.
+        narrowing: limits of the camera's pose, for choosing references and for checking the answer.
+        reference_count: how many references are chosen.
         options: of the method.
         allow_coarse: whether the coarse pose is an answer where there is no time to refine it.
-        rerank: whether `reference_count` of the named references are to be chosen.
-        priors: what is known of the pose, each with its uncertainty, in the scene's world.
-        is_part: whether it is one of several photographs that are to be posed together: then its matches are wanted
-            even where it cannot be localized alone.
+        rerank: whether `reference_count` of the named references are chosen.
+        priors: on the pose, each with its uncertainty, in the scene's world.
+        is_part: whether it belongs to a rig or a sequence: then its matches are wanted even where it cannot be
+            localized alone.
     """
 
     scene_key: SceneKey
@@ -73,20 +90,32 @@ class Query:
 
     @property
     def chooses(self) -> bool:
-        """Whether the references are chosen here, by how much they resemble the photograph."""
+        """Whether the server chooses the references, by their similarity to the photograph."""
         return self.rerank or not self.reference_ids
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The attempt that is answered, and where the time went.
+    """The answer to a query, and what it was computed from.
 
     Attributes:
-        attempt: of the tier whose answer is the better one.
-        stage_seconds: of all that was computed, in order, whichever tier is answered. A stage of another tier than the
-            first begins with its extractor's name and a slash. Such a tier has, alone, "unfinished", if it failed, was
-            given up for lack of time, or has yet to describe the references.
+        answer: of the method.
+        tier: the features that gave it.
+        references: those it used, in order.
+        generation: of the scene when they were read.
+        processed: the camera of the reduced image that features were found in.
+        choice: how the references were chosen; None if they were used as they were named.
+        attributes: of the scene.
+        stage_seconds: time of all that was computed, in order, whichever tier gave the answer. A stage of another tier
+            than the first begins with its extractor's name and a slash. Such a tier has only "unfinished" if it failed,
+            was ended for lack of time, or has yet to describe the references.
     """
 
-    attempt: Attempt
-    stage_seconds: dict[str, float]
+    answer: Answer
+    tier: Tier
+    references: tuple[PosedView, ...]
+    generation: int
+    processed: Camera
+    choice: Choice | None = None
+    attributes: SceneAttributes = field(default_factory=SceneAttributes)
+    stage_seconds: dict[str, float] = field(default_factory=dict)

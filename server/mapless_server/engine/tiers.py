@@ -1,42 +1,26 @@
-"""When a query deserves stronger features, and which of two answers to it is the better one.
+"""When a query is tried with stronger features, and which of the two answers is better.
 
 Cheap features answer nearly every query. Where they find little, stronger ones often find enough, at many times the
-price; so a tier is tried only when the answer of the one before is a rejection that better matches could mend, or a
-pose that is claimed with little support.
+cost; so a tier is tried only when the answer of the one before is a rejection that better matches could change,
+or a pose with little support.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapless.geometry import Camera, rotation_angle_deg
-from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.localize import Answer, Localization, Pipeline
+from mapless.geometry import rotation_angle_deg
+from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.uncertainty.accuracy import Accuracy, accuracy_from_covariance
-from mapless_server.method.views import PosedView
-from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.store import SceneAttributes
 
-UNMENDABLE = frozenset({RejectionReason.NO_USABLE_REFERENCES, RejectionReason.DEGENERATE_REFERENCES})
-"""Rejections for what the references are, whatever is seen in them."""
+from .query import Result
 
-
-@dataclass(frozen=True, eq=False)
-class Tier:
-    """Features, and what works on them.
-
-    Attributes:
-        extractor: finds them.
-        pipeline: its matcher remembers matches of these features, so no other tier may have the same one. Tiers may
-            share a reconstructor.
-    """
-
-    extractor: FeatureExtractor
-    pipeline: Pipeline
+UNRECOVERABLE = frozenset({RejectionReason.NO_USABLE_REFERENCES, RejectionReason.DEGENERATE_REFERENCES})
+"""Rejections because of the references themselves, which no features change."""
 
 
 @dataclass(frozen=True)
@@ -63,50 +47,31 @@ class EscalationOptions:
     time_share: float = 0.8
 
     def __post_init__(self) -> None:
-        bounds = (self.doubtful_trust, self.doubtful_radius_m, self.same_position_m, self.same_rotation_deg)
-        if not (all(bound >= 0 for bound in bounds) and self.clearly_more >= 1 and 0 < self.time_share <= 1):
-            raise ValueError(f"senseless options: {self}")
-
-
-@dataclass(frozen=True, eq=False)
-class Attempt:
-    """What one tier made of a query.
-
-    Attributes:
-        tier: which.
-        answer: its answer.
-        references: those it used, in order.
-        generation: of the scene when they were read.
-        processed: the camera of the reduced image that features were found in.
-        choice: how the references were chosen; None if they were used as they were named.
-        attributes: of the scene.
-    """
-
-    tier: Tier
-    answer: Answer
-    references: tuple[PosedView, ...]
-    generation: int
-    processed: Camera
-    choice: Choice | None = None
-    attributes: SceneAttributes = field(default_factory=SceneAttributes)
+        for name in ("doubtful_trust", "doubtful_radius_m", "same_position_m", "same_rotation_deg"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be at least 0, is {getattr(self, name)}")
+        if not self.clearly_more >= 1:
+            raise ValueError(f"clearly_more must be at least 1, is {self.clearly_more}")
+        if not 0 < self.time_share <= 1:
+            raise ValueError(f"time_share must be above 0 and at most 1, is {self.time_share}")
 
 
 def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:
-    """Whether stronger features could mend the answer.
+    """Whether stronger features could improve the answer.
 
     A pose that nothing has checked (`Variant.COARSE`) has no trust and claims nothing, so there is nothing to doubt.
     """
     outcome = answer.outcome
     if isinstance(outcome, Rejection):
-        return outcome.reason not in UNMENDABLE
+        return outcome.reason not in UNRECOVERABLE
     if outcome.covariance is None or outcome.trust is None:
         return False
     radius_m = accuracy_from_covariance(outcome.covariance).position_68_m
     return outcome.trust < options.doubtful_trust or not radius_m <= options.doubtful_radius_m
 
 
-def better_of(cheaper: Attempt, stronger: Attempt, options: EscalationOptions) -> Attempt:
-    """The better of a doubtful attempt and one with stronger features.
+def better_of(cheaper: Result, stronger: Result, options: EscalationOptions) -> Result:
+    """The better of a doubtful result and one with stronger features.
 
     A localization is better than a rejection, and of two rejections the stronger features' says more. Of two poses that
     agree, within the sum of their 95 % radii or what the options let pass, the one with the smaller claimed radius is

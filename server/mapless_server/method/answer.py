@@ -6,11 +6,13 @@ import math
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
+import numpy as np
+
 from mapless.geometry import Array, RigidTransform
 
 from .adjust import AdjustOptions
 from .match import PAPER_MATCH, MatchOptions
-from .pnp import PnpOptions, PoseStage
+from .pnp import PnpOptions, PoseEstimate, PoseStage
 from .priors.known import PriorCheck
 from .rejection import Rejection
 from .scale import MetricScale
@@ -105,6 +107,20 @@ class Localization:
     reprojection_error_px: float
     prior_checks: tuple[PriorCheck, ...] = ()
     trust: float | None = None
+
+    @classmethod
+    def of(cls, estimate: PoseEstimate, match_count: int, trust: float) -> Localization:
+        """The answer that an accepted estimate is."""
+        return cls(
+            estimate.world_from_camera,
+            estimate.covariance,
+            estimate.stage,
+            int(estimate.inliers.sum()),
+            match_count,
+            float(np.median(estimate.errors_px[estimate.inliers])),
+            estimate.prior_checks,
+            trust,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,14 +6,14 @@ import math
 import re
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from urllib.parse import unquote
 
 from mapless_server.engine.query import Caller
 from mapless_server.observability.tracing import Metadata
 from mapless_server.observability.trail import Trail
-from mapless_server.scheduling import Flow
+from mapless_server.scheduling import Flow, StageRecord
 from mapless_server.security.principal import Principal
 
 from .receiving import Context
@@ -57,6 +57,13 @@ class Call:
     def note(self, **fields: object) -> None:
         """Adds fields to the call's line in the log and to its trace; those that every line has cannot be changed."""
         self.trail.notes.update(fields)
+
+    def record(self, records: Iterable[StageRecord]) -> None:
+        """Notes the stages of the queue that a job of the call has been through."""
+        for it in records:
+            self.waited(it.stage, it.queued_s, it.start_s)
+            if it.jobs:
+                self.computed(it.stage, it.start_s, it.end_s, batch=it.batch, batch_size=it.jobs)
 
     def waited(self, stage: str, start_s: float, end_s: float) -> None:
         """It waited for a stage of the queue, `time.monotonic`."""

@@ -12,8 +12,8 @@ import numpy as np
 from mapless.geometry import Camera, RigidTransform
 from mapless.names import parse_reference_name, reference_name
 from mapless_server.errors import DataLoss, NotFound, RequestError, Unavailable
+from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.turns import Turn
 from mapless_server.method.views import PosedView
 from mapless_server.security.tenancy import SceneKey, scene_id_of
 
@@ -110,7 +110,7 @@ class SceneExaminer:
         entries = self._read()
         name = self._name(reference_id)
         try:
-            self._tools.library.load(self._scene_key, [reference_id], self._tools.extractor, Turn(self._check))
+            self._tools.library.load(self._scene_key, [reference_id], self._tools.extractor, StageContext(self._check))
         except DataLoss:
             return ReferenceAudit(name, Verdict.UNVERIFIABLE, DAMAGED)
         except NotFound as error:
@@ -155,7 +155,7 @@ class SceneExaminer:
 
     def _read(self) -> Entries:
         if self._entries is None:
-            self._entries = self._tools.indexes.entries(self._scene_key, Turn(self._check))
+            self._entries = self._tools.indexes.entries(self._scene_key, StageContext(self._check))
         return self._entries
 
     def _steadily(self, examine: Callable[[], Outcome]) -> Outcome:
@@ -190,7 +190,9 @@ class SceneExaminer:
         """Those of them that are there still and not damaged."""
 
         def load(reference_ids: Sequence[str]) -> Loaded:
-            return self._tools.library.load(self._scene_key, reference_ids, self._tools.extractor, Turn(self._check))
+            return self._tools.library.load(
+                self._scene_key, reference_ids, self._tools.extractor, StageContext(self._check)
+            )
 
         reference_ids = [parse_reference_name(name)[1] for name in names]
         try:

@@ -8,8 +8,8 @@ from collections import OrderedDict
 from collections.abc import Mapping
 
 from mapless_server.errors import DataLoss, NotFound
+from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.turns import Turn
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import Store
 
@@ -49,7 +49,7 @@ class SceneIndexes:
         self._size_bytes = 0
         self._lock = threading.Lock()
 
-    def entries(self, scene_key: SceneKey, turn: Turn) -> Entries:
+    def entries(self, scene_key: SceneKey, context: StageContext) -> Entries:
         """The references of a scene as it is now.
 
         Those without a descriptor are described now, one by one until the turn is over; what was done by then stays
@@ -64,9 +64,9 @@ class SceneIndexes:
         entries = self._refresh(scene_key, held)
         while undescribed := held.describable(entries):
             log.info("describing %d references of scene %s for retrieval", len(undescribed), scene_key)
-            with turn.stage("describe"):
+            with context.stage("describe"):
                 for reference_id, key in undescribed:
-                    self._describe(scene_key, held, reference_id, key, turn)
+                    self._describe(scene_key, held, reference_id, key, context)
             entries = self._refresh(scene_key, held)
         return entries
 
@@ -98,16 +98,18 @@ class SceneIndexes:
                 held.told.add(reference_id)
             log.error("reference %s of scene %s is not used: %s", reference_id, scene_key, error)
 
-    def _describe(self, scene_key: SceneKey, held: _Held, reference_id: str, key: str, turn: Turn) -> None:
+    def _describe(self, scene_key: SceneKey, held: _Held, reference_id: str, key: str, context: StageContext) -> None:
         """Finds and keeps a reference's descriptor; nothing if it was deleted since."""
-        turn.check()
+        context.check()
         claims = self._library.claims
         with claims.claimed((key, self._descriptor.name)) as is_mine:
             if not is_mine:
-                claims.wait((key, self._descriptor.name), turn.check)
+                claims.wait((key, self._descriptor.name), context.check)
                 return
             try:
-                _, (reference,) = self._library.load(scene_key, (reference_id,), self._extractor, Turn(turn.check))
+                _, (reference,) = self._library.load(
+                    scene_key, (reference_id,), self._extractor, StageContext(context.check)
+                )
                 if reference.key != key:  # another one of the same name by now
                     return
                 vector = self._descriptor.describe(reference.view)

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from mapless.names import reference_name
 from mapless_server.errors import AlreadyExists, DataLoss, InvalidArgument, RequestError
 from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.turns import Turn
 from mapless_server.method.views import Photograph, PosedView
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import DescribedReference, ReferenceRecord, SceneAttributes, Store
@@ -66,7 +66,7 @@ class ReferenceLibrary:
         scene_key: SceneKey,
         reference_ids: Sequence[str],
         extractor: FeatureExtractor,
-        turn: Turn,
+        context: StageContext,
         waits: bool = True,
     ) -> Loaded:
         """The scene's generation and references of it, in the order asked for.
@@ -91,8 +91,8 @@ class ReferenceLibrary:
             log.info(
                 "describing %d references of scene %s with %s", len(snapshot.undescribed), scene_key, extractor.name
             )
-            with turn.stage("describe"):
-                self._describe_all(snapshot.undescribed, extractor, turn.check)
+            with context.stage("describe"):
+                self._describe_all(snapshot.undescribed, extractor, context.check)
 
     def attributes(self, scene_key: SceneKey) -> SceneAttributes:
         """What is known of a scene as a whole; errors as `Store.get_attributes`."""

@@ -162,7 +162,8 @@ class Job:
         size_bytes: memory that it holds.
         on_end: called once, with how it ended and its result or exception.
         records: the stages that it has been through.
-        continues: whether it completes what other jobs of its call have computed; then it is always admitted.
+        continues: whether it completes what other jobs of its call have computed; then it is always admitted, also
+            while the server drains, since their work would otherwise be lost.
         used_s: computing time so far.
         fallback: replaces expiry.
         waits_since_s: when it began to wait for the step, by the queue's clock.
@@ -178,7 +179,7 @@ class Job:
     step: Step
     deadline_s: float
     size_bytes: int
-    on_end: Callable[[Ending, Any], None]
+    on_end: Callable[[Ending, Any], None] = lambda *_: None
     records: list[StageRecord] = field(default_factory=list)
     continues: bool = False
     used_s: float = 0.0
@@ -191,6 +192,11 @@ class Job:
     checked_s: float = -math.inf
     timer_s: float = -math.inf
     _over: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def waited_s(self) -> float:
+        """How long it waited for the stages that it has been through."""
+        return sum(record.start_s - record.queued_s for record in self.records)
 
     @property
     def is_over(self) -> bool:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from enum import Enum
 from typing import Any, Generic, TypeVar
 
-from .jobs import Batch, Done, Ending, Flow, Job, Next, Stage, StageRecord, StageResult, Step
+from .jobs import Batch, Done, Ending, Flow, Job, Next, Stage, StageResult, Step
 from .observer import Observer
 from .options import WorkQueueOptions
 from .scheduler import Quota, Scheduler
@@ -136,32 +136,11 @@ class WorkQueue:
             for thread in self._threads:
                 thread.start()
 
-    async def submit(
-        self,
-        flow: Flow,
-        step: Step,
-        deadline_s: float,
-        size_bytes: int,
-        records: list[StageRecord] | None = None,
-        *,
-        continues: bool = False,
-    ) -> tuple[Any, Sequence[StageRecord]]:
+    async def run(self, job: Job) -> Any:
         """Submits a job and waits for its result; cancelling the wait cancels the job.
 
-        Args:
-            flow: whose job it is.
-            step: its first.
-            deadline_s: when its result becomes useless, `time.monotonic`.
-            size_bytes: memory that it holds.
-            records: receives the stages that it goes through, also if it fails.
-            continues: whether it completes what other jobs of the same call have computed: then it is admitted however
-                full the queue is, and while the server drains, since their work would otherwise be lost.
-
-        Returns:
-            Its result, and the stages that it went through.
-
         Raises:
-            Refused: there is no room for it.
+            Refused: there is no room for it; the same job may be run again.
             Expired: its deadline passed.
             Fatal: the queue has ended.
             Exception: its stage failed with it.
@@ -172,15 +151,15 @@ class WorkQueue:
         def on_end(_: Ending, value: Any) -> None:  # in whatever thread ends the job
             loop.call_soon_threadsafe(_resolve, future, value)
 
-        job = Job(flow, step, deadline_s, size_bytes, on_end, [] if records is None else records, continues)
+        job.on_end = on_end
         with self._lock:
-            if continues and self._is_closed:
+            if job.continues and self._is_closed:
                 raise Fatal("the server has stopped")
             self._scheduler.admit(job, time.monotonic())
             self._notify()
         self.start()
         try:
-            return await future, job.records
+            return await future
         finally:
             if not job.is_over:
                 with self._lock:

@@ -7,21 +7,27 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
-from mapless_server.engine.engine import Engine, EngineOptions
-from mapless_server.engine.tiers import Tier
+from mapless_server.engine.engine import Engine, EngineOptions, check_tiers
+from mapless_server.engine.query import Tier
+from mapless_server.engine.references import References
+from mapless_server.engine.stages import Method
 from mapless_server.extras import install_hint
 from mapless_server.images.decode import ImageLimits
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import Matcher, make_matcher
 from mapless_server.method.features import FEATURES, FeatureExtractor, make_extractor
-from mapless_server.method.localize import Pipeline
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.networks.weights import CATALOGUE, WeightsError, WeightsMissing, find_weights
 from mapless_server.observability.metrics import Metrics
+from mapless_server.scenes.audit.neighbourhood import PairMatches
+from mapless_server.scenes.auditing import Tools
+from mapless_server.scenes.indexes import SceneIndexes
+from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.retrieval.descriptor import GlobalDescriptor
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
-from mapless_server.scheduling import WorkQueueOptions
+from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
 from mapless_server.security.rate import RateLimiter
 from mapless_server.settings import Settings, available_cores
 from mapless_server.store import Store, StoreError
@@ -36,6 +42,9 @@ references far apart, SIFT loses 16 at 0.1 s a photograph, ALIKED 3 at 1 to 3 s,
 only 53 need it. On a GPU the second is as quick as the first, and answers alone.
 """
 
+
+CACHED_AUDIT_PAIRS = 2000
+"""Pairs of references whose matches audits keep, about 10 KB a pair."""
 
 RETRIEVAL = ("auto", "vlad", "megaloc")
 
@@ -88,11 +97,46 @@ def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateL
     try:
         tiers = make_tiers(settings)
         descriptor = make_descriptor(settings, tiers[0].extractor)
-        return Engine(store, tiers, engine_options(settings), metrics, quota, descriptor=descriptor)
+        return engine_over(store, tiers, engine_options(settings), metrics, quota, descriptor=descriptor)
     except (ImportError, WeightsMissing) as error:
         raise StartupError(what_is_missing(error)) from error
     except (ValueError, WeightsError) as error:
         raise StartupError(str(error)) from error
+
+
+def engine_over(
+    store: Store,
+    tiers: Sequence[Tier],
+    options: EngineOptions,
+    observer: Observer | None = None,
+    quota: Quota | None = None,
+    method: Method | None = None,
+    descriptor: GlobalDescriptor | None = None,
+) -> Engine:
+    """An engine and the references in memory that it works on.
+
+    Args:
+        store: of the references.
+        tiers: the cheapest first.
+        options: limits.
+        observer: see `Engine`.
+        quota: likewise.
+        method: likewise.
+        descriptor: for choosing references; None makes one of the first tier's features.
+
+    Raises:
+        ValueError: no tier, two with the same extractor or matcher, or a descriptor of other features.
+    """
+    check_tiers(tiers)
+    extractors = [tier.extractor for tier in tiers]
+    first = extractors[0]
+    descriptor = descriptor or VladDescriptor.of(first)
+    library = ReferenceLibrary(store)
+    indexes = SceneIndexes(store, library, descriptor, first, options.index_cache_bytes)
+    pairs = PairMatches(tiers[0].pipeline.matcher.options.reference_ratio, CACHED_AUDIT_PAIRS)
+    audit_tools = Tools(library, indexes, descriptor, first, pairs)
+    references = References(library, indexes, descriptor, extractors, audit_tools, options.image_limits)
+    return Engine(tiers, references, options, observer, quota, method)
 
 
 def feature_names(features: str, device: str) -> tuple[str, ...]:

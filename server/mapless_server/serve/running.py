@@ -179,7 +179,7 @@ def _watch_engine(engine: Engine, metrics: Metrics) -> None:
     first = engine.tiers[0]
     reconstructor = first.pipeline.reconstructor
     metrics.built(__version__, reconstructor.name, first.extractor.name, reconstructor.weights_sha256)
-    metrics.watch_retrieval_index(lambda: engine.index_bytes)
+    metrics.watch_retrieval_index(lambda: engine.references.index_bytes)
     metrics.watch_gpu_memory(gpu_memory)
     cache = getattr(reconstructor, "cache", None)  # of tokens; only networks have one
     if cache is not None:

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.engine.engine import Engine
 from mapless_server.engine.query import Caller, Photo, Query
+from mapless_server.method.answer import Localization, LocalizeOptions
+from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.localize import Localization, LocalizeOptions
-from mapless_server.method.turns import Turn
 from mapless_server.method.views import Photograph, PosedView
+from mapless_server.scenes.retrieval.chosen import Choice
 from mapless_server.scenes.retrieval.narrowing import Narrowing
 from mapless_server.scheduling import Flow
 from mapless_server.security.tenancy import SceneKey
@@ -66,8 +67,8 @@ async def warm_up(engine: Engine) -> None:
     for number in range(ROUNDS):
         # Of no tenant: nobody's computing time is charged for it.
         caller = Caller(Flow("", "warm-up"), time.monotonic() + _LIMIT_S)
-        result, _ = await engine.localize(query, caller, references)
-        outcome = result.attempt.answer.outcome
+        result = await engine.run(engine.query_job(query, caller, references))
+        outcome = result.answer.outcome
         if not isinstance(outcome, Localization):
             raise WarmUpFailed(f"an easy photograph was rejected: {outcome.message}")
         error_m = float(np.linalg.norm(outcome.world_from_camera.translation - query_pose.translation))
@@ -87,7 +88,12 @@ class _RenderedReferences:
         }
 
     def load(
-        self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: FeatureExtractor, turn: Turn, waits: bool
+        self,
+        scene_key: SceneKey,
+        reference_ids: Sequence[str],
+        extractor: FeatureExtractor,
+        context: StageContext,
+        waits: bool,
     ) -> tuple[int, tuple[PosedView, ...]]:
         """See ReferenceSource."""
         return 1, self._views[extractor.name]
@@ -95,6 +101,14 @@ class _RenderedReferences:
     def attributes(self, scene_key: SceneKey) -> SceneAttributes:
         """See ReferenceSource."""
         return SceneAttributes()
+
+    def choose(self, *_: object) -> Choice:
+        """See ReferenceSource."""
+        raise NotImplementedError("the warm-up names its references")
+
+    def report_damaged(self, *_: object) -> None:
+        """See ReferenceSource."""
+        raise NotImplementedError("what is rendered is not damaged")
 
 
 def _photograph(world_from_camera: RigidTransform) -> bytes:

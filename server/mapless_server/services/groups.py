@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 from mapless.v1 import localization_service_pb2 as pb
@@ -20,7 +19,6 @@ from mapless_server.engine.query import Query
 from mapless_server.method.rejection import Rejection
 from mapless_server.observability.metrics import LOCALIZED, Metrics
 from mapless_server.rpc.call import Call
-from mapless_server.scheduling import StageRecord
 
 from .capture.recorder import Recorder
 from .messages.groups import (
@@ -73,14 +71,12 @@ async def answer_sequence(
 
 async def _localize_each(engine: Engine, queries: Sequence[Query], call: Call, list_name: str) -> GroupResult:
     call.note(scene=queries[0].scene_key, images=len(queries))
-    visits: list[list[StageRecord]] = [[] for _ in queries]
+    jobs = [engine.query_job(query, call.caller) for query in queries]
     try:
-        return await localize_each(engine, queries, call.caller, list_name, visits)
+        return await localize_each(engine, jobs, call.caller, list_name)
     finally:
-        for visit in itertools.chain.from_iterable(visits):
-            call.waited(visit.stage, visit.queued_s, visit.start_s)
-            if visit.jobs:
-                call.computed(visit.stage, visit.start_s, visit.end_s, batch=visit.batch, batch_size=visit.jobs)
+        for job in jobs:
+            call.record(job.records)
 
 
 def _conclude(
@@ -90,7 +86,7 @@ def _conclude(
     call: Call,
     metrics: Metrics,
 ) -> None:
-    """Tells the caller, the log and the metrics what each wants to know."""
+    """Completes the response, and reports it to the log and the metrics."""
     for report in response.images:
         report.diagnostics.request_id = call.request_id
     for result in group.results:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncGenerator, Callable
-from dataclasses import dataclass, field
 from functools import partial
 
 from mapless import wire
@@ -14,43 +13,20 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless_server.engine.engine import Engine
 from mapless_server.engine.query import Query, Result
-from mapless_server.method.localize import Localization
+from mapless_server.method.answer import Localization
 from mapless_server.observability.metrics import LOCALIZED, Metrics
 from mapless_server.rpc.call import Call
-from mapless_server.scheduling import StageRecord
 from mapless_server.security.tenancy import key_of
 from mapless_server.store import SceneAttributes, Store
 
 from .capture.recorder import Recorder
 from .groups import answer_rig, answer_sequence
-from .messages.answers import Addressee, addressee_of, diagnostics_to_message, outcome_to_message
+from .messages.answers import AnswerFrames, answer_frames_of, diagnostics_to_message, outcome_to_message
 from .messages.debug import debug_to_message
 from .messages.priors import needs_attributes
 from .messages.queries import query_from_message
-from .progressive import TellCoarse, coarse_then_final
+from .progressive import coarse_then_final
 from .watching import Watch, Watchers
-
-
-@dataclass(frozen=True, eq=False)
-class _Asked:
-    """A request of Localize, understood.
-
-    Attributes:
-        request: as it came.
-        query: what it asks.
-        addressee: whom the answer is made for.
-        visits: the stages of the queue that the query has been through; grows.
-    """
-
-    request: pb.LocalizeRequest
-    query: Query
-    addressee: Addressee
-    visits: list[StageRecord] = field(default_factory=list)
-
-    @property
-    def queued_s(self) -> float:
-        """How long it has waited, as far as that is over."""
-        return sum(visit.start_s - visit.queued_s for visit in self.visits)
 
 
 class LocalizationService(rpcs.LocalizationServiceServicer):
@@ -73,55 +49,69 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
 
     async def Localize(self, request: pb.LocalizeRequest, call: Call) -> pb.LocalizeResponse:
         """Implements LocalizationService.Localize."""
-        return await self._answer(await self._understand(request, call), call)
+        query, frames = await self._query(request, call)
+        return await self._answer(request, query, frames, call)
 
     async def LocalizeProgressively(
         self, request: pb.LocalizeRequest, call: Call
     ) -> AsyncGenerator[pb.LocalizeProgressivelyResponse, None]:
         """Implements LocalizationService.LocalizeProgressively."""
-        asked = await self._understand(request, call)
+        query, frames = await self._query(request, call)
+        return coarse_then_final(partial(self._answer, request, query, frames, call))
 
-        async def answer(tell_coarse: TellCoarse) -> pb.LocalizeResponse:
-            return await self._answer(asked, call, tell_coarse)
-
-        return coarse_then_final(answer, partial(self._coarse, asked, call))
-
-    async def _understand(self, request: pb.LocalizeRequest, call: Call) -> _Asked:
-        """What a request asks; what is wrong with it is a FieldError or a RequestError."""
-        engine = self._engine()
-        addressee = addressee_of(request)
+    async def _query(self, request: pb.LocalizeRequest, call: Call) -> tuple[Query, AnswerFrames]:
+        """The query of a request; FieldError or RequestError names what is wrong with it."""
+        options = self._engine().options
+        frames = answer_frames_of(request)
         attributes = await self._attributes(request, call.principal.tenant)
-        query = query_from_message(request, call.principal.tenant, engine.options, attributes)
+        query = query_from_message(request, call.principal.tenant, options, attributes)
         call.note(scene=query.scene_key, references=len(query.reference_ids))
-        return _Asked(request, query, addressee)
+        return query, frames
 
-    async def _answer(self, asked: _Asked, call: Call, tell_coarse: TellCoarse | None = None) -> pb.LocalizeResponse:
-        """The final answer; before it, what is known without refining is told to whom it may concern."""
-        request, query, visits = asked.request, asked.query, asked.visits
+    async def _answer(
+        self,
+        request: pb.LocalizeRequest,
+        query: Query,
+        frames: AnswerFrames,
+        call: Call,
+        coarse: asyncio.Future[pb.LocalizeResponse] | None = None,
+    ) -> pb.LocalizeResponse:
+        """The final answer; before it, `coarse` gets the first answer that is known without refining."""
+        engine = self._engine()
+
+        def to_message(result: Result) -> pb.LocalizeResponse:
+            response = outcome_to_message(result, query.options, frames)
+            for echoed in ("capture_time", "session_from_camera"):
+                if request.HasField(echoed):
+                    getattr(response, echoed).CopyFrom(getattr(request, echoed))
+            response.diagnostics.CopyFrom(diagnostics_to_message(result, query.options))
+            response.diagnostics.request_id = call.request_id
+            response.diagnostics.queue_duration.FromNanoseconds(round(1e9 * job.waited_s))
+            response.diagnostics.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))
+            return response
+
+        def give_coarse(result: Result) -> None:
+            if coarse is not None and not coarse.done():
+                seconds = time.monotonic() - call.arrived_s
+                call.note(coarse_ms=round(1000 * seconds, 1))
+                self._metrics.answered_coarsely(seconds)
+                coarse.set_result(to_message(result))
+
+        job = engine.query_job(query, call.caller, on_coarse=None if coarse is None else give_coarse)
         try:
-            result, _ = await self._engine().localize(query, call.caller, visits=visits, tell_coarse=tell_coarse)
+            result = await engine.run(job)
         finally:
-            for visit in visits:
-                call.waited(visit.stage, visit.queued_s, visit.start_s)
-                if visit.jobs:
-                    call.computed(visit.stage, visit.start_s, visit.end_s, batch=visit.batch, batch_size=visit.jobs)
-        response = _to_message(result, asked, call)
+            call.record(job.records)
+        response = to_message(result)
         self._count(result, response, call)
-        debug, support = None, result.attempt.answer.support
+        debug, support = None, result.answer.support
         if support is not None and (request.options.include_debug or self._watchers.is_watched(query.scene_key)):
             debug = await asyncio.to_thread(debug_to_message, support)
         if request.options.include_debug and debug is not None:
             response.debug.CopyFrom(debug)
         if self._recorder is not None:
-            self._recorder.answered("Localize", request, response, call, [(query, result)], self._engine().tiers)
+            self._recorder.answered("Localize", request, response, call, [(query, result)], engine.tiers)
         self._watchers.publish(query.scene_key, request, response, debug)
-        return response
-
-    def _coarse(self, asked: _Asked, call: Call, result: Result) -> pb.LocalizeResponse:
-        """The coarse answer; log and metrics are told when it was there."""
-        response, seconds = _to_message(result, asked, call), time.monotonic() - call.arrived_s
-        call.note(coarse_ms=round(1000 * seconds, 1))
-        self._metrics.answered_coarsely(seconds)
         return response
 
     async def LocalizeRig(self, request: pb.LocalizeRigRequest, call: Call) -> pb.LocalizeRigResponse:
@@ -148,12 +138,12 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         return await asyncio.to_thread(self._store.get_attributes, scene_key)
 
     def _count(self, result: Result, response: pb.LocalizeResponse, call: Call) -> None:
-        """Tells the log and the metrics how good the answer is."""
-        answer = result.attempt.answer
+        """Reports how good the answer is to the log and the metrics."""
+        answer = result.answer
         outcome = answer.outcome
         self._metrics.stages(result.stage_seconds)
         parts_ms = {stage: round(1000 * seconds, 1) for stage, seconds in result.stage_seconds.items()}
-        call.note(parts_ms=parts_ms, used_references=len(result.attempt.references))
+        call.note(parts_ms=parts_ms, used_references=len(result.references))
         if not isinstance(outcome, Localization):
             self._metrics.answered(outcome.reason.value)
             call.note(outcome=outcome.reason.value)
@@ -168,16 +158,3 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             scale_deviation=answer.scale.deviation if answer.scale else None,
             accuracy_radius_m=response.localization.accuracy.position_68_m if measured else None,
         )
-
-
-def _to_message(result: Result, asked: _Asked, call: Call) -> pb.LocalizeResponse:
-    """Message of an answer, as of now, without the matches it rests on."""
-    response = outcome_to_message(result, asked.query.options, asked.addressee)
-    for echoed in ("capture_time", "session_from_camera"):
-        if asked.request.HasField(echoed):
-            getattr(response, echoed).CopyFrom(getattr(asked.request, echoed))
-    response.diagnostics.CopyFrom(diagnostics_to_message(result, asked.query.options))
-    response.diagnostics.request_id = call.request_id
-    response.diagnostics.queue_duration.FromNanoseconds(round(1e9 * asked.queued_s))
-    response.diagnostics.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))
-    return response

@@ -7,40 +7,32 @@ from collections.abc import AsyncGenerator, Callable, Coroutine
 from typing import Any
 
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.engine.query import Result
 
-TellCoarse = Callable[[Result], None]
-"""Told a coarse result, on the event loop."""
+Coarse = asyncio.Future[pb.LocalizeResponse]
+"""Gets the coarse answer, on the event loop, if there is one."""
 
 
 async def coarse_then_final(
-    answer: Callable[[TellCoarse], Coroutine[Any, Any, pb.LocalizeResponse]],
-    coarse_message: Callable[[Result], pb.LocalizeResponse],
+    answer: Callable[[Coarse], Coroutine[Any, Any, pb.LocalizeResponse]],
 ) -> AsyncGenerator[pb.LocalizeProgressivelyResponse, None]:
     """The coarse answer as soon as there is one, if there is, and the final one.
 
-    The answer is computed whether anybody reads or not: who reads slowly holds up their own messages alone. Closing the
-    generator gives the answer up, and with it its place in the queue.
+    The answer is computed whether the messages are read or not: a slow reader delays only its own messages. Closing the
+    generator cancels the answer, and frees its place in the queue.
 
     Args:
-        answer: gives the final answer, and tells a coarse result before, or none. Of several the first is sent.
-        coarse_message: of such a result.
+        answer: gives the final answer; before it may set its argument.
 
     Raises:
-        Exception: whatever `answer` does, after the coarse message if there was one.
+        Exception: whatever `answer` raises, after the coarse message if there was one.
     """
-    coarse: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
-
-    def tell(result: Result) -> None:
-        if not coarse.done():
-            coarse.set_result(result)
-
-    answering = asyncio.ensure_future(answer(tell))
+    coarse: Coarse = asyncio.get_running_loop().create_future()
+    answering = asyncio.ensure_future(answer(coarse))
     either: set[asyncio.Future[Any]] = {answering, coarse}
     try:
         await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
         if coarse.done():
-            yield pb.LocalizeProgressivelyResponse(answer=coarse_message(coarse.result()))
+            yield pb.LocalizeProgressivelyResponse(answer=coarse.result())
         yield pb.LocalizeProgressivelyResponse(answer=await answering, is_final=True)
     finally:
         answering.cancel()

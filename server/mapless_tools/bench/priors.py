@@ -17,10 +17,12 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.method.answer import Localization, LocalizeOptions
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import OPTIONS, make_matcher
 from mapless_server.method.features import make_extractor
-from mapless_server.method.localize import Localization, LocalizeOptions, Pipeline, localize
+from mapless_server.method.localize import localize
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.priors.known import NO_PRIORS, GravityPrior, Priors
 from mapless_server.method.retrieve import choose_references
 from mapless_server.method.views import PosedView, View

@@ -17,11 +17,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from mapless_server.engine.tiers import Tier
+from mapless_server.engine.query import Tier
 from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.method.answer import Answer, Localization, LocalizeOptions
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline, localize
+from mapless_server.method.localize import localize
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.views import Photograph, PosedView
 from mapless_server.networks.network import Network
 from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapless_server.method.localize import Answer, Localization, LocalizeOptions
+from mapless_server.method.answer import Answer, Localization, LocalizeOptions
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.method.trust.evidence import evidence_of
 from mapless_server.method.trust.judge import trust_of

@@ -25,7 +25,7 @@ from scipy.special import bdtrik
 
 from mapless.geometry import Array
 from mapless_server.method.adjust import AdjustOptions
-from mapless_server.method.localize import Localization, LocalizeOptions
+from mapless_server.method.answer import Localization, LocalizeOptions
 from mapless_server.method.uncertainty.accuracy import error_radius
 from mapless_server.method.uncertainty.covariance import UncertaintyOptions
 

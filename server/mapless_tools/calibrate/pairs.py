@@ -16,10 +16,12 @@ import numpy as np
 
 from mapless.geometry import RigidTransform
 from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.method.answer import Answer, Localization, LocalizeOptions
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import OPTIONS, make_matcher
 from mapless_server.method.features import FeatureExtractor, make_extractor
-from mapless_server.method.localize import Answer, Localization, LocalizeOptions, Pipeline, localize
+from mapless_server.method.localize import localize
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.retrieve import choose_references
 from mapless_server.method.views import PosedView, View
 from mapless_tools.dataset import Frame, read_folder

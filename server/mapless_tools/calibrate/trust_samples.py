@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.method.answer import Localization, LocalizeOptions
 from mapless_server.method.features import make_extractor
-from mapless_server.method.localize import Localization, LocalizeOptions
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.method.trust.evidence import Evidence, evidence_of
 from mapless_server.method.views import Features, PosedView

@@ -11,8 +11,8 @@ import numpy as np
 
 from mapless_server.errors import InvalidArgument
 from mapless_server.images.decode import ImageLimits, decode_image, image_size
+from mapless_server.method.answer import Variant
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.localize import Variant
 from mapless_server.method.retrieve import choose_references
 from mapless_server.method.scale_equations import ScaleStrategy
 from mapless_server.method.views import PosedView, View

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapless_server.method.localize import Variant
+from mapless_server.method.answer import Variant
 from mapless_server.method.scale_equations import ScaleStrategy
 from mapless_tools.dataset import Dataset, Frame
 

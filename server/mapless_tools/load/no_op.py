@@ -20,15 +20,16 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera
 from mapless_server.engine.engine import Engine
+from mapless_server.engine.query import Tier
 from mapless_server.engine.stages import Method
-from mapless_server.engine.tiers import Tier
-from mapless_server.method.localize import Answer, Coarse, Pipeline, Prepared
+from mapless_server.method.answer import Answer
+from mapless_server.method.pipeline import Coarse, Pipeline, Prepared
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import Features, View
 from mapless_server.observability.logs import configure_logging
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.rate import RateLimiter
-from mapless_server.serve.assembly import engine_options
+from mapless_server.serve.assembly import engine_options, engine_over
 from mapless_server.serve.run import serve
 from mapless_server.settings import Settings, load_settings
 from mapless_server.store import Store
@@ -71,7 +72,7 @@ def no_op_method() -> Method:
     rejected = Answer(Rejection(RejectionReason.LOW_TEXTURE, "nothing was computed"))
     return Method(
         prepare=lambda *_: cast(Prepared, Nothing()),
-        reconstruct=lambda batch, _: [cast(Coarse, part) for part in batch],
+        reconstruct=lambda batch: [cast(Coarse, part) for part in batch],
         refine=lambda *_: rejected,
         coarse_answer=lambda _: None,
     )
@@ -80,7 +81,7 @@ def no_op_method() -> Method:
 def make_no_op_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
     """An engine with the settings' queue and threads that computes nothing."""
     tiers = [Tier(BlindExtractor(), Pipeline())]
-    return Engine(store, tiers, engine_options(settings), metrics, quota, no_op_method())
+    return engine_over(store, tiers, engine_options(settings), metrics, quota, no_op_method())
 
 
 def main(arguments: Sequence[str]) -> None:

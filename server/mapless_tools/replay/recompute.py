@@ -16,14 +16,15 @@ from typing import Any, TypeVar, cast
 
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.engine import Engine, EngineOptions
-from mapless_server.engine.query import UNFINISHED, Caller, Query, Result
-from mapless_server.engine.stages import COARSE, PREPARE, REFINE, Method, QueryStages, Work
-from mapless_server.engine.tiers import Tier
-from mapless_server.engine.views import QueryViews
-from mapless_server.method.localize import Answer, Coarse, coarse_answer, refine
+from mapless_server.engine.query import UNFINISHED, Caller, Query, Result, Tier
+from mapless_server.engine.references import QueryViews
+from mapless_server.engine.stages import COARSE, PREPARE, REFINE, Method, QueryRun, QueryStages
+from mapless_server.method.answer import Answer
+from mapless_server.method.localize import refine
+from mapless_server.method.pipeline import Coarse, coarse_answer
 from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc.call import Call
-from mapless_server.scheduling import Done, Flow, Job, StageRecord
+from mapless_server.scheduling import Done, Flow, Job
 from mapless_server.security.principal import Principal
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.services.capture.calls import CapturedCall
@@ -33,7 +34,7 @@ from mapless_server.services.localization import LocalizationService
 from mapless_server.services.watching import Watchers
 from mapless_server.store import SceneAttributes, Store
 
-from .stand_ins import RETRIEVAL, Blobs, RecordedChooser, RecordedSource
+from .stand_ins import RETRIEVAL, Blobs, RecordedSource
 
 Joined = TypeVar("Joined")
 
@@ -108,22 +109,19 @@ class _Recomputing:
         self._looked_at = {field for field, names in stages.items() if RETRIEVAL in names}
         self._method = _unrefined() if _is_cut_short(request, then) else Method()
 
-    async def localize(
-        self,
-        query: Query,
-        caller: Caller,
-        source: object = None,
-        visits: list[StageRecord] | None = None,
-        tell_coarse: object = None,
-    ) -> tuple[Result, Sequence[StageRecord]]:
-        part = self._parts[query.photo.field]
-        given_up = self._unfinished[query.photo.field]
-        tried = [tier for tier in self._tiers if tier.extractor.name not in given_up]
-        chooser = RecordedChooser(part.choice, self._tiers[0].extractor, query.photo.field in self._looked_at)
-        stages = QueryStages(tried or self._tiers, chooser, self.options.escalation, self._method)
+    def query_job(self, query: Query, caller: Caller, source: object = None, on_coarse: object = None) -> Job:
+        field = query.photo.field
+        extractor, part = self._tiers[0].extractor, self._parts[field]
+        recorded = RecordedSource(self._call, part, self._blobs, extractor, field in self._looked_at)
         views = QueryViews(query.photo, self.options.image_limits)
-        work = Work(query, RecordedSource(self._call, part, self._blobs), views, math.inf)
-        return await asyncio.to_thread(_compute, stages, work), ()
+        return Job(Flow("", ""), QueryRun(query, recorded, views, math.inf).first_step, math.inf, 0)
+
+    async def run(self, job: Job) -> Result:
+        run: QueryRun = job.step.payload
+        given_up = self._unfinished[run.query.photo.field]
+        tried = [tier for tier in self._tiers if tier.extractor.name not in given_up]
+        stages = QueryStages(tried or self._tiers, self.options.escalation, self._method)
+        return await asyncio.to_thread(_compute, stages, job)
 
     @contextmanager
     def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
@@ -133,17 +131,16 @@ class _Recomputing:
         return await asyncio.to_thread(compute)
 
 
-def _compute(stages: QueryStages, work: Work) -> Result:
+def _compute(stages: QueryStages, job: Job) -> Result:
     """The way through the stages, without a queue."""
     of_name = {PREPARE: stages.prepare, COARSE: stages.coarse, REFINE: stages.refine}
-    step = stages.first_step(work)
     while True:
-        (verdict,) = of_name[step.stage]([Job(Flow("", ""), step, math.inf, 0, lambda *_: None)])
-        if isinstance(verdict, Done):
-            return cast(Result, verdict.value)
-        if isinstance(verdict, Exception):
-            raise verdict
-        step = verdict.step
+        (result,) = of_name[job.step.stage]([job])
+        if isinstance(result, Done):
+            return cast(Result, result.value)
+        if isinstance(result, Exception):
+            raise result
+        job.step = result.step
 
 
 def _unfinished(stages: Sequence[str]) -> frozenset[str]:
@@ -160,7 +157,7 @@ def _is_cut_short(request: Any, then: Response) -> bool:
 
 
 def _unrefined() -> Method:
-    def answer(coarse: Coarse, check: Callable[[], None]) -> Answer:
-        return coarse_answer(coarse) or refine(coarse, check)
+    def answer(coarse: Coarse) -> Answer:
+        return coarse_answer(coarse) or refine(coarse)
 
     return Method(refine=answer)

@@ -9,7 +9,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from mapless_server.engine.engine import EngineOptions
-from mapless_server.engine.tiers import Tier
+from mapless_server.engine.query import Tier
 from mapless_server.networks.weights import WeightsError, WeightsMissing
 from mapless_server.serve.assembly import engine_options, make_tiers, what_is_missing
 from mapless_server.services.capture.calls import CapturedCall, decode_call

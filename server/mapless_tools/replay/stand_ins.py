@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.names import reference_name
-from mapless_server.engine.views import QueryViews
+from mapless_server.engine.references import QueryViews
 from mapless_server.errors import DataLoss
 from mapless_server.images.decode import decode_image
+from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.turns import Turn
 from mapless_server.method.views import Photograph, PosedView, View
 from mapless_server.scenes.library import STORED_IMAGES, Loaded
 from mapless_server.scenes.retrieval.chosen import Choice
@@ -90,14 +90,29 @@ class Blobs:
 
 @dataclass(frozen=True, eq=False)
 class RecordedSource:
-    """Where references come from; see `ReferenceSource`."""
+    """References and their choice as a captured call has them; see `ReferenceSource`.
+
+    Attributes:
+        call: which was captured.
+        part: one of its photographs.
+        blobs: of the references.
+        extractor: whose features photographs are compared by.
+        is_described: whether the photograph was described for the choice, which takes a reference to compare it with.
+    """
 
     call: CapturedCall
     part: CapturedPart
     blobs: Blobs
+    extractor: FeatureExtractor
+    is_described: bool
 
     def load(
-        self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: FeatureExtractor, turn: Turn, waits: bool
+        self,
+        scene_key: SceneKey,
+        reference_ids: Sequence[str],
+        extractor: FeatureExtractor,
+        context: StageContext,
+        waits: bool,
     ) -> Loaded:
         """Implements ReferenceSource: those that were captured; one that was not could not be read then either."""
         by_id = {it.reference_id: it for it in self.part.references}
@@ -111,30 +126,6 @@ class RecordedSource:
         """Implements ReferenceSource."""
         return self.call.attributes
 
-    def _posed_view(self, reference: CapturedReference, extractor: FeatureExtractor, scene_key: SceneKey) -> PosedView:
-        tenant = self.call.tenant
-        view = self.blobs.view(tenant, reference, extractor)
-        read = partial(self.blobs.pixels, tenant, reference)
-        photograph = Photograph(reference.image_sha256, reference.camera, read)
-        name = reference_name(scene_id_of(scene_key), reference.reference_id)
-        return PosedView(reference.key, name, replace(view, photograph=photograph), reference.world_from_camera)
-
-
-class RecordedChooser:
-    """Chooses what was chosen, whatever is asked; see `query_stages.Chooser`."""
-
-    def __init__(self, choice: Choice | None, extractor: FeatureExtractor, has_looked: bool) -> None:
-        """A chooser for one photograph.
-
-        Args:
-            choice: that was captured.
-            extractor: whose features photographs are compared by.
-            has_looked: whether the photograph was looked at for it, which takes a reference to compare it with.
-        """
-        self._choice = choice
-        self._extractor = extractor
-        self._has_looked = has_looked
-
     def choose(
         self,
         scene_key: SceneKey,
@@ -142,17 +133,25 @@ class RecordedChooser:
         count: int,
         narrowing: Narrowing,
         among: Sequence[str],
-        turn: Turn,
+        context: StageContext,
         options: RankOptions | None = None,
     ) -> Choice:
-        """The choice that was captured; DamagedCapture if there is none."""
-        if self._choice is None:
+        """Implements ReferenceSource: the captured choice, whatever the arguments; DamagedCapture if there is none."""
+        if self.part.choice is None:
             raise DamagedCapture("no choice of references was captured")
-        if self._has_looked:
-            views.view(self._extractor, turn)
-            with turn.stage(RETRIEVAL):  # it is over, but the answer lists it
+        if self.is_described:
+            views.view(self.extractor, context)
+            with context.stage(RETRIEVAL):  # it is over, but the answer lists it
                 pass
-        return self._choice
+        return self.part.choice
 
-    def tell_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
-        """It was left out then, too."""
+    def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
+        """Implements ReferenceSource: it was left out then, too."""
+
+    def _posed_view(self, reference: CapturedReference, extractor: FeatureExtractor, scene_key: SceneKey) -> PosedView:
+        tenant = self.call.tenant
+        view = self.blobs.view(tenant, reference, extractor)
+        read = partial(self.blobs.pixels, tenant, reference)
+        photograph = Photograph(reference.image_sha256, reference.camera, read)
+        name = reference_name(scene_id_of(scene_key), reference.reference_id)
+        return PosedView(reference.key, name, replace(view, photograph=photograph), reference.world_from_camera)

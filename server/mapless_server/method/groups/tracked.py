@@ -7,20 +7,19 @@ of the photograph. Too few to tell where it was taken, they may be enough togeth
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
-from ..localize import Prepared
 from ..match import vote
 from ..observations import triangulate
+from ..pipeline import Prepared
 from ..structure import Structure, StructureOptions, observe, refine_points, tracks_of
 from ..support import Support
 from ..tracks import Tracks
 
 
-def tracked_support(prepared: Prepared, check: Callable[[], None]) -> Support | None:
+def tracked_support(prepared: Prepared) -> Support | None:
     """What a pose of the photograph could rest on, found more widely; None where there is nothing."""
-    query, references = prepared.query, prepared.references
+    query, references, check = prepared.query, prepared.references, prepared.context.check
     if len(references) < 2:
         return None
     known = prepared.correspondences.query_matches

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 
 from mapless_server import __version__
-from mapless_server.engine.tiers import Tier
+from mapless_server.engine.query import Tier
 from mapless_server.observability.provenance import ROOT, commit_of, cpu_model
 from mapless_server.settings import Settings
 

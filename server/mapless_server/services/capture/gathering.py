@@ -44,13 +44,13 @@ class Used:
 
 def used_of(query: Query, result: Result) -> Used:
     """What is to be gathered of an answered photograph."""
-    attempt, choice = result.attempt, result.attempt.choice
+    choice = result.choice
     if choice is not None:
         wanted = {it.reference_id: it.key for it in choice.references}
     else:
-        wanted = {parse_reference_name(it.name)[1]: it.key for it in attempt.references}
-    used = frozenset(it.key for it in attempt.references)
-    return Used(query.photo.field, attempt.generation, used, wanted, choice)
+        wanted = {parse_reference_name(it.name)[1]: it.key for it in result.references}
+    used = frozenset(it.key for it in result.references)
+    return Used(query.photo.field, result.generation, used, wanted, choice)
 
 
 class Gatherer:

@@ -16,8 +16,7 @@ from typing import Protocol
 from google.protobuf.message import Message
 
 from mapless.names import parse_scene_name
-from mapless_server.engine.query import Query, Result
-from mapless_server.engine.tiers import Tier
+from mapless_server.engine.query import Query, Result, Tier
 from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.rpc.call import Call
 from mapless_server.security.tenancy import key_of
@@ -149,7 +148,7 @@ class Recorder:
         messages: tuple[Message, Message] = request, response
         size_bytes = sum(it.ByteSize() for it in messages)
         used = tuple(used_of(*part) for part in parts)
-        attributes = parts[0][1].attempt.attributes
+        attributes = parts[0][1].attributes
         scene_id, now_s = parse_scene_name(request.scene), time.time()
         if self._has_room(size_bytes):
             for diagnostics in diagnostics_of(response):

@@ -10,8 +10,7 @@ from mapless.geometry import Array, RigidTransform
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import __version__
 from mapless_server.engine.query import Result
-from mapless_server.engine.tiers import Attempt
-from mapless_server.method.localize import Answer, Localization, LocalizeOptions
+from mapless_server.method.answer import Localization, LocalizeOptions
 from mapless_server.method.priors.known import PriorCheck
 from mapless_server.method.rejection import Hint, Rejection
 from mapless_server.method.scale import MetricScale
@@ -24,44 +23,43 @@ from .frames import axes_from_message, session_from_message, set_frames
 
 
 @dataclass(frozen=True, eq=False)
-class Addressee:
-    """Whom an answer is made for.
+class AnswerFrames:
+    """The frames that an answer is given in, beside OpenCV's.
 
     Attributes:
-        axes: in which the caller speaks of its camera.
-        session_from_camera: of the moment of capture, in these axes; None if the caller has said nothing of it.
+        axes: of the caller's camera.
+        session_from_camera: at the moment of capture, in these axes; None if the request has none.
     """
 
     axes: Axes
     session_from_camera: RigidTransform | None
 
 
-def addressee_of(request: pb.LocalizeRequest) -> Addressee:
-    """Whom the answer to a request is made for; FieldError names what is wrong."""
-    return Addressee(axes_from_message(request.options), session_from_message(request))
+def answer_frames_of(request: pb.LocalizeRequest) -> AnswerFrames:
+    """The frames that a request wants its answer in; FieldError names what is wrong."""
+    return AnswerFrames(axes_from_message(request.options), session_from_message(request))
 
 
-def outcome_to_message(result: Result, options: LocalizeOptions, addressee: Addressee) -> pb.LocalizeResponse:
+def outcome_to_message(result: Result, options: LocalizeOptions, frames: AnswerFrames) -> pb.LocalizeResponse:
     """Message of an answer, with nothing in it but its outcome."""
-    attempt = result.attempt
-    outcome = attempt.answer.outcome
+    outcome = result.answer.outcome
     if isinstance(outcome, Rejection):
         return pb.LocalizeResponse(rejection=rejection_to_message(outcome))
-    claim = claim_of(outcome.covariance, attempt, options)
-    return pb.LocalizeResponse(localization=_localization_to_message(outcome, claim, attempt.attributes, addressee))
+    claim = claim_of(outcome.covariance, result, options)
+    return pb.LocalizeResponse(localization=_localization_to_message(outcome, claim, result.attributes, frames))
 
 
-def claim_of(covariance: Array | None, attempt: Attempt, options: LocalizeOptions) -> Claimed | None:
+def claim_of(covariance: Array | None, result: Result, options: LocalizeOptions) -> Claimed | None:
     """What is told of a pose's error, by its covariance (6, 6) and the scene's calibration; None if there is none."""
     if covariance is None:
         return None
-    backend = attempt.tier.pipeline.reconstructor.name
-    conditions = Conditions(attempt.tier.extractor.name, backend, options.variant.name, __version__)
-    return claimed(accuracy_from_covariance(covariance), covariance, conditions, attempt.attributes.calibration)
+    backend = result.tier.pipeline.reconstructor.name
+    conditions = Conditions(result.tier.extractor.name, backend, options.variant.name, __version__)
+    return claimed(accuracy_from_covariance(covariance), covariance, conditions, result.attributes.calibration)
 
 
 def _localization_to_message(
-    localization: Localization, claim: Claimed | None, attributes: SceneAttributes, addressee: Addressee
+    localization: Localization, claim: Claimed | None, attributes: SceneAttributes, frames: AnswerFrames
 ) -> pb.Localization:
     message = pb.Localization(
         world_from_camera=wire.transform_to_message(localization.world_from_camera),
@@ -79,8 +77,8 @@ def _localization_to_message(
         message,
         localization.world_from_camera,
         claim.covariance if claim else None,
-        addressee.axes,
-        addressee.session_from_camera,
+        frames.axes,
+        frames.session_from_camera,
         attributes.datum,
     )
     return message
@@ -141,31 +139,31 @@ def _hint_to_message(hint: Hint) -> pb.Hint:
 
 def diagnostics_to_message(result: Result, options: LocalizeOptions) -> pb.Diagnostics:
     """Message of what was used and where the time went; the caller knows the call's id and durations."""
-    attempt, answer = result.attempt, result.attempt.answer
-    reconstructor = attempt.tier.pipeline.reconstructor
+    answer, reconstructor = result.answer, result.tier.pipeline.reconstructor
     message = pb.Diagnostics(
         backend=reconstructor.name,
         weights_sha256=reconstructor.weights_sha256,
-        features=attempt.tier.extractor.name,
+        features=result.tier.extractor.name,
         variant=enum_to_message(options.variant, pb.Variant),
-        store_generation=attempt.generation,
+        store_generation=result.generation,
         scale=_scale_to_message(answer.scale) if answer.scale else None,
-        processed_width_px=attempt.processed.width_px,
-        processed_height_px=attempt.processed.height_px,
+        processed_width_px=result.processed.width_px,
+        processed_height_px=result.processed.height_px,
         server_version=__version__,
-        retrieval=attempt.choice.descriptor if attempt.choice else "",
+        retrieval=result.choice.descriptor if result.choice else "",
     )
-    message.references.extend(_reference_uses(attempt, answer))
+    message.references.extend(_reference_uses(result))
     for stage, seconds in result.stage_seconds.items():
         message.stages.add(stage=stage).duration.FromNanoseconds(round(1e9 * seconds))
     return message
 
 
-def _reference_uses(attempt: Attempt, answer: Answer) -> list[pb.ReferenceUse]:
+def _reference_uses(result: Result) -> list[pb.ReferenceUse]:
+    answer = result.answer
     # Counts are missing when the stage that counts was not reached.
-    match_counts = answer.reference_match_counts or (0,) * len(attempt.references)
-    inlier_counts = answer.reference_inlier_counts or (0,) * len(attempt.references)
-    similarities = {it.key: it.similarity for it in attempt.choice.references} if attempt.choice else {}
+    match_counts = answer.reference_match_counts or (0,) * len(result.references)
+    inlier_counts = answer.reference_inlier_counts or (0,) * len(result.references)
+    similarities = {it.key: it.similarity for it in result.choice.references} if result.choice else {}
     return [
         pb.ReferenceUse(
             name=reference.name,
@@ -173,7 +171,7 @@ def _reference_uses(attempt: Attempt, answer: Answer) -> list[pb.ReferenceUse]:
             inlier_count=inliers,
             similarity=similarities.get(reference.key, 0.0),
         )
-        for reference, matches, inliers in zip(attempt.references, match_counts, inlier_counts, strict=True)
+        for reference, matches, inliers in zip(result.references, match_counts, inlier_counts, strict=True)
     ]
 
 

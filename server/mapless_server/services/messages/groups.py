@@ -13,12 +13,12 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.engine.engine import EngineOptions
-from mapless_server.engine.groups import GroupResult, queued_s
+from mapless_server.engine.groups import GroupResult
 from mapless_server.engine.query import Query
+from mapless_server.method.answer import Variant
 from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.groups.sightings import MatchedSighting
-from mapless_server.method.localize import Variant
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_server.scenes.retrieval.narrowing import Narrowing
@@ -130,7 +130,7 @@ def rig_to_message(
         if session_from_rig is not None:
             world_from_session = outcome.world_from_rig.compose(session_from_rig.inverse())
             message.world_from_session.CopyFrom(wire.transform_to_message(world_from_session))
-        datum = group.results[0].attempt.attributes.datum
+        datum = group.results[0].attributes.datum
         if datum is not None:
             message.geo_pose.CopyFrom(geo_pose_to_message(outcome.world_from_rig, datum))
         response = pb.LocalizeRigResponse(localization=message)
@@ -196,9 +196,9 @@ def _reports(
     matched = {} if isinstance(outcome, Rejection) else {it.sighting.image: it for it in outcome.matched}
     reports = []
     for i, (result, query) in enumerate(zip(group.results, queries, strict=True)):
-        alone = result.attempt.answer
+        alone = result.answer
         report = pb.ImageReport(diagnostics=diagnostics_to_message(result, query.options))
-        report.diagnostics.queue_duration.FromNanoseconds(round(1e9 * queued_s(group.visits[i])))
+        report.diagnostics.queue_duration.FromNanoseconds(round(1e9 * group.queued_s[i]))
         report.diagnostics.total_duration.FromNanoseconds(round(1e9 * group.seconds[i]))
         if isinstance(alone.outcome, Rejection):
             report.alone.CopyFrom(rejection_to_message(alone.outcome))

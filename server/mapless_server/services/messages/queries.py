@@ -7,7 +7,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.engine.engine import EngineOptions
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Query
-from mapless_server.method.localize import LocalizeOptions
+from mapless_server.method.answer import LocalizeOptions
 from mapless_server.security.tenancy import key_of
 from mapless_server.store import SceneAttributes
 

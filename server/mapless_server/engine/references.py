@@ -1,0 +1,213 @@
+"""Photographs and references as the stages of a query see them: decoded and described once, loaded, chosen."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from mapless_server.errors import DataLoss, NotFound
+from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.method.context import StageContext
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.views import Photograph, View
+from mapless_server.scenes.auditing import SceneExaminer, Tools
+from mapless_server.scenes.indexes import SceneIndexes
+from mapless_server.scenes.library import Loaded, ReferenceLibrary
+from mapless_server.scenes.retrieval.chosen import Choice
+from mapless_server.scenes.retrieval.descriptor import GlobalDescriptor, Vector
+from mapless_server.scenes.retrieval.narrowing import Narrowing
+from mapless_server.scenes.retrieval.ranking import RankOptions, rank_references
+from mapless_server.security.tenancy import SceneKey, scene_id_of
+from mapless_server.store import SceneAttributes
+
+from .query import Photo
+
+
+class QueryViews:
+    """Decodes a photograph once, and has it described once by each extractor, when first asked."""
+
+    def __init__(self, photo: Photo, limits: ImageLimits) -> None:
+        self._photo = photo
+        self._limits = limits
+        self._photograph: Photograph | None = None
+        self._views: dict[str, View] = {}
+
+    def view(self, extractor: FeatureExtractor, context: StageContext) -> View:
+        """The view with its photograph; InvalidArgument if the image is bad."""
+        if extractor.name not in self._views:
+            photograph = self._decoded(context)
+            with context.stage("features"):
+                view = extractor.extract(photograph.read(), photograph.camera)
+            self._views[extractor.name] = replace(view, photograph=photograph)
+        return self._views[extractor.name]
+
+    def _decoded(self, context: StageContext) -> Photograph:
+        if self._photograph is None:
+            photo = self._photo
+            with context.stage("decode"):
+                pixels = decode_image(photo.image, self._limits, photo.field)
+                sha256 = hashlib.sha256(photo.image).hexdigest()
+            self._photograph = Photograph(sha256, photo.camera, lambda: pixels)
+        return self._photograph
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """What is stored of a photograph beside the photograph.
+
+    Attributes:
+        views: camera and features by the extractor's name, the first tier's first; without the pixels.
+        descriptors: global ones, by name.
+    """
+
+    views: Mapping[str, View]
+    descriptors: Mapping[str, Vector]
+
+
+class ReferenceSource(Protocol):
+    """Where a query's references come from: `References`, or what was recorded or rendered."""
+
+    def load(
+        self,
+        scene_key: SceneKey,
+        reference_ids: Sequence[str],
+        extractor: FeatureExtractor,
+        context: StageContext,
+        waits: bool,
+    ) -> Loaded:
+        """The scene's generation and references of it, in the order given."""
+        ...
+
+    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        """The attributes of a scene as a whole."""
+        ...
+
+    def choose(
+        self,
+        scene_key: SceneKey,
+        views: QueryViews,
+        count: int,
+        narrowing: Narrowing,
+        among: Sequence[str],
+        context: StageContext,
+        options: RankOptions | None = None,
+    ) -> Choice:
+        """At most `count` references for a photograph."""
+        ...
+
+    def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
+        """Notes that a chosen reference is not used because it is damaged."""
+        ...
+
+
+class References:
+    """The references of all scenes: loaded, chosen, described, audited. Safe to use from several threads."""
+
+    def __init__(
+        self,
+        library: ReferenceLibrary,
+        indexes: SceneIndexes,
+        descriptor: GlobalDescriptor,
+        extractors: Sequence[FeatureExtractor],
+        audit_tools: Tools,
+        limits: ImageLimits,
+    ) -> None:
+        """The first extractor's features are those that the descriptor is made of; ValueError if they are not."""
+        if descriptor.extractor not in (None, extractors[0].name):
+            raise ValueError(f"{descriptor.name} is made of {descriptor.extractor}, not of {extractors[0].name}")
+        self._library = library
+        self._indexes = indexes
+        self._descriptor = descriptor
+        self._extractors = extractors
+        self._audit_tools = audit_tools
+        self._limits = limits
+
+    def load(
+        self,
+        scene_key: SceneKey,
+        reference_ids: Sequence[str],
+        extractor: FeatureExtractor,
+        context: StageContext,
+        waits: bool = True,
+    ) -> Loaded:
+        """See `ReferenceLibrary.load`."""
+        return self._library.load(scene_key, reference_ids, extractor, context, waits)
+
+    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        """The attributes of a scene as a whole."""
+        return self._library.attributes(scene_key)
+
+    def choose(
+        self,
+        scene_key: SceneKey,
+        views: QueryViews,
+        count: int,
+        narrowing: Narrowing,
+        among: Sequence[str],
+        context: StageContext,
+        options: RankOptions | None = None,
+    ) -> Choice:
+        """At most `count` references for a photograph, by its global descriptor.
+
+        Args:
+            scene_key: the scene.
+            views: the photograph.
+            count: how many.
+            narrowing: limits of the camera's pose.
+            among: ids of the candidates; empty for all of the scene's.
+            context: cancels and times.
+            options: of the ranking.
+
+        Raises:
+            NotFound: there is no such scene (field "scene") or reference (field "references[i]").
+            DataLoss: a named reference is damaged (field "references[i]").
+            InvalidArgument: the image is bad.
+        """
+        # The scene comes first: a wrong name is found before the photograph is described.
+        entries = self._indexes.entries(scene_key, context)
+        for index, reference_id in enumerate(among):
+            if reference_id not in entries:
+                if self._indexes.is_damaged(scene_key, reference_id):
+                    message = f"reference {reference_id!r} is damaged in the store: delete it and add it again"
+                    raise DataLoss(message, field=f"references[{index}]")
+                message = f"there is no reference {reference_id!r} in scene {scene_id_of(scene_key)!r}"
+                raise NotFound(message, field=f"references[{index}]")
+        if not len(entries):
+            return Choice((), self._descriptor.name, entries.generation)
+        view = views.view(self._extractors[0], context)
+        with context.stage("retrieval"):
+            vector = self._descriptor.describe(view)
+            ranked = rank_references(entries, vector, count, narrowing, frozenset(among) if among else None, options)
+        return Choice(tuple(ranked), self._descriptor.name, entries.generation)
+
+    def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
+        """Logs, once while the scene is in memory, that a chosen reference is not used because it is damaged."""
+        self._indexes.tell_damaged(scene_key, reference_id, error)
+
+    def describe(self, photo: Photo, check: Callable[[], None]) -> Description:
+        """Everything that is stored of a photograph: every tier's features; InvalidArgument if it is bad."""
+        decoded, context = QueryViews(photo, self._limits), StageContext(check)
+        views = {it.name: decoded.view(it, context) for it in self._extractors}
+        vector = self._descriptor.describe(views[self._extractors[0].name])
+        # A batch is held in memory until it is stored, so without its pixels.
+        without_pixels = {name: replace(view, photograph=None) for name, view in views.items()}
+        return Description(without_pixels, {self._descriptor.name: vector})
+
+    def examiner(self, scene_key: SceneKey, named: Sequence[str] = ()) -> SceneExaminer:
+        """Audits references of a scene, of which the caller named some."""
+        return SceneExaminer(self._audit_tools, scene_key, named)
+
+    def forget_scene(self, scene_key: SceneKey) -> None:
+        """Frees what is in memory of a deleted scene."""
+        self._indexes.forget(scene_key)
+
+    @property
+    def index_bytes(self) -> int:
+        """Memory of the retrieval indexes."""
+        return self._indexes.size_bytes
+
+    def close(self) -> None:
+        """Ends the background work of the library."""
+        self._library.close()
