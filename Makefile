@@ -10,7 +10,7 @@ TORCH  ?= torch==2.13.0
 PROTO_TOOLS := grpcio-tools==1.71.2 setuptools==80.9.0
 PROTO_VENV  := $(VENV)/proto-tools
 
-.PHONY: help setup test thorough lint format proto demo bench bench-gpu load load-ray fuzz clean
+.PHONY: help setup test thorough lint format proto demo bench bench-gpu load load-ray fuzz docs clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -70,6 +70,13 @@ fuzz: setup  ## Fuzz what reads the inputs of strangers; TARGET="images names" f
 
 load-ray: setup  ## Measure replicas on Ray Serve, on this machine: half an hour; PART=overhead, throughput, failover or redeploys
 	$(BIN)/python -m mapless_tools.load_ray $(or $(PART),all) $(if $(DATA),--data '$(DATA)') $(ARGS)
+
+$(VENV)/.docs: $(VENV)/.installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	touch $@
+
+docs: $(VENV)/.docs  ## Build the documentation as a site in build/docs; a broken link is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean:  ## Remove the environment and caches
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache build *.egg-info

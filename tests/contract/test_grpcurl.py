@@ -1,4 +1,4 @@
-"""The README's grpcurl lines are right: services, methods, types and fields as a server describes itself by reflection.
+"""The grpcurl lines of the pages are right: services, methods, types and fields as a server describes itself.
 
 What stands on a line is read as grpcurl reads it, and the request it would send is built from the server's own
 description, by nothing that mapless ships.
@@ -12,22 +12,22 @@ import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import grpc
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+from support.documents import PAGES, shell
 from support.servers import CAMERA, PHOTO, pose, serving
 
 from mapless import Client, NewReference, wire
 
 _FILES: Any = descriptor_pb2  # which is not annotated
 
-README = (Path(__file__).parents[2] / "README.md").read_text()
+SHOWN = "\n".join(map(shell, PAGES))
 FLAGS = {"-plaintext": 0, "-d": 1, "-max-msg-sz": 1, "-cacert": 1, "-H": 1}
-"""Flags that the README uses, and how many values each takes."""
+"""Flags that the pages use, and how many values each takes."""
 
 
 @dataclass
@@ -49,9 +49,24 @@ def parsed(arguments: list[str]) -> Line:
 
 
 def lines() -> list[Line]:
-    text = re.sub(r"(\\|\|)\n", r" ", README)
-    found = re.findall(r"^ {4}.*?\bgrpcurl (.*)$", text, re.MULTILINE)
-    return [parsed(shlex.split(line)) for line in found]
+    found = []
+    for after in SHOWN.split("grpcurl -")[1:]:
+        text, *rest = f"-{after}".split("\n")
+        while text.count("'") % 2:  # a quotation that ends in a later line
+            text += rest.pop(0)
+        found.append(parsed(shlex.split(text)))
+    return found
+
+
+def as_protobuf_json(body: str) -> str:
+    """JSON as protobuf defines it. grpcurl takes a field mask as a message alone, not as the string that is defined."""
+
+    def with_masks(message: dict[str, Any]) -> dict[str, Any]:
+        if "update_mask" in message:
+            message["update_mask"] = ",".join(message["update_mask"]["paths"])
+        return message
+
+    return json.dumps(json.loads(body, object_hook=with_masks))
 
 
 class Described:
@@ -82,7 +97,7 @@ class Described:
         """The message that a JSON body is; an error if a name in it is none."""
         service, name = method.split("/")
         kind = self.pool.FindServiceByName(service).methods_by_name[name].input_type
-        return json_format.Parse(body, message_factory.GetMessageClass(kind)())
+        return json_format.Parse(as_protobuf_json(body), message_factory.GetMessageClass(kind)())
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +109,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def test_every_line_is_read() -> None:
-    assert len(lines()) == len(re.findall(r"^ {4}.*\bgrpcurl ", README, re.MULTILINE)) >= 3
+    assert len(lines()) >= 7
     assert {line.address for line in lines()} == {"localhost:50051"}
 
 
@@ -113,10 +128,12 @@ def test_every_symbol_is_described(server: str) -> None:
 
 def test_the_request_that_the_shell_puts_together_is_answered(server: str) -> None:
     """What `printf`, `cat` and `base64` write for grpcurl's standard input is a request, and it localizes."""
-    (prefix, suffix) = re.findall(r"printf '([^']*)'", README)[:2]
+    written = re.findall(r"printf '([^']*)'", SHOWN)
+    prefix, suffix = written[:2]
+    assert {*written} == {prefix, suffix}  # wherever it is shown
     body = prefix.replace("%s", json_format.MessageToJson(wire.camera_to_message(CAMERA)))
     body += base64.b64encode(PHOTO).decode() + suffix
-    (line,) = [line for line in lines() if line.flags.get("-d") == "@"]
+    line = next(line for line in lines() if line.flags.get("-d") == "@")
     described = Described(server)
     request = described.request(line.symbols[0], body)
     assert json.loads(body)["scene"] == request.scene == "scenes/kitchen"
