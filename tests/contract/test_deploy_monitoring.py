@@ -20,8 +20,10 @@ import promql_parser
 import pytest
 import yaml  # type: ignore[import-untyped]
 
+from mapless_server.method.coarse.token_cache import TokenCacheCounters
 from mapless_server.observability.metrics import LOCALIZED, STAGES, Metrics
 from mapless_server.settings import Settings
+from mapless_server.store.cache import LruCache
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 DASHBOARD = json.loads((DEPLOY / "grafana/dashboards/mapless.json").read_text())
@@ -37,20 +39,6 @@ TARGET_LABELS = {"job": "mapless", "instance": "a:9464", "namespace": "mapless",
 """What Prometheus adds to every series."""
 
 Labels = dict[str, str]
-
-
-@dataclass(frozen=True)
-class Counts:
-    """What the caches of a server that computes tell of themselves."""
-
-    hits: int = 1
-    misses: int = 1
-    evictions: int = 1
-    used_bytes: int = 1
-    device_hits: int = 1
-    host_hits: int = 1
-    device_bytes: int = 1
-    host_bytes: int = 1
 
 
 @dataclass
@@ -96,11 +84,11 @@ def everything_happened() -> Metrics:
     )
     metrics.stored("read", 0.01)
     metrics.built("0.1.0", "geometric", "sift", "")
-    metrics.watch_reference_cache(Counts)
-    metrics.watch_retrieval_index(lambda: 1)
-    metrics.watch_token_cache(Counts)
-    metrics.watch_gpu_memory(lambda: {"allocated": 1.0, "reserved": 1.0, "peak": 1.0})
-    metrics.watch_certificate(lambda: 1.0)
+    metrics.scraped.reference_cache = lambda: LruCache[str](0)
+    metrics.scraped.retrieval_index = lambda: 1
+    metrics.scraped.token_cache = TokenCacheCounters
+    metrics.scraped.gpu_memory = lambda: {"allocated": 1.0, "reserved": 1.0, "peak": 1.0}
+    metrics.scraped.certificate_expiry = lambda: 1.0
     return metrics
 
 

@@ -229,7 +229,7 @@ def test_the_stages_of_a_group_that_fails_are_told_too() -> None:
         call = Call("id", time.monotonic(), time.monotonic() + LIMIT_S)
         with pytest.raises(RuntimeError, match="planted"):
             await _localize_each(engine, [PART] * 4, call, "images")
-        assert call.trail.queue_s is not None
-        assert call.trail.stage_seconds[PREPARE] >= engine.seconds
+        assert call.history.queue_s is not None
+        assert call.history.stage_seconds[PREPARE] >= engine.seconds
 
     run(engine, work())

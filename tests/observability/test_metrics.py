@@ -13,12 +13,12 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import pytest
 from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
+from mapless_server.method.coarse.token_cache import TokenCacheCounters
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability import exporter
 from mapless_server.observability.event_loop import LoopObserver, watch_event_loop
@@ -26,6 +26,7 @@ from mapless_server.observability.exporter import MAX_CONNECTIONS, MetricsServer
 from mapless_server.observability.metrics import LOCALIZED, STAGES, Metrics
 from mapless_server.rpc.guard import CallObserver
 from mapless_server.scheduling import Ending, Observer, Refusal
+from mapless_server.store.cache import LruCache
 
 LOCALIZE = "/mapless.v1.LocalizationService/Localize"
 
@@ -87,18 +88,16 @@ HISTOGRAMS = {
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
 
-@dataclass(frozen=True)
-class Counts:
-    """Both kinds of cache."""
+TOKENS = TokenCacheCounters(device_hits=2, host_hits=3, misses=4, device_bytes=7, host_bytes=8, evictions=5)
 
-    hits: int = 1
-    device_hits: int = 2
-    host_hits: int = 3
-    misses: int = 4
-    evictions: int = 5
-    used_bytes: int = 6
-    device_bytes: int = 7
-    host_bytes: int = 8
+
+def reference_cache(hits: int) -> LruCache[str]:
+    """A cache of one entry of 6 bytes that was found so often."""
+    cache = LruCache[str](10)
+    cache.put("key", "value", 6)
+    for _ in range(hits):
+        cache.get("key")
+    return cache
 
 
 def samples_of(metrics: Metrics) -> Samples:
@@ -149,10 +148,10 @@ def tell_everything(metrics: Metrics) -> None:
     metrics.set_serving(True)
     metrics.warmed_up(3.0)
     metrics.built("1.2.3", "pi3x", "aliked", "ab" * 32)
-    metrics.watch_reference_cache(Counts)
-    metrics.watch_token_cache(Counts)
-    metrics.watch_gpu_memory(lambda: {"allocated": 10.0, "reserved": 20.0})
-    metrics.watch_certificate(lambda: 2e9)
+    metrics.scraped.reference_cache = lambda: reference_cache(1)
+    metrics.scraped.token_cache = lambda: TOKENS
+    metrics.scraped.gpu_memory = lambda: {"allocated": 10.0, "reserved": 20.0}
+    metrics.scraped.certificate_expiry = lambda: 2e9
 
 
 @pytest.fixture
@@ -346,7 +345,7 @@ def test_caches_are_read_when_somebody_asks(metrics: Metrics) -> None:
     assert samples["mapless_token_cache_hits_total", frozenset({("tier", "host")})] == 3
     assert samples["mapless_token_cache_bytes", frozenset({("tier", "host")})] == 8
     assert samples["mapless_gpu_memory_bytes", frozenset({("kind", "reserved")})] == 20
-    metrics.watch_reference_cache(lambda: Counts(hits=17))
+    metrics.scraped.reference_cache = lambda: reference_cache(17)
     assert samples_of(metrics)["mapless_reference_cache_hits_total", frozenset()] == 17
 
 
@@ -355,10 +354,10 @@ def test_one_that_cannot_be_read_blinds_nobody_to_the_others(
 ) -> None:
     tell_everything(metrics)
 
-    def broken() -> Counts:
+    def broken() -> LruCache[str]:
         raise RuntimeError("the cache is gone")
 
-    metrics.watch_reference_cache(broken)
+    metrics.scraped.reference_cache = broken
     samples = samples_of(metrics)
     assert ("mapless_reference_cache_hits_total", frozenset()) not in samples
     assert samples["mapless_token_cache_misses_total", frozenset()] == 4

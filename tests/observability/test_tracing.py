@@ -21,9 +21,11 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 from opentelemetry.trace import SpanKind, StatusCode
 
 from mapless_server.extras import install_hint
-from mapless_server.observability.otlp import OtlpTracer
-from mapless_server.observability.tracing import NoTracer, make_tracer
-from mapless_server.observability.trail import Step
+from mapless_server.observability.call_record import TracedStep
+from mapless_server.observability.otlp import OtlpTracer, make_otlp_tracer
+from mapless_server.serve import running
+from mapless_server.serve.assembly import StartupError
+from mapless_server.settings import Settings
 
 METHOD = "/mapless.v1.LocalizationService/Localize"
 TRACE_ID = "0af7651916cd43dd8448eb211c80319c"
@@ -86,7 +88,7 @@ def test_what_the_caller_does_not_sample_is_not_recorded() -> None:
     tracer = OtlpTracer(exporter := InMemorySpanExporter())
     span = tracer.begin(METHOD, [("traceparent", f"00-{TRACE_ID}-{PARENT_ID}-00")], 0.0)
     assert span.trace_id == ""
-    span.end("OK", [Step("coarse", 0.0, 1.0)], {})
+    span.end("OK", [TracedStep("coarse", 0.0, 1.0)], {})
     tracer.close(10)
     assert exporter.get_finished_spans() == ()
 
@@ -113,8 +115,8 @@ def test_only_faults_of_the_server_are_errors(code: str, is_fault: bool) -> None
 def test_steps_are_children_and_parts_follow_each_other() -> None:
     start_s = time.monotonic() - 100
     steps = [
-        Step("queue prepare", start_s, start_s + 1),
-        Step("prepare", start_s + 1, start_s + 4, {"batch_id": "b-7"}, {"decode": 1.0, "features": 2.0}),
+        TracedStep("queue prepare", start_s, start_s + 1),
+        TracedStep("prepare", start_s + 1, start_s + 4, {"batch_id": "b-7"}, {"decode": 1.0, "features": 2.0}),
     ]
     before_ns = time.time_ns()
     spans = spans_of(([], "OK", steps, {}))
@@ -148,30 +150,22 @@ def test_odd_attributes_spoil_nothing() -> None:
     }
 
 
-def test_without_an_endpoint_nothing_is_traced() -> None:
-    tracer = make_tracer("")
-    assert isinstance(tracer, NoTracer)
-    span = tracer.begin(METHOD, [TRACEPARENT], 0.0)
-    assert span.trace_id == ""
-    span.end("OK", [], {})
-    tracer.close(1)
-
-
 def test_opentelemetry_is_imported_only_where_traces_are_wanted() -> None:
     program = (
         "import sys\n"
-        "import mapless_server.rpc.guard\n"
-        "from mapless_server.observability.tracing import make_tracer\n"
-        "make_tracer('')\n"
-        "print(sorted({name.partition('.')[0] for name in sys.modules} & {'opentelemetry', 'prometheus_client'}))"
+        "from mapless_server.serve import running\n"
+        "from mapless_server.settings import Settings\n"
+        "tracer = running._make_tracer(Settings())\n"
+        "print(repr(tracer.begin('/m', [], 0.0).trace_id), 'opentelemetry' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout == "[]\n"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "'' False\n"
 
 
 @pytest.mark.parametrize("endpoint", ["localhost:4317", "ftp://host:1", "http://", "nonsense"])
-def test_an_endpoint_that_is_no_address_is_refused(endpoint: str) -> None:
-    with pytest.raises(ValueError, match="otlp_endpoint must be http://host:port"):
-        make_tracer(endpoint)
+def test_an_endpoint_that_is_no_address_ends_the_start(endpoint: str) -> None:
+    with pytest.raises(StartupError, match="otlp_endpoint must be http://host:port"):
+        running._make_tracer(Settings(otlp_endpoint=endpoint))
 
 
 def test_a_missing_package_names_its_extra() -> None:
@@ -212,10 +206,10 @@ def collector() -> Iterator[tuple[Collector, str]]:
 def test_a_real_collector_gets_the_call_when_the_server_ends(collector: tuple[Collector, str]) -> None:
     receiver, endpoint = collector
     receiver.gate.set()
-    tracer = make_tracer(endpoint)
+    tracer = make_otlp_tracer(endpoint)
     now_s = time.monotonic()
     span = tracer.begin(METHOD, [TRACEPARENT], now_s)
-    span.end("OK", [Step("coarse", now_s, now_s + 0.1, {"batch_id": "b-7"})], {"scene": "hall"})
+    span.end("OK", [TracedStep("coarse", now_s, now_s + 0.1, {"batch_id": "b-7"})], {"scene": "hall"})
     tracer.close(20)
     (request,) = receiver.received
     (resource_spans,) = request.resource_spans
@@ -242,7 +236,7 @@ def nobody() -> Iterator[str]:
 def test_a_collector_that_is_away_hurts_no_call_and_no_end(nobody: str, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.CRITICAL, "opentelemetry")
     before = tracing_threads()
-    tracer = make_tracer(nobody)
+    tracer = make_otlp_tracer(nobody)
     for _ in range(5000):  # more than are held
         tracer.begin(METHOD, [], time.monotonic()).end("OK", [], {})
     tracer.close(0.2)
@@ -255,7 +249,7 @@ def test_a_silent_collector_delays_the_end_by_the_limit(
     caplog.set_level(logging.CRITICAL, "opentelemetry")
     receiver, endpoint = collector
     before = tracing_threads()
-    tracer = make_tracer(endpoint)
+    tracer = make_otlp_tracer(endpoint)
     tracer.begin(METHOD, [], time.monotonic()).end("OK", [], {})
     tracer.close(0.2)
     assert receiver.received == []

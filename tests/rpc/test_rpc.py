@@ -19,7 +19,7 @@ from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.errors import NotFound, Overloaded, PermissionDenied, Unauthenticated
-from mapless_server.observability.trail import MAX_STEPS, Step
+from mapless_server.observability.call_record import MAX_STEPS, TracedStep
 from mapless_server.rpc import receiving
 from mapless_server.rpc.call import ANSWER_MARGIN_SHARE, Call
 from mapless_server.rpc.guard import CallGuard
@@ -42,7 +42,7 @@ class Counted:
     trace_id: str = ""
     started: list[str] = field(default_factory=list)
     handled: list[tuple[str, str, float, str]] = field(default_factory=list)
-    ended: list[tuple[str, Sequence[Step], Mapping[str, object]]] = field(default_factory=list)
+    ended: list[tuple[str, Sequence[TracedStep], Mapping[str, object]]] = field(default_factory=list)
 
     def call_started(self, method: str) -> None:
         self.started.append(method)
@@ -53,7 +53,7 @@ class Counted:
     def begin(self, method: str, metadata: Any, start_s: float) -> Counted:
         return self
 
-    def end(self, code: str, steps: Sequence[Step], attributes: Mapping[str, object]) -> None:
+    def end(self, code: str, steps: Sequence[TracedStep], attributes: Mapping[str, object]) -> None:
         self.ended.append((code, steps, attributes))
 
     def close(self, limit_s: float) -> None:
@@ -248,7 +248,7 @@ def test_a_passed_deadline_is_answered_before_the_servicer_ends(
 
     asyncio.run(run())
     assert counted.codes == ["DEADLINE_EXCEEDED"]
-    assert "given up" in caplog.text
+    assert "abandoned" in caplog.text
 
 
 def test_the_caller_hears_of_its_deadline_from_the_server(counted: Counted) -> None:
@@ -550,8 +550,8 @@ def test_a_call_of_many_steps_adds_them_up_and_keeps_the_first() -> None:
     call = Call("id", 0.0, 10.0)
     for i in range(1000):
         call.computed("describe", i, i + 0.5)
-    assert call.trail.stage_seconds == {"describe": 500.0}
-    assert len(call.trail.steps) == MAX_STEPS
+    assert call.history.stage_seconds == {"describe": 500.0}
+    assert len(call.history.steps) == MAX_STEPS
 
 
 def test_cancellation_inside_a_servicer_is_no_cancelled_call(counted: Counted) -> None:

@@ -1,4 +1,4 @@
-"""Whether the event loop is free: how late a timer runs that should run all the time."""
+"""The lag of the event loop: how late a periodic timer runs."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Protocol
 log = logging.getLogger(__name__)
 
 TICK_S = 0.01
-"""A block of the loop is seen with its length less this, at least; waking up so often costs 1 to 2 % of a core."""
+"""The timer's period, by which a lag may be underestimated; waking up so often costs 1 to 2 % of a core."""
 WARN_S = 0.1
 
 
 class LoopObserver(Protocol):
-    """Hears how the loop does."""
+    """Receives the measurements."""
 
     def loop_lagged(self, seconds: float) -> None:
-        """A timer ran so late."""
+        """A timer ran this much late."""
 
     def beat(self) -> None:
         """The loop and the scheduler are alive."""

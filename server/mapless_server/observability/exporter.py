@@ -1,12 +1,12 @@
-"""The port that Prometheus and probes ask: plain HTTP in threads of its own, which answer while the event loop is busy.
+"""The port of metrics and probes: HTTP, answered by threads of its own while the event loop is busy.
 
-"/metrics" is the registry. "/ready", for probes that do not speak gRPC, is 200 while the server serves and 503 before
-and after, and when its event loop or its queue have not been heard of for a moment. "/live" is 503 when they have not
-been for long: that server answers nobody any more, and whoever supervises it should start it anew.
+"/metrics" is the registry. "/ready", for probes without gRPC, is 200 while the server serves, and 503 before, after,
+and when the heartbeat of event loop and queue is older than `READY_LIMIT_S`. "/live" is 503 when it is older than
+`LIVE_LIMIT_S`: the server hangs, and its supervisor should restart it.
 
-The library's own server starts a thread for every connection and waits for its request without end, so that a thousand
-idle connections take a thousand threads and file descriptors from the server beside it. This one holds a few, lets go
-of the oldest for a new one, and gives each a time.
+The server of prometheus_client starts a thread for every connection and waits for its request without a limit, so that
+a thousand idle connections take a thousand threads and file descriptors. This one holds a few connections, closes the
+oldest for a new one, and limits the time of each.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_CONNECTIONS = 8
-"""Prometheus needs one, its twin another; a person looks as well."""
-SILENCE_S = 5.0
-"""A connection on which nothing comes or goes for so long is closed."""
+"""Two instances of Prometheus and a few probes or people."""
+IDLE_LIMIT_S = 5.0
+"""A connection that is idle for longer is closed."""
 READY_LIMIT_S = 5.0
-"""A heartbeat may be so old; the loop beats a hundred times a second."""
+"""Largest age of the heartbeat of a ready server, which beats a hundred times a second."""
 LIVE_LIMIT_S = 60.0
-"""As old as no machine, however busy, makes it; longer than closing takes, during which it does not beat."""
+"""Longer than any load delays the heartbeat, and than closing takes, during which there is none."""
 _POLL_S = 0.2
 
 
 class State(Protocol):
-    """How the server does; read in threads of its own.
+    """State of the server; read by the threads of this port.
 
     Attributes:
-        is_serving: whether health says SERVING.
-        beaten_s: when its heart beat last, `time.monotonic`; None while it starts.
+        is_serving: whether health reports SERVING.
+        beaten_s: time of the last heartbeat, `time.monotonic`; None while the server starts.
     """
 
     is_serving: bool
@@ -55,7 +55,7 @@ class State(Protocol):
 
 
 class MetricsServer:
-    """Serves a registry, and whether the server is ready and alive, until it is closed."""
+    """Serves a registry and the probes until it is closed."""
 
     def __init__(self, registry: CollectorRegistry, host: str, port: int, state: State) -> None:
         """Listens and serves.
@@ -96,26 +96,26 @@ def _application(registry: CollectorRegistry, state: State) -> WSGIApplication:
             return metrics(environ, start_response)
         if path == "/ready":
             if not beats_within(READY_LIMIT_S):
-                return _say(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "hanging")
+                return _text(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "hanging")
             if state.is_serving:
-                return _say(start_response, HTTPStatus.OK, "serving")
-            return _say(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "not serving")
+                return _text(start_response, HTTPStatus.OK, "serving")
+            return _text(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "not serving")
         if path == "/live":
             if beats_within(LIVE_LIMIT_S):
-                return _say(start_response, HTTPStatus.OK, "alive")
-            return _say(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "hanging")
-        return _say(start_response, HTTPStatus.NOT_FOUND, "there are /metrics, /ready and /live")
+                return _text(start_response, HTTPStatus.OK, "alive")
+            return _text(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "hanging")
+        return _text(start_response, HTTPStatus.NOT_FOUND, "there are /metrics, /ready and /live")
 
     return answer
 
 
-def _say(start_response: StartResponse, status: HTTPStatus, text: str) -> list[bytes]:
+def _text(start_response: StartResponse, status: HTTPStatus, text: str) -> list[bytes]:
     start_response(f"{status.value} {status.phrase}", [("Content-Type", "text/plain; charset=utf-8")])
     return [f"{text}\n".encode()]
 
 
 class _Handler(WSGIRequestHandler):
-    timeout = SILENCE_S
+    timeout = IDLE_LIMIT_S
 
     def log_message(self, *_: Any) -> None:
         pass
@@ -129,45 +129,45 @@ class _HttpServer(socketserver.ThreadingMixIn, WSGIServer):
 
     def __init__(self, host: str, port: int) -> None:
         self._open: OrderedDict[socket.socket, None] = OrderedDict()
-        self._changing = threading.Lock()
+        self._lock = threading.Lock()
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         self.address_family = family
         super().__init__((str(address[0]), port), _Handler)
 
     def server_bind(self) -> None:
-        """As WSGIServer's, but nobody is asked for the host's name, which can take seconds."""
+        """As WSGIServer's, without a look-up of the host's name, which can take seconds."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = self.server_address[:2]  # type: ignore[assignment]
         self.setup_environ()
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Overrides ThreadingMixIn's."""
-        with self._changing:
+        with self._lock:
             if len(self._open) >= MAX_CONNECTIONS:
                 oldest, _ = self._open.popitem(last=False)
-                _hang_up(oldest)
+                _disconnect(oldest)
             self._open[request] = None
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
         """Overrides TCPServer's."""
-        with self._changing:
+        with self._lock:
             self._open.pop(request, None)
         super().shutdown_request(request)
 
     def close_connections(self) -> None:
-        """Ends what is still being answered."""
-        with self._changing:
+        """Ends the open connections."""
+        with self._lock:
             for connection in self._open:
-                _hang_up(connection)
+                _disconnect(connection)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Overrides BaseServer's: into the log, and what a client does to its connection is no error of ours."""
+        """Overrides BaseServer's: logs the error, unless the client broke the connection."""
         error = sys.exception() if sys.version_info >= (3, 11) else sys.exc_info()[1]
         if not isinstance(error, OSError):
             log.warning("a request for metrics failed", exc_info=error)
 
 
-def _hang_up(connection: socket.socket) -> None:
+def _disconnect(connection: socket.socket) -> None:
     with suppress(OSError):  # it may have ended meanwhile
         connection.shutdown(socket.SHUT_RDWR)  # wakes the thread that reads from it, which then closes it

@@ -1,8 +1,7 @@
-"""The log: one JSON object a line for machines, or text for people; what repeats is counted, not written.
+"""The log: one JSON object a line for programs, or text for people; repeated warnings are counted, not written.
 
-What a record says beyond its message stands in fields, given by `extra=`. Whatever a field holds, the line can be read:
-no value breaks it, and bytes never enter it. Lines are written by whoever logs, at once, so that the last words of a
-server that dies are there.
+A record's fields beside its message are given by `extra=`. No value of a field breaks the line, and bytes are never
+written. The thread that logs writes the line at once, so that the last lines of a server that dies are there.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ MAX_TEXT = 16_000
 _MAX_FIELD_TEXT = 1000
 _MAX_ITEMS = 64
 _MAX_DEPTH = 4
-_MAX_INTEGER = 2**63  # readers of JSON take no more
+_MAX_INTEGER = 2**63  # JSON parsers read no larger ones
 
 _OWN_ATTRIBUTES = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
 _ENCODER = json.JSONEncoder(allow_nan=False)  # `json.dumps` would make one for every line
@@ -72,9 +71,9 @@ class TextFormatter(logging.Formatter):
 
 
 class RepeatFilter(logging.Filter):
-    """Lets through a few warnings and errors a minute from one place in the code, and says how many it kept back.
+    """Limits the rate of warnings and errors from one place in the code; a later record has the number left out.
 
-    A place is a line of code and, where there is an exception, its type. What is below a warning always passes.
+    A place is a line of code and, where there is an exception, its type. Records below a warning always pass.
     """
 
     def __init__(self, burst: int = 10, period_s: float = 60.0, clock: Callable[[], float] = time.monotonic) -> None:
@@ -84,14 +83,14 @@ class RepeatFilter(logging.Filter):
         self._period_s = period_s
         self._clock = clock
         self._places: dict[tuple[object, ...], _Place] = {}  # bounded by the lines of code that warn
-        self._changing = threading.Lock()
+        self._lock = threading.Lock()
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Implements logging.Filter."""
         if record.levelno < logging.WARNING:
             return True
         error_type = record.exc_info[0] if record.exc_info else None
-        with self._changing:
+        with self._lock:
             now_s = self._clock()
             place = self._places.setdefault((record.name, record.pathname, record.lineno, error_type), _Place(now_s))
             if now_s - place.since_s >= self._period_s:
@@ -113,7 +112,7 @@ class _Place:
 
 
 def configure_logging(settings: Settings, stream: TextIO | None = None) -> None:
-    """Sends everything that is logged to a stream (stderr), as the settings ask; what was configured before is gone."""
+    """Writes all logs to a stream (stderr) as the settings say; replaces an earlier configuration."""
     handler = logging.StreamHandler(stream or sys.stderr)
     handler.setFormatter(JsonFormatter() if settings.log_format == "json" else TextFormatter())
     handler.addFilter(RepeatFilter())
@@ -122,27 +121,27 @@ def configure_logging(settings: Settings, stream: TextIO | None = None) -> None:
 
 
 def as_extra(fields: Mapping[str, object]) -> dict[str, object]:
-    """Fields for `extra=`, which refuses some names: these get an underscore."""
+    """Fields for `extra=`, which rejects some names: these get an underscore."""
     return {f"{name}_" if name in _OWN_ATTRIBUTES else name: value for name, value in fields.items()}
 
 
 def fields_of(record: logging.LogRecord) -> dict[str, object]:
-    """What a record says beyond its message, as values that JSON has."""
+    """The fields of a record beside its message, as values that JSON has."""
     return {
         name: plain(value)
         for name, value in vars(record).items()
-        if name not in _OWN_ATTRIBUTES and not name.startswith("_")  # what other libraries mark records with
+        if name not in _OWN_ATTRIBUTES and not name.startswith("_")  # those are marks of other libraries
     }
 
 
 def plain(value: object) -> object:
     """The value as JSON has it: text, finite numbers, lists and objects; cut where it is large.
 
-    What JSON has no word for is its `repr`; of bytes, their number is told. Never raises.
+    Other values become their `repr`, and bytes their number. Never raises.
     """
     try:
         return _plain(value, 0)
-    except Exception as error:  # the line is worth more than this part of it
+    except Exception as error:  # the rest of the line is still of use
         return f"<{type(value).__name__} that raises {type(error).__name__}>"
 
 
@@ -153,7 +152,7 @@ def _plain(value: object, depth: int) -> object:
         return value
     if isinstance(value, str):
         return _cut(value, _MAX_FIELD_TEXT)
-    if type(value) is float and math.isfinite(value):  # most are; what follows is for the rest
+    if type(value) is float and math.isfinite(value):  # the usual case first
         return value
     if isinstance(value, Integral):  # NumPy's too
         number = int(value)
@@ -175,7 +174,7 @@ def _plain(value: object, depth: int) -> object:
 def _repr(value: object) -> str:
     try:
         return repr(value)
-    except Exception as error:  # the others in its list are still worth telling
+    except Exception as error:  # the other items of its list are still of use
         return f"<{type(value).__name__} that raises {type(error).__name__}>"
 
 
@@ -200,7 +199,7 @@ def _cut(text: str, length: int) -> str:
 
 
 def _visible(text: str) -> str:
-    """The text with what a terminal would obey, and what cannot be encoded, escaped."""
+    """The text with control characters, and what cannot be encoded, escaped."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or c == "\t" else c.encode("unicode_escape").decode("ascii") for c in text)

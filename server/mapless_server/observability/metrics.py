@@ -1,8 +1,8 @@
-"""Every metric of the server: names, labels, buckets, and the events that move them.
+"""Every metric of the server: names, labels, buckets, and the events that change them.
 
-All of them live in a registry of their own, so that several servers can live in one process. No label has values that
-callers choose: scenes, tenants and requests are in the log. Series whose labels are known beforehand exist from the
-start, because a series that appears with its first event hides that event from `rate`.
+Each server has a registry of its own, so that several can run in one process. No label has values that callers choose:
+scenes, tenants and requests are in the log. Series whose labels are known beforehand exist from the start, because a
+series that appears with its first event hides that event from `rate`.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from mapless_server.method.rejection import RejectionReason
 from mapless_server.scheduling import Ending, Observer, Refusal
 from mapless_server.security.access import ENDLESS_METHODS
 
-from .scraped import CacheCounts, Scraped, TokenCacheCounts
+from .scraped import Scraped
 
 STAGES = ("prepare", "coarse", "refine", "join", "describe", "retrieve", "audit", "coverage")
 """Stages of the queue."""
 
 CAPTURE_DROPS = ("queue", "size", "disk", "deleted", "store", "fault")
-"""Why a call was not captured."""
+"""Reasons for which a call was not captured."""
 
 LOCALIZED = "localized"
 """The outcome of an answer that is a pose."""
 
 CALL_BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1, 1.5, 2, 3, 5, 10, 30)
-"""Seconds; an edge at each time that somebody may be promised, and at the default deadline."""
+"""Seconds; an edge at each likely service level, and at the default deadline."""
 WAIT_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5)
 STAGE_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10)
 LAG_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5)
@@ -66,14 +66,14 @@ _CODES = (
 )
 _OTHER = "other"
 _MAX_CHILDREN = 64
-"""Stages and operations have names of ours, far fewer than this. Buckets, of which there is one for every number of
-references and size of image, may be more: those that come later are counted together, as "other"."""
+"""Far above the number of stages and operations. There may be more buckets, of which there is one for every number of
+references and size of image: further ones are counted together, as "other"."""
 
 M = TypeVar("M", bound=MetricWrapperBase)
 
 
 class Registry(CollectorRegistry):
-    """A registry that leaves out when each series began, which doubles their number and which nobody reads."""
+    """A registry without the times at which series began, which double their number."""
 
     def collect(self) -> Iterable[Metric]:
         """Implements Collector."""
@@ -83,7 +83,7 @@ class Registry(CollectorRegistry):
 
 
 class _Children(Generic[M]):
-    """A metric by its labels' values: a look into a dict, because it is on the way of every call; bounded in number."""
+    """A metric by its labels' values, bounded in number; a dict, because every call looks into it."""
 
     def __init__(self, metric: M, known: Iterable[tuple[str, ...]] = ()) -> None:
         self._metric = metric
@@ -103,9 +103,10 @@ class Metrics(Observer):
     """The metrics of one server. Implements `rpc.CallObserver`, too; never raises.
 
     Attributes:
-        registry: what a scrape reads.
-        is_serving: what `set_serving` was told last; False before.
-        beaten_s: when `beat` was called last, `time.monotonic`; None before.
+        registry: of all metrics.
+        scraped: the metrics that are read from other objects at every scrape.
+        is_serving: the last value of `set_serving`; False before.
+        beaten_s: time of the last `beat`, `time.monotonic`; None before.
     """
 
     def __init__(self) -> None:
@@ -115,8 +116,8 @@ class Metrics(Observer):
         GCCollector(registry=self.registry)
         self.is_serving = False
         self.beaten_s: float | None = None
-        self._scraped = Scraped()
-        self.registry.register(self._scraped)
+        self.scraped = Scraped()
+        self.registry.register(self.scraped)
         self._make_call_metrics()
         self._make_queue_metrics()
         self._make_answer_metrics()
@@ -133,7 +134,7 @@ class Metrics(Observer):
         service_and_name = self._methods.get(method, (_OTHER, _OTHER))
         self._handled(*service_and_name, code).inc()
         if method in ENDLESS_METHODS:
-            return  # it lasts as long as its caller wants to watch, which is no latency
+            return  # it lasts as long as its caller watches, which is no latency
         exemplar = {"trace_id": trace_id} if trace_id else None
         self._handling(*service_and_name).observe(seconds, exemplar)
 
@@ -180,13 +181,13 @@ class Metrics(Observer):
     # Answers
 
     def stages(self, stage_seconds: Mapping[str, float]) -> None:
-        """What the stages of an answer took; those of stronger features are named "extractor/stage"."""
+        """Durations of an answer's stages; those of stronger features are named "extractor/stage"."""
         for name, seconds in stage_seconds.items():
             extractor, _, stage = name.rpartition("/")
             self._stage_seconds(stage, "1" if extractor else "0").observe(seconds)
 
     def answered_coarsely(self, seconds: float) -> None:
-        """A call got a coarse answer, to be refined, so long after it arrived."""
+        """A call got a coarse answer, to be refined, this long after it arrived."""
         self._coarse_answer.observe(seconds)
 
     def answered(
@@ -199,15 +200,15 @@ class Metrics(Observer):
         scale_deviation: float | None = None,
         accuracy_radius_m: float | None = None,
     ) -> None:
-        """An answer was given: LOCALIZED or the value of a RejectionReason, and what is known of its quality.
+        """A query was answered.
 
         Args:
-            outcome: which.
+            outcome: LOCALIZED or the value of a RejectionReason.
             inlier_count: 2D-3D matches that agree with the pose; None where none were counted.
-            match_count: 2D-3D matches that were tried.
+            match_count: 2D-3D matches from which the pose was estimated.
             reprojection_error_px: median of the inliers.
             scale_deviation: relative, of the scaled trajectory.
-            accuracy_radius_m: the claimed 68 % radius.
+            accuracy_radius_m: the reported 68 % radius.
         """
         self._answers(outcome if outcome in self._outcomes else _OTHER).inc()
         _observe(self._inliers, inlier_count)
@@ -220,7 +221,7 @@ class Metrics(Observer):
     # The server
 
     def loop_lagged(self, seconds: float) -> None:
-        """The event loop ran a timer so late."""
+        """The event loop ran a timer this much late."""
         self._lag.observe(seconds)
 
     def stored(self, operation: str, seconds: float) -> None:
@@ -228,7 +229,7 @@ class Metrics(Observer):
         self._store_seconds(operation).observe(seconds)
 
     def store_failed(self) -> None:
-        """The store could not do what was asked of it, by a fault that is not the caller's."""
+        """An operation of the store failed by a fault that is not the caller's."""
         self._store_errors.inc()
 
     def ran_out_of_memory(self) -> None:
@@ -236,54 +237,34 @@ class Metrics(Observer):
         self._oom.inc()
 
     def failed_fatally(self) -> None:
-        """Something is broken that ends the process."""
+        """A failure ends the process."""
         self._fatal.inc()
 
     def captured(self) -> None:
-        """A call is kept."""
+        """A call was captured."""
         self._captured.inc()
 
     def capture_dropped(self, reason: str) -> None:
-        """A call that was to be kept is not."""
+        """A call was to be captured and was not."""
         self._capture_dropped(reason).inc()
 
     def watch_captures(self, read: Callable[[], int]) -> None:
-        """Calls are captured; asks, at every scrape, what they take on the disk, bytes."""
+        """Calls are captured; `read` gives their size on the disk, bytes, at every scrape."""
         self._capture_enabled.set(1)
         self._capture_bytes.set_function(read)
 
     def set_serving(self, is_serving: bool) -> None:
-        """What health says of the server as a whole."""
+        """Health reports this of the server as a whole."""
         self.is_serving = is_serving
         self._serving.set(is_serving)
 
     def warmed_up(self, seconds: float) -> None:
-        """The warm-up is over and took so long."""
+        """The warm-up ended and took this long."""
         self._warm_up.set(seconds)
 
     def built(self, version: str, backend: str, features: str, weights_sha256: str) -> None:
-        """What runs; to be said once."""
+        """Version, backend, features and weights of the server; called once."""
         self._build.labels(version, backend, features, weights_sha256).set(1)
-
-    def watch_reference_cache(self, read: Callable[[], CacheCounts]) -> None:
-        """Asks, at every scrape, how the cache of references' features does."""
-        self._scraped.reference_cache = read
-
-    def watch_retrieval_index(self, read: Callable[[], int]) -> None:
-        """Asks, at every scrape, what the scenes in memory take, bytes."""
-        self._scraped.retrieval_index = read
-
-    def watch_token_cache(self, read: Callable[[], TokenCacheCounts]) -> None:
-        """Asks, at every scrape, how the cache of references' tokens does."""
-        self._scraped.token_cache = read
-
-    def watch_gpu_memory(self, read: Callable[[], Mapping[str, float]]) -> None:
-        """Asks, at every scrape, for bytes by kind: allocated, reserved, peak."""
-        self._scraped.gpu_memory = read
-
-    def watch_certificate(self, read: Callable[[], float | None]) -> None:
-        """Asks, at every scrape, when the server's certificate expires, Unix seconds; None if there is none."""
-        self._scraped.certificate_expiry = read
 
     def _make_call_metrics(self) -> None:
         labels = ["grpc_service", "grpc_method"]
@@ -299,20 +280,13 @@ class Metrics(Observer):
         }
         known = list(self._methods.values())
         finite = [labelled for method, labelled in self._methods.items() if method not in ENDLESS_METHODS]
+        codes = [(*method, code) for method in known for code in _CODES]
         self._started = _Children(self._counter("grpc_server_started", "Calls that arrived.", labels), known)
-        self._handled = _Children(
-            self._counter("grpc_server_handled", "Calls that ended, by status.", [*labels, "grpc_code"]),
-            [(*method, code) for method in known for code in _CODES],
-        )
-        self._handling = _Children(
-            self._histogram(
-                "grpc_server_handling_seconds",
-                "Time from arrival to answer; of endless streams none.",
-                CALL_BUCKETS,
-                labels,
-            ),
-            finite,
-        )
+        handled = self._counter("grpc_server_handled", "Calls that ended, by status.", [*labels, "grpc_code"])
+        self._handled = _Children(handled, codes)
+        text = "Time from arrival to answer; of endless streams none."
+        handling = self._histogram("grpc_server_handling_seconds", text, CALL_BUCKETS, labels)
+        self._handling = _Children(handling, finite)
 
     def _make_queue_metrics(self) -> None:
         stage = ["stage"]
@@ -320,39 +294,29 @@ class Metrics(Observer):
         counter, gauge, histogram = self._counter, self._gauge, self._histogram
         self._admitted = counter("mapless_admitted", "Jobs admitted to the queue.")
         self._admitted_cost = counter("mapless_admitted_cost_seconds", "Computing time predicted for admitted jobs.")
-        self._refused = _Children(
-            counter("mapless_admission_rejected", "Jobs not admitted, by reason.", ["reason"]),
-            [(reason.value,) for reason in Refusal],
-        )
-        self._waited = _Children(
-            histogram("mapless_queue_wait_seconds", "Time that jobs waited for a stage.", WAIT_BUCKETS, stage), stages
-        )
+        refused = counter("mapless_admission_rejected", "Jobs not admitted, by reason.", ["reason"])
+        self._refused = _Children(refused, [(reason.value,) for reason in Refusal])
+        waited = histogram("mapless_queue_wait_seconds", "Time that jobs waited for a stage.", WAIT_BUCKETS, stage)
+        self._waited = _Children(waited, stages)
         self._depth = _Children(gauge("mapless_queue_depth", "Jobs that wait.", stage), stages)
-        self._cost = _Children(
-            gauge("mapless_queue_cost_seconds", "Computing time predicted for jobs that wait.", stage), stages
-        )
+        cost = gauge("mapless_queue_cost_seconds", "Computing time predicted for jobs that wait.", stage)
+        self._cost = _Children(cost, stages)
         self._inflight = _Children(gauge("mapless_inflight", "Jobs that are computed.", stage), stages)
-        self._ended = _Children(
-            counter("mapless_jobs_terminated", "Admitted jobs that ended.", ["stage", "outcome"]),
-            [(name, ending.value) for name in STAGES for ending in Ending],
-        )
+        ended = counter("mapless_jobs_terminated", "Admitted jobs that ended.", ["stage", "outcome"])
+        self._ended = _Children(ended, [(name, ending.value) for name in STAGES for ending in Ending])
         self._batch_size = _Children(histogram("mapless_batch_size", "Jobs in a batch.", BATCH_BUCKETS, stage), stages)
-        self._batch_seconds = _Children(
-            histogram("mapless_batch_seconds", "Computing time of a batch.", STAGE_BUCKETS, stage), stages
-        )
+        seconds = histogram("mapless_batch_seconds", "Computing time of a batch.", STAGE_BUCKETS, stage)
+        self._batch_seconds = _Children(seconds, stages)
         self._batches = _Children(counter("mapless_batches", "Batches, by shape.", ["stage", "bucket"]))
-        self._busy = _Children(
-            counter("mapless_busy_seconds", "Time in which the device or a worker computed.", stage), stages
-        )
+        busy = counter("mapless_busy_seconds", "Time in which the device or a worker computed.", stage)
+        self._busy = _Children(busy, stages)
         self._heartbeat = gauge("mapless_scheduler_heartbeat_timestamp_seconds", "When the scheduler was last alive.")
 
     def _make_answer_metrics(self) -> None:
         histogram = self._histogram
         self._outcomes = {LOCALIZED, *(reason.value for reason in RejectionReason)}
-        self._answers = _Children(
-            self._counter("mapless_answers", "Answers, by outcome.", ["outcome"]),
-            [(outcome,) for outcome in sorted(self._outcomes)],
-        )
+        answers = self._counter("mapless_answers", "Answers, by outcome.", ["outcome"])
+        self._answers = _Children(answers, [(outcome,) for outcome in sorted(self._outcomes)])
         self._stage_seconds = _Children(
             histogram("mapless_stage_seconds", "Time of a stage of the method.", STAGE_BUCKETS, ["stage", "tier"])
         )
@@ -368,27 +332,22 @@ class Metrics(Observer):
             "mapless_scale_deviation", "Relative deviation of the scaled trajectory.", DEVIATION_BUCKETS
         )
         self._accuracy_radius = histogram(
-            "mapless_accuracy_radius_m", "Claimed radius that holds 68 % of positions, metres.", RADIUS_BUCKETS
+            "mapless_accuracy_radius_m", "Reported radius that holds 68 % of positions, metres.", RADIUS_BUCKETS
         )
 
     def _make_server_metrics(self) -> None:
         counter, gauge, histogram = self._counter, self._gauge, self._histogram
         self._lag = histogram("mapless_event_loop_lag_seconds", "How late timers of the loop ran.", LAG_BUCKETS)
-        self._store_seconds = _Children(
-            histogram("mapless_store_op_seconds", "Time of the store's operations.", STAGE_BUCKETS, ["op"])
-        )
+        stored = histogram("mapless_store_op_seconds", "Time of the store's operations.", STAGE_BUCKETS, ["op"])
+        self._store_seconds = _Children(stored)
         self._store_errors = counter("mapless_store_errors", "Operations of the store that failed by a fault of ours.")
         self._oom = counter("mapless_gpu_oom", "Batches that the device had no memory for.")
         self._fatal = counter("mapless_fatal", "Faults that end the process.")
-        self._capture_enabled = gauge(
-            "mapless_capture_enabled", "1 if calls are captured, photographs and all, else 0."
-        )
+        self._capture_enabled = gauge("mapless_capture_enabled", "1 if calls are captured, with photographs, else 0.")
         self._capture_bytes = gauge("mapless_capture_bytes", "What captured calls take on the disk.")
         self._captured = counter("mapless_captured", "Calls that were captured.")
-        self._capture_dropped = _Children(
-            counter("mapless_capture_dropped", "Calls that were to be captured and were not, by reason.", ["reason"]),
-            [(reason,) for reason in CAPTURE_DROPS],
-        )
+        dropped = counter("mapless_capture_dropped", "Calls that were to be captured and were not.", ["reason"])
+        self._capture_dropped = _Children(dropped, [(reason,) for reason in CAPTURE_DROPS])
         self._serving = gauge("mapless_health_serving", "1 if health says SERVING, else 0.")
         self._warm_up = gauge("mapless_warmup_seconds", "Time of the warm-up; 0 if there was none.")
         blocks = gauge("mapless_python_allocated_blocks", "Pieces of memory that Python's objects hold.")

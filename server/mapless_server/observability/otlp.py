@@ -1,4 +1,4 @@
-"""Traces by OpenTelemetry: names and attributes as its conventions for RPC say, sent by OTLP in the background."""
+"""Traces by OpenTelemetry: names and attributes follow its conventions for RPC; OTLP sends them in the background."""
 
 from __future__ import annotations
 
@@ -18,34 +18,38 @@ from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapProp
 
 from mapless_server import __version__
 
+from .call_record import TracedStep
 from .logs import plain
 from .tracing import Metadata
-from .trail import Step
 
 EXPORT_LIMIT_S = 5.0
-"""What a collector may take for a batch; retries included."""
+"""Time that a collector may take for a batch, retries included."""
 _SERVER_FAULTS = frozenset({"UNKNOWN", "DEADLINE_EXCEEDED", "UNIMPLEMENTED", "INTERNAL", "UNAVAILABLE", "DATA_LOSS"})
 """Statuses that a server's span counts as errors; the others are the caller's."""
-_HANG_UP_S = 1.0
+_CANCEL_LIMIT_S = 1.0
 
 Attribute = str | bool | int | float
 
 
 def make_otlp_tracer(endpoint: str) -> OtlpTracer:
-    """A tracer that sends to the endpoint; ValueError if it is no address."""
+    """A tracer that sends to an address such as "http://host:4317"; whether a collector listens there is not checked.
+
+    Raises:
+        ValueError: the endpoint is no such address.
+    """
     address = urlsplit(endpoint)
     if address.scheme not in ("http", "https") or not address.hostname:
-        raise ValueError(f"otlp_endpoint must be http://host:port or https://host:port, is {endpoint!r}")
+        raise ValueError(f"otlp_endpoint must be http://host:port or https://host:port, not {endpoint!r}")
     is_insecure = address.scheme == "http"
     return OtlpTracer(OTLPSpanExporter(endpoint=endpoint, insecure=is_insecure, timeout=EXPORT_LIMIT_S))
 
 
 class OtlpTracer:
-    """Implements Tracer. Holds 2048 spans at most; what comes while it is full is dropped."""
+    """Implements Tracer. Holds 2048 spans at most, and drops further ones."""
 
     def __init__(self, exporter: SpanExporter) -> None:
         resource = Resource({"service.name": "mapless", "service.version": __version__})
-        # What the operator set by OTEL_SERVICE_NAME and OTEL_RESOURCE_ATTRIBUTES wins.
+        # The operator's OTEL_SERVICE_NAME and OTEL_RESOURCE_ATTRIBUTES have precedence.
         self._provider = TracerProvider(
             resource=resource.merge(OTELResourceDetector().detect()), shutdown_on_exit=False
         )
@@ -72,12 +76,12 @@ class OtlpTracer:
         flushing = threading.Thread(target=self._provider.shutdown, name="traces", daemon=True)
         flushing.start()
         flushing.join(limit_s)
-        if flushing.is_alive():  # the collector is away: its exporter is cut off in what it is waiting for
+        if flushing.is_alive():  # the collector does not answer: cancels the export
             self._exporter.shutdown()
-            flushing.join(_HANG_UP_S)
+            flushing.join(_CANCEL_LIMIT_S)
 
-    def record(self, parent: Span, steps: Sequence[Step]) -> None:
-        """Adds a child for each step, and below it one for each of its parts."""
+    def record(self, parent: Span, steps: Sequence[TracedStep]) -> None:
+        """Adds a child span for each step, and below it one for each of its parts."""
         for step in steps:
             span = self._child(parent, step.name, step.start_s, step.attributes)
             part_start_s = step.start_s
@@ -103,7 +107,7 @@ class _OtlpSpan:
         context = span.get_span_context()
         self.trace_id = f"{context.trace_id:032x}" if context.trace_flags.sampled else ""
 
-    def end(self, code: str, steps: Sequence[Step], attributes: Mapping[str, object]) -> None:
+    def end(self, code: str, steps: Sequence[TracedStep], attributes: Mapping[str, object]) -> None:
         """Implements CallSpan."""
         if not self._span.is_recording():
             return
@@ -116,12 +120,14 @@ class _OtlpSpan:
 
 
 def _attributes(fields: Mapping[str, object]) -> dict[str, Attribute]:
-    """Fields of the log as attributes, below our own name; what is nested, as JSON."""
+    """Fields of the log as attributes named "mapless.*"; nested values as JSON."""
     attributes: dict[str, Attribute] = {}
     for name, field in fields.items():
         value = plain(field)
         if isinstance(value, str):
-            attributes[f"mapless.{name}"] = value.encode(errors="replace").decode()  # half a character spoils the batch
+            attributes[f"mapless.{name}"] = value.encode(
+                errors="replace"
+            ).decode()  # an unpaired surrogate would fail the batch
         elif isinstance(value, bool | int | float):
             attributes[f"mapless.{name}"] = value
         elif value is not None:
@@ -130,5 +136,5 @@ def _attributes(fields: Mapping[str, object]) -> dict[str, Attribute]:
 
 
 def _epoch_ns(monotonic_s: float) -> int:
-    """A moment of `time.monotonic` by the clock that traces use."""
+    """A time of `time.monotonic` as nanoseconds since 1970."""
     return time.time_ns() - round(1e9 * (time.monotonic() - monotonic_s))

@@ -1,4 +1,4 @@
-"""What computed: the checkout's commit and the processor, for records of answers and figures."""
+"""The checkout's commit and the processor, for records of answers and measurements."""
 
 from __future__ import annotations
 

@@ -1,14 +1,14 @@
-"""Traces: who takes what calls leave behind. OpenTelemetry is imported only where traces are wanted."""
+"""The interface of a tracer, and the one that traces nothing; `otlp` has the other."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from .trail import Step
+from .call_record import TracedStep
 
 Metadata = Sequence[tuple[str, str | bytes]]
-"""What a caller sent beside its message."""
+"""The keys and values that a caller sends beside its message."""
 
 
 class CallSpan(Protocol):
@@ -18,15 +18,15 @@ class CallSpan(Protocol):
     def trace_id(self) -> str:
         """32 hexadecimal digits; empty if the call is not traced."""
 
-    def end(self, code: str, steps: Sequence[Step], attributes: Mapping[str, object]) -> None:
-        """The call ended with a gRPC status; to be said once."""
+    def end(self, code: str, steps: Sequence[TracedStep], attributes: Mapping[str, object]) -> None:
+        """Ends the span with a gRPC status; called once."""
 
 
 class Tracer(Protocol):
-    """Takes the traces of calls; called on the event loop, so it returns at once and never raises."""
+    """Traces calls; called on the event loop, so its methods return at once and never raise."""
 
     def begin(self, method: str, metadata: Metadata, start_s: float) -> CallSpan:
-        """A call to "/package.Service/Method" arrived, `time.monotonic`."""
+        """Begins the span of a call to "/package.Service/Method", at `time.monotonic`."""
 
     def close(self, limit_s: float) -> None:
         """Sends what is left, and ends; blocks for `limit_s` at most."""
@@ -35,7 +35,7 @@ class Tracer(Protocol):
 class _NoSpan:
     trace_id = ""
 
-    def end(self, code: str, steps: Sequence[Step], attributes: Mapping[str, object]) -> None:
+    def end(self, code: str, steps: Sequence[TracedStep], attributes: Mapping[str, object]) -> None:
         pass
 
 
@@ -50,19 +50,3 @@ class NoTracer:
 
     def close(self, limit_s: float) -> None:
         """Implements Tracer."""
-
-
-def make_tracer(otlp_endpoint: str) -> Tracer:
-    """Sends traces to "http://host:4317", or https, by OTLP over gRPC; traces nothing if the endpoint is empty.
-
-    Whether anybody listens there is found out later, and does not matter to calls.
-
-    Raises:
-        ImportError: OpenTelemetry is not installed; see `extras.install_hint`.
-        ValueError: the endpoint is no such address.
-    """
-    if not otlp_endpoint:
-        return NoTracer()
-    from .otlp import make_otlp_tracer
-
-    return make_otlp_tracer(otlp_endpoint)

@@ -1,4 +1,11 @@
-"""What every call has in common: deadline, identity, errors, receiving, sending, log line.
+"""What every call has in common: deadline, identity, errors, receiving, sending, the line in the log.
 
-May import observability, store, security and errors. Begin with `guard.CallGuard`, which wraps every handler.
+May import observability and everything below it. Begin with `guard.CallGuard`, which wraps every handler: it makes the
+`call.Call`, has `receiving` read its message and `sending` write its messages, and turns errors into `status`.
 """
+
+from .call import CLIENT_ID_KEY, REQUEST_ID_KEY, Call
+from .guard import Authenticate, CallGuard
+from .status import to_status
+
+__all__ = ["CLIENT_ID_KEY", "REQUEST_ID_KEY", "Authenticate", "Call", "CallGuard", "to_status"]

@@ -1,4 +1,4 @@
-"""What is known of a call before its message is read: who calls by what id, and until when the answer is awaited."""
+"""The call that a servicer answers: its id, its caller, its deadline, and the record of what was done for it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from urllib.parse import unquote
 
 from mapless_server.engine.query import Caller
+from mapless_server.observability.call_record import CallRecord
 from mapless_server.observability.tracing import Metadata
-from mapless_server.observability.trail import Trail
 from mapless_server.scheduling import Flow, StageRecord
 from mapless_server.security.principal import Principal
 
@@ -21,25 +21,25 @@ from .receiving import Context
 REQUEST_ID_KEY = "x-request-id"
 CLIENT_ID_KEY = "x-client-id"
 ANSWER_MARGIN_SHARE = 0.02
-"""Of the time given, the answer leaves this early: gRPC rounds the time up when it sends it, by 1 % at most."""
+"""Share of the time given by which the answer is early: gRPC rounds the time up when it sends it, by at most 1 %."""
 ANSWER_MARGIN_S = 0.01
-"""And at least so early, because the answer has to be written and sent as well ..."""
+"""Least time by which it is early, because the answer has to be written and sent as well ..."""
 _MAX_MARGIN_SHARE = 0.1
-"""... where there is time for that."""
-_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it enters the log: no line breaks, no escapes
+"""... and the largest share of the time that this may take."""
+_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it is logged: no line breaks, no escapes
 
 
 @dataclass(frozen=True)
 class Call:
-    """What a servicer may know of the call it answers, and what it tells of it.
+    """A call, as its servicer knows it.
 
     Attributes:
-        request_id: identifies it in the log; the caller's own if it sent a well-formed one.
+        request_id: identifies it in the log; the caller's own if that is well-formed.
         arrived_s: when its headers arrived, `time.monotonic`; its message may take longer.
         deadline_s: when the servicer must have answered, `time.monotonic`.
-        principal: who calls.
-        client: what tells callers apart: the id that they give, else the address of their connection.
-        trail: what was told of it so far.
+        principal: the caller, authenticated.
+        client: tells callers apart: the id that the caller gives, else the address of its connection.
+        history: what was done for it so far.
     """
 
     request_id: str
@@ -47,51 +47,51 @@ class Call:
     deadline_s: float
     principal: Principal = field(default_factory=Principal)
     client: str = ""
-    trail: Trail = field(default_factory=Trail, repr=False, compare=False)
+    history: CallRecord = field(default_factory=CallRecord, repr=False, compare=False)
 
     @property
     def caller(self) -> Caller:
-        """Who asks, as the engine knows it."""
+        """The caller, as the engine knows it."""
         return Caller(Flow(self.principal.tenant, self.client), self.deadline_s)
 
     def note(self, **fields: object) -> None:
-        """Adds fields to the call's line in the log and to its trace; those that every line has cannot be changed."""
-        self.trail.notes.update(fields)
+        """Adds fields to the call's line in the log and to its trace; they cannot replace those of every line."""
+        self.history.notes.update(fields)
 
     def record(self, records: Iterable[StageRecord]) -> None:
-        """Notes the stages of the queue that a job of the call has been through."""
+        """Records the stages of the queue that a job of the call passed."""
         for it in records:
             self.waited(it.stage, it.queued_s, it.start_s)
             if it.jobs:
                 self.computed(it.stage, it.start_s, it.end_s, batch=it.batch, batch_size=it.jobs)
 
     def waited(self, stage: str, start_s: float, end_s: float) -> None:
-        """It waited for a stage of the queue, `time.monotonic`."""
-        self.trail.waited(stage, start_s, end_s)
+        """Records a wait for a stage of the queue, `time.monotonic`."""
+        self.history.waited(stage, start_s, end_s)
 
     def computed(
         self, stage: str, start_s: float, end_s: float, part_seconds: Mapping[str, float] | None = None, **about: object
     ) -> None:
-        """A stage was computed for it, `time.monotonic`; the parts that it consisted of followed each other."""
-        self.trail.computed(stage, start_s, end_s, part_seconds or {}, **about)
+        """Records the computation of a stage, `time.monotonic`, and of its parts, which followed each other."""
+        self.history.computed(stage, start_s, end_s, part_seconds or {}, **about)
 
 
 @dataclass(frozen=True)
 class Deadlines:
-    """How long calls may take; see the settings of these names."""
+    """Time limits of calls; see the settings of these names."""
 
     default_deadline_s: float = 30.0
     max_deadline_s: float = 600.0
 
     def given_s(self, asked_s: float | None, is_endless: bool) -> float:
-        """What a call gets that asks for so many seconds, or for none; a call that need not end may get all."""
+        """Time for a call that asks for `asked_s`, or for no limit; unlimited only for an endless method."""
         if is_endless:
             return math.inf if asked_s is None else asked_s
         return min(self.default_deadline_s if asked_s is None else asked_s, self.max_deadline_s)
 
 
 def begin_call(context: Context, deadlines: Deadlines, is_endless: bool) -> Call:
-    """The call whose headers have just arrived; nobody knows yet who makes it."""
+    """The call whose headers have just arrived, not yet authenticated."""
     now_s = time.monotonic()
     given_s, margin_s = deadlines.given_s(context.time_remaining(), is_endless), 0.0
     if math.isfinite(given_s):
@@ -106,11 +106,11 @@ def begin_call(context: Context, deadlines: Deadlines, is_endless: bool) -> Call
 
 
 def metadata_of(context: Context) -> Metadata:
-    """What the caller sent along, in order."""
+    """The caller's metadata, in order."""
     return context.invocation_metadata() or ()
 
 
 def _well_formed(metadata: Metadata, wanted: str) -> str:
-    """The metadata's value; empty if there is none or it is not fit for the log."""
+    """The value of a key of the metadata; empty if there is none or it is not fit for the log."""
     given = next((str(value) for key, value in metadata if key == wanted), "")
     return given if _ID.fullmatch(given) else ""

@@ -1,4 +1,4 @@
-"""What every call has in common: an id, a caller, a deadline, one line in the log, and errors as google.rpc.Status."""
+"""Wraps the handlers of all methods: an id, authentication, a deadline, a log line, errors as google.rpc.Status."""
 
 from __future__ import annotations
 
@@ -30,34 +30,28 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 Authenticate = Callable[[Metadata, str, Mapping[str, Iterable[bytes]]], Principal]
-"""Who calls a method ("/package.Service/Method"), from the call's metadata and the connection's auth_context.
+"""The caller of a method ("/package.Service/Method"), from the call's metadata and the connection's auth_context.
 
 Raises Unauthenticated or PermissionDenied; called on the event loop.
 """
 
-
-Making = Coroutine[Any, Any, AsyncGenerator[Any, None]]
+Opening = Coroutine[Any, Any, AsyncGenerator[Any, None]]
 """A servicer's method of a stream: gives an iterator of messages."""
 
 
 class CallObserver(Protocol):
-    """Counts calls; called on the event loop, so it must return at once and never raise."""
+    """Counts calls; called on the event loop, so its methods return at once and never raise."""
 
     def call_started(self, method: str) -> None:
         """A call arrived; `method` is "/package.Service/Method"."""
 
     def call_handled(self, method: str, code: str, seconds: float, trace_id: str) -> None:
-        """It ended with a gRPC status; told once, whatever happened. The id is empty if it is not traced."""
+        """A call ended with a gRPC status; called exactly once. The id is empty if the call is not traced."""
 
 
 @dataclass
-class _Account:
-    """What is to be said of a call at its end.
-
-    Attributes:
-        span: of its trace.
-        code: its gRPC status.
-    """
+class _Result:
+    """The span and the gRPC status with which a call is logged at its end."""
 
     span: CallSpan
     code: str = "UNKNOWN"
@@ -66,7 +60,7 @@ class _Account:
 class CallGuard:
     """Wraps the handlers of all methods but the open ones (health, reflection): servicers get a `Call`, not a context.
 
-    No interceptor: a server that somebody else made, and that takes none, can be given handlers.
+    This is no interceptor, because Ray Serve makes gRPC servers that accept handlers and no interceptors.
     """
 
     def __init__(
@@ -75,29 +69,30 @@ class CallGuard:
         max_deadline_s: float = 600.0,
         *,
         authenticate: Authenticate | None = None,
-        check_door: Callable[[str], None] = lambda method: None,
+        check_admission: Callable[[str], None] = lambda method: None,
         observer: CallObserver | None = None,
         tracer: Tracer | None = None,
     ) -> None:
-        """Without `authenticate`, everybody is admitted.
+        """Without `authenticate`, every caller is admitted.
 
         Args:
-            default_deadline_s: for calls without one.
+            default_deadline_s: for calls without a deadline.
             max_deadline_s: for calls with a later one.
-            authenticate: who calls.
-            check_door: raises RequestError if nobody can be let in to this method now; called on the event loop.
+            authenticate: finds the caller of a method.
+            check_admission: raises RequestError if no call of this method can be served now; called on the event loop,
+                before the message is read.
             observer: counts calls.
-            tracer: traces them; closed by whoever made it.
+            tracer: traces calls; its owner closes it.
         """
         self._deadlines = Deadlines(default_deadline_s, max_deadline_s)
         self._authenticate = authenticate
-        self._check_door = check_door
+        self._check_admission = check_admission
         self._observer = observer
         self._tracer = tracer or NoTracer()
         self._active = 0
         self._idle = asyncio.Event()
         self._idle.set()
-        self._abandoned: set[asyncio.Task[Any]] = set()  # the loop itself would forget them
+        self._abandoned: set[asyncio.Task[Any]] = set()  # the loop holds only weak references
         self._receiver = Receiver()
         self._sender = Sender()
         self._open = OpenMethods(self._receiver)
@@ -111,68 +106,68 @@ class CallGuard:
 
         async def answer(_: object, context: Context) -> bytes | None:
             call = begin_call(context, self._deadlines, method in ENDLESS_METHODS)
-            with self._accounted(method, call, context) as account:
+            with self._recorded(method, call, context) as result:
                 try:
-                    self._who_calls(method, context)
-                    self._check_door(method)
+                    self._principal(method, context)
+                    self._check_admission(method)
                     response = await reply(handler, method, call, context)
                     context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id),))
-                    account.code = "OK"
+                    result.code = "OK"
                     return response
                 except RequestError as error:
-                    account.code = error.code
+                    result.code = error.code
                     call.note(reason=error.reason, error=str(error))
                     await self._sender.error(context, call, error)
                     raise  # not reached: sending it raises
                 except asyncio.CancelledError:
-                    # Where the caller's deadline passes, it may be grpc that notices first.
-                    account.code = "CANCELLED" if time.monotonic() < call.deadline_s else "DEADLINE_EXCEEDED"
+                    # When the caller's deadline passes, grpc may notice it first.
+                    result.code = "CANCELLED" if time.monotonic() < call.deadline_s else "DEADLINE_EXCEEDED"
                     raise
                 except Exception as error:
-                    account.code = "INTERNAL"
+                    result.code = "INTERNAL"
                     call.note(reason=type(error).__name__)
-                    ids = {"request_id": call.request_id, "trace_id": account.span.trace_id}
+                    ids = {"request_id": call.request_id, "trace_id": result.span.trace_id}
                     log.exception("%s failed", method, extra=ids)
                     await self._sender.error(context, call, RequestError(f"internal error, id={call.request_id}"))
                     raise
 
-        # Not as a unary method, whose message grpc receives first: what is refused shall cost nothing, and who sends no
-        # message shall not hold a place. Without a deserializer a malformed message is answered here, too.
+        # Not as a unary method, whose message grpc receives first: a rejected call must cost nothing, and one without a
+        # message must not hold a place. Without a deserializer a malformed message is answered here, too.
         if streams:
             return grpc.stream_stream_rpc_method_handler(answer, None, None)
         return grpc.stream_unary_rpc_method_handler(answer, None, None)
 
     @contextmanager
-    def _accounted(self, method: str, call: Call, context: Context) -> Iterator[_Account]:
-        """Counts a call, traces it, and writes its line when it has ended, with the status that the account says."""
+    def _recorded(self, method: str, call: Call, context: Context) -> Iterator[_Result]:
+        """Counts and traces a call, and logs it when it has ended, with the status of the result."""
         is_awaited = method not in ENDLESS_METHODS
         self._active += is_awaited
         if self._active:
             self._idle.clear()
-        account = _Account(self._tracer.begin(method, metadata_of(context), call.arrived_s))
+        result = _Result(self._tracer.begin(method, metadata_of(context), call.arrived_s))
         if self._observer is not None:
             self._observer.call_started(method)
         log.debug("%s begins", method, extra={"request_id": call.request_id})
         try:
-            yield account
+            yield result
         finally:
             self._active -= is_awaited
             if not self._active:
                 self._idle.set()
-            self._end(method, account.code, call, account.span)
+            self._log_end(method, call, result)
 
     async def wait_until_idle(self, limit_s: float) -> None:
-        """Returns when no call is being answered, or the time is over."""
+        """Returns when no call is being answered, or after the limit."""
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(self._idle.wait(), limit_s)
 
-    def _who_calls(self, method: str, context: Context) -> Principal:
+    def _principal(self, method: str, context: Context) -> Principal:
         if self._authenticate is None:
             return Principal()
         return self._authenticate(metadata_of(context), method, context.auth_context())
 
     async def _answer(self, handler: Any, method: str, call: Call, context: Context) -> bytes:
-        """The servicer's answer; whatever is wrong with the request is a RequestError."""
+        """The servicer's answer; every fault of the request is raised as RequestError."""
         request, call = await self._request(handler, method, call, context)
         try:
             response = await self._in_time(lambda: handler.unary_unary(request, call), call.deadline_s)
@@ -183,19 +178,19 @@ class CallGuard:
         return data
 
     async def _stream(self, handler: Any, method: str, call: Call, context: Context) -> None:
-        """Sends the servicer's messages as they come, until it or the caller ends, or the time is over.
+        """Sends the servicer's messages as they come, until servicer or caller end, or the deadline passes.
 
         The servicer's method is a coroutine that gives an iterator of messages, with `aclose`.
         """
         is_endless = method in ENDLESS_METHODS
         request, call = await self._request(handler, method, call, context)
-        making = handler.unary_stream(request, call)
-        del request  # a photograph, which shall not wait for who reads slowly
+        opening = handler.unary_stream(request, call)
+        del request  # it has a photograph, which a slow reader must not keep in memory
         limit_s, sent_bytes = ENDLESS_SEND_LIMIT_S if is_endless else SEND_LIMIT_S, 0
         messages = (
-            self._endless(making, method, handler, context)
+            self._endless(opening, method, handler, context)
             if is_endless
-            else self._finite(making, handler, call, context)
+            else self._finite(opening, handler, call, context)
         )
         try:
             async with aclosing(messages) as coming:
@@ -208,63 +203,65 @@ class CallGuard:
             call.note(bytes_out=sent_bytes)
 
     async def _endless(
-        self, making: Making, method: str, handler: Any, context: Context
+        self, opening: Opening, method: str, handler: Any, context: Context
     ) -> AsyncGenerator[bytes, None]:
-        """A servicer's messages, each when the one before is sent; the caller learns when they can come."""
-        async with aclosing(await making) as responses:
+        """A servicer's messages, each when the one before is sent; headers are sent when messages can come."""
+        async with aclosing(await opening) as responses:
             await self._sender.headers(context)
             async for response in responses:
                 # The token may have been revoked, or have expired, since.
-                self._who_calls(method, context)
+                self._principal(method, context)
                 yield bytes(handler.response_serializer(response))
 
-    async def _finite(self, making: Making, handler: Any, call: Call, context: Context) -> AsyncGenerator[bytes, None]:
-        """A servicer's messages, a few, made in time and as fast as it can, however slowly the caller reads."""
-        made: asyncio.Queue[bytes | None] = asyncio.Queue()
+    async def _finite(
+        self, opening: Opening, handler: Any, call: Call, context: Context
+    ) -> AsyncGenerator[bytes, None]:
+        """A servicer's messages, a few, computed before the deadline however slowly the caller reads."""
+        ready: asyncio.Queue[bytes | None] = asyncio.Queue()
 
-        async def make() -> None:
-            async with aclosing(await making) as responses:
+        async def compute() -> None:
+            async with aclosing(await opening) as responses:
                 async for response in responses:
-                    made.put_nowait(bytes(handler.response_serializer(response)))
+                    ready.put_nowait(bytes(handler.response_serializer(response)))
 
-        task = asyncio.ensure_future(self._in_time(make, call.deadline_s))
-        task.add_done_callback(lambda _: made.put_nowait(None))
+        task = asyncio.ensure_future(self._in_time(compute, call.deadline_s))
+        task.add_done_callback(lambda _: ready.put_nowait(None))
         try:
-            data = await made.get()
+            data = await ready.get()
             if data is not None:
                 await self._sender.headers(context)
             while data is not None:
                 yield data
-                data = await made.get()
+                data = await ready.get()
             await task
         finally:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
-            if inspect.getcoroutinestate(making) == inspect.CORO_CREATED:  # the time was over before it began
-                making.close()
+            if inspect.getcoroutinestate(opening) == inspect.CORO_CREATED:  # the deadline passed before it began
+                opening.close()
 
     async def _request(self, handler: Any, method: str, call: Call, context: Context) -> tuple[Any, Call]:
-        """The call's message, and the call with who makes it."""
+        """The call's message, and the call with its principal."""
         limit_s = call.deadline_s - time.monotonic()
         if method in ENDLESS_METHODS:  # which may have no deadline
             limit_s = min(limit_s, self._deadlines.default_deadline_s)
         data = await self._receiver.message(context, limit_s)
         call.note(bytes_in=len(data))
-        call = replace(call, principal=self._who_calls(method, context))
+        call = replace(call, principal=self._principal(method, context))
         call.note(tenant=call.principal.tenant, **({"principal": call.principal.name} if call.principal.name else {}))
         try:
-            # Reading holds the interpreter, about 1 ms for a MiB, in whatever thread: in another one it would hold up
-            # the event loop no less. Clients send uploads in pieces (`batch_mib`).
+            # Parsing holds the interpreter lock, about 1 ms for a MiB, so another thread would block the event loop as
+            # much. Clients split uploads (`batch_mib`).
             request = handler.request_deserializer(data)
         except (DecodeError, ValueError):
             raise InvalidArgument("the request is not a well-formed message", reason="MALFORMED_MESSAGE") from None
         return request, call
 
     async def _in_time(self, answer: Callable[[], Coroutine[Any, Any, T]], deadline_s: float) -> T:
-        """The answer, or DeadlineExceeded as soon as the time is over, however long it takes the servicer to stop.
+        """The answer, or DeadlineExceeded as soon as the deadline passes, however long the servicer takes to stop.
 
-        Neither asyncio.wait_for nor asyncio.timeout will do: before Python 3.12 the first forgets that the caller has
-        gone where the answer comes in the same moment, Python 3.10 lacks the second, and both wait for the servicer.
+        Not asyncio.wait_for, which before Python 3.12 swallows a cancellation that comes together with the answer, nor
+        asyncio.timeout, which Python 3.10 lacks; and both wait for the servicer.
         """
         remaining_s = deadline_s - time.monotonic()
         if remaining_s > 0:
@@ -274,8 +271,8 @@ class CallGuard:
             except asyncio.CancelledError:
                 self._abandon(task)
                 raise
-            if task.cancelled():  # by what it waited for, since nobody else knows it
-                raise Unavailable("the server gave the call up", reason="GIVEN_UP")
+            if task.cancelled():  # by the job that it waited for
+                raise Unavailable("the server abandoned the call", reason="GIVEN_UP")
             if task.done():
                 return task.result()
             self._abandon(task)
@@ -283,30 +280,29 @@ class CallGuard:
 
     def _abandon(self, task: asyncio.Task[Any]) -> None:
         self._abandoned.add(task)
-        task.add_done_callback(self._bury)
+        task.add_done_callback(self._log_abandoned)
         task.cancel()
 
-    def _bury(self, task: asyncio.Task[Any]) -> None:
+    def _log_abandoned(self, task: asyncio.Task[Any]) -> None:
         self._abandoned.discard(task)
         error = None if task.cancelled() else task.exception()
         if error is not None and not isinstance(error, RequestError | FieldError):
-            log.error("a call failed after it was given up", exc_info=error)
+            log.error("a call failed after it was abandoned", exc_info=error)
 
-    def _end(self, method: str, code: str, call: Call, span: CallSpan) -> None:
-        seconds = time.monotonic() - call.arrived_s
+    def _log_end(self, method: str, call: Call, result: _Result) -> None:
+        seconds, span, record = time.monotonic() - call.arrived_s, result.span, call.history
         if self._observer is not None:
-            self._observer.call_handled(method, code, seconds, span.trace_id)
-        trail = call.trail
-        fields: dict[str, object] = {**trail.notes, "request_id": call.request_id, "client": call.client}
-        span.end(code, trail.steps, fields)
+            self._observer.call_handled(method, result.code, seconds, span.trace_id)
+        fields: dict[str, object] = {**record.notes, "request_id": call.request_id, "client": call.client}
+        span.end(result.code, record.steps, fields)
         if span.trace_id:
             fields["trace_id"] = span.trace_id
-        if trail.queue_s is not None:
-            fields["queue_ms"] = _ms(trail.queue_s)
-        if trail.stage_seconds:
-            fields["stages_ms"] = {name: _ms(spent_s) for name, spent_s in trail.stage_seconds.items()}
-        fields |= {"method": method, "code": code, "duration_ms": _ms(seconds)}
-        log.info("%s %s", method.rpartition("/")[2], code, extra=as_extra(fields))
+        if record.queue_s is not None:
+            fields["queue_ms"] = _ms(record.queue_s)
+        if record.stage_seconds:
+            fields["stages_ms"] = {name: _ms(spent_s) for name, spent_s in record.stage_seconds.items()}
+        fields |= {"method": method, "code": result.code, "duration_ms": _ms(seconds)}
+        log.info("%s %s", method.rpartition("/")[2], result.code, extra=as_extra(fields))
 
 
 def _ms(seconds: float) -> float:

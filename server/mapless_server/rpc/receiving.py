@@ -1,8 +1,8 @@
-"""Receiving a call's one message in limited time.
+"""Receives the one message of a call in limited time.
 
-For methods of one message grpc receives it before it asks anybody, however long that takes: a call of which only the
-headers were sent would hold its place among the concurrent calls as long as its connection. So all methods are served
-as if their callers sent streams, of which the first message is read here.
+For methods of one message grpc receives it before it calls the handler, however long that takes: a call whose caller
+sends only the headers would hold its place among the concurrent calls as long as its connection. So all methods are
+served as if their callers sent streams, of which the first message is read here.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import grpc
 from mapless_server.errors import DeadlineExceeded, InvalidArgument, Overloaded, RequestError
 
 OPEN_MESSAGE_LIMIT_S = 5.0
-"""For the messages of methods that anybody may call; they are a few bytes, and are sent together with the headers."""
+"""For the messages of methods without authentication, a few bytes that are sent together with the headers."""
 MAX_OPEN_WAITING = 256
-"""Calls of such methods whose message has not come; the oldest gives way. A message is rarely late, and never much."""
+"""Calls of such methods whose message has not come; a further one ends the oldest. Messages are rarely late."""
 MAX_OPEN_STREAMS = 256
-"""Streams of such methods (health watches, reflection) that are open at a time, which may last for ever."""
+"""Open streams of such methods (health watches, reflection), which have no deadline."""
 
 Context = Any
 """grpc.aio.ServicerContext, whose annotations are wrong in places."""
@@ -30,30 +30,30 @@ class Receiver:
     """Reads messages; lives on the event loop."""
 
     def __init__(self) -> None:
-        self._reading: set[asyncio.Future[Any]] = set()  # the loop itself would forget them
+        self._reading: set[asyncio.Future[Any]] = set()  # the loop holds only weak references
 
-    async def message(self, context: Context, limit_s: float, gives_way: asyncio.Future[None] | None = None) -> bytes:
-        """A call's first message as it came.
+    async def message(self, context: Context, limit_s: float, evicted: asyncio.Future[None] | None = None) -> bytes:
+        """The bytes of a call's first message.
 
         Args:
             context: the call's, which has no deserializer.
-            limit_s: seconds to wait for it.
-            gives_way: when this is done, the message is not waited for any longer.
+            limit_s: longest wait, seconds.
+            evicted: done when the call has to end for another one.
 
         Raises:
-            DeadlineExceeded: it did not come in time.
-            Overloaded: the call had to give way.
-            InvalidArgument: the caller ended without one, or it was too large (which grpc tells the caller itself).
+            DeadlineExceeded: no message came in time.
+            Overloaded: the call was evicted.
+            InvalidArgument: the caller sent none, or a too large one (which grpc itself reports to the caller).
         """
         reading = asyncio.ensure_future(context.read())
         self._reading.add(reading)
         reading.add_done_callback(self._forget)
-        awaited: set[asyncio.Future[Any]] = {reading} if gives_way is None else {reading, gives_way}
-        # Never cancelled: grpc still writes to where it was told to. It ends with the call at the latest.
+        awaited: set[asyncio.Future[Any]] = {reading} if evicted is None else {reading, evicted}
+        # Never cancelled, because grpc still writes into its buffer. It ends with the call at the latest.
         await asyncio.wait(awaited, timeout=max(0.0, limit_s), return_when=asyncio.FIRST_COMPLETED)
         if not reading.done():
-            if gives_way is not None and gives_way.done():
-                raise Overloaded("too many calls of which no message has come")
+            if evicted is not None and evicted.done():
+                raise Overloaded("too many calls whose message has not come")
             raise DeadlineExceeded("the message did not come in time", reason="MESSAGE_LATE")
         message = reading.result()
         if message is grpc.aio.EOF:
@@ -66,7 +66,7 @@ class Receiver:
 
 
 class OpenMethods:
-    """Serves methods that anybody may call, so that nobody can use up the server's calls by them."""
+    """Serves methods without authentication in limited number, so that they cannot take up all calls of the server."""
 
     def __init__(self, receiver: Receiver) -> None:
         self._receiver = receiver
@@ -74,7 +74,7 @@ class OpenMethods:
         self._streams = 0
 
     def guarded(self, handler: Any) -> Any:
-        """The method's handler, bounded in number and in the time that its message has to come."""
+        """The method's handler, limited in number and in the time for its message."""
         if not handler.response_streaming:
             return grpc.stream_unary_rpc_method_handler(self._unary(handler), None, handler.response_serializer)
         if handler.request_streaming:
@@ -116,25 +116,25 @@ class OpenMethods:
         self._streams += 1
 
     async def _request(self, handler: Any, context: Context) -> Any:
-        """The call's message, read; aborts the call if there is none."""
+        """The call's message, parsed; aborts the call if there is none."""
         if len(self._waiting) >= MAX_OPEN_WAITING:
             oldest = next(iter(self._waiting))
             del self._waiting[oldest]
             oldest.set_result(None)
-        gives_way: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._waiting[gives_way] = None
+        evicted: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting[evicted] = None
         try:
-            return handler.request_deserializer(await self._receiver.message(context, OPEN_MESSAGE_LIMIT_S, gives_way))
+            return handler.request_deserializer(await self._receiver.message(context, OPEN_MESSAGE_LIMIT_S, evicted))
         except RequestError as error:
             await context.abort(getattr(grpc.StatusCode, error.code), str(error))
         finally:
-            self._waiting.pop(gives_way, None)
+            self._waiting.pop(evicted, None)
 
 
 class _Latest:
-    """What a health watch writes to. It waits for no reader: of what the caller does not read, the latest is kept.
+    """The context of a health watch, whose `write` never waits: of unread messages only the latest is kept.
 
-    The servicer writes while it holds a lock that whoever changes the health needs, as the server does that stops.
+    The servicer writes while it holds the lock that changing the health takes, as a server does that stops.
     """
 
     def __init__(self, context: Context) -> None:
@@ -150,13 +150,13 @@ class _Latest:
             self._writing.add_done_callback(retrieve)
 
     async def _write(self) -> None:
-        """Never cancelled, as reading is not."""
+        """Never cancelled, for the same reason as reading."""
         while self._message is not None:
             message, self._message = self._message, None
             await self._context.write(message)
 
 
 def retrieve(task: asyncio.Future[Any]) -> None:
-    """Looks at how a task ended, lest asyncio complains that nobody did."""
+    """Retrieves the exception of a task of a call that has ended, which asyncio would otherwise log."""
     if not task.cancelled():
-        task.exception()  # of a call that has ended: nobody waits for it
+        task.exception()

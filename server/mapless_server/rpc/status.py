@@ -1,4 +1,4 @@
-"""Errors as callers get them: google.rpc.Status with details for programs."""
+"""Errors as callers receive them: google.rpc.Status with details for programs."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from google.rpc import error_details_pb2, status_pb2
 from mapless_server.errors import AlreadyExists, NotFound, RequestError
 
 _DOMAIN = "mapless"
-_MAX_MESSAGE_CHARACTERS = 1000  # trailers hold about 8 KB, and the text stands in them twice
+_MAX_MESSAGE_CHARACTERS = 1000  # trailers hold about 8 KB, and they hold the text twice
 
 
 def to_status(error: RequestError) -> status_pb2.Status:
-    """The error as google.rpc.Status: one ErrorInfo, and what belongs to its kind."""
+    """The error as google.rpc.Status: one ErrorInfo, and the details of its kind."""
     message = str(error)[:_MAX_MESSAGE_CHARACTERS]
     field = {} if error.field is None else {"field": error.field}
     details: list[Message] = [error_details_pb2.ErrorInfo(reason=error.reason, domain=_DOMAIN, metadata=field)]

@@ -17,7 +17,7 @@ from mapless_server.engine.engine import Engine
 from mapless_server.observability.event_loop import watch_event_loop
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
-from mapless_server.observability.tracing import Tracer, make_tracer
+from mapless_server.observability.tracing import NoTracer, Tracer
 from mapless_server.scheduling import Fatal
 from mapless_server.security.errors import SecurityError
 from mapless_server.security.protection import Protection
@@ -148,20 +148,26 @@ def _make_protection(settings: Settings) -> Protection:
 
 
 def _make_tracer(settings: Settings) -> Tracer:
+    if not settings.otlp_endpoint:
+        return NoTracer()
     try:
-        return make_tracer(settings.otlp_endpoint)
+        from mapless_server.observability.otlp import make_otlp_tracer
+
+        return make_otlp_tracer(settings.otlp_endpoint)
     except ImportError as error:
         raise StartupError(what_is_missing(error)) from error
+    except ValueError as error:
+        raise StartupError(str(error)) from error
 
 
 def _serve_metrics(
     settings: Settings, metrics: Metrics, store: Store, protection: Protection, stack: AsyncExitStack
 ) -> str:
     """Where the metrics are served, "host:port"; empty if they are not."""
-    metrics.watch_reference_cache(lambda: store.reference_cache)
+    metrics.scraped.reference_cache = lambda: store.reference_cache
     if protection.tls is not None:
         tls = protection.tls
-        metrics.watch_certificate(lambda: tls.expiry_s)
+        metrics.scraped.certificate_expiry = lambda: tls.expiry_s
     if not settings.metrics:
         return ""
     try:
@@ -179,11 +185,11 @@ def _watch_engine(engine: Engine, metrics: Metrics) -> None:
     first = engine.tiers[0]
     reconstructor = first.pipeline.reconstructor
     metrics.built(__version__, reconstructor.name, first.extractor.name, reconstructor.weights_sha256)
-    metrics.watch_retrieval_index(lambda: engine.references.index_bytes)
-    metrics.watch_gpu_memory(gpu_memory)
+    metrics.scraped.retrieval_index = lambda: engine.references.index_bytes
+    metrics.scraped.gpu_memory = gpu_memory
     cache = getattr(reconstructor, "cache", None)  # of tokens; only networks have one
     if cache is not None:
-        metrics.watch_token_cache(lambda: cache.counters)
+        metrics.scraped.token_cache = lambda: cache.counters
 
 
 async def _open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorder | None:

@@ -66,7 +66,7 @@ class Services:
             settings.default_deadline_s,
             settings.max_deadline_s,
             authenticate=authenticate,
-            check_door=self._check_door,
+            check_admission=self._check_admission,
             observer=metrics,
             tracer=tracer,
         )
@@ -145,7 +145,7 @@ class Services:
         if self._is_serving:
             await self.set_serving(True)
 
-    def _check_door(self, method: str) -> None:
+    def _check_admission(self, method: str) -> None:
         """Raises Unavailable while the server starts or stops, and Overloaded while it has no room for any query."""
         if self._is_draining:
             raise Unavailable("the server is stopping", reason="DRAINING", retry_after_s=1.0)
