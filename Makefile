@@ -15,10 +15,14 @@ PROTO_VENV  := $(VENV)/proto-tools
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
+# uv installs in seconds what takes pip minutes.
+INSTALL = $(BIN)/python .ci/uv.py pip install --quiet
+
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check $(TORCH)
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[server,tools,networks,otel,postgres,ray,view,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check uv
+	$(INSTALL) $(TORCH)
+	$(INSTALL) --editable '.[server,tools,networks,otel,postgres,ray,view,dev]'
 	touch $@
 
 setup: $(VENV)/.installed  ## Create .venv with everything
@@ -44,8 +48,8 @@ format: setup  ## Format the code
 	$(BIN)/ruff format .
 
 $(PROTO_VENV)/.installed: Makefile $(VENV)/.installed
-	$(PYTHON) -m venv $(PROTO_VENV)
-	$(PROTO_VENV)/bin/pip install --quiet --disable-pip-version-check $(PROTO_TOOLS)
+	$(PYTHON) -m venv --without-pip $(PROTO_VENV)
+	$(INSTALL) --python $(PROTO_VENV)/bin/python $(PROTO_TOOLS)
 	touch $@
 
 proto: $(PROTO_VENV)/.installed  ## Regenerate client/mapless/v1 from proto/
