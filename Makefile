@@ -10,7 +10,7 @@ TORCH  ?= torch==2.13.0
 PROTO_TOOLS := grpcio-tools==1.71.2 setuptools==80.9.0
 PROTO_VENV  := $(VENV)/proto-tools
 
-.PHONY: help setup test thorough lint format proto demo bench bench-gpu load load-ray fuzz docs clean
+.PHONY: help setup test nightly weights lint format proto demo bench bench-gpu load load-ray fuzz docs clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -29,13 +29,18 @@ setup: $(VENV)/.installed  ## Create .venv with everything
 
 # The matrices are small: threads gain nothing, and wait for one another where cores are shared. Not so the full networks.
 THREADS ?= 1
-# Two cores at once; WORKERS= for one after the other.
+# Two processes, of which the one that has finished takes over tests of the other; WORKERS= for one process.
 WORKERS ?= -n 2 --dist loadfile
-test: setup $(PROTO_VENV)/.installed  ## Run the tests; ARGS=... for pytest, ARGS="-m slow" THREADS=2 for the slow ones
+test: setup $(PROTO_VENV)/.installed  ## Run the tests in at most five minutes; ARGS=... for pytest
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=$(THREADS) PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(WORKERS) $(ARGS)
 
-thorough:  ## Run the tests that repeat with many cases what others show with few: ten minutes
-	$(MAKE) test WORKERS= ARGS="-m thorough --timeout=600"
+nightly: weights  ## Run the tests that are slow and not specific to a change; TENTH=0 to 9 for a tenth of them, as CI does
+	$(MAKE) test ARGS="-m nightly --timeout=600 $(if $(TENTH),--tenth=$(TENTH)) $(ARGS)"
+
+# Freely licensed, in the environment's own folder, where tests look for them.
+export TEST_WEIGHTS ?= $(abspath $(VENV))/weights
+weights: setup
+	MAPLESS_WEIGHTS_DIR=$(TEST_WEIGHTS) $(BIN)/mapless-server weights fetch aliked
 
 lint: setup  ## Check style, types and protos
 	$(BIN)/ruff check .

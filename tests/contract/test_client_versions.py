@@ -82,7 +82,7 @@ def _pip(*arguments: str) -> None:
     subprocess.run(command, check=True, timeout=170)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("end", ["floor", "newest"])
 def test_the_client_runs_at_both_ends_of_its_versions(end: str, wheel: Path, tmp_path: Path) -> None:
     assert {"protobuf", "grpcio", "numpy"} < {it.partition(">=")[0] for it in FLOORS}

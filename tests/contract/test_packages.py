@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 SOURCES = ("client", "server", "deploy/ray/mapless_ray", "pyproject.toml", "README.md", "LICENSE")
 BUILD_LIMIT_S = 170.0
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.nightly, pytest.mark.timeout(600)]
 
 
 def environment() -> dict[str, str]:

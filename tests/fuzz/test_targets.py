@@ -36,7 +36,7 @@ def test_seeds_are_accepted_and_their_mutations_break_no_law(name: str) -> None:
 
 
 @needs_atheris
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", TARGETS)
 def test_a_short_campaign_finds_nothing(name: str, tmp_path: Path) -> None:
     outcome = campaign.fuzz(name, tmp_path, RUNS, SEED, LIMIT_S)

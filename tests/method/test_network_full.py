@@ -31,7 +31,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 log = logging.getLogger(__name__)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(900)
 def test_a_full_network_reconstructs_photographs_within_16_gib() -> None:
     """In a process of its own, whose memory is the network's alone."""

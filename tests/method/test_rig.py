@@ -125,7 +125,7 @@ def test_few_matches_are_too_few() -> None:
     assert "3 2D-3D matches in 3 images" in outcome.message
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_errors_are_as_large_as_the_covariance_says() -> None:
     """Whitened by it, errors of many rigs have a spread of about one over `error_inflation`, 2."""
     whitened = []

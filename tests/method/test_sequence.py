@@ -50,8 +50,8 @@ def test_every_frame_is_found_in_the_callers_world(alone: bool, scale: float, is
     ("share", "deg"),
     [
         (0.02, 0.2),
-        pytest.param(0.02, 0.0, marks=pytest.mark.thorough),
-        pytest.param(0.10, 0.5, marks=pytest.mark.thorough),
+        pytest.param(0.02, 0.0, marks=pytest.mark.nightly),
+        pytest.param(0.10, 0.5, marks=pytest.mark.nightly),
         (0.30, 1.0),
     ],
 )

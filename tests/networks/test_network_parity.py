@@ -80,7 +80,7 @@ def full_network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPa
     return network.eval().requires_grad_(False)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(("full_network", "case"), FULL_CASES, indirect=["full_network"])
 def test_a_full_network_answers_as_the_official_one(case: str, full_network: Network) -> None:

@@ -88,7 +88,7 @@ def check_fault(found: ReferenceAudit, fault: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "scene", [FOUNTAIN, KITCHEN, *(pytest.param(scene, marks=pytest.mark.thorough) for scene in list(COUNTS)[2:])]
+    "scene", [FOUNTAIN, KITCHEN, *(pytest.param(scene, marks=pytest.mark.nightly) for scene in list(COUNTS)[2:])]
 )
 def test_nothing_is_found_where_nothing_was_planted(photographs: Photographs, scene: str) -> None:
     """On the drive the first poses are off by 6 to 11 cm themselves: there it may be in doubt, but accuses nobody."""
@@ -104,8 +104,8 @@ def test_nothing_is_found_where_nothing_was_planted(photographs: Photographs, sc
     [
         (FOUNTAIN, (5,)),
         (KITCHEN, (7,)),
-        pytest.param(FOUNTAIN, (0, 2, 8, 10), marks=pytest.mark.thorough),
-        pytest.param(KITCHEN, (0, 4, 15, 23, 28), marks=pytest.mark.thorough),
+        pytest.param(FOUNTAIN, (0, 2, 8, 10), marks=pytest.mark.nightly),
+        pytest.param(KITCHEN, (0, 4, 15, 23, 28), marks=pytest.mark.nightly),
     ],
 )
 def test_a_planted_fault_is_named_and_nothing_else(
@@ -125,9 +125,9 @@ def test_a_planted_fault_is_named_and_nothing_else(
     ("scene", "pair"),
     [
         (FOUNTAIN, (4, 5)),
-        pytest.param(FOUNTAIN, (1, 8), marks=pytest.mark.thorough),
+        pytest.param(FOUNTAIN, (1, 8), marks=pytest.mark.nightly),
         (KITCHEN, (15, 21)),
-        pytest.param(KITCHEN, (3, 20), marks=pytest.mark.thorough),
+        pytest.param(KITCHEN, (3, 20), marks=pytest.mark.nightly),
     ],
 )
 def test_swapped_photographs_name_each_other_and_nothing_else(

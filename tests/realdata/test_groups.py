@@ -23,7 +23,7 @@ from mapless_tools.child import child_server
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.evaluate.run import CONNECT
 
-pytestmark = [pytest.mark.realdata, pytest.mark.thorough]
+pytestmark = [pytest.mark.realdata, pytest.mark.nightly]
 
 KITCHEN = "7scenes-redkitchen-seq01-first600"
 STARTS = (40, 200, 380, 530)

@@ -13,7 +13,7 @@ from mapless_tools.child import child_server
 from mapless_tools.dataset import Dataset
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_coarse_pose_is_near_the_refined_and_a_little_worse(
     photographs: Callable[[str], Dataset], tmp_path: Path
 ) -> None:

@@ -89,7 +89,7 @@ def test_a_scene_with_half_its_references_moved_is_ambiguous(photographs: Photog
     assert np.linalg.norm(centres[0] - centres[1]) == pytest.approx(5.0, abs=0.1)
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 @pytest.mark.timeout(3600)
 def test_at_95_percent_coverage_one_percent_is_wrong(photographs: Photographs) -> None:
     """All metric scenes with 10, 5, 3 and 2 references; and 588 pairs of a query and references of another place."""

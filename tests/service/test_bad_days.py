@@ -248,7 +248,7 @@ class TestDisk:
             with pytest.raises(StoreError, match="not closed in order"), served(disk / "data"):
                 pass
 
-    @pytest.mark.slow
+    @pytest.mark.nightly
     def test_a_disk_that_fails_meanwhile_leaves_what_can_be_served(self, tmp_path: Path) -> None:
         with failing_disk(tmp_path / "disk", 32) as disk, served(disk / "data") as client:
             fill(client)
@@ -397,7 +397,7 @@ class TestTwoServers:
 
 
 class TestScenesThatGo:
-    @pytest.mark.slow
+    @pytest.mark.nightly
     def test_a_scene_made_anew_during_calls_gives_no_mixed_answer(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

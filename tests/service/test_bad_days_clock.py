@@ -68,7 +68,7 @@ def has_begun(server: Program, calls: int) -> bool:
     return server.began >= calls
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_jumps_of_the_wall_clock_change_no_deadline(tmp_path: Path) -> None:
     settings = {"workers": 2, "tenant_rate_ms": 100_000, "max_queued_s": 1000, "stall_limit_s": 40}
     with (

@@ -32,7 +32,7 @@ from mapless import (
 from mapless.geometry import Camera
 from mapless_server.store import Store
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 ONCE = ConnectOptions(max_attempts=1, timeout_s=30)
 SMALL_MIB = 72

@@ -259,7 +259,7 @@ def test_wrong_folders_are_one_line(server: RunningServer, tmp_path: Path) -> No
     assert "name the folder" in refusal(calibrate(server, tmp_path / "out", "--scene", "s"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(600)
 def test_a_folder_by_itself(tmp_path: Path) -> None:
     """Through a server of its own, with the real method: right answers, and claims that were counted."""

@@ -379,7 +379,7 @@ def asking(client: Client) -> Iterator[list[BaseException]]:
         assert not any(thread.is_alive() for thread in threads)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_server_that_drains_is_left_and_nobody_notices(url: str, fleet: Fleet, tmp_path: Path) -> None:
     with fleet_of(tmp_path, url, drain_delay_s=2.0) as leaving:
         once = replace(leaving.gateway.options, max_attempts=1)  # not even a retry hides anything
@@ -395,7 +395,7 @@ def test_a_server_that_drains_is_left_and_nobody_notices(url: str, fleet: Fleet,
         assert {leaving.who(scene) for scene in SCENES} == {1}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_server_that_is_killed_costs_retries_and_no_call(url: str, fleet: Fleet, tmp_path: Path) -> None:
     with ExitStack() as stack:
         killed, left = (stack.enter_context(gated(tmp_path / str(i), database_url=url)) for i in range(2))
@@ -426,7 +426,7 @@ def before_the_end(running: Gateway) -> list[str]:
     return [*shell, asked]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_gateway_that_is_to_go_says_so_and_answers_until_then(url: str, fleet: Fleet, tmp_path: Path) -> None:
     (server,) = fleet.servers[:1]
     with gateway(tmp_path, [server.address]) as leaving:

@@ -132,7 +132,7 @@ def test_a_failed_scene_stops_no_other_and_is_measured_later(chess: Path, tmp_pa
     assert (output / "report.html").read_text().count("data:image/jpeg") == 2
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_measures_every_layout(chess: Path, tmp_path: Path) -> None:
     folder, output = tmp_path / "data", tmp_path / "out"
     shutil.copytree(chess, folder / "chess")
@@ -159,7 +159,7 @@ def test_measures_every_layout(chess: Path, tmp_path: Path) -> None:
     assert "Cambridge Landmarks. Dense: median error, cm/°" in " ".join(done.stdout.split())
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_takes_the_references_of_a_pairs_file(chess: Path, tmp_path: Path) -> None:
     pairs = tmp_path / "pairs.txt"
     wanted = ["seq-01/frame-000002.color.png", "seq-01/frame-000000.color.png", "seq-01/frame-000001.color.png"]

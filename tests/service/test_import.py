@@ -229,7 +229,7 @@ def test_a_dry_run_finds_images_of_another_size(folder: Path) -> None:
     assert "its camera 640x" in done.stdout
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_terminated_in_the_middle_the_next_run_goes_on(tmp_path: Path) -> None:
     """Without an address: a server of its own on the settings' store, which goes with the command."""
     folder = tmp_path / "many"

@@ -58,7 +58,7 @@ from support.ray_app import FAILS, HANGS, SECRET
 from mapless_tools.load_ray.callers import Calls, Scenes, calling
 from mapless_tools.load_ray.cluster import Cluster, Replica, application, running_cluster
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.nightly, pytest.mark.timeout(300)]
 
 DATA = Path(os.environ.get("TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
 LIMIT_S = 60.0

@@ -254,7 +254,7 @@ def _takes_an_image(message: Any) -> bool:
 
 
 @pytest.mark.parametrize(
-    "settings", [{"log_level": "debug"}, pytest.param({"log_format": "text"}, marks=pytest.mark.slow)]
+    "settings", [{"log_level": "debug"}, pytest.param({"log_format": "text"}, marks=pytest.mark.nightly)]
 )
 def test_files_and_the_log_have_nothing_of_what_was_sent(tmp_path: Path, search: Search, settings: Any) -> None:
     """While the server runs, which has a database with a log of its own, and when it has ended."""
@@ -269,7 +269,7 @@ def test_files_and_the_log_have_nothing_of_what_was_sent(tmp_path: Path, search:
     assert list((tmp_path / "home").iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_shared_database_has_nothing_of_what_was_sent(tmp_path: Path, search: Search) -> None:
     cluster = shared_cluster()
     url = cluster.fresh_url()
@@ -293,7 +293,7 @@ def copied(connection: psycopg.Connection[Any], table: str) -> bytes:
         return b"".join(map(bytes, copy))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_search_finds_what_is_captured(tmp_path: Path, search: Search) -> None:
     """The same server, told to keep calls: then the photographs are there, in that folder and nowhere else."""
     with served(tmp_path, capture_dir=tmp_path / "captured") as server:
@@ -323,7 +323,7 @@ def test_expired_captures_are_deleted_without_any_call(tmp_path: Path, search: S
         assert search.files(captured) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_captures_that_expired_during_a_stop_are_gone_at_start(tmp_path: Path, search: Search) -> None:
     captured = tmp_path / "captured"
     with served(tmp_path / "first", capture_dir=captured) as server:
@@ -353,7 +353,7 @@ def test_the_search_finds_a_piece_of_anything(search: Search, what: str) -> None
         assert search.find(around[:position] + pieces[what] + around[:-position])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_nothing_is_opened_for_writing_elsewhere(tmp_path: Path, search: Search) -> None:
     """As the kernel saw it: the server writes to its own folders and to no other, not even for a moment."""
     strace = shutil.which("strace")

@@ -344,7 +344,7 @@ def test_killed_while_scenes_are_deleted(database: str, tmp_path: Path) -> None:
             nursery.end()
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 @pytest.mark.parametrize("database", DATABASES)
 def test_killed_two_hundred_times(database: str, tmp_path: Path) -> None:
     kill_and_check(database, tmp_path, 200)

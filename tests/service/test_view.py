@@ -71,7 +71,7 @@ def switch(page: Page, label: str) -> None:
     page.evaluate(script)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @needs_chromium()
 def test_what_is_seen_in_a_browser(tmp_path: Path) -> None:
     poses = dict(zip(REFERENCES, map(pose, (-25, -15, -5, 5, 15, 25)), strict=True))
