@@ -81,7 +81,7 @@ load-ray: setup  ## Measure replicas on Ray Serve, on this machine: half an hour
 	$(BIN)/python -m mapless_tools.load_ray $(or $(PART),all) $(if $(DATA),--data '$(DATA)') $(ARGS)
 
 $(VENV)/.docs: $(VENV)/.installed
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(INSTALL) --editable '.[docs]'
 	touch $@
 
 docs: $(VENV)/.docs  ## Build the documentation as a site in build/docs; a broken link is an error

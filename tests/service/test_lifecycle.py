@@ -209,9 +209,11 @@ def test_a_product_uses_one_thread_unless_set_otherwise(environment: dict[str, s
     """The libraries read the environment when they are imported, so the command line must not import them."""
     program = """if True:
         import sys
+        from mapless_server.serve.libraries import configure_libraries
+        from mapless_server.settings import Settings
         from mapless_tools.cli import app
         assert not {"numpy", "scipy", "cv2", "grpc"} & {*sys.modules}
-        app.configure_libraries(app.Settings())
+        configure_libraries(Settings())
         import os
         print(os.environ["OPENBLAS_NUM_THREADS"])
     """
