@@ -7,7 +7,7 @@ import pytest
 from mapless.scenes import Calibration
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
-from mapless_server.services.messages.scenes import changes_from_message
+from mapless_server.services.messages.references import changes_from_message
 
 
 @pytest.mark.parametrize("seconds", [0, 1, 10**15, -(10**15)])

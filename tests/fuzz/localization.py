@@ -25,8 +25,12 @@ from mapless_server.engine.query import Query
 from mapless_server.images.decode import image_size
 from mapless_server.method.priors.known import DirectionPrior, PosePrior, PositionPrior, Prior
 from mapless_server.security.tenancy import scene_id_of, tenant_of
-from mapless_server.services.messages.answers import answer_frames_of
-from mapless_server.services.messages.frames import MAX_SESSION_COORDINATE_M, framed_to_message, geo_pose_to_message
+from mapless_server.services.messages.answers import (
+    MAX_SESSION_COORDINATE_M,
+    answer_frames_of,
+    framed_to_message,
+    geo_pose_to_message,
+)
 from mapless_server.services.messages.groups import (
     poses_from_message,
     queries_from_message,

@@ -36,7 +36,7 @@ from mapless_server.scenes.retrieval.narrowing import Narrowing
 from mapless_server.security.principal import Principal
 from mapless_server.security.tenancy import SceneKey, key_of, scene_id_of, tenant_of
 from mapless_server.services import references as reference_service
-from mapless_server.services.messages.pages import MAX_PAGE_SIZE
+from mapless_server.services.messages.references import MAX_PAGE_SIZE
 from mapless_server.store import NewReference, ReferenceRecord, SceneAttributes, SceneRecord, codec, rows
 
 from . import messages

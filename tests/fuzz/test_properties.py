@@ -30,8 +30,8 @@ from mapless_server.errors import InvalidArgument
 from mapless_server.images.decode import ImageLimits, decode_image, image_size
 from mapless_server.images.png_chunks import essential_png
 from mapless_server.services.messages.answers import answer_frames_of
-from mapless_server.services.messages.pages import Page
 from mapless_server.services.messages.queries import query_from_message
+from mapless_server.services.messages.references import Page
 from mapless_server.store import SceneAttributes, codec
 from mapless_tools.dataset import Dataset, Refusal, printable
 from mapless_tools.ingest.formats import read_dataset

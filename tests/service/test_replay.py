@@ -37,8 +37,7 @@ from mapless import (
     SequenceFrame,
 )
 from mapless.geometry import RigidTransform as Pose
-from mapless_server.services.capture.calls import CapturedCall, decode_call, encode_call
-from mapless_server.services.capture.errors import CaptureError
+from mapless_server.services.capture.calls import CapturedCall, CaptureError, decode_call, encode_call
 from mapless_server.services.capture.files import blob_path, calls_of
 from mapless_server.settings import load_settings
 from mapless_tools.child import child_server

@@ -23,18 +23,20 @@ from mapless.geometry import Camera, RadialTangential, RigidTransform, rotation_
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes.retrieval.chosen import Choice
 from mapless_server.scenes.retrieval.ranking import RankedReference
-from mapless_server.services.capture import blobs as blobs_module
+from mapless_server.services.capture import files as blobs_module
 from mapless_server.services.capture import files as files_module
 from mapless_server.services.capture import folder as folder_module
 from mapless_server.services.capture import held as held_module
 from mapless_server.services.capture.calls import (
+    BlobGone,
     CapturedCall,
     CapturedPart,
     CapturedReference,
+    CaptureError,
+    DamagedCapture,
     decode_call,
     encode_call,
 )
-from mapless_server.services.capture.errors import BlobGone, CaptureError, DamagedCapture
 from mapless_server.services.capture.files import write_whole
 from mapless_server.services.capture.folder import CaptureFolder, Retention
 from mapless_server.services.capture.opening import open_recorder

@@ -14,7 +14,7 @@ from mapless.geodesy import Datum, GeoPose
 from mapless.geometry import Quaternion, RigidTransform
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
-from mapless_server.services.messages.frames import axes_from_message, session_from_message, set_frames
+from mapless_server.services.messages.answers import axes_from_message, session_from_message, set_frames
 
 AXES: wire.ProtoEnum = pb.Axes
 H = math.sqrt(0.5)

@@ -33,12 +33,11 @@ from mapless_server.security.principal import Principal
 from mapless_server.security.tenancy import SceneKey, key_of
 from mapless_server.services.capture import deletion as deletion_module
 from mapless_server.services.capture import recorder as recorder_module
-from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CapturedReference, decode_call
-from mapless_server.services.capture.errors import BlobGone
+from mapless_server.services.capture.calls import BlobGone, CapturedCall, CapturedPart, CapturedReference, decode_call
+from mapless_server.services.capture.deletion import Staleness
 from mapless_server.services.capture.files import calls_of
 from mapless_server.services.capture.folder import CaptureFolder, Retention
 from mapless_server.services.capture.recorder import Recorder
-from mapless_server.services.capture.staleness import Staleness
 from mapless_server.store import SceneAttributes, SceneRecord, Store, reading
 from mapless_server.store.reading import ReadingStore
 from mapless_server.store.rows import time_us

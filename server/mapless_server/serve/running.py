@@ -22,7 +22,7 @@ from mapless_server.scheduling import Fatal
 from mapless_server.security.errors import SecurityError
 from mapless_server.security.protection import Protection
 from mapless_server.security.reloading import keep_fresh
-from mapless_server.services.capture.errors import CaptureError
+from mapless_server.services.capture.calls import CaptureError
 from mapless_server.services.capture.opening import open_recorder
 from mapless_server.services.capture.recorder import Recorder
 from mapless_server.services.handlers import Services

@@ -22,12 +22,19 @@ from mapless_server.scenes.auditing import Viewpoint
 from mapless_server.security.tenancy import SceneKey, key_of, scene_id_of
 from mapless_server.store import ContradictingDown, NewReference, ReferenceRecord, Store
 
-from .messages.naming import reference_ids_from_names, reference_key_from_name, scene_key_from_name
-from .messages.pages import Page, Record
-from .messages.photos import photo_from_message
 from .messages.priors import narrowing_from_message
-from .messages.references import audit_to_message, choice_to_message, coverage_to_message, reference_to_message
-from .messages.scenes import attributes_from_message, changes_from_message, scene_to_message
+from .messages.queries import photo_from_message, reference_ids_from_names, reference_key_from_name, scene_key_from_name
+from .messages.references import (
+    Page,
+    Record,
+    attributes_from_message,
+    audit_to_message,
+    changes_from_message,
+    choice_to_message,
+    coverage_to_message,
+    reference_to_message,
+    scene_to_message,
+)
 
 MAX_BATCH = 1000
 MAX_RETRIEVED = 1000

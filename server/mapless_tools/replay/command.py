@@ -43,7 +43,7 @@ def replay_command(
         _fail(str(error))
     configure_libraries(settings)
 
-    from mapless_server.services.capture.errors import CaptureError
+    from mapless_server.services.capture.calls import CaptureError
 
     from .report import Selection, replay
 

@@ -19,7 +19,7 @@ from mapless.geometry import rotation_angle_deg
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.query import UNFINISHED
-from mapless_server.services.capture.messages import Response, diagnostics_of
+from mapless_server.services.capture.calls import Response, diagnostics_of
 
 DESCRIBE = "describe"
 """The stage in which a server finds features once and for all: a replay has them."""

@@ -27,9 +27,7 @@ from mapless_server.rpc.call import Call
 from mapless_server.scheduling import Done, Flow, Job
 from mapless_server.security.principal import Principal
 from mapless_server.security.tenancy import SceneKey
-from mapless_server.services.capture.calls import CapturedCall
-from mapless_server.services.capture.errors import CaptureError
-from mapless_server.services.capture.messages import Response, diagnostics_of
+from mapless_server.services.capture.calls import CapturedCall, CaptureError, Response, diagnostics_of
 from mapless_server.services.localization import LocalizationService
 from mapless_server.services.watching import Watchers
 from mapless_server.store import SceneAttributes, Store

@@ -12,10 +12,9 @@ from mapless_server.engine.engine import EngineOptions
 from mapless_server.engine.query import Tier
 from mapless_server.networks.weights import WeightsError, WeightsMissing
 from mapless_server.serve.assembly import engine_options, make_tiers, what_is_missing
-from mapless_server.services.capture.calls import CapturedCall, decode_call
-from mapless_server.services.capture.circumstances import circumstances_of
-from mapless_server.services.capture.errors import CaptureError
+from mapless_server.services.capture.calls import CapturedCall, CaptureError, decode_call
 from mapless_server.services.capture.files import calls_of, check_format
+from mapless_server.services.capture.opening import circumstances_of
 from mapless_server.settings import Settings
 
 from .comparing import Change, changed, compare, outcome_of, stage_seconds

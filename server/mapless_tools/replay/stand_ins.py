@@ -23,8 +23,7 @@ from mapless_server.scenes.retrieval.chosen import Choice
 from mapless_server.scenes.retrieval.narrowing import Narrowing
 from mapless_server.scenes.retrieval.ranking import RankOptions
 from mapless_server.security.tenancy import SceneKey, scene_id_of
-from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CapturedReference
-from mapless_server.services.capture.errors import DamagedCapture
+from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CapturedReference, DamagedCapture
 from mapless_server.services.capture.files import blob_path
 from mapless_server.store import SceneAttributes, codec
 from mapless_server.store.cache import LruCache

@@ -21,12 +21,35 @@ import numpy as np
 
 from mapless.geometry import Camera, RigidTransform
 from mapless.names import check_id
+from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.scenes.retrieval.chosen import Choice
 from mapless_server.scenes.retrieval.ranking import RankedReference
 from mapless_server.security.tenancy import check_tenant
 from mapless_server.store import SceneAttributes, codec
 
-from .errors import CaptureError, DamagedCapture
+
+class CaptureError(Exception):
+    """The folder, or a call in it, cannot be used; the message is one sentence for the operator."""
+
+
+class DamagedCapture(CaptureError):
+    """What is kept of a call is not what was written: cut, changed, or a part of it is gone."""
+
+
+class BlobGone(Exception):
+    """A blob that the folder had when it was asked has been deleted since."""
+
+
+Request = pb.LocalizeRequest | pb.LocalizeRigRequest | pb.LocalizeSequenceRequest
+Response = pb.LocalizeResponse | pb.LocalizeRigResponse | pb.LocalizeSequenceResponse
+
+
+def diagnostics_of(response: Response) -> list[pb.Diagnostics]:
+    """Of each photograph, in order."""
+    if isinstance(response, pb.LocalizeResponse):
+        return [response.diagnostics]
+    return [image.diagnostics for image in response.images]
+
 
 FORMAT_VERSION = 1
 _DIGEST_BYTES = 32

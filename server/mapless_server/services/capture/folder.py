@@ -20,10 +20,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from .blobs import BlobLedger
-from .calls import CapturedCall, encode_call
-from .errors import BlobGone, CaptureError, DamagedCapture
+from .calls import BlobGone, CapturedCall, CaptureError, DamagedCapture, encode_call
 from .files import (
+    BlobLedger,
     blob_path,
     call_path,
     calls_of,

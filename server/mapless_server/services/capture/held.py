@@ -12,8 +12,7 @@ from pathlib import Path
 
 from mapless_server.security.tenancy import SceneKey, key_of
 
-from .calls import CapturedCall, decode_call
-from .errors import DamagedCapture
+from .calls import CapturedCall, DamagedCapture, decode_call
 from .files import blob_path, call_path, space_of
 
 _FUTURE_S = 60.0

@@ -23,12 +23,10 @@ from mapless_server.security.tenancy import key_of
 from mapless_server.store import SceneAttributes, Store
 from mapless_server.store.rows import time_us
 
-from .calls import CapturedCall
+from .calls import BlobGone, CapturedCall, Request, Response, diagnostics_of
 from .deletion import Deletion
-from .errors import BlobGone
 from .folder import CaptureFolder
 from .gathering import Gatherer, Gone, Used, used_of
-from .messages import Request, Response, diagnostics_of
 from .telling import Telling
 
 MAX_WAITING = 32

@@ -24,13 +24,25 @@ from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_server.scenes.retrieval.narrowing import Narrowing
 from mapless_server.security.tenancy import key_of
 
-from .answers import accuracy_to_message, covariance_to_message, diagnostics_to_message, rejection_to_message
-from .enums import enum_to_message
+from .answers import (
+    MAX_SESSION_COORDINATE_M,
+    accuracy_to_message,
+    axes_from_message,
+    covariance_to_message,
+    diagnostics_to_message,
+    geo_pose_to_message,
+    rejection_to_message,
+)
 from .factors import Claimed
-from .frames import MAX_SESSION_COORDINATE_M, axes_from_message, geo_pose_to_message
-from .naming import reference_ids_from_names
-from .photos import photo_from_message
-from .queries import MAX_CANDIDATES, MAX_REFERENCES, options_from_message, reference_count_from_message
+from .queries import (
+    MAX_CANDIDATES,
+    MAX_REFERENCES,
+    enum_to_message,
+    options_from_message,
+    photo_from_message,
+    reference_count_from_message,
+    reference_ids_from_names,
+)
 
 
 def queries_from_message(

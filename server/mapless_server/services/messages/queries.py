@@ -2,19 +2,89 @@
 
 from __future__ import annotations
 
-from mapless import wire
+from collections.abc import Sequence
+from enum import Enum
+from typing import Any, TypeVar
+
+from mapless import names, wire
 from mapless.v1 import localization_service_pb2 as pb
-from mapless.wire import FieldError
+from mapless.wire import FieldError, camera_from_message, joined
 from mapless_server.engine.engine import EngineOptions
-from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Query
+from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query
+from mapless_server.images.decode import ImageLimits, image_size
 from mapless_server.method.answer import LocalizeOptions
-from mapless_server.security.tenancy import key_of
+from mapless_server.security.tenancy import SceneKey, key_of
 from mapless_server.store import SceneAttributes
 
-from .enums import enum_from_message
-from .naming import reference_ids_from_names
-from .photos import photo_from_message
 from .priors import priors_from_message
+
+E = TypeVar("E", bound=Enum)
+
+
+def enum_to_message(value: Enum, enum: wire.ProtoEnum) -> Any:
+    """The number of a value on the wire."""
+    return enum.Value(wire.enum_prefix(enum) + value.name)
+
+
+def enum_from_message(number: int, enum: wire.ProtoEnum, default: E, field: str) -> E:
+    """The value of a number, the default for 0; FieldError if it is none."""
+    if number == 0:
+        return default
+    if number not in enum.values():
+        raise FieldError(field, f"{number} is no value of {enum.DESCRIPTOR.name}")
+    return type(default)[enum.Name(number).removeprefix(wire.enum_prefix(enum))]
+
+
+def scene_key_from_name(name: str, field: str, tenant: str) -> SceneKey:
+    """The key of a tenant's scene of this name; FieldError if it is none."""
+    return key_of(tenant, wire.scene_id_from_name(name, field))
+
+
+def reference_key_from_name(name: str, field: str, tenant: str) -> tuple[SceneKey, str]:
+    """The key of a tenant's scene, and the reference's id within it; FieldError if the name is none."""
+    scene_id, reference_id = wire.reference_ids_from_name(name, field)
+    return key_of(tenant, scene_id), reference_id
+
+
+def reference_ids_from_names(names_given: Sequence[str], scene_id: str, most: int) -> tuple[str, ...]:
+    """Ids of the references that `references` of a request names, in order.
+
+    Raises:
+        FieldError: there are more than `most`, or one is no name, of another scene, or stands twice.
+    """
+    if len(names_given) > most:
+        raise FieldError("references", f"must be at most {most}, are {len(names_given)}")
+    reference_ids: dict[str, None] = {}
+    for i, name in enumerate(names_given):
+        field = f"references[{i}]"
+        its_scene_id, reference_id = wire.reference_ids_from_name(name, field)
+        if its_scene_id != scene_id:
+            raise FieldError(field, f"{names.shown(name)} is a reference of another scene than {scene_id!r}")
+        if reference_id in reference_ids:
+            raise FieldError(field, f"{names.shown(name)} stands twice")
+        reference_ids[reference_id] = None
+    return tuple(reference_ids)
+
+
+def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
+    """The photograph in a message's `image` and `intrinsics`, its header checked; cheap enough for the event loop.
+
+    Raises:
+        FieldError: the intrinsics are missing, out of range, or of another size than the image.
+        InvalidArgument: the image is refused by its header.
+    """
+    if not message.HasField("intrinsics"):
+        raise FieldError(joined(path, "intrinsics"), "is required")
+    camera = camera_from_message(message.intrinsics, joined(path, "intrinsics"))
+    width_px, height_px = image_size(message.image, limits, joined(path, "image"))
+    if (camera.width_px, camera.height_px) != (width_px, height_px):
+        raise FieldError(
+            joined(path, "intrinsics.width_px"),
+            f"the intrinsics are for {camera.width_px}x{camera.height_px} pixels, the image has {width_px}x{height_px} "
+            "(EXIF orientation is not applied)",
+        )
+    return Photo(message.image, camera, joined(path, "image"))
+
 
 MAX_REFERENCES = 64
 MAX_CANDIDATES = 1000

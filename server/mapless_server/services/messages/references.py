@@ -2,14 +2,89 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, TypeVar
+
 from mapless import names, wire
+from mapless.scene_messages import (
+    calibration_from_message,
+    calibration_to_message,
+    datum_from_message,
+    datum_to_message,
+    direction_from_message,
+    direction_to_message,
+)
+from mapless.scenes import Calibration
+from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
+from mapless.wire import FieldError, joined
 from mapless_server.scenes.audit.coverage import Coverage
 from mapless_server.scenes.audit.verdict import ReferenceAudit
 from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.store import ReferenceRecord
+from mapless_server.store import ContradictingDown, ReferenceRecord, SceneAttributes, SceneRecord
 
-from .enums import enum_to_message
+from .queries import enum_to_message
+
+DEFAULT_PAGE_SIZE = 100
+MAX_PAGE_SIZE = 1000
+
+Record = TypeVar("Record")
+
+
+class PageRequest(Protocol):
+    """A request for a page of a list."""
+
+    @property
+    def page_size(self) -> int:
+        """How much is wanted; 0 for the default."""
+
+    @property
+    def page_token(self) -> str:
+        """Of the page before; empty for the first."""
+
+
+class Page:
+    """One page of a list: how much to ask the store for, where to begin, where the next page begins.
+
+    A token is the tenant, the collection and the last id of the page before: opaque to callers, and good for its own
+    list only.
+
+    Raises:
+        FieldError: a negative page size, or a token that this list did not give.
+    """
+
+    def __init__(
+        self,
+        request: PageRequest,
+        tenant: str,
+        collection: str,
+        default_size: int = DEFAULT_PAGE_SIZE,
+        max_size: int = MAX_PAGE_SIZE,
+    ) -> None:
+        if request.page_size < 0:
+            raise FieldError("page_size", f"must not be negative, is {request.page_size}")
+        self._size = min(request.page_size or default_size, max_size)
+        self._list = f"{tenant}\n{collection}"
+        self.limit = self._size + 1  # one more tells whether there is a next page
+        self.after = self._read_token(request.page_token) if request.page_token else ""
+
+    def cut(self, records: Sequence[Record], id_of: Callable[[Record], str]) -> tuple[Sequence[Record], str]:
+        """The records of this page, and the token of the next one."""
+        if len(records) <= self._size:
+            return records, ""
+        token = f"{self._list}\n{id_of(records[self._size - 1])}"
+        return records[: self._size], base64.urlsafe_b64encode(token.encode()).decode()
+
+    def _read_token(self, token: str) -> str:
+        try:
+            its_list, _, after = base64.b64decode(token, b"-_", validate=True).decode().rpartition("\n")
+            if its_list == self._list:
+                return names.check_id(after)
+        except (binascii.Error, ValueError):
+            pass
+        raise FieldError("page_token", "is not one that this list gave")
 
 
 def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
@@ -64,3 +139,68 @@ def coverage_to_message(coverage: Coverage) -> pb.CheckCoverageResponse:
         position_68_m=coverage.position_68_m or 0.0,
         references=coverage.references,
     )
+
+
+def scene_to_message(scene: SceneRecord) -> pb.Scene:
+    """Message of a scene."""
+    known = scene.attributes
+    message = pb.Scene(
+        name=names.scene_name(scene.scene_id),
+        generation=scene.generation,
+        reference_count=scene.reference_count,
+        datum=datum_to_message(known.datum) if known.datum else None,
+        down_in_world=direction_to_message(known.down_in_world) if known.down_in_world else None,
+        calibration=calibration_to_message(known.calibration) if known.calibration else None,
+    )
+    message.create_time.FromDatetime(scene.create_time)
+    return message
+
+
+def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
+    """What is known of a scene to be created; FieldError names what is none."""
+    try:
+        return SceneAttributes(
+            datum_from_message(request.datum, "datum") if request.HasField("datum") else None,
+            direction_from_message(request.down_in_world, "down_in_world")
+            if request.HasField("down_in_world")
+            else None,
+        )
+    except ContradictingDown as error:
+        raise FieldError("down_in_world", str(error)) from None
+
+
+def changes_from_message(request: pb.UpdateSceneRequest) -> dict[str, Any]:
+    """Arguments of ``Store.update_scene``: what a request's mask names, None for what its scene lacks.
+
+    Raises:
+        FieldError: the mask is empty or names what cannot be changed, or a value is none.
+    """
+    paths = list(dict.fromkeys(request.update_mask.paths))
+    if not paths:
+        raise FieldError("update_mask", f"must name what to change: {', '.join(_READERS)}")
+    for path in paths:
+        if path not in _READERS:
+            raise FieldError("update_mask", f"{names.shown(path)} is none of {', '.join(_READERS)}")
+    scene = request.scene
+    return {
+        path: _READERS[path](getattr(scene, path), joined("scene", path)) if scene.HasField(path) else None
+        for path in paths
+    }
+
+
+def _measured(message: pb.SceneCalibration, field: str) -> Calibration:
+    """A calibration that says what it was measured with; when, the server says itself."""
+    variants: wire.ProtoEnum = localization_pb.Variant
+    if message.variant not in variants.values()[1:]:
+        raise FieldError(joined(field, "variant"), f"must be one of Variant's values, is {message.variant}")
+    measured = pb.SceneCalibration()
+    measured.CopyFrom(message)
+    measured.ClearField("create_time")  # ignored, so that it may be anything
+    return calibration_from_message(measured, field)
+
+
+_READERS: dict[str, Any] = {
+    "datum": datum_from_message,
+    "down_in_world": direction_from_message,
+    "calibration": _measured,
+}
