@@ -10,5 +10,5 @@ ingest/         import and export; formats/ reads what other programs write
 replay/         captured calls computed again
 view/           the viewer in the browser
 load_ray/       replicas on Ray Serve, measured on this machine
-demo/           the rendered room and `make demo`
+demo/           photographs of a room, and `make demo`
 """

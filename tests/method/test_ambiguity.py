@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support import corner
 from support.compare import assert_pose_close
 from support.scenes import make_scene, random_for
 
-from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless_server.images.decode import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization, LocalizeOptions
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import make_extractor
@@ -20,9 +22,6 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.trust import ambiguity
 from mapless_server.method.trust.ambiguity import AmbiguityOptions
 from mapless_server.method.views import PosedView, View
-from mapless_tools.demo.raycast import Quad, Surface
-from mapless_tools.demo.room import Station, look_at, take
-from mapless_tools.demo.textures import painting
 
 ELSEWHERE = RigidTransform(rotation_from_vector([0.0, 0.7, 0.0]), np.array([20.0, -3.0, 8.0]))
 """Where the copy stands: another room, turned."""
@@ -103,18 +102,10 @@ def test_where_nearly_all_agree_no_second_pose_is_searched(monkeypatch: pytest.M
 
 
 def test_a_photograph_of_what_is_in_both_of_two_like_rooms() -> None:
-    """Rendered photographs of a corner between painted walls, which stands twice in the world."""
-    random = np.random.default_rng(5)
-    edges = ([2.0, 0, 0], [0.0, -2, 0])
-    walls = [Quad(np.array([x, 2.0, 2]), np.array(e), np.array([0, 0, -2.0]), painting(random, (700, 700)))
-             for x, e in zip((0.0, 2.0), edges, strict=True)]  # fmt: skip
-    surfaces = [Surface.of(wall, wall.texture) for wall in walls]
-    camera = Camera(320, 240, 280.0, 280.0, 160.3, 118.9)
-    poses = [look_at([0.2 + 0.12 * i, 0.1, 1 + 0.08 * (i % 3)], [1.5, 1.6, 1]) for i in range(9)]
+    """Photographs of a corner, which stands twice in the world."""
+    poses = [corner.pose(-16.0 + 4 * i, height_m=-1.6 + 0.1 * (i % 3)) for i in range(9)]
     extractor = make_extractor("sift")
-    views = [
-        extractor.extract(take(surfaces, Station(f"p{i}", camera, pose)).image, camera) for i, pose in enumerate(poses)
-    ]
+    views = [extractor.extract(decode_image(corner.photograph(it), ImageLimits()), corner.CAMERA) for it in poses]
     references = [
         PosedView(f"p{i}", f"scenes/corner/references/p{i}", view, pose)
         for i, (view, pose) in enumerate(zip(views, poses, strict=True))

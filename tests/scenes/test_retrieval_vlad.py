@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from mapless_server.scenes.retrieval.vocabulary import (
     nearest_words,
     shipped,
 )
-from mapless_tools.learn_vocabulary import write
 
 DIGESTS = {"sift": "53ac1a6f", "aliked": "d26d2f4e", "xfeat": "8c987f94"}
 """Of the shipped vocabularies. Another digest makes another name, and all stored descriptors are computed again."""
@@ -125,16 +123,6 @@ class TestVocabularies:
 
     def test_other_kinds_have_none(self) -> None:
         assert shipped("superpoint") is None
-
-    def test_it_is_written_as_it_is_read(self, tmp_path: Path) -> None:
-        vocabulary = shipped("xfeat")
-        assert vocabulary is not None
-        write(tmp_path / FILE, {"xfeat": vocabulary})
-        with np.load(tmp_path / FILE) as arrays:
-            again = Vocabulary(
-                *(arrays[f"xfeat_{part}"].astype(np.float32) for part in ("mean", "projection", "words"))
-            )
-        assert again.digest() == DIGESTS["xfeat"]
 
     def test_learning_finds_planted_clusters(self) -> None:
         """32 far clusters: every word ends in one, and all that are close together share a word."""

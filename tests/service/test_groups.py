@@ -12,6 +12,8 @@ import grpc
 import numpy as np
 import pytest
 from support.compare import assert_pose_close
+from support.corner import photograph
+from support.corner import pose as corner_pose
 from support.images import encode
 from support.servers import CAMERA, PHOTO, Stubs, failure_of, pose, serving
 
@@ -34,48 +36,29 @@ from mapless.geometry import rotation_from_vector
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_tools.child import child_server
-from mapless_tools.demo.raycast import Quad, Surface
-from mapless_tools.demo.room import Photo, Station, look_at, take
-from mapless_tools.demo.textures import painting
 
 CORNER = Camera(320, 240, 280.0, 280.0, 160.3, 118.9)
-WALK = [look_at([0.25 + 0.12 * i, 0.15, 1.02 + 0.01 * i], [1.5, 1.6, 1]) for i in range(4)]
+STANDPOINTS = [corner_pose(-15.0 + 6 * i, height_m=-1.6 + 0.05 * (i % 2)) for i in range(6)]
+WALK = [corner_pose(-10.0 + 5 * i, height_m=-1.58 - 0.01 * i, distance_m=3.3) for i in range(4)]
 BLANK = encode(".png", np.full((240, 320, 3), 90, np.uint8))
 
 
 @pytest.fixture(scope="module")
-def photos() -> list[Photo]:
-    """Six photographs of two painted walls that meet in a corner, and four from a walk."""
-    random = np.random.default_rng(5)
-    walls = [
-        Quad(np.array([0.0, 2, 2]), np.array([2.0, 0, 0]), np.array([0, 0, -2.0]), painting(random, (700, 700))),
-        Quad(np.array([2.0, 2, 2]), np.array([0.0, -2, 0]), np.array([0, 0, -2.0]), painting(random, (700, 700))),
-    ]
-    surfaces = [Surface.of(wall, wall.texture) for wall in walls]
-    poses = [look_at([0.2 + 0.15 * i, 0.1, 1 + 0.05 * (i % 2)], [1.5, 1.6, 1]) for i in range(6)]
-    return [take(surfaces, Station(f"p{i}", CORNER, at)) for i, at in enumerate([*poses, *WALK])]
-
-
-def png(photo: Photo) -> bytes:
-    return encode(".png", np.ascontiguousarray(photo.image[..., ::-1]))
-
-
-@pytest.fixture(scope="module")
-def corner(photos: list[Photo], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
+def corner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
     with (
         child_server(tmp_path_factory.mktemp("corner"), {"--workers": "1"}) as server,
         Client(server.address) as client,
     ):
         client.create_scene("corner")
         client.add_references(
-            "corner", [NewReference(it.name, png(it), CORNER, it.world_from_camera) for it in photos[:6]]
+            "corner", [NewReference(f"p{i}", photograph(it, CORNER), CORNER, it) for i, it in enumerate(STANDPOINTS)]
         )
         yield client
 
 
 @pytest.fixture(scope="module")
-def queries(photos: list[Photo]) -> list[bytes]:
-    return [png(it) for it in photos[6:]]
+def queries() -> list[bytes]:
+    return [photograph(it, CORNER) for it in WALK]
 
 
 WORLD_FROM_RIG = RigidTransform(rotation_from_vector([0.4, 0.2, -1.0]), np.array([0.5, 0.3, 0.9]))

@@ -23,6 +23,7 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from pydantic import SecretStr
+from support.images import encode
 from support.postgres import Cluster as Database
 from support.postgres import require
 from support.servers import CAMERA, PHOTO, localize_request, pose, serving
@@ -47,8 +48,7 @@ from mapless_server.security.tokens import create_token
 from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.store import Store
 from mapless_tools.child import child_server
-from mapless_tools.demo import room
-from mapless_tools.demo.run import Photograph, Place, real_place
+from mapless_tools.demo import Place, room, split_folder
 from mapless_tools.load.requests import photo_request
 
 pytest.importorskip("ray.serve", reason="needs Ray Serve: the extra `ray`")
@@ -104,17 +104,15 @@ def real(cluster: Cluster) -> Cluster:
 
 
 def rendered() -> Place:
-    """A corner of the room that the project renders: six photographs along a walk, two of which are asked for."""
-    _, surfaces = room._lit_room(0)
-    photos = [room.take(surfaces, station) for station in room.walk(0, 16)[:6]]
-    own = [Photograph(it.name, room.jpeg(it.image), it.camera, it.world_from_camera) for it in photos]
+    """A corner of the demo's room: six photographs along a walk, two of which are asked for."""
+    own = room().references[:6]
     return Place("a corner", [own[i] for i in (0, 1, 4, 5)], [own[2], own[3]], metric=True)
 
 
 def photographed() -> Place:
     if not (DATA / "fountain-P11" / "cameras.json").is_file():
         pytest.skip(f"needs real photographs, {DATA} has none")
-    return real_place(DATA / "fountain-P11")
+    return split_folder(DATA / "fountain-P11")
 
 
 def asked(place: Place) -> list[bytes]:
@@ -126,7 +124,7 @@ def asked(place: Place) -> list[bytes]:
         photo_request(first.data, first.camera, names),
         photo_request(first.data, first.camera, ()),
         photo_request(second.data, second.camera, ()),
-        photo_request(room.jpeg(grey), first.camera, ()),
+        photo_request(encode(".jpg", grey), first.camera, ()),
         photo_request(first.data, first.camera, names[:1]),
     ]
 

@@ -25,11 +25,10 @@ from mapless_tools.bench_network import host
 from mapless_tools.bench_network.command import bench_network
 from mapless_tools.bench_network.forward import Forward, max_difference
 from mapless_tools.bench_network.operations import H200, Operations, count_operations
-from mapless_tools.bench_network.planted import UNITS_PER_METRE, PlantedReconstructor, true_points
+from mapless_tools.bench_network.planted import UNITS_PER_METRE, PlantedReconstructor, Truth, true_points
 from mapless_tools.bench_network.report import Figure, markdown, table
 from mapless_tools.bench_network.subject import Work, make_network, operations_of
 from mapless_tools.bench_network.variants import with_low_precision_stream
-from mapless_tools.demo.room import Photo
 
 GRID = (3, 4)
 SIZES = SMALL["pi3"]
@@ -123,34 +122,32 @@ def test_forward_from_kept_tokens_is_the_forward_of_everything() -> None:
     assert 0 < max_difference(low, everything) < 0.3
 
 
-def plane_photo() -> Photo:
+def plane() -> Truth:
     """A tilted plane, 2 m away at the centre."""
     camera = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
     rows, columns = np.indices((72, 96))
     rays = camera.rays(np.stack([columns, rows], axis=-1))
     depth = (2.0 / (1.0 + 0.3 * rays[..., 0] - 0.2 * rays[..., 1])).astype(np.float32)
     pose = references_of([photograph_of(np.zeros((72, 96, 3), np.uint8))])[0].world_from_camera
-    return Photo("plane", np.full((72, 96, 3), 90, np.uint8), camera, pose, depth)
+    return Truth(camera, pose, depth)
 
 
 def test_planted_points_lie_on_the_true_surface() -> None:
-    points = true_points(plane_photo()).astype(float) / UNITS_PER_METRE
+    points = true_points(plane()).astype(float) / UNITS_PER_METRE
     on_plane = points[..., 2] + 0.3 * points[..., 0] - 0.2 * points[..., 1]
     np.testing.assert_allclose(on_plane, 2.0, atol=0.01)  # depth is read at the nearest of coarser pixels
 
 
 @pytest.mark.parametrize("keep_on_device", [True, False])
 def test_planted_reconstruction_is_the_truth_up_to_scale(keep_on_device: bool) -> None:
-    photos = [replace(plane_photo(), name=str(i), image=np.full((72, 96, 3), 40 * i, np.uint8)) for i in range(3)]
-    pictures = [photograph_of(photo.image, photo.camera) for photo in photos]
+    pictures = [photograph_of(np.full((72, 96, 3), 40 * i, np.uint8), plane().camera) for i in range(3)]
     references = references_of(pictures[1:])
-    poses = [photos[0].world_from_camera, *(reference.world_from_camera for reference in references)]
+    poses = [plane().world_from_camera, *(reference.world_from_camera for reference in references)]
     truth = {
-        picture.sha256: replace(photo, world_from_camera=pose)
-        for picture, photo, pose in zip(pictures, photos, poses, strict=True)
+        picture.sha256: replace(plane(), world_from_camera=pose) for picture, pose in zip(pictures, poses, strict=True)
     }
     nothing = Features(np.empty((0, 2), np.float32), np.empty((0, 4), np.float32), np.empty(0, np.float32))
-    query = View(photos[0].camera, nothing, pictures[0])
+    query = View(plane().camera, nothing, pictures[0])
     network = NetworkReconstructor(small_runner("pi3"), NetworkOptions(keep_on_device=keep_on_device))
     outcome = reconstruct_one(PlantedReconstructor(network, truth, torch.device("cpu")), query, references)
     network.close()
@@ -164,7 +161,7 @@ def test_planted_reconstruction_is_the_truth_up_to_scale(keep_on_device: bool) -
         np.testing.assert_allclose(
             view.local_from_camera.translation / UNITS_PER_METRE, expected.translation, atol=1e-6
         )
-    np.testing.assert_array_equal(outcome.references[0].point_map, true_points(photos[1]))
+    np.testing.assert_array_equal(outcome.references[0].point_map, true_points(plane()))
 
 
 def test_table_shows_every_number_beside_its_floor() -> None:

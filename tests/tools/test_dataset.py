@@ -9,7 +9,6 @@ import pytest
 
 from mapless.geometry import Camera, RadialTangential, RigidTransform
 from mapless_tools.dataset import read_folder, reference_id
-from mapless_tools.demo.room import Photo, write_folder
 
 
 def entry(**changed: Any) -> dict[str, Any]:
@@ -31,15 +30,13 @@ def write(folder: Path, *frames: object, **about: object) -> Path:
     return folder
 
 
-def test_reads_what_the_room_writes(tmp_path: Path) -> None:
+def test_a_frame_is_read_as_it_is_written(tmp_path: Path) -> None:
     pose = RigidTransform.from_matrix([[0.0, -1.0, 0.0, 1.5], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.25]])
-    camera = Camera(64, 48, 50.0, 51.0, 31.25, 23.75)
-    image = np.full((48, 64, 3), 128, np.uint8)
-    write_folder(tmp_path, [Photo("one", image, camera, pose, np.ones((48, 64), np.float32))], "a test")
-    dataset = read_folder(tmp_path)
+    dataset = read_folder(write(tmp_path, entry(world_from_camera=pose.matrix().tolist()), source="a test"))
     assert (dataset.metric, dataset.source, dataset.name) == (True, "a test", tmp_path.name)
     (frame,) = dataset.frames
-    assert (frame.name, frame.camera, frame.image_path) == ("one", camera, tmp_path / "images" / "one.jpg")
+    assert frame.camera == Camera(64, 48, 50.0, 51.0, 31.5, 23.5)
+    assert (frame.name, frame.image_path) == ("a", tmp_path / "images" / "a.jpg")
     np.testing.assert_allclose(frame.world_from_camera.matrix(), pose.matrix(), atol=1e-12)
 
 

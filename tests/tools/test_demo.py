@@ -1,5 +1,7 @@
 """The demo without its server: triangulated points, pictures, errors, the verdict."""
 
+import itertools
+import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,35 +13,88 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rich.console import Console
+from support import corner
 
 from mapless import Camera, Client, LocalizationResult, Rejected, RigidTransform
 from mapless.answers import Diagnostics, ReferenceUse
 from mapless.geometry import RadialTangential, rotation_from_vector
 from mapless_tools.child import ChildServer
-from mapless_tools.demo import run
-from mapless_tools.demo.raycast import Quad, Surface
-from mapless_tools.demo.room import Photo, Station, look_at, take, write_folder
-from mapless_tools.demo.sparse import Shot, find_in, points_to_draw, triangulate, undistorted
-from mapless_tools.demo.textures import painting
+from mapless_tools.demo import Photograph, Place, depth_map_m, room, run
+from mapless_tools.demo.photographs import ROOM
+from mapless_tools.demo.structure import Shot, find_in, points_to_draw, triangulate
 
 CAMERA = Camera(320, 240, 280.0, 280.0, 160.3, 118.9)
 
 
+POSES = [corner.pose(-15.0 + 6 * i, height_m=-1.6 + 0.05 * (i % 2)) for i in range(6)]
+
+
 @pytest.fixture(scope="module")
-def photos() -> list[Photo]:
-    """Six photographs of two painted walls that meet in a corner."""
-    random = np.random.default_rng(5)
-    walls = [
-        Quad(np.array([0.0, 2, 2]), np.array([2.0, 0, 0]), np.array([0, 0, -2.0]), painting(random, (700, 700))),
-        Quad(np.array([2.0, 2, 2]), np.array([0.0, -2, 0]), np.array([0, 0, -2.0]), painting(random, (700, 700))),
-    ]
-    surfaces = [Surface.of(wall, wall.texture) for wall in walls]
-    poses = [look_at([0.2 + 0.15 * i, 0.1, 1 + 0.05 * (i % 2)], [1.5, 1.6, 1]) for i in range(6)]
-    return [take(surfaces, Station(f"p{i}", CAMERA, pose)) for i, pose in enumerate(poses)]
+def photos() -> list[Photograph]:
+    """Six photographs of a corner between papered walls."""
+    return [Photograph(f"p{i}", corner.photograph(it, CAMERA), CAMERA, it) for i, it in enumerate(POSES)]
 
 
-def shot(photo: Photo) -> Shot:
-    return Shot(photo.name, photo.image, photo.camera, photo.world_from_camera)
+@pytest.fixture(scope="module")
+def place() -> Place:
+    return room()
+
+
+def shot(photo: Photograph) -> Shot:
+    return Shot.of(photo, 960)
+
+
+# The room's photographs
+
+
+def test_the_room_has_16_references_and_8_queries_in_6_mb(place: Place) -> None:
+    assert (len(place.references), len(place.queries)) == (16, 8)
+    assert place.outline is not None
+    assert set(place.outline.visible_edges) == {it.name for it in place.queries}
+    assert sum(path.stat().st_size for path in ROOM.rglob("*") if path.is_file()) < 6e6
+
+
+def test_depth_maps_of_neighbours_agree(place: Place) -> None:
+    """A point of one photograph lies on the surface that the next one sees there, unless something hides it."""
+    for a, b in itertools.pairwise(place.references):
+        camera_a, camera_b = (it.camera.resized(240, 180) for it in (a, b))
+        rows, columns = np.indices((180, 240))
+        in_a = camera_a.rays(np.stack([columns, rows], axis=-1)) * depth_map_m(a.name)[..., None]
+        in_b = b.world_from_camera.inverse().apply(a.world_from_camera.apply(in_a.reshape(-1, 3)))
+        pixels = camera_b.project(in_b)
+        inside = ((pixels >= 0) & (pixels <= [239, 179])).all(axis=-1)
+        column, row = np.rint(pixels[inside]).astype(int).T
+        offset_m = in_b[inside, 2] - depth_map_m(b.name)[row, column]
+        assert (offset_m < 0.02).mean() > 0.5
+        assert np.median(np.abs(offset_m[offset_m < 0.02])) < 0.005
+
+
+def test_photographs_show_triangulated_points_in_place(place: Place) -> None:
+    """Half a pixel would be seen: points from references, recognized in queries, beside where true poses put them."""
+    offsets = []
+    points = points_to_draw([shot(it) for it in place.references[9:12]])
+    for query in map(shot, place.queries[5:]):
+        indices, pixels = find_in(points, query, 20)
+        offsets.append(pixels - query.project(points.x_in_world[indices]))
+    together = np.concatenate(offsets)
+    assert len(together) > 200
+    assert np.abs(np.median(together, axis=0)).max() < 0.1
+    assert np.median(np.linalg.norm(together, axis=-1)) < 0.6
+
+
+@pytest.mark.nightly
+def test_the_script_renders_the_photographs_that_are_here(place: Place) -> None:
+    from research.rendered_room.photographs import lit_room, photograph, walk
+
+    _, surfaces = lit_room(0)
+    station = walk(0, 16)[5]
+    expected = Shot.of(place.references[5], 960)
+    np.testing.assert_allclose(station.world_from_camera.matrix(), expected.world_from_camera.matrix(), atol=1e-12)
+    difference = photograph(surfaces, station, 0).astype(float) - expected.image
+    assert np.sqrt(np.mean(difference**2)) < 6  # the compression of a noisy picture
+
+
+# Structure that is drawn
 
 
 def test_triangulation_finds_planted_points() -> None:
@@ -51,17 +106,14 @@ def test_triangulation_finds_planted_points() -> None:
     poses = [RigidTransform.identity(), RigidTransform(rotation_from_vector([0.02, -0.1, 0]), np.array([0.5, 0.1, 0]))]
     a, b = (Shot("", blank, camera, pose) for pose in poses)
     pixels = [camera.project(pose.inverse().apply(x)) for pose in poses]
-    np.testing.assert_allclose(
-        undistorted(camera, pixels[0]), camera.pinhole().project(x), atol=0.05, err_msg="OpenCV inverts the lens"
-    )
     found, parallax_deg = triangulate(a, b, *pixels)
     np.testing.assert_allclose(found, x, atol=2e-3)
     assert (parallax_deg > 3).all()
 
 
-def test_drawn_points_lie_on_the_walls_and_are_found_again(photos: list[Photo]) -> None:
+def test_drawn_points_lie_on_walls_and_are_recognized(photos: list[Photograph]) -> None:
     points = points_to_draw([shot(photo) for photo in photos[:3]])
-    off_wall = np.abs(points.x_in_world[:, :2] - 2).min(axis=-1)
+    off_wall = np.abs(points.x_in_world).min(axis=-1)
     assert len(off_wall) > 50
     assert np.median(off_wall) < 0.02
     indices, pixels = find_in(points, shot(photos[4]), 20)
@@ -95,10 +147,17 @@ class FakeClient(Client):
 
 
 @pytest.fixture
-def folder(photos: list[Photo], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    write_folder(tmp_path / "walls", photos, "a test")
-    files = {photo.name: (tmp_path / "walls" / "images" / f"{photo.name}.jpg").read_bytes() for photo in photos}
-    FakeClient.truth = {files[photo.name]: (photo.name, photo.world_from_camera) for photo in photos}
+def folder(photos: list[Photograph], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    images = {f"images/{it.name}.png": (it.data, it.camera, it.world_from_camera) for it in photos}
+    frames = []
+    for name, (data, camera, at) in images.items():
+        file = tmp_path / "walls" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(data)
+        size = {"width": camera.width_px, "height": camera.height_px, "K": camera.matrix().tolist()}
+        frames.append({"image": name, **size, "world_from_camera": at.matrix().tolist()})
+    (tmp_path / "walls" / "cameras.json").write_text(json.dumps({"frames": frames}))
+    FakeClient.truth = {it.data: (it.name, it.world_from_camera) for it in photos}
 
     @contextmanager
     def no_server(data_dir: Path) -> Iterator[ChildServer]:
@@ -139,11 +198,9 @@ def test_half_of_a_folder_is_too_little(folder: Path, tmp_path: Path, monkeypatc
 
 
 @pytest.mark.parametrize(("offset_m", "good"), [(0.029, True), (0.031, False), (math.inf, False)])
-def test_the_rendered_room_must_reach_its_limits(photos: list[Photo], offset_m: float, good: bool) -> None:
-    queries = [run.Photograph(p.name, b"", p.camera, p.world_from_camera) for p in photos]
-    place = run.Place("", [], queries, metric=True, seed=0)
+def test_the_room_must_reach_its_limits(place: Place, offset_m: float, good: bool) -> None:
     client = FakeClient("127.0.0.1:1")
-    client.offset_m, client.stored, client.truth = offset_m, [], {b"": ("x", queries[0].world_from_camera)}
+    client.offset_m, client.stored, client.truth = offset_m, [], {b"": ("x", place.queries[0].world_from_camera)}
     client.rejected = () if math.isfinite(offset_m) else ("x",)
-    outcomes = [run.judge(queries[0], client.localize(b"", CAMERA, "demo"))]
+    outcomes = [run.judge(place.queries[0], client.localize(b"", CAMERA, "demo"))]
     assert run.summarize(Console(quiet=True), place, outcomes) == good

@@ -146,7 +146,7 @@ class _Bench:
 
         options = query.QueryOptions(compile_backend=self._backend, query_count=2 if self.quick else 8)
         tier, note = query.make_tier(options.features, self.device)
-        room = query.render(options)
+        room = query.photographs(options.query_count)
         bench = query.Bench(room, tier)
         runner = query.make_runner(make_network(name, device=self.device), name, self.device, self._backend)
         for on_device in (True, False):

@@ -7,13 +7,13 @@ that it would, and instead of its output the rendered room's true depths and pos
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, RigidTransform
+from mapless.geometry import Array, Camera, RigidTransform
 from mapless_server.method.coarse import Bucket, Outcome, Request
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.grids import GridOptions, common_grid, lay_out
@@ -21,10 +21,18 @@ from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.reconstruction import ReconstructedView, Reconstruction
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.views import PosedView, View
-from mapless_tools.demo.room import Photo
 
 UNITS_PER_METRE = 0.3
 """Of the planted reconstruction, so that there is a scale to find."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """A photograph's camera and pose, and its depths in metres (h, w), of the camera resized to that."""
+
+    camera: Camera
+    world_from_camera: RigidTransform
+    depth_m: NDArray[np.float32]
 
 
 class PlantedReconstructor:
@@ -36,11 +44,11 @@ class PlantedReconstructor:
 
     uses_correspondences = False
 
-    def __init__(self, network: NetworkReconstructor, photos: Mapping[str, Photo], device: torch.device) -> None:
-        """`photos` are the views' by the SHA-256 of their images; their truth lies on the device beforehand."""
+    def __init__(self, network: NetworkReconstructor, truths: Mapping[str, Truth], device: torch.device) -> None:
+        """`truths` are the views' by the SHA-256 of their images; they lie on the device beforehand."""
         self.network = network
-        self._photos = photos
-        self._maps = {sha256: torch.from_numpy(true_points(photo)).to(device) for sha256, photo in photos.items()}
+        self._truths = truths
+        self._maps = {sha256: torch.from_numpy(true_points(truth)).to(device) for sha256, truth in truths.items()}
 
     @property
     def name(self) -> str:
@@ -90,22 +98,22 @@ class PlantedReconstructor:
 
     def _local_pose(self, key: str, anchor: str) -> Array:
         """(4, 4) in the planted frame, which is the first reference's camera."""
-        local_from_world = self._photos[anchor].world_from_camera.inverse()
-        pose = local_from_world.compose(self._photos[key].world_from_camera).matrix()
+        local_from_world = self._truths[anchor].world_from_camera.inverse()
+        pose = local_from_world.compose(self._truths[key].world_from_camera).matrix()
         pose[:3, 3] *= UNITS_PER_METRE
         return pose
 
 
-def true_points(photo: Photo) -> NDArray[np.float32]:
+def true_points(truth: Truth) -> NDArray[np.float32]:
     """(H, W, 3) what the pixels of the network's picture see, in the camera's frame, planted units."""
     options = GridOptions()
-    camera = lay_out(photo.camera, common_grid([photo.camera], options), options).camera
+    camera = lay_out(truth.camera, common_grid([truth.camera], options), options).camera
     rows, columns = np.indices((camera.height_px, camera.width_px))
     rays = camera.rays(np.stack([columns, rows], axis=-1))
-    pixels = np.rint(photo.camera.project(rays)).astype(int)
-    limits = (photo.camera.width_px - 1, photo.camera.height_px - 1)
-    column, row = np.moveaxis(np.clip(pixels, 0, limits), -1, 0)
-    points = rays / rays[..., 2:] * photo.depth_m[row, column][..., None]
+    height, width = truth.depth_m.shape
+    pixels = np.rint(truth.camera.resized(width, height).project(rays)).astype(int)
+    column, row = np.moveaxis(np.clip(pixels, 0, (width - 1, height - 1)), -1, 0)
+    points = rays / rays[..., 2:] * truth.depth_m[row, column][..., None]
     return np.ascontiguousarray(UNITS_PER_METRE * points, np.float32)
 
 

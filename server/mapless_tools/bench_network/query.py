@@ -30,10 +30,11 @@ from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions
 from mapless_server.networks.weights import WeightsError
 from mapless_server.serve.assembly import make_tiers
 from mapless_server.settings import load_settings
-from mapless_tools.demo.room import Photo, jpeg, render_room
+from mapless_tools.demo import Photograph as Picture
+from mapless_tools.demo import depth_map_m, room
 
 from .operations import compiled_graphs
-from .planted import PlantedReconstructor
+from .planted import PlantedReconstructor, Truth
 from .report import Figure
 from .subject import GRID, REFERENCES
 
@@ -51,33 +52,29 @@ class QueryOptions:
         compile_backend: see RunnerOptions.
         query_count: different photographs.
         rounds: how often each is localized in one measurement.
-        reference_count: stored; the nearest ten are used.
     """
 
     features: str = "aliked"
     compile_backend: str | None = "inductor"
     query_count: int = 8
     rounds: int = 3
-    reference_count: int = 16
 
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """The rendered room: photographs and encoded images by the SHA-256 of these."""
+    """Photographs of the demo's room by the SHA-256 of their data."""
 
-    references: dict[str, Photo]
-    queries: dict[str, Photo]
-    data: dict[str, bytes]
+    references: dict[str, Picture]
+    queries: dict[str, Picture]
 
 
-def render(options: QueryOptions) -> Room:
-    """Renders and encodes all photographs."""
-    photos = render_room(0, options.reference_count, options.query_count)
-    encoded = [[(jpeg(photo.image), photo) for photo in some] for some in photos]
-    named = [{hashlib.sha256(data).hexdigest(): photo for data, photo in some} for some in encoded]
-    images = {hashlib.sha256(data).hexdigest(): data for some in encoded for data, _ in some}
-    references, queries = named
-    return Room(references, queries, images)
+def photographs(query_count: int) -> Room:
+    """All references, and some queries."""
+    place = room()
+    references, queries = (
+        {hashlib.sha256(it.data).hexdigest(): it for it in some} for some in (place.references, place.queries)
+    )
+    return Room(references, dict(list(queries.items())[:query_count]))
 
 
 def make_tier(features: str, device: torch.device) -> tuple[Tier, str]:
@@ -101,14 +98,14 @@ class Bench:
         self.tier = tier
         self._stored = {key: self._store(key, photo, tier.extractor) for key, photo in room.references.items()}
 
-    def _store(self, key: str, photo: Photo, extractor: FeatureExtractor) -> PosedView:
-        pixels = decode_image(self.room.data[key], ImageLimits())
+    def _store(self, key: str, photo: Picture, extractor: FeatureExtractor) -> PosedView:
+        pixels = decode_image(photo.data, ImageLimits())
         view = replace(
             extractor.extract(pixels, photo.camera), photograph=Photograph(key, photo.camera, lambda: pixels)
         )
         return PosedView(key, photo.name, view, photo.world_from_camera)
 
-    def nearest(self, photo: Photo) -> list[PosedView]:
+    def nearest(self, photo: Picture) -> list[PosedView]:
         """The ten references whose cameras stand the nearest."""
         centre = photo.world_from_camera.translation
 
@@ -121,7 +118,7 @@ class Bench:
         """One query; its answer, and the seconds of each stage and of all ("total")."""
         photo, stages = self.room.queries[key], {}
         start_s = time.perf_counter()
-        pixels = decode_image(self.room.data[key], ImageLimits())
+        pixels = decode_image(photo.data, ImageLimits())
         stages["decode"] = time.perf_counter() - start_s
         view = self.tier.extractor.extract(pixels, photo.camera)
         stages["features"] = time.perf_counter() - start_s - stages["decode"]
@@ -145,8 +142,11 @@ def measure_queries(
     features = bench.tier.extractor.name.split("-")[0]
     part = f"{runner.name} query, {features}, K = {REFERENCES}, stages after the network on the {where}"
     network = NetworkReconstructor(runner, NetworkOptions(keep_on_device=keep_on_device))
-    photos = {**bench.room.references, **bench.room.queries}
-    planted = Pipeline(PlantedReconstructor(network, photos, runner.device), bench.tier.pipeline.matcher)
+    truths = {
+        key: Truth(photo.camera, photo.world_from_camera, depth_map_m(photo.name))
+        for key, photo in (bench.room.references | bench.room.queries).items()
+    }
+    planted = Pipeline(PlantedReconstructor(network, truths, runner.device), bench.tier.pipeline.matcher)
     _runs(bench, planted, 1)  # fills caches
     graphs = compiled_graphs()
     runs, again = (_runs(bench, planted, options.rounds) for _ in range(2))

@@ -14,7 +14,7 @@ from mapless_server.settings import ConfigError, load_settings
 
 def demo_command(
     data: Annotated[
-        Path | None, typer.Option(help="Folder with images/ and cameras.json; default: a room rendered on the spot.")
+        Path | None, typer.Option(help="Folder with images/ and cameras.json; default: mapless's own room.")
     ] = None,
     output: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("demo-output"),
 ) -> None:

@@ -7,7 +7,7 @@ structure, below the numbers and a plan of the place.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from .sparse import Shot, SparsePoints, find_in
+from .structure import Shot, SparsePoints, find_in
 
 Canvas = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -41,12 +41,12 @@ class Scenery:
     Attributes:
         points: triangulated from references.
         outline: (E, 2, 3) edges, world; none for a real place.
-        visible_outline: (S, 2, 3) the pieces of edges that are not hidden, seen with the pose to be judged.
+        visible_outline: (S, 2, 3) the parts of edges that nothing hides from the photograph.
     """
 
     points: SparsePoints
-    outline: Array
-    visible_outline: Array
+    outline: Array = field(default_factory=lambda: np.empty((0, 2, 3)))
+    visible_outline: Array = field(default_factory=lambda: np.empty((0, 2, 3)))
 
 
 def draw(

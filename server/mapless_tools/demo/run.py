@@ -4,30 +4,24 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from mapless import Camera, Client, LocalizationResult, NewReference, Rejected, RigidTransform
-from mapless.geometry import Array, rotation_angle_deg
+from mapless import Client, LocalizationResult, NewReference, Rejected
+from mapless.geometry import rotation_angle_deg
 from mapless_tools.child import child_server
-from mapless_tools.dataset import Frame, read_folder
 
-from . import picture, room
-from .sparse import Shot, points_to_draw
+from . import picture
+from .photographs import Photograph, Place, place_of
+from .structure import Shot, points_to_draw
 
 SCENE = "demo"
-SEED = 0
-MAX_FRAMES = 60
-"""Of a longer real sequence so many frames are used, evenly spread: enough to judge, and a minute to run."""
-QUERY_EVERY = 3
 DRAWN_PX = 960
 """Longer side of the photographs that are drawn."""
 DRAWN_REFERENCES = 3
@@ -35,34 +29,6 @@ DRAWN_REFERENCES = 3
 MAX_MEDIAN_ERROR_M = 0.03
 MAX_MEDIAN_ERROR_DEG = 1.0
 """What the rendered room must reach for the demo to succeed."""
-
-
-@dataclass(frozen=True, eq=False)
-class Photograph:
-    """A photograph with its true pose, as it goes over the wire."""
-
-    name: str
-    data: bytes
-    camera: Camera
-    world_from_camera: RigidTransform
-
-
-@dataclass(frozen=True)
-class Place:
-    """What the demo runs on.
-
-    Attributes:
-        title: for the person who watches.
-        references, queries: apart from one another.
-        metric: whether lengths are metres.
-        seed: of the rendered room; None for real photographs.
-    """
-
-    title: str
-    references: Sequence[Photograph]
-    queries: Sequence[Photograph]
-    metric: bool
-    seed: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +59,7 @@ def run_demo(data: Path | None, output: Path, console: Console | None = None) ->
         MaplessError: a call failed.
     """
     console = console or Console()
-    with console.status("preparing photographs"):
-        place = rendered_place(SEED) if data is None else real_place(data)
+    place = place_of(data)
     console.print(f"[bold]{place.title}[/]: {len(place.references)} references, {len(place.queries)} queries")
     if not place.metric:
         console.print("This folder is not metric: errors are in hundredths of its own unit of length, not in cm.")
@@ -122,31 +87,6 @@ def run_demo(data: Path | None, output: Path, console: Console | None = None) ->
         paths = write_pictures(place, outcomes, output)
     console.print(f"pictures: {paths[0]} and {len(paths) - 1} beside it")
     return good
-
-
-def rendered_place(seed: int) -> Place:
-    """The room that the project renders itself."""
-    references, queries = (
-        [Photograph(photo.name, room.jpeg(photo.image), photo.camera, photo.world_from_camera) for photo in photos]
-        for photos in room.render_room(seed)
-    )
-    return Place("a room rendered from nothing but code", references, queries, metric=True, seed=seed)
-
-
-def real_place(path: Path) -> Place:
-    """A folder of real photographs: every third frame is a query, the others are references."""
-    dataset = read_folder(path)
-    chosen = np.unique(
-        np.linspace(0, len(dataset.frames) - 1, min(len(dataset.frames), MAX_FRAMES)).round().astype(int)
-    )
-    frames = [dataset.frames[i] for i in chosen]
-    is_query = [i % QUERY_EVERY == QUERY_EVERY // 2 for i in range(len(frames))]
-    title = f"{dataset.name}, every {QUERY_EVERY}rd frame a query"
-    if len(frames) < len(dataset.frames):
-        title += f", {len(frames)} of {len(dataset.frames)} frames used"
-    references = [_read(frame) for frame, query in zip(frames, is_query, strict=True) if not query]
-    queries = [_read(frame) for frame, query in zip(frames, is_query, strict=True) if query]
-    return Place(title, references, queries, dataset.metric)
 
 
 def judge(query: Photograph, answer: LocalizationResult | Rejected) -> Outcome:
@@ -192,7 +132,7 @@ def summarize(console: Console, place: Place, outcomes: Sequence[Outcome]) -> bo
         f"{len(localized)} of {len(outcomes)} localized; median error over all "
         f"[bold]{100 * translation:.2f} {unit}, {rotation_deg:.3f} deg[/]"
     )
-    if place.seed is None:
+    if place.outline is None:
         good = 2 * len(localized) > len(outcomes)
         if not good:
             console.print("[red]expected: more than half localized[/]")
@@ -208,7 +148,7 @@ def summarize(console: Console, place: Place, outcomes: Sequence[Outcome]) -> bo
 def write_pictures(place: Place, outcomes: Sequence[Outcome], output: Path) -> list[Path]:
     """One picture a query, and first a sheet of all."""
     output.mkdir(parents=True, exist_ok=True)
-    shots = {photo.name: _shot(photo) for photo in place.references}
+    shots = {photo.name: Shot.of(photo, DRAWN_PX) for photo in place.references}
     pictures = [_picture(place, outcome, shots) for outcome in outcomes]
     paths = [output / "all.png", *(output / f"{outcome.query.name}.png" for outcome in outcomes)]
     for path, image in zip(paths, [picture.contact_sheet(pictures), *pictures], strict=True):
@@ -216,18 +156,16 @@ def write_pictures(place: Place, outcomes: Sequence[Outcome], output: Path) -> l
     return paths
 
 
-def _picture(place: Place, outcome: Outcome, shots: dict[str, Shot]) -> NDArray[np.uint8]:
-    answer, query = outcome.answer, _shot(outcome.query)
+def _picture(place: Place, outcome: Outcome, shots: Mapping[str, Shot]) -> picture.Canvas:
+    answer = outcome.answer
     uses = sorted(answer.diagnostics.references, key=lambda use: (-use.inlier_count, -use.match_count))
     used = [shots[use.name.rsplit("/", 1)[-1]] for use in uses] or list(shots.values())
+    scenery = picture.Scenery(points_to_draw(used[:DRAWN_REFERENCES]))
+    if place.outline is not None:
+        visible = place.outline.visible_edges[outcome.query.name]
+        scenery = picture.Scenery(scenery.points, place.outline.edges, visible)
+    query = Shot.of(outcome.query, DRAWN_PX)
     found = answer.world_from_camera if isinstance(answer, LocalizationResult) else None
-    outline: Array = np.zeros((0, 2, 3))
-    visible: Array = outline
-    if place.seed is not None:
-        outline = room.room_outline(place.seed)
-        if found is not None:
-            visible = room.visible_outline(place.seed, query.camera, found)
-    scenery = picture.Scenery(points_to_draw(used[:DRAWN_REFERENCES]), outline, visible)
     return picture.draw(query, found, used[0], list(shots.values()), scenery, _caption(outcome, place.metric))
 
 
@@ -246,19 +184,3 @@ def _caption(outcome: Outcome, metric: bool) -> list[str]:
             f"{100 * accuracy.position_95_m:.2f} {unit} (95 %)"
         )
     return lines
-
-
-def _read(frame: Frame) -> Photograph:
-    return Photograph(frame.name, frame.image_path.read_bytes(), frame.camera, frame.world_from_camera)
-
-
-def _shot(photo: Photograph) -> Shot:
-    """Decoded for drawing, not larger than needed; like the server, blind to EXIF orientation."""
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    bgr = cv2.imdecode(np.frombuffer(photo.data, np.uint8), flags)
-    if bgr is None:
-        raise ValueError(f"{photo.name} is not an image that can be read")
-    scale = min(1.0, DRAWN_PX / max(bgr.shape[:2]))
-    size = (round(bgr.shape[1] * scale), round(bgr.shape[0] * scale))
-    image = np.ascontiguousarray(cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)[..., ::-1])
-    return Shot(photo.name, image.astype(np.uint8), photo.camera.resized(*size), photo.world_from_camera)

@@ -24,7 +24,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1 import reference_service_pb2_grpc as reference_rpcs
-from mapless_tools.demo.run import Photograph, Place
+from mapless_tools.demo import Photograph, Place
 
 from .requests import SCENE
 from .sender import MAX_MESSAGE_BYTES

@@ -22,9 +22,7 @@ load_app = typer.Typer(
     no_args_is_help=True,
 )
 
-Data = Annotated[
-    Path | None, typer.Option(help="Folder with images/ and cameras.json; default: a room rendered on the spot.")
-]
+Data = Annotated[Path | None, typer.Option(help="Folder with images/ and cameras.json; default: mapless's own room.")]
 Output = Annotated[Path, typer.Option(help="Folder for the picture and the figures.")]
 Quick = Annotated[bool, typer.Option(help="Seconds instead of minutes: to see that it runs. Not for figures.")]
 Deadline = Annotated[float, typer.Option(help="Deadline of every call, seconds.")]
@@ -95,12 +93,12 @@ def _overhead(quick: bool, output: Path) -> list[Check]:
 def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
     from mapless_server.settings import available_cores
     from mapless_tools.charts import write_figure
+    from mapless_tools.demo import place_of
     from mapless_tools.evaluate.command import usage_errors
 
     from .charts import draw_load
     from .pipeline import PipelineOptions, measure_pipeline, pipeline_checks, pipeline_json
     from .report import machine_lines, step_lines
-    from .requests import place_of
 
     brief = {"unloaded_s": 4.0, "ramp_s": 4.0, "step_s": 6.0, "settle_s": 1.0} if quick else {}
     with _measuring() as progress:
@@ -119,11 +117,11 @@ def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> lis
 def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
     from mapless_server.settings import available_cores
     from mapless_tools.charts import write_figure
+    from mapless_tools.demo import place_of
     from mapless_tools.evaluate.command import usage_errors
 
     from .charts import draw_soak
     from .report import machine_lines, step_lines
-    from .requests import place_of
     from .soak import SoakOptions, least_minutes, measure_soak, soak_checks, soak_json, soak_lines
 
     brief = {"minutes": 0.25, "ramp_s": 4.0, "sample_every_s": 0.5, "churn": 4.0} if quick else {}

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mapless import Client
 from mapless_tools.child import child_server
-from mapless_tools.demo.run import Place
+from mapless_tools.demo import Place
 from mapless_tools.evaluate.run import CONNECT
 from mapless_tools.progress import Progress
 

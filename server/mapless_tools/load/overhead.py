@@ -12,7 +12,7 @@ from typing import Any
 
 from mapless import Client, RigidTransform
 from mapless_tools.child import ChildServer, child_module
-from mapless_tools.demo.run import Photograph
+from mapless_tools.demo import Photograph
 from mapless_tools.progress import Progress
 
 from . import no_op

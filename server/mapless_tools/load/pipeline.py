@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mapless_server.settings import available_cores
-from mapless_tools.demo.run import Place
+from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
 
 from .driving import LoadedServer, calling, closed_step, find_saturation, open_step, server_with_scene

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,21 +11,12 @@ from mapless import Client, NewReference, wire
 from mapless.geometry import Camera
 from mapless.names import reference_name, scene_name
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_tools.demo.run import Photograph, Place, real_place, rendered_place
+from mapless_tools.demo import Photograph
 
 from .arrivals import Requests
 
 SCENE = "load"
 METHOD = "/mapless.v1.LocalizationService/Localize"
-
-
-def place_of(data: Path | None, seed: int = 0) -> Place:
-    """References and queries from a folder with `images/` and `cameras.json`; None for the rendered room.
-
-    Raises:
-        ValueError: the folder is malformed.
-    """
-    return rendered_place(seed) if data is None else real_place(data)
 
 
 def store_references(client: Client, references: Sequence[Photograph]) -> None:

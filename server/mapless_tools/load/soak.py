@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mapless_tools.demo.run import Place
+from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
 
 from .arrivals import Mix

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from mapless_server.serve.signals import terminable
+from mapless_tools.demo import place_of
 from mapless_tools.load.report import Check, check_lines, machine, update_json
-from mapless_tools.load.requests import place_of
 from mapless_tools.progress import Progress, progress_bars
 
 from .cluster import ClusterFailed
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m mapless_tools.load_ray", description=__doc__)
     parser.add_argument("part", choices=[*PARTS, "all"])
     parser.add_argument("--count", type=int, help=f"kills or redeploys; default: {KILLS} and {REDEPLOYS}")
-    parser.add_argument("--data", type=Path, help="folder with images/ and cameras.json; default: a rendered room")
+    parser.add_argument("--data", type=Path, help="folder with images/ and cameras.json; default: the demo's room")
     parser.add_argument("--quick", action="store_true", help="to see that it runs; not for figures")
     parser.add_argument("--output", type=Path, default=Path("load-output"), help="folder for the figures")
     given = parser.parse_args(arguments)

@@ -12,7 +12,7 @@ from statistics import median
 from typing import Any
 
 from mapless import Client
-from mapless_tools.demo.run import Place
+from mapless_tools.demo import Place
 from mapless_tools.load.records import Fate
 from mapless_tools.load.report import Check
 from mapless_tools.load.requests import METHOD, read_answer, requests_for, store_references

@@ -1,4 +1,6 @@
-"""How the shipped vocabularies were made: `python -m mapless_tools.learn_vocabulary`, ten minutes on a CPU core.
+"""How the shipped vocabularies were made, in ten minutes on a CPU core.
+
+    PYTHONPATH=client:server python -m research.learn_vocabulary --weights-dir FOLDER --output FILE
 
 Rooms are furnished, textured and lit from random numbers, and photographed from anywhere in them with a camera that
 errs in exposure and colour, blurs and has noise. From the features of these photographs the vocabularies are learned.
@@ -9,15 +11,20 @@ algebra may differ; descriptors are named after the very numbers, so another fil
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mapless_server.method.features import FeatureExtractor, make_extractor
+from mapless.geometry import Camera
+from mapless_server.method.features import make_extractor
 from mapless_server.networks.weights import find_weights
-from mapless_server.scenes.retrieval.vocabulary import FILE, LEARNED, Floats, Vocabulary, learned
-from mapless_tools.demo.room import Photo, render_room
+from mapless_server.scenes.retrieval.vocabulary import LEARNED, Vocabulary, learned
+
+from .rendered_room.photographs import lit_room, photograph, scatter
+
+View = tuple[NDArray[np.uint8], Camera]
 
 ROOMS = range(100, 110)
 PHOTOGRAPHS = 14
@@ -34,7 +41,7 @@ def main() -> None:
     """Learns and writes the file."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--weights-dir", type=Path, required=True, help="where the features' weights are")
-    parser.add_argument("--output", type=Path, default=Path(__file__).with_name(FILE))
+    parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
     photographs = list(rendered())
     vocabularies = {kind: of_kind(kind, photographs, arguments.weights_dir) for kind in LEARNED}
@@ -43,17 +50,19 @@ def main() -> None:
         print(f"{kind}: {vocabulary.digest()}")
 
 
-def rendered() -> Iterator[Photo]:
+def rendered() -> Iterator[View]:
     """Photographs of the rooms."""
     for seed in ROOMS:
-        yield from render_room(seed, 0, PHOTOGRAPHS)[1]
+        room, surfaces = lit_room(seed)
+        for station in scatter(seed, PHOTOGRAPHS, room):
+            yield photograph(surfaces, station, seed), station.camera
         print(f"room {seed}: {PHOTOGRAPHS} photographs", flush=True)
 
 
-def of_kind(kind: str, photographs: list[Photo], weights_dir: Path) -> Vocabulary:
+def of_kind(kind: str, photographs: Sequence[View], weights_dir: Path) -> Vocabulary:
     """The vocabulary of a kind of features."""
     extractor = make_extractor(kind, None if kind == "sift" else find_weights(kind, weights_dir))
-    descriptors = np.concatenate([_descriptors(extractor, photo) for photo in photographs[:: EVERY[kind]]])
+    descriptors = np.concatenate([extractor.extract(*it).features.descriptors for it in photographs[:: EVERY[kind]]])
     print(f"{kind}: {len(descriptors)} features", flush=True)
     drawn = np.random.default_rng(0).choice(len(descriptors), min(DESCRIPTORS, len(descriptors)), replace=False)
     return learned(descriptors[np.sort(drawn)])
@@ -67,10 +76,6 @@ def write(path: Path, vocabularies: dict[str, Vocabulary]) -> None:
         for part in ("mean", "projection", "words")
     }
     np.savez_compressed(path, allow_pickle=False, **parts)
-
-
-def _descriptors(extractor: FeatureExtractor, photo: Photo) -> Floats:
-    return extractor.extract(photo.image, photo.camera).features.descriptors
 
 
 if __name__ == "__main__":
