@@ -12,27 +12,28 @@ from support.planted import NOISE, disturbed, stages, true_correspondences, true
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.method.adjust import AdjustOptions, _pose_problem, _Problem, _State, adjust_pose
+from mapless_server.method.adjust import AdjustOptions, adjust_pose, pose_problem
+from mapless_server.method.bundle import Bundle, BundleProblem
 from mapless_server.method.match import PointMatches
 from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
 
 
-def problem_of(case: str, moved: float = 0.0) -> tuple[_Problem, _State]:
+def problem_of(case: str, moved: float = 0.0) -> tuple[BundleProblem, Bundle]:
     """A small problem, at its start or after random motions of about so much."""
     scene = make_scene(random_for(case), SceneOptions(point_count=25, reference_count=3))
     structure, matches = true_structure(scene, NOISE)
     used = np.arange(len(matches))
-    problem, state = _pose_problem(
+    problem, state = pose_problem(
         scene.query, scene.references, structure, matches, used, scene.world_from_query, AdjustOptions()
     )
     random = random_for(case, "moved")
-    motion = random.normal(0, moved, (len(state.rotation), 6))
+    motion = random.normal(0, moved, (len(state.poses.rotation), 6))
     return problem, state.moved(motion, random.normal(0, moved, state.points.shape))
 
 
-def from_vector(state: _State, vector: Array) -> _State:
+def from_vector(state: Bundle, vector: Array) -> Bundle:
     """The state after the motions and steps in one vector."""
-    split = 6 * len(state.rotation)
+    split = 6 * len(state.poses.rotation)
     return state.moved(vector[:split].reshape(-1, 6), vector[split:].reshape(-1, 3))
 
 
@@ -60,22 +61,22 @@ def test_the_gradient_is_that_of_the_cost(moved: float, tolerance: float) -> Non
     )
 
 
-def dense_system(problem: _Problem, state: _State) -> tuple[Array, Array]:
+def dense_system(problem: BundleProblem, state: Bundle) -> tuple[Array, Array]:
     """The whole matrix and gradient of the normal equations, from derivatives by differences."""
-    observations, options = problem.at(state), problem.options
-    size = 6 * len(state.rotation) + 3 * len(state.points)
+    observations = problem.at(state)
+    size = 6 * len(state.poses.rotation) + 3 * len(state.points)
     step = 1e-6
     columns = []
     for axis in np.eye(size):
         ahead, behind = from_vector(state, step * axis), from_vector(state, -step * axis)
         there, back = problem.at(ahead).residuals(ahead.points), problem.at(behind).residuals(behind.points)
-        prior = problem.prior_error(ahead) - problem.prior_error(behind)
+        prior = problem.reference_motion(ahead) - problem.reference_motion(behind)
         columns.append(np.concatenate([(there - back).ravel(), prior.ravel()]) / (2 * step))
     jacobian = np.stack(columns, axis=1)
     residual = observations.residuals(state.points)
-    weight = 1 / (1 + (residual**2).sum(axis=1) / options.loss_scale_sigma**2)
+    weight = 1 / (1 + (residual**2).sum(axis=1) / problem.loss_scale_sigma**2)
     weights = np.concatenate([np.repeat(weight, 2), problem.information.ravel()])
-    errors = np.concatenate([residual.ravel(), problem.prior_error(state).ravel()])
+    errors = np.concatenate([residual.ravel(), problem.reference_motion(state).ravel()])
     return jacobian.T @ (weights[:, None] * jacobian), jacobian.T @ (weights * errors)
 
 
@@ -84,15 +85,17 @@ def test_the_step_is_that_of_the_whole_system(damping: float) -> None:
     problem, state = problem_of("dense", 1e-3)
     matrix, gradient = dense_system(problem, state)
     expected = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
-    motion, points = problem.linearize(state).step(damping)
-    actual = np.concatenate([motion.ravel(), points.ravel()])
+    there = problem.step(state, problem.linearize(state), damping)
+    assert there
+    motion = there.poses.motion_from(state.poses)
+    actual = np.concatenate([motion.ravel(), (there.points - state.points).ravel()])
     np.testing.assert_allclose(actual, expected, atol=2e-3 * np.abs(expected).max())
 
 
 def test_the_eliminated_system_inverts_to_the_covariance() -> None:
     problem, state = problem_of("marginal")
     matrix, _ = dense_system(problem, state)
-    cameras = 6 * len(state.rotation)
+    cameras = 6 * len(state.poses.rotation)
     reduced, _, _ = problem.linearize(state).reduced(0.0)
     expected = np.linalg.inv(matrix)[:cameras, :cameras]
     np.testing.assert_allclose(np.linalg.inv(reduced), expected, rtol=0, atol=1e-3 * np.abs(expected).max())
@@ -100,9 +103,9 @@ def test_the_eliminated_system_inverts_to_the_covariance() -> None:
 
 def test_the_prior_measures_the_motion() -> None:
     problem, state = problem_of("prior")
-    np.testing.assert_allclose(problem.prior_error(state), 0, atol=1e-12)
-    motion = random_for("prior motion").normal(0, 1e-4, (len(state.rotation), 6))
-    error = problem.prior_error(state.moved(motion, np.zeros_like(state.points)))
+    np.testing.assert_allclose(problem.reference_motion(state), 0, atol=1e-12)
+    motion = random_for("prior motion").normal(0, 1e-4, (len(state.poses.rotation), 6))
+    error = problem.reference_motion(state.moved(motion, np.zeros_like(state.points)))
     np.testing.assert_allclose(error, motion[:-1], atol=1e-7)
 
 

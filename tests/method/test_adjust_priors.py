@@ -12,7 +12,7 @@ from support.planted import NOISE, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.adjust import AdjustOptions, _pose_problem, _State, adjust_pose
+from mapless_server.method.adjust import AdjustOptions, adjust_pose, pose_problem
 from mapless_server.method.match import PointMatches
 from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
 from mapless_server.method.priors.known import NO_PRIORS, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
@@ -55,17 +55,16 @@ def adjusted(
 def test_the_gradient_with_priors_is_that_of_the_cost() -> None:
     scene, structure, matches = scene_of("gradient")
     used = np.arange(len(matches))
-    problem, state = _pose_problem(
+    problem, state = pose_problem(
         scene.query, scene.references, structure, matches, used, scene.world_from_query, AdjustOptions()
     )
-    problem = problem.with_priors(all_priors(scene.world_from_query, 0.01))
+    problem = replace(problem, priors=all_priors(scene.world_from_query, 0.01), prior_weight=4.0)
     gradient = problem.linearize(state).pose_gradient[-6:]
 
     def cost(motion: Array) -> float:
-        motions = np.zeros((len(state.rotation), 6))
+        motions = np.zeros((len(state.poses.rotation), 6))
         motions[-1] = motion
-        there: _State = state.moved(motions, np.zeros_like(state.points))
-        return problem.cost(there)
+        return problem.cost(state.moved(motions, np.zeros_like(state.points)))
 
     assert_jacobian(2 * gradient, cost, np.zeros(6), tolerance=1e-5)
 

@@ -8,7 +8,7 @@ from support.jacobians import assert_jacobian, finite_differences
 from support.scenes import CAMERA, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.priors.known import rotation_vector
+from mapless_server.method.rigid import rotation_vector
 from mapless_server.method.uncertainty.perturbation import (
     Perturbation,
     motion_jacobian,

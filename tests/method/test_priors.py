@@ -21,9 +21,9 @@ from mapless_server.method.priors.known import (
     PriorKind,
     Priors,
     conflict_threshold,
-    rotation_vector,
 )
 from mapless_server.method.priors.pose_only import moved
+from mapless_server.method.rigid import rotation_vector
 
 POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
 DOWN = np.array([0.0, 0.0, -1.0])

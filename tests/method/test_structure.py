@@ -14,6 +14,7 @@ from support.planted import metric_scale, true_correspondences, true_tracks
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, arc_poses, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform
+from mapless_server.method.arrays import invert_symmetric, solve_symmetric
 from mapless_server.method.correspond import Correspondences
 from mapless_server.method.observations import (
     MIN_NOISE_LEVEL_PX,
@@ -23,12 +24,9 @@ from mapless_server.method.observations import (
     adjust_points,
     better_start,
     estimate_noise,
-    invert_symmetric,
-    soft_l1,
-    soft_l1_weight,
-    solve_symmetric,
     triangulate,
 )
+from mapless_server.method.robust import soft_l1, soft_l1_weight
 from mapless_server.method.structure import (
     PAPER_STRUCTURE,
     Structure,
@@ -99,7 +97,7 @@ def test_residuals_are_projections_minus_observations() -> None:
 
 def test_jacobians() -> None:
     _, observations, truth = planted("jacobians", SceneOptions(point_count=20), KeypointNoise(0.4, 0.05))
-    jacobians = observations.jacobians(truth)
+    _, jacobians = observations.linearized(truth)
     for o in range(0, len(observations.point), 7):
         point = observations.point[o]
 

@@ -3,6 +3,7 @@
 Begin with `localize`, the stages in order. A module imports only modules above it in this list, which has no circle:
 
 arrays, stopwatch, turns     either NumPy or torch; time of the stages; a call that may end early
+rigid, robust, optimize      small motions; robust losses; Levenberg-Marquardt, the only one
 views, reconstruction        photographs with features and poses; what the coarse stage gives
 rejection                    "no pose" is a result
 features/                    local features of a photograph
@@ -15,7 +16,8 @@ match                        which keypoints of the query show them
 priors/                      what is known of the query's pose beforehand
 uncertainty/                 how far a pose may be off: parts of its covariance
 pnp, support                 the pose; what it rests on
-adjust                       (ours) everything adjusted together
+resection                    pose and focal length from points that stay where they are
+bundle, adjust               (ours) everything adjusted together
 trust/                       whether a pose is believed
 pose_covariance              the covariance of an answer's pose
 answer, hints                what the method answers; what to do about a rejection

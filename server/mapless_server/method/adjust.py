@@ -14,21 +14,21 @@ it. The points are eliminated (Schur complement), leaving a dense system of 6 un
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless.geometry import RigidTransform
 
+from .bundle import Bundle, BundleProblem, bundle_of, reference_information
 from .match import PointMatches
-from .observations import Observations, invert_symmetric
+from .optimize import MinimizeOptions, minimize
 from .pnp import PoseEstimate, PoseStage, reprojection_errors_px
 from .priors.known import NO_PRIORS, Priors
-from .structure import Structure, observe
-from .uncertainty.covariance import Uncertainty, UncertaintyOptions, one_match_covariance, uncertainty_of
-from .uncertainty.linearization import Linearization, grounds_of, linearize, tracks_with_query
+from .structure import Structure
+from .uncertainty.covariance import UncertaintyOptions, one_match_covariance, uncertainty_of
+from .uncertainty.linearization import grounds_of, tracks_with_query
 from .views import PosedView, View
 
 
@@ -72,155 +72,6 @@ class AdjustOptions:
         )
         if not min(positive) > 0:
             raise ValueError(f"senseless options: {self}")
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """Poses camera_from_world of references, then query: rotation (V, 3, 3), translation (V, 3); points (P, 3)."""
-
-    rotation: Array
-    translation: Array
-    points: Array
-
-    def moved(self, motion: Array, step: Array) -> _State:
-        """After left perturbations (V, 6) of the poses and steps (P, 3) of the points."""
-        turn = np.stack([rotation_from_vector(w) for w in motion[:, 3:]])
-        return _State(
-            turn @ self.rotation, (turn @ self.translation[:, :, None])[..., 0] + motion[:, :3], self.points + step
-        )
-
-    @property
-    def world_from_query(self) -> RigidTransform:
-        """The query's pose."""
-        return RigidTransform(self.rotation[-1], self.translation[-1]).inverse()
-
-
-class _Problem:
-    """The cost and its derivatives; knows nothing of how it is minimized."""
-
-    def __init__(
-        self,
-        observations: Observations,
-        view: NDArray[np.intp],
-        given: _State,
-        prior_sigma: Array,
-        options: AdjustOptions,
-    ) -> None:
-        self.priors = NO_PRIORS  # of the query, the last camera
-        self.observations, self.view, self.given, self.options = observations, view, given, options
-        self.information = prior_sigma**-2.0  # (V - 1, 6), of the references
-        self.cameras = len(given.rotation)
-        # Row v picks camera v's observations: sums over cameras become one matrix product.
-        self.pick = (view == np.arange(self.cameras)[:, None]).astype(float)
-
-    def with_priors(self, priors: Priors) -> _Problem:
-        """The same with something known of the query's pose."""
-        problem = copy(self)
-        problem.priors = priors
-        return problem
-
-    def at(self, state: _State) -> Observations:
-        return replace(self.observations, rotation=state.rotation[self.view], translation=state.translation[self.view])
-
-    def prior_error(self, state: _State) -> Array:
-        """(V - 1, 6): the motion of each reference away from its given pose."""
-        turn = state.rotation[:-1] @ np.swapaxes(self.given.rotation[:-1], 1, 2)
-        shift = state.translation[:-1] - (turn @ self.given.translation[:-1, :, None])[..., 0]
-        skew = (turn - np.swapaxes(turn, 1, 2)) / 2
-        return np.concatenate([shift, skew[:, [2, 0, 1], [1, 2, 0]]], axis=1)
-
-    def cost(self, state: _State) -> float:
-        squared = (self.at(state).residuals(state.points) ** 2).sum(axis=1)
-        scale = self.options.loss_scale_sigma**2
-        prior = (self.prior_error(state) ** 2 * self.information).sum()
-        if self.priors:
-            prior += self.options.error_inflation**2 * self.priors.cost(state.world_from_query)
-        return float(scale * np.log1p(squared / scale).sum() + prior)  # NaN for a point behind a camera
-
-    def query_terms(self, world_from_query: RigidTransform) -> tuple[Array, Array]:
-        """Gradient (6,) and information (6, 6) of the query's priors, by a left perturbation of camera_from_world.
-
-        That moves the centre by -R v and turns the camera by -R w about fixed axes (see `world_covariance`). Weighed
-        like what the observations say, which is too much by `error_inflation`.
-        """
-        gradient, information = self.priors.gradient_and_information(world_from_query)
-        turn = -np.kron(np.eye(2), world_from_query.rotation)
-        weight = self.options.error_inflation**2
-        return weight * turn.T @ gradient, weight * turn.T @ information @ turn
-
-    def linearize(self, state: _State) -> _NormalEquations:
-        observations = self.at(state)
-        rows = linearize(observations, state.points, self.options.loss_scale_sigma)
-        weight, by_point, by_pose = rows.weight, rows.by_point, rows.by_pose
-        weighted_point = np.swapaxes(by_point * weight[:, None, None], 1, 2)
-        weighted_pose = np.swapaxes(by_pose * weight[:, None, None], 1, 2)
-        error = rows.residual[:, :, None]
-
-        pose_block = (self.pick @ (weighted_pose @ by_pose).reshape(-1, 36)).reshape(-1, 6, 6)
-        pose_gradient = self.pick @ (weighted_pose @ error)[..., 0]
-        pose_block[:-1] += self.information[:, :, None] * np.eye(6)
-        pose_gradient[:-1] += self.information * self.prior_error(state)
-        if self.priors:
-            known_gradient, known = self.query_terms(state.world_from_query)
-            pose_gradient[-1] += known_gradient
-            pose_block[-1] += known
-        cross = np.zeros((len(state.points), self.cameras, 6, 3))
-        cross[observations.point, self.view] = weighted_pose @ by_point  # a point is seen once in a view
-        return _NormalEquations(
-            pose_block,
-            pose_gradient.ravel(),
-            observations.sum_by_point(weighted_point @ by_point),
-            observations.sum_by_point((weighted_point @ error)[..., 0]),
-            cross.reshape(len(state.points), -1, 3),
-            rows,
-        )
-
-    def uncertainty(self, state: _State, rows: Linearization, one_match: Array) -> Uncertainty | None:
-        """Of the query's pose at an optimum, linearized there, without what priors say of it."""
-        motions = np.concatenate([self.prior_error(state), np.zeros((1, 6))])
-        options = self.options.uncertainty
-        grounds = grounds_of(rows, self.observations.point, self.view, options.max_matches, motions)
-        return uncertainty_of(grounds, state.world_from_query, one_match, options)
-
-
-@dataclass(frozen=True, eq=False)
-class _NormalEquations:
-    """[B E; E^T C] [d_pose; d_point] = -[g; h], where B and C are block-diagonal.
-
-    Attributes:
-        pose_block: B, (V, 6, 6).
-        pose_gradient: g, (6 V,).
-        point_block: C, (P, 3, 3).
-        point_gradient: h, (P, 3).
-        cross: E, (P, 6 V, 3).
-        rows: of the observations, from which all this is summed.
-    """
-
-    pose_block: Array
-    pose_gradient: Array
-    point_block: Array
-    point_gradient: Array
-    cross: Array
-    rows: Linearization
-
-    def reduced(self, damping: float) -> tuple[Array, Array, Array]:
-        """B - E C^-1 E^T (6 V, 6 V), g - E C^-1 h (6 V,) and C^-1 (P, 3, 3), diagonals enlarged by `damping`."""
-        damped_points = self.point_block * (1 + damping * np.eye(3))
-        inverse = invert_symmetric(damped_points)
-        size = self.cross.shape[1]
-        wide = np.swapaxes(self.cross, 0, 1).reshape(size, -1)  # (6 V, 3 P)
-        gained = np.swapaxes(self.cross @ inverse, 0, 1).reshape(size, -1)
-        matrix = -gained @ wide.T
-        for v, block in enumerate(self.pose_block * (1 + damping * np.eye(6))):
-            matrix[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] += block
-        return matrix, self.pose_gradient - gained @ self.point_gradient.ravel(), inverse
-
-    def step(self, damping: float) -> tuple[Array, Array]:
-        """Motions (V, 6) of the cameras and steps (P, 3) of the points."""
-        matrix, gradient, inverse = self.reduced(damping)
-        motion = -np.asarray(np.linalg.solve(matrix, gradient), np.float64)
-        back = self.point_gradient + np.swapaxes(self.cross, 1, 2) @ motion
-        return motion.reshape(-1, 6), -(inverse @ back[:, :, None])[..., 0]
 
 
 def adjust_pose(
@@ -275,9 +126,10 @@ def _adjusted(
     used = np.flatnonzero(estimate.errors_px < options.max_error_px)
     if len(used) < 3:  # two equations each, for six unknowns
         return None
-    problem, start = _pose_problem(query, references, structure, matches, used, estimate.world_from_camera, options)
-    state, equations = _minimize(problem.with_priors(priors), start, options)
-    found = _conclude(query, structure, matches, used, estimate, problem, state, equations)
+    problem, start = pose_problem(query, references, structure, matches, used, estimate.world_from_camera, options)
+    with_priors = replace(problem, priors=priors, prior_weight=options.error_inflation**2)
+    bundle = minimize(with_priors, start, MinimizeOptions(options.iterations, options.min_decrease))
+    found = _conclude(query, structure, matches, used, estimate, problem, bundle, options)
     if found is None:
         return None
     return replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
@@ -289,46 +141,32 @@ def _conclude(
     matches: PointMatches,
     used: NDArray[np.intp],
     estimate: PoseEstimate,
-    problem: _Problem,
-    state: _State,
-    equations: _NormalEquations,
+    problem: BundleProblem,
+    bundle: Bundle,
+    options: AdjustOptions,
 ) -> PoseEstimate | None:
     """The estimate at the optimum, its covariance without priors; None if it has run off."""
-    pose, options = state.world_from_query, problem.options
+    pose = bundle.world_from_query
     pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
     points = structure.x_in_world.copy()
-    points[np.unique(matches.point[used])] = state.points
+    points[np.unique(matches.point[used])] = bundle.points
     errors_px = reprojection_errors_px(query.camera, pose, points[matches.point], pixels)
     inliers = errors_px < options.inlier_px
     if inliers.sum() < max(1, options.min_kept_share * estimate.inliers.sum()):
         return None
     x_in_world = points[matches.point[inliers]]
     one_match = one_match_covariance(query.camera, pose, x_in_world, structure.noise.level_px)
-    uncertainty = problem.uncertainty(state, equations.rows, one_match)
+    motions = np.concatenate([problem.reference_motion(bundle), np.zeros((1, 6))])
+    rows, point = problem.rows(bundle), problem.observations.point
+    grounds = grounds_of(rows, point, problem.view, options.uncertainty.max_matches, motions)
+    uncertainty = uncertainty_of(grounds, pose, one_match, options.uncertainty)
     if uncertainty is None:
         return None
     covariance = uncertainty.covariance
     return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, covariance, uncertainty=uncertainty)
 
 
-def _minimize(problem: _Problem, state: _State, options: AdjustOptions) -> tuple[_State, _NormalEquations]:
-    cost, damping = problem.cost(state), 1e-4
-    equations = problem.linearize(state)
-    for _ in range(options.iterations):
-        candidate = state.moved(*equations.step(damping))
-        candidate_cost = problem.cost(candidate)
-        if not candidate_cost < cost:
-            damping *= 10
-            continue
-        converged = cost - candidate_cost < options.min_decrease * cost
-        state, cost, damping = candidate, candidate_cost, damping * 0.1
-        equations = problem.linearize(state)
-        if converged:
-            break
-    return state, equations
-
-
-def _pose_problem(
+def pose_problem(
     query: View,
     references: Sequence[PosedView],
     structure: Structure,
@@ -336,19 +174,14 @@ def _pose_problem(
     used: NDArray[np.intp],
     world_from_query: RigidTransform,
     options: AdjustOptions,
-) -> tuple[_Problem, _State]:
+) -> tuple[BundleProblem, Bundle]:
+    """The problem of one query without priors, and where it begins; `used` are the matches that take part."""
     views = [*references, PosedView("", "", query, world_from_query)]
     tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(references))
-    observations = observe(tracks, views, structure.noise)
-
-    camera_from_world = [v.world_from_camera.inverse() for v in views]
-    state = _State(
-        np.stack([c.rotation for c in camera_from_world]),
-        np.stack([c.translation for c in camera_from_world]),
-        structure.x_in_world[chosen],
+    observations, start, depth_m = bundle_of(tracks, views, structure, chosen)
+    noise_px = options.prior_share * structure.noise.level_px
+    information = [reference_information(noise_px, it.view.camera.focal_x_px, depth_m) for it in references]
+    problem = BundleProblem(
+        observations, tracks.view, start.poses[:-1], np.array(information), options.loss_scale_sigma
     )
-    # Noise of a pixel is a turn of 1 / f, or a shift of depth / f.
-    turn = options.prior_share * structure.noise.level_px / np.array([r.view.camera.focal_x_px for r in references])
-    depth_m = float(np.median(observations.in_camera(state.points)[:, 2]))
-    prior_sigma = np.repeat(np.stack([turn * depth_m, turn], axis=1), 3, axis=1)
-    return _Problem(observations, tracks.view, state, prior_sigma, options), state
+    return problem, start

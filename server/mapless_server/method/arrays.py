@@ -13,6 +13,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from mapless import geometry
+
 AnyArray: TypeAlias = Any
 """A NumPy array or a torch tensor; all arguments of a call are of one kind, on one device."""
 
@@ -66,17 +68,32 @@ def multiply(first: AnyArray, second: AnyArray) -> AnyArray:
     return (first[:, :, :, None] * second[:, None, :, :]).sum(2)
 
 
+def solve_symmetric(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
+    """Solves symmetric 3x3 systems (P, 3, 3), (P, 3); NaN where singular."""
+    return apply(invert_symmetric(matrices), vectors)
+
+
+def invert_symmetric(matrices: AnyArray) -> AnyArray:
+    """Inverses of symmetric matrices (P, 3, 3) by the adjugate; NaN where singular.
+
+    Much faster than a LAPACK call per matrix, and exact enough for steps that are checked afterwards.
+    """
+    xp = namespace(matrices)
+
+    def moved(rows: int, columns: int) -> AnyArray:
+        return xp.roll(matrices, (-rows, -columns), (1, 2))
+
+    adjugate = moved(1, 1) * moved(2, 2) - moved(1, 2) * moved(2, 1)
+    determinant = (matrices[:, 0] * adjugate[:, 0]).sum(-1)
+    solvable = abs(determinant) > 1e-14 * xp.amax(abs(matrices), (1, 2)) ** 3
+    return adjugate / xp.where(solvable, determinant, np.nan)[:, None, None]
+
+
 def normalize(x_in_camera: AnyArray) -> AnyArray:
-    """`mapless.geometry.normalize` for any array; robots, who install that, shall not need to know of torch."""
-    depth = x_in_camera[..., 2:]
-    return x_in_camera[..., :2] / namespace(depth).where(depth > 0, depth, np.nan)
+    """`mapless.geometry.normalize` for either library."""
+    return geometry.normalize(x_in_camera, namespace(x_in_camera))
 
 
 def normalize_jacobian(x_in_camera: AnyArray) -> AnyArray:
-    """`mapless.geometry.normalize_jacobian` for any array."""
-    xp, depth = namespace(x_in_camera), x_in_camera[..., 2]
-    inverse_depth = 1 / xp.where(depth > 0, depth, np.nan)
-    jacobian = xp.stack([xp.zeros_like(x_in_camera)] * 2, -2)
-    jacobian[..., 0, 0] = jacobian[..., 1, 1] = inverse_depth
-    jacobian[..., :, 2] = -normalize(x_in_camera) * inverse_depth[..., None]
-    return jacobian
+    """`mapless.geometry.normalize_jacobian` for either library."""
+    return geometry.normalize_jacobian(x_in_camera, namespace(x_in_camera))

@@ -9,7 +9,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .arrays import AnyArray, apply, identity, length, median, multiply, namespace, normalize, normalize_jacobian
+from .arrays import (
+    AnyArray,
+    apply,
+    identity,
+    length,
+    median,
+    multiply,
+    namespace,
+    normalize,
+    normalize_jacobian,
+    solve_symmetric,
+)
+from .optimize import minimize_each
+from .robust import soft_l1, soft_l1_weight
 from .tracks import Grouping
 
 
@@ -69,12 +82,16 @@ class Observations:
 
     def residuals(self, x_in_world: AnyArray) -> AnyArray:
         """(O, 2) projection minus observation of points (P, 3), in standard deviations; NaN where not in front."""
-        ideal = normalize(self.in_camera(x_in_world))
-        return (ideal * self.focal_px + self.principal_px - self.pixel) / self.sigma_px[:, None]
+        return self.camera_residuals(self.in_camera(x_in_world))
 
-    def jacobians(self, x_in_world: AnyArray) -> AnyArray:
-        """(O, 2, 3) derivative of each residual by its own point, per metre."""
-        return multiply(self.camera_jacobians(self.in_camera(x_in_world)), self.rotation)
+    def linearized(self, x_in_world: AnyArray) -> tuple[AnyArray, AnyArray]:
+        """The residuals (O, 2), and the derivative (O, 2, 3) of each by its own point, per metre."""
+        x_in_camera = self.in_camera(x_in_world)
+        return self.camera_residuals(x_in_camera), multiply(self.camera_jacobians(x_in_camera), self.rotation)
+
+    def camera_residuals(self, x_in_camera: AnyArray) -> AnyArray:
+        """The same residuals (O, 2) of points in the camera's frame (O, 3)."""
+        return (normalize(x_in_camera) * self.focal_px + self.principal_px - self.pixel) / self.sigma_px[:, None]
 
     def camera_jacobians(self, x_in_camera: AnyArray) -> AnyArray:
         """(O, 2, 3) derivative of each residual by its point in the camera's frame (O, 3), per metre."""
@@ -99,6 +116,10 @@ class Observations:
     def in_camera(self, x_in_world: AnyArray) -> AnyArray:
         """Each observation's point (O, 3) in the frame of its camera, of points (P, 3)."""
         return apply(self.rotation, x_in_world[self.point]) + self.translation
+
+    def moved(self, rotation: AnyArray, translation: AnyArray) -> Observations:
+        """The same from cameras at other poses (O, 3, 3), (O, 3)."""
+        return replace(self, rotation=rotation, translation=translation)
 
     def weighted(self, noise: KeypointNoise) -> Observations:
         """The same with another noise."""
@@ -150,57 +171,18 @@ def adjust_points(
     Returns:
         (P, 3). No point has a higher cost than it began with.
     """
-    xp, eye, points = namespace(x_in_world), identity(x_in_world), x_in_world
-    damping = xp.full_like(points[:, 0], 1e-3)
-    residuals = observations.residuals(points)
-    cost = _cost(observations, residuals, loss_scale_sigma)
-    for _ in range(iterations):
-        jacobians = observations.jacobians(points)
+
+    def cost(points: AnyArray) -> AnyArray:
+        return _cost(observations, observations.residuals(points), loss_scale_sigma)
+
+    def linearize(points: AnyArray) -> tuple[AnyArray, AnyArray]:
+        residuals, jacobians = observations.linearized(points)
         weight = soft_l1_weight((residuals**2).sum(-1), loss_scale_sigma)
-        weighted = xp.swapaxes(jacobians * weight[:, None, None], 1, 2)
+        weighted = namespace(points).swapaxes(jacobians * weight[:, None, None], 1, 2)
         hessian = observations.sum_by_point(multiply(weighted, jacobians))
-        gradient = observations.sum_by_point(apply(weighted, residuals))
-        damped = hessian * (1 + damping[:, None, None] * eye)
-        candidate = points - solve_symmetric(damped, gradient)
-        candidate_residuals = observations.residuals(candidate)
-        candidate_cost = _cost(observations, candidate_residuals, loss_scale_sigma)
-        better = candidate_cost <= cost  # False for NaN: behind a camera, or a singular system
-        points = xp.where(better[:, None], candidate, points)
-        residuals = xp.where(better[observations.point][:, None], candidate_residuals, residuals)
-        cost = xp.where(better, candidate_cost, cost)
-        damping = xp.where(better, damping * 0.1, damping * 10)
-    return points
+        return hessian, observations.sum_by_point(apply(weighted, residuals))
 
-
-def soft_l1(squared: AnyArray, scale: float) -> AnyArray:
-    """rho(s) = 2 c^2 (sqrt(1 + s / c^2) - 1): s for small residuals, 2 c sqrt(s) for large ones."""
-    return 2 * scale**2 * ((1 + squared / scale**2) ** 0.5 - 1)
-
-
-def soft_l1_weight(squared: AnyArray, scale: float) -> AnyArray:
-    """rho'(s), the weight of a squared residual in iteratively reweighted least squares."""
-    return 1 / (1 + squared / scale**2) ** 0.5
-
-
-def solve_symmetric(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
-    """Solves symmetric 3x3 systems (P, 3, 3), (P, 3); NaN where singular."""
-    return apply(invert_symmetric(matrices), vectors)
-
-
-def invert_symmetric(matrices: AnyArray) -> AnyArray:
-    """Inverses of symmetric matrices (P, 3, 3) by the adjugate; NaN where singular.
-
-    Much faster than a LAPACK call per matrix, and exact enough for steps that are checked afterwards.
-    """
-    xp = namespace(matrices)
-
-    def moved(rows: int, columns: int) -> AnyArray:
-        return xp.roll(matrices, (-rows, -columns), (1, 2))
-
-    adjugate = moved(1, 1) * moved(2, 2) - moved(1, 2) * moved(2, 1)
-    determinant = (matrices[:, 0] * adjugate[:, 0]).sum(-1)
-    solvable = abs(determinant) > 1e-14 * xp.amax(abs(matrices), (1, 2)) ** 3
-    return adjugate / xp.where(solvable, determinant, np.nan)[:, None, None]
+    return minimize_each(cost, linearize, x_in_world, iterations)
 
 
 def estimate_noise(observations: Observations, x_in_world: AnyArray, noise: KeypointNoise) -> KeypointNoise:

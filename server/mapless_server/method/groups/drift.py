@@ -19,7 +19,8 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, Similarity, cross_matrix
 
-from .rigid import perturbed, rotation_vector
+from ..rigid import perturbed, rotation_vector
+from ..robust import cauchy_cost, cauchy_weight
 
 _MEDIAN_SQUARE = 5.35
 """Median of a chi-square of six degrees of freedom."""
@@ -132,8 +133,7 @@ class SequenceFreedom:
 
     def cost(self) -> float:
         """See Freedom."""
-        bound = self._bound
-        return float(bound * np.log1p((self.residuals() ** 2).sum(axis=1) / bound).sum())
+        return cauchy_cost((self.residuals() ** 2).sum(axis=1), self._loss_scale)
 
     def residuals(self) -> Array:
         """(F - 1, 6): by how many standard deviations each step differs from the session's."""
@@ -141,7 +141,7 @@ class SequenceFreedom:
 
     def weights(self) -> Array:
         """(F - 1,) how much of each step is still believed, 0 to 1."""
-        return np.asarray(1 / (1 + (self.residuals() ** 2).sum(axis=1) / self._bound))
+        return cauchy_weight((self.residuals() ** 2).sum(axis=1), self._loss_scale)
 
     def equations(self) -> tuple[Array, Array]:
         """See Freedom."""
@@ -154,8 +154,9 @@ class SequenceFreedom:
         return matrix, gradient
 
     @property
-    def _bound(self) -> float:
-        return 6 * self.options.loss_scale**2
+    def _loss_scale(self) -> float:
+        """Of the squares of six numbers."""
+        return math.sqrt(6) * self.options.loss_scale
 
     def _step(self, i: int) -> RigidTransform:
         """Camera i from camera i + 1, as the poses have it."""

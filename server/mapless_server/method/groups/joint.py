@@ -19,6 +19,7 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform
 
 from ..match import PointMatches
+from ..optimize import MinimizeOptions, minimize
 from ..pnp import reprojection_errors_px
 from .freedom import F, Freedom
 from .problem import GroupProblem, JointOptions
@@ -72,7 +73,8 @@ def adjust_jointly(
         The refined poses; those that were given where no match takes part.
     """
     problem = GroupProblem(sightings, matches, freedom, options)
-    point = problem.minimize(problem.start)
+    steps = MinimizeOptions(options.iterations, options.adjust.min_decrease)
+    point = minimize(problem, problem.start, steps) if problem.blocks else problem.start
     points = {block.image: (problem.chosen[i], point.points[i]) for i, block in enumerate(problem.blocks)}
     matched = []
     for sighting, its_matches in zip(sightings, matches, strict=True):

@@ -1,4 +1,4 @@
-"""The cost of a group of photographs, and how it is minimized; see `joint`."""
+"""The cost of a group of photographs and its derivatives; see `joint`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
-from ..adjust import AdjustOptions, _NormalEquations, _Problem, _State
+from ..adjust import AdjustOptions
+from ..bundle import Bundle, BundleProblem, NormalEquations, Poses, bundle_of, reference_information
 from ..match import PointMatches
-from ..structure import observe
+from ..optimize import solve_step
 from ..views import PosedView
 from .freedom import F, Freedom
 from .parts import Part, Shared, part_of
@@ -50,7 +51,7 @@ class Block:
     """
 
     image: int
-    problem: _Problem
+    problem: BundleProblem
     references: NDArray[np.intp]
 
     def columns(self, reference_count: int, freedom: Freedom) -> Array:
@@ -67,23 +68,18 @@ class Block:
 class Point(Generic[F]):
     """Where the search for the optimum is: references (R), points of each block (P_b, 3), and the group's freedom."""
 
-    rotation: Array
-    translation: Array
+    references: Poses
     points: tuple[Array, ...]
     freedom: F
 
-    def state(self, index: int, block: Block) -> _State:
+    def bundle(self, index: int, block: Block) -> Bundle:
         """Of one block."""
         last = self.freedom.camera_from_world(block.image)
-        return _State(
-            np.concatenate([self.rotation[block.references], last.rotation[None]]),
-            np.concatenate([self.translation[block.references], last.translation[None]]),
-            self.points[index],
-        )
+        return Bundle(self.references[block.references].and_last(last), self.points[index])
 
 
 class GroupProblem(Generic[F]):
-    """The cost of a group and its derivatives.
+    """The cost of a group and its derivatives; see `optimize.Problem`.
 
     Attributes:
         start: where it begins.
@@ -100,7 +96,7 @@ class GroupProblem(Generic[F]):
     ) -> None:
         self.options = options
         self._references: dict[str, tuple[int, PosedView]] = {}
-        self._prior_sigma: list[Array] = []
+        self._information: list[Array] = []
         self.blocks: list[Block] = []
         self.chosen: list[NDArray[np.intp]] = []
         points: list[Array] = []
@@ -114,14 +110,9 @@ class GroupProblem(Generic[F]):
             self.chosen.append(part.chosen)
             points.append(part.sighting.structure.x_in_world[part.chosen])
             self.blocks.append(self._block(part, shared))
-        given = [reference.world_from_camera.inverse() for _, reference in self._references.values()]
-        self.information = np.concatenate([np.ravel(sigma) for sigma in self._prior_sigma] or [np.empty(0)]) ** -2.0
-        self.start = Point(
-            np.stack([it.rotation for it in given]) if given else np.empty((0, 3, 3)),
-            np.stack([it.translation for it in given]) if given else np.empty((0, 3)),
-            tuple(points),
-            freedom,
-        )
+        self.information = np.array(self._information).ravel()
+        references = Poses.of(reference.world_from_camera for _, reference in self._references.values())
+        self.start = Point(references, tuple(points), freedom)
 
     @property
     def reference_count(self) -> int:
@@ -131,49 +122,41 @@ class GroupProblem(Generic[F]):
     def _block(self, part: Part, shared: Shared) -> Block:
         sighting, structure = part.sighting, part.sighting.structure
         views = [*sighting.references, PosedView("", "", sighting.query, part.world_from_camera)]
-        observations = observe(part.tracks, views, structure.noise)
+        observations, start, depth_m = bundle_of(part.tracks, views, structure, part.chosen)
         observations = replace(observations, sigma_px=observations.sigma_px * np.sqrt(shared.times(part)))
-        camera_from_world = [it.world_from_camera.inverse() for it in views]
-        state = _State(
-            np.stack([c.rotation for c in camera_from_world]),
-            np.stack([c.translation for c in camera_from_world]),
-            structure.x_in_world[part.chosen],
-        )
-        depth_m = float(np.nanmedian(observations.in_camera(state.points)[:, 2]))
         references = np.array([self._index(it, structure.noise.level_px, depth_m) for it in sighting.references])
-        no_prior = np.full((len(sighting.references), 6), np.inf)
-        problem = _Problem(observations, part.tracks.view, state, no_prior, self.options.adjust)
+        free = np.zeros((len(references), 6))
+        problem = BundleProblem(
+            observations, part.tracks.view, start.poses[:-1], free, self.options.adjust.loss_scale_sigma
+        )
         return Block(sighting.image, problem, references)
 
     def _index(self, reference: PosedView, level_px: float, depth_m: float) -> int:
         """Which of the group's references it is; a new one is held to its pose as `adjust` does."""
         if reference.key not in self._references:
             self._references[reference.key] = (len(self._references), reference)
-            # Noise of a pixel is a turn of 1 / f, or a shift of depth / f.
-            turn = self.options.adjust.prior_share * level_px / reference.view.camera.focal_x_px
-            self._prior_sigma.append(np.repeat([turn * depth_m, turn], 3))
+            noise_px = self.options.adjust.prior_share * level_px
+            self._information.append(reference_information(noise_px, reference.view.camera.focal_x_px, depth_m))
         return self._references[reference.key][0]
 
     def cost(self, point: Point[F]) -> float:
         """NaN for a point behind a camera."""
-        data = sum(block.problem.cost(point.state(i, block)) for i, block in enumerate(self.blocks))
-        return data + float((self._prior_error(point) ** 2 * self.information).sum()) + point.freedom.cost()
+        data = sum(block.problem.cost(point.bundle(i, block)) for i, block in enumerate(self.blocks))
+        return data + float((self._reference_motion(point) ** 2 * self.information).sum()) + point.freedom.cost()
 
-    def _prior_error(self, point: Point[F]) -> Array:
+    def _reference_motion(self, point: Point[F]) -> Array:
         """(6 R,): the motion of each reference away from its given pose."""
-        turn = point.rotation @ np.swapaxes(self.start.rotation, 1, 2)
-        shift = point.translation - (turn @ self.start.translation[:, :, None])[..., 0]
-        skew = (turn - np.swapaxes(turn, 1, 2)) / 2
-        return np.asarray(np.concatenate([shift, skew[:, [2, 0, 1], [1, 2, 0]]], axis=1).ravel())
+        return point.references.motion_from(self.start.references).ravel()
 
-    def _linearize(self, point: Point[F]) -> list[_NormalEquations]:
-        return [block.problem.linearize(point.state(i, block)) for i, block in enumerate(self.blocks)]
+    def linearize(self, point: Point[F]) -> list[NormalEquations]:
+        """See optimize.Problem."""
+        return [block.problem.linearize(point.bundle(i, block)) for i, block in enumerate(self.blocks)]
 
     def _columns(self, point: Point[F]) -> list[Array]:
         return [block.columns(self.reference_count, point.freedom) for block in self.blocks]
 
-    def _step(self, point: Point[F], equations: Sequence[_NormalEquations], damping: float) -> Point[F]:
-        """Where one Levenberg-Marquardt step leads."""
+    def step(self, point: Point[F], equations: Sequence[NormalEquations], damping: float) -> Point[F] | None:
+        """See optimize.Problem."""
         columns = self._columns(point)
         reduced = [it.reduced(damping) for it in equations]
         matrix, gradient = self._held(point)
@@ -182,16 +165,15 @@ class GroupProblem(Generic[F]):
             matrix += its_columns.T @ its_matrix @ its_columns
             gradient += its_columns.T @ its_gradient
         # A parameter that nothing tells (a photograph without matches, before anything holds it) stays.
-        step = -np.asarray(np.linalg.lstsq(matrix, gradient, rcond=None)[0], np.float64)
+        step = solve_step(matrix, gradient, least_norm=True)
+        if step is None:
+            return None
         points = []
         for i, (it, (_, _, inverse), its_columns) in enumerate(zip(equations, reduced, columns, strict=True)):
-            back = it.point_gradient + np.swapaxes(it.cross, 1, 2) @ (its_columns @ step)
             centre = point.freedom.camera_from_world(self.blocks[i].image).inverse().translation
-            points.append(_stepped(point.points[i], -(inverse @ back[:, :, None])[..., 0], centre))
-        motion = step[: 6 * self.reference_count].reshape(-1, 6)
-        moved = _State(point.rotation, point.translation, np.empty((0, 3))).moved(motion, np.empty((0, 3)))
-        freedom = point.freedom.moved(step[6 * self.reference_count :])
-        return Point(moved.rotation, moved.translation, tuple(points), freedom)
+            points.append(_stepped(point.points[i], it.point_steps(its_columns @ step, inverse), centre))
+        references = point.references.moved(step[: 6 * self.reference_count].reshape(-1, 6))
+        return Point(references, tuple(points), point.freedom.moved(step[6 * self.reference_count :]))
 
     def _held(self, point: Point[F], data_inflation: float = 1.0) -> tuple[Array, Array]:
         """Matrix and gradient of all that is no observation."""
@@ -199,28 +181,9 @@ class GroupProblem(Generic[F]):
         matrix = np.zeros((references + point.freedom.size,) * 2)
         gradient = np.zeros(len(matrix))
         matrix[range(references), range(references)] = self.information / data_inflation**2
-        gradient[:references] = self.information * self._prior_error(point) / data_inflation**2
+        gradient[:references] = self.information * self._reference_motion(point) / data_inflation**2
         matrix[references:, references:], gradient[references:] = point.freedom.equations()
         return matrix, gradient
-
-    def minimize(self, point: Point[F]) -> Point[F]:
-        """The optimum near a point, by Levenberg-Marquardt."""
-        if not self.blocks:
-            return point
-        cost, damping = self.cost(point), 1e-4
-        equations = self._linearize(point)
-        for _ in range(self.options.iterations):
-            candidate = self._step(point, equations, damping)
-            candidate_cost = self.cost(candidate)
-            if not candidate_cost < cost:
-                damping *= 10
-                continue
-            converged = cost - candidate_cost < self.options.adjust.min_decrease * cost
-            point, cost, damping = candidate, candidate_cost, damping * 0.1
-            equations = self._linearize(point)
-            if converged:
-                break
-        return point
 
     def covariance(self, point: Point[F]) -> Array:
         """(N, N) of the freedom's parameters; infinite on the diagonal where nothing tells them.
@@ -230,7 +193,7 @@ class GroupProblem(Generic[F]):
         """
         inflation = self.options.adjust.error_inflation
         matrix, _ = self._held(point, inflation)
-        for it, its_columns in zip(self._linearize(point), self._columns(point), strict=True):
+        for it, its_columns in zip(self.linearize(point), self._columns(point), strict=True):
             its_matrix, _, _ = it.reduced(0.0)
             matrix += its_columns.T @ its_matrix @ its_columns / inflation**2
         references = 6 * self.reference_count

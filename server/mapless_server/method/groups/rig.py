@@ -16,10 +16,10 @@ from mapless.geometry import Array, RigidTransform, cross_matrix
 
 from ..pnp import PnpOptions
 from ..rejection import Rejection, RejectionReason
+from ..rigid import perturbed
 from ..trust.gate import GateOptions
 from .generalized import inlier_count, rig_ransac
 from .joint import JointOptions, adjust_in_rounds, covariance_in_world
-from .rigid import perturbed
 from .sightings import GroupImage, MatchedSighting, Sighting, group_doubts, rejection_without_matches, sightings_of
 
 

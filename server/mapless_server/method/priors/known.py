@@ -25,6 +25,8 @@ from scipy.special import chdtri
 
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
+from ..rigid import rotation_vector
+
 CONFLICT_PROBABILITY = 1e-4
 """A prior is in conflict if so few consistent ones are as far from the photograph's pose."""
 
@@ -355,14 +357,6 @@ def check_covariance(covariance: Array, size: int) -> None:
         raise ValueError("a covariance must be symmetric")
     if not np.linalg.eigvalsh((correlation + correlation.T) / 2).min() > 1e-12:
         raise ValueError("a covariance must be positive definite")
-
-
-def rotation_vector(rotation: Array) -> Array:
-    """The logarithm of a rotation matrix (3, 3): axis times angle (3,), radians; the inverse of Rodrigues' formula."""
-    q = RigidTransform(rotation, np.zeros(3)).quaternion()
-    sine = math.hypot(q.x, q.y, q.z)
-    scale = 2 * math.atan2(sine, q.w) / sine if sine > 1e-12 else 2.0
-    return scale * np.array([q.x, q.y, q.z])
 
 
 def _log_jacobian(vector: Array) -> Array:

@@ -13,6 +13,8 @@ import numpy as np
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian, rotation_from_vector
 
+from ..optimize import MinimizeOptions, damped_step, minimize
+from ..robust import cauchy_cost, cauchy_weight
 from .known import NO_PRIORS, Priors
 
 
@@ -59,25 +61,7 @@ def refine_pose(
     """
     in_front = world_from_camera.inverse().apply(x_in_world)[:, 2] > 0
     problem = _Problem(camera, x_in_world[in_front], pixels[in_front], priors, options)
-    pose, cost, damping = world_from_camera, problem.cost(world_from_camera), 1e-4
-    gradient, hessian = problem.linearize(pose)
-    for _ in range(options.iterations):
-        damped = hessian + damping * np.diag(np.diag(hessian) + 1e-12)
-        try:
-            step = -np.asarray(np.linalg.solve(damped, gradient), np.float64)
-        except np.linalg.LinAlgError:  # fewer than three matches, and priors that leave something open
-            break
-        candidate = moved(pose, step)
-        candidate_cost = problem.cost(candidate)
-        if not candidate_cost < cost:
-            damping *= 10
-            continue
-        converged = cost - candidate_cost < options.min_decrease * cost
-        pose, cost, damping = candidate, candidate_cost, damping * 0.1
-        if converged:
-            break
-        gradient, hessian = problem.linearize(pose)
-    return pose
+    return minimize(problem, world_from_camera, MinimizeOptions(options.iterations, options.min_decrease))
 
 
 def information(
@@ -122,13 +106,12 @@ class _Problem:
     def cost(self, pose: RigidTransform) -> float:
         """NaN for a point behind the camera, which is no decrease."""
         _, residual = self.residuals(pose)
-        scale = self.options.loss_scale_sigma**2
-        matched = scale * np.log1p((residual**2).sum(axis=1) / scale).sum()
-        return float(matched) + self.options.prior_weight * self.priors.cost(pose)
+        matched = cauchy_cost((residual**2).sum(axis=1), self.options.loss_scale_sigma)
+        return matched + self.options.prior_weight * self.priors.cost(pose)
 
     def linearize(self, pose: RigidTransform) -> tuple[Array, Array]:
         x_in_camera, residual = self.residuals(pose)
-        weight = 1 / (1 + (residual**2).sum(axis=1) / self.options.loss_scale_sigma**2)
+        weight = cauchy_weight((residual**2).sum(axis=1), self.options.loss_scale_sigma)
         # x_in_camera = R^T (X - t): a shift of the camera moves it by -R^T, a turn w by R^T [X - t]x w.
         by_camera_point = normalize_jacobian(x_in_camera) * (self.focal / self.options.sigma_px)[:, None]
         by_point = by_camera_point @ pose.rotation.T  # (N, 2, 3)
@@ -138,3 +121,8 @@ class _Problem:
         gradient, information = self.priors.gradient_and_information(pose)
         w = self.options.prior_weight
         return weighted.T @ residual.ravel() + w * gradient, weighted.T @ jacobian + w * information
+
+    def step(self, pose: RigidTransform, equations: tuple[Array, Array], damping: float) -> RigidTransform | None:
+        gradient, hessian = equations
+        error = damped_step(hessian, gradient, damping)
+        return None if error is None else moved(pose, error)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array
 
 from ..observations import Observations
+from ..robust import cauchy_weight
 from ..structure import Structure
 from ..tracks import Tracks
 from .dispersion import Grounds, Sightings
@@ -35,9 +36,9 @@ class Linearization:
 
 def linearize(observations: Observations, x_in_world: Array, loss_scale_sigma: float) -> Linearization:
     """Of points (P, 3), with a Cauchy loss of this scale."""
-    residual = observations.residuals(x_in_world)
-    weight = 1 / (1 + (residual**2).sum(axis=1) / loss_scale_sigma**2)
     x_in_camera = observations.in_camera(x_in_world)
+    residual = observations.camera_residuals(x_in_camera)
+    weight = cauchy_weight((residual**2).sum(axis=1), loss_scale_sigma)
     by_camera_point = observations.camera_jacobians(x_in_camera)
     by_point = by_camera_point @ observations.rotation
     return Linearization(residual, weight, by_point, by_camera_point @ motion_jacobian(x_in_camera))

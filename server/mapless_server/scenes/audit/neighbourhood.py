@@ -16,9 +16,10 @@ from threading import Lock
 import numpy as np
 
 from mapless.geometry import Array
+from mapless_server.method.arrays import invert_symmetric
 from mapless_server.method.correspond import Correspondences, epipolar_distance_px, mutual_matches
 from mapless_server.method.match import vote
-from mapless_server.method.observations import Observations, invert_symmetric, triangulate
+from mapless_server.method.observations import Observations, triangulate
 from mapless_server.method.structure import Structure, StructureOptions, observe, refine_points
 from mapless_server.method.tracks import Tracks, build_tracks
 from mapless_server.method.views import Matches, PosedView
@@ -110,5 +111,5 @@ def sight(subject: PosedView, neighbourhood: Neighbourhood, pairs: PairMatches) 
 
 
 def _point_covariance(observations: Observations, x_in_world: Array) -> Array:
-    jacobians = observations.jacobians(x_in_world)
+    _, jacobians = observations.linearized(x_in_world)
     return np.asarray(invert_symmetric(observations.sum_by_point(np.swapaxes(jacobians, 1, 2) @ jacobians)))

@@ -1,25 +1,26 @@
 """Where a photograph was taken and with what focal length, from points that it shows: four explanations to compare.
 
 Points known from other references, seen in this one, are explained by the given pose and focal length; or by another
-pose; or by another focal length; or by another of both. Each explanation is a robust least-squares fit,
-
-    min  sum_m c^2 log(1 + |r_m|^2 / (sigma_m^2 c^2))     (Cauchy, which forgets wrong matches),
-
-over a left perturbation of camera_from_world (6), the logarithm of the focal length (1), or both. A match's sigma has
-two parts, the keypoint's own and what the point's uncertainty looks like in this image: where few references
-triangulate a point, it is uncertain along their rays.
+pose; or by another focal length; or by another of both. Each explanation is a robust fit (see `method.resection`). A
+match's sigma has two parts, the keypoint's own and what the point's uncertainty looks like in this image: where few
+references triangulate a point, it is uncertain along their rays.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, RigidTransform, normalize, normalize_jacobian, rotation_from_vector
-from mapless_server.method.uncertainty.perturbation import motion_jacobian
+from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
+from mapless_server.method.optimize import MinimizeOptions, minimize
+from mapless_server.method.resection import Resection
+
+_BEHIND_SIGMA = 1e3
+"""A point behind the camera counts as an error so large."""
 
 
 class Freedom(Enum):
@@ -116,49 +117,34 @@ def explain(
 def _minimize(
     sighting: Sighting, camera: Camera, start: RigidTransform, freedom: Freedom, options: ResectionOptions
 ) -> Explanation:
-    camera_from_world = start.inverse()
+    camera_from_world, loss_scale = start.inverse(), options.loss_scale_sigma
     sigma_px = _sigma_px(sighting, camera, camera_from_world)
-    residual, jacobian = _linearize(sighting, camera, camera_from_world, sigma_px)
-    cost, free, damping = _cost(residual, options), list(freedom.value), 1e-3
-    for _ in range(options.iterations if free else 0):
-        weight = _weight(residual, options)
-        reduced = jacobian[:, :, free]
-        hessian = np.einsum("m,mia,mib->ab", weight, reduced, reduced)
-        gradient = np.einsum("m,mia,mi->a", weight, reduced, np.nan_to_num(residual))
-        step = np.zeros(7)
-        step[free] = -np.linalg.lstsq(hessian + damping * np.diag(hessian.diagonal() + 1e-12), gradient, rcond=None)[0]
-        moved_camera, moved = _moved(camera, camera_from_world, step)
-        candidate = _linearize(sighting, moved_camera, moved, sigma_px)
-        candidate_cost = _cost(candidate[0], options)
-        if not candidate_cost < cost:
-            damping *= 10
-            if damping > 1e6:
-                break
-            continue
-        converged = cost - candidate_cost < options.min_decrease * cost
-        camera, camera_from_world, cost, (residual, jacobian) = moved_camera, moved, candidate_cost, candidate
-        damping *= 0.1
-        if converged:
-            break
-    # Weighed by what points look like from where it ended, so that explanations from different starts can be compared.
-    sigma_px = _sigma_px(sighting, camera, camera_from_world)
-    residual, jacobian = _linearize(sighting, camera, camera_from_world, sigma_px)
-    information = np.einsum("m,mia,mib->ab", _weight(residual, options), jacobian, jacobian)
-    length = np.linalg.norm(residual, axis=1)
-    return Explanation(
+    problem = Resection(
         camera,
-        camera_from_world.inverse(),
-        _cost(residual, options),
-        length < options.inlier_sigma,
-        length * sigma_px,
-        information,
+        sighting.x_in_world,
+        sighting.pixel,
+        sigma_px,
+        loss_scale,
+        freedom.value,
+        behind_sigma=_BEHIND_SIGMA,
+        shorten_all=False,
     )
-
-
-def _moved(camera: Camera, camera_from_world: RigidTransform, step: Array) -> tuple[Camera, RigidTransform]:
-    turn = rotation_from_vector(step[3:6])
-    pose = RigidTransform(turn @ camera_from_world.rotation, turn @ camera_from_world.translation + step[:3])
-    return with_focal(camera, float(np.exp(np.clip(step[6], -0.5, 0.5)))), pose
+    iterations = options.iterations if freedom.value else 0
+    steps = MinimizeOptions(iterations, options.min_decrease, damping=1e-3)  # a start may be off by metres
+    fit = minimize(problem, problem.at(camera_from_world), steps)
+    fitted = with_focal(camera, math.exp(fit.log_ratio))
+    # Weighed by what points look like from where it ended, so that explanations from different starts can be compared.
+    problem = replace(problem, sigma_px=_sigma_px(sighting, fitted, fit.camera_from_world))
+    fit = problem.at(fit.camera_from_world, fit.log_ratio)
+    length = np.linalg.norm(fit.residual, axis=1)
+    return Explanation(
+        fitted,
+        fit.camera_from_world.inverse(),
+        problem.cost(fit),
+        length < options.inlier_sigma,
+        length * problem.sigma_px,
+        problem.linearize(fit)[0],
+    )
 
 
 def with_focal(camera: Camera, ratio: float) -> Camera:
@@ -176,31 +162,3 @@ def _sigma_px(sighting: Sighting, camera: Camera, camera_from_world: RigidTransf
     half_difference = (projected[:, 0, 0] - projected[:, 1, 1]) / 2
     largest = half_trace + np.hypot(half_difference, projected[:, 0, 1])
     return np.asarray(np.sqrt(sighting.keypoint_sigma_px**2 + np.nan_to_num(largest)))
-
-
-def _linearize(
-    sighting: Sighting, camera: Camera, camera_from_world: RigidTransform, sigma_px: Array
-) -> tuple[Array, Array]:
-    """Residuals (M, 2) in standard deviations and their derivatives (M, 2, 7); zero derivatives behind the camera."""
-    x_in_camera = camera_from_world.apply(sighting.x_in_world)
-    focal = np.array([camera.focal_x_px, camera.focal_y_px])
-    ideal = normalize(x_in_camera)
-    projected = ideal * focal + (camera.principal_x_px, camera.principal_y_px)
-    by_pose = (normalize_jacobian(x_in_camera) * focal[:, None]) @ motion_jacobian(x_in_camera)
-    jacobian = np.concatenate([by_pose, (ideal * focal)[:, :, None]], axis=2) / sigma_px[:, None, None]
-    return (projected - sighting.pixel) / sigma_px[:, None], np.nan_to_num(jacobian)
-
-
-_BEHIND_SIGMA = 1e3
-"""A point behind the camera counts as an error so large."""
-
-
-def _cost(residual: Array, options: ResectionOptions) -> float:
-    squared = np.nan_to_num((residual**2).sum(axis=1), nan=_BEHIND_SIGMA**2)
-    scale = options.loss_scale_sigma**2
-    return float(scale * np.log1p(squared / scale).sum())
-
-
-def _weight(residual: Array, options: ResectionOptions) -> Array:
-    squared = np.nan_to_num((residual**2).sum(axis=1), nan=_BEHIND_SIGMA**2)
-    return np.asarray(1 / (1 + squared / options.loss_scale_sigma**2))

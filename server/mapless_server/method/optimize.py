@@ -1,0 +1,143 @@
+"""Levenberg-Marquardt: `minimize` for one problem, `minimize_each` for many small ones side by side.
+
+A step solves the linearized problem with its diagonal enlarged by a relative damping. One that lowers the cost is taken
+and the damping falls; any other, also one that cannot be computed, is tried again with more damping. So no cost ever
+rises, and a start whose cost is NaN is returned as it is.
+
+What is solved is the problem's own: six unknowns at once (`damped_step`), or a system from which points are eliminated
+(see `bundle`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from mapless.geometry import Array
+
+from .arrays import AnyArray, identity, namespace, solve_symmetric
+
+X = TypeVar("X")
+E = TypeVar("E")
+
+LOWERED = 0.1
+"""The damping's factor after a step that was taken."""
+
+LEAST_DIAGONAL = 1e-12
+"""Added to the diagonal before it is damped: an unknown that nothing determines stays where it is."""
+
+
+class Problem(Protocol[X, E]):
+    """A cost over points of any type X; E is what a step is computed from."""
+
+    def cost(self, x: X) -> float:
+        """NaN where there is none, behind a camera for example."""
+        ...
+
+    def linearize(self, x: X) -> E:
+        """What `step` needs at a point, whatever the damping."""
+        ...
+
+    def step(self, x: X, equations: E, damping: float) -> X | None:
+        """Where a step leads; None where it is not determined."""
+        ...
+
+
+@dataclass(frozen=True)
+class MinimizeOptions:
+    """Options of `minimize`.
+
+    Attributes:
+        iterations: at most so many steps are tried.
+        min_decrease: stop after a step that lowers the cost by a smaller share.
+        damping: the first. Small: from within an inlier threshold of the minimum Gauss-Newton's step is nearly right.
+        raised_by: the damping's factor after a step that was not taken.
+        max_damping: give up beyond; the steps are then too short to matter.
+    """
+
+    iterations: int
+    min_decrease: float
+    damping: float = 1e-4
+    raised_by: float = 10.0
+    max_damping: float = 1e6
+
+    def __post_init__(self) -> None:
+        if self.iterations < 0:
+            raise ValueError(f"iterations must be at least 0, is {self.iterations}")
+        if self.raised_by <= 1:
+            raise ValueError(f"raised_by must be above 1, is {self.raised_by}")
+        for name in ("min_decrease", "damping", "max_damping"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be above 0, is {getattr(self, name)}")
+
+
+def minimize(problem: Problem[X, E], start: X, options: MinimizeOptions) -> X:
+    """The minimum near a start, or where the last of the steps led."""
+    x, cost, damping = start, problem.cost(start), options.damping
+    if math.isnan(cost):
+        return start
+    equations: E | None = None
+    for _ in range(options.iterations):
+        if equations is None:
+            equations = problem.linearize(x)
+        candidate = problem.step(x, equations, damping)
+        candidate_cost = math.nan if candidate is None else problem.cost(candidate)
+        if candidate is None or not candidate_cost < cost:
+            damping *= options.raised_by
+            if damping > options.max_damping:
+                break
+            continue
+        converged = cost - candidate_cost < options.min_decrease * cost
+        x, cost, damping, equations = candidate, candidate_cost, damping * LOWERED, None
+        if converged:
+            break
+    return x
+
+
+def minimize_each(
+    cost: Callable[[AnyArray], AnyArray],
+    linearize: Callable[[AnyArray], tuple[AnyArray, AnyArray]],
+    start: AnyArray,
+    iterations: int,
+    damping: float = 1e-3,
+) -> AnyArray:
+    """Minima of many independent problems of three unknowns, each with its own damping.
+
+    Looks at no value, so that a device does not wait for the host: all take the same number of steps.
+
+    Args:
+        cost: of points (P, 3), the cost of each (P,).
+        linearize: at points (P, 3), hessians (P, 3, 3) and gradients (P, 3) of half the cost.
+        start: (P, 3).
+        iterations: number of steps.
+        damping: the first.
+    """
+    xp, x, eye = namespace(start), start, identity(start)
+    damped, least = xp.full_like(start[:, 0], damping), cost(start)
+    for _ in range(iterations):
+        hessian, gradient = linearize(x)
+        candidate = x - solve_symmetric(hessian * (1 + damped[:, None, None] * eye), gradient)
+        candidate_cost = cost(candidate)
+        better = candidate_cost <= least  # False for NaN: behind a camera, or a singular system
+        x = xp.where(better[:, None], candidate, x)
+        least = xp.where(better, candidate_cost, least)
+        damped = xp.where(better, damped * LOWERED, damped * 10)
+    return x
+
+
+def damped_step(hessian: Array, gradient: Array, damping: float) -> Array | None:
+    """The step (N,) of dense normal equations (N, N), (N,); None where it is not determined."""
+    return solve_step(hessian + damping * np.diag(np.diag(hessian) + LEAST_DIAGONAL), gradient)
+
+
+def solve_step(matrix: Array, gradient: Array, *, least_norm: bool = False) -> Array | None:
+    """-matrix^-1 gradient, None where that does not exist or is not finite; or the shortest step in a singular case."""
+    try:
+        step = -np.linalg.lstsq(matrix, gradient, rcond=None)[0] if least_norm else -np.linalg.solve(matrix, gradient)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(step, np.float64) if np.isfinite(step).all() else None
