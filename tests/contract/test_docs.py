@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import asyncio
+import importlib
 import re
 from fnmatch import fnmatch
 from pathlib import Path
@@ -16,6 +17,7 @@ from prometheus_client import generate_latest
 from support.documents import PAGES, ROOT, anchors, blocks, commands, prose, shell
 from support.images import encode, textured
 from support.servers import pose, serving
+from test_imports import LADDER
 
 from mapless import Client, NewReference, RigidTransform
 from mapless import errors as client_errors
@@ -93,6 +95,23 @@ def test_files_that_commands_and_text_name_exist() -> None:
     assert sorted(name for name in named if not (ROOT / name).exists()) == ["deploy/.env"]
 
 
+@pytest.mark.parametrize("page", sorted((DOCS / "architecture").iterdir()), ids=page_id)
+def test_architecture_names_files_that_exist(page: Path) -> None:
+    bases = [ROOT, SERVER, SERVER / "method"]
+    for name in re.findall(r"`([\w./]+(?:\.py|/))`", page.read_text()):
+        assert any((base / name).exists() for base in bases), name
+
+
+def test_the_table_of_rooms_is_the_ladder_of_imports() -> None:
+    table = re.findall(r"^\| `(\w+)` \|.*\|(.*)\|$", (DOCS / "architecture/rooms.md").read_text(), re.MULTILINE)
+    assert [room for room, _ in table] == list(LADDER)
+    for room, begin in table:
+        for name in re.findall(r"`([\w.]+)`", begin):
+            module, _, attribute = name.partition(".")
+            loaded = importlib.import_module(f"mapless_server.{room}.{module}")
+            assert not attribute or hasattr(loaded, attribute), name
+
+
 # Python
 
 
@@ -150,6 +169,13 @@ def test_tables_of_rejections_and_variants_are_complete() -> None:
     assert reasons == [reason.name for reason in RejectionReason]
     variants = [row[0] for row in rows(DOCS / "guides/researcher.md", "variant")]
     assert variants == [variant.value for variant in Variant]
+
+
+def test_the_table_of_methods_is_complete() -> None:
+    named = [name for row in rows(DOCS / "guides/first-calls.md", "method") for name in row]
+    protos = "".join(path.read_text() for path in (ROOT / "proto").rglob("*.proto"))
+    assert {name for name in named if name[0].isupper()} == set(re.findall(r"rpc (\w+)\(", protos))
+    assert [name for name in named if name.islower() and not hasattr(Client, name)] == []
 
 
 def test_the_table_of_errors_has_every_reason() -> None:
