@@ -14,7 +14,7 @@ from mapless_server.scenes.retrieval.descriptor import Vector
 from mapless_server.scenes.retrieval.index import SceneIndex
 from mapless_server.scenes.retrieval.ranking import RankedReference, RankOptions, rank_references
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
-from mapless_server.store.records import IndexedReference, SceneChanges
+from mapless_server.store import IndexedReference, SceneChanges
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.plan import EvaluationOptions, split_frames

@@ -26,8 +26,8 @@ from mapless_server.method.views import View
 from mapless_server.scenes import library as library_module
 from mapless_server.scenes.library import Loaded, NotDescribedYet, ReferenceLibrary, load_usable
 from mapless_server.security.tenancy import SceneKey
-from mapless_server.store import NewReference, Store
-from mapless_server.store.sqlite import DATABASE_FILE, choose_library
+from mapless_server.store import DATABASE_FILE, NewReference, Store
+from mapless_server.store.sqlite import choose_library
 
 SCENE = SceneKey("s")
 IDS = [f"r{i}" for i in range(4)]

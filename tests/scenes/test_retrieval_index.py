@@ -13,7 +13,7 @@ from support.scenes import random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.scenes.retrieval.index import SceneIndex
-from mapless_server.store.records import IndexedReference, SceneChanges
+from mapless_server.store import IndexedReference, SceneChanges
 
 DIMENSION = 24
 SIMILARITY_TOLERANCE = 5e-3

@@ -17,7 +17,7 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.scenes.retrieval.index import Entries, SceneIndex
 from mapless_server.scenes.retrieval.narrowing import Cone, Narrowing, Sphere
 from mapless_server.scenes.retrieval.ranking import RankedReference, RankOptions, rank_references, spread
-from mapless_server.store.records import IndexedReference, SceneChanges
+from mapless_server.store import IndexedReference, SceneChanges
 
 DIMENSION = 16
 QUERY = np.eye(DIMENSION, dtype=np.float32)[0]

@@ -48,10 +48,8 @@ from mapless_server.method.views import PosedView, View
 from mapless_server.serve import running
 from mapless_server.serve.store_health import watch_store
 from mapless_server.services.handlers import SERVICE_NAMES
-from mapless_server.store import StoreError
+from mapless_server.store import DATABASE_FILE, SqliteDatabase, StoreError, verify
 from mapless_server.store.folder_lock import LOCK_FILE
-from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
-from mapless_server.store.verify import verify
 
 ONCE = ConnectOptions(max_attempts=1, timeout_s=30)
 LARGE = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
@@ -116,7 +114,7 @@ def is_answered(client: Client, *references: str) -> bool:
 
 
 def faults_of(folder: Path) -> tuple[str, ...]:
-    with closing(SqliteDatabase.look_at(folder / DATABASE_FILE)) as database, database.read() as connection:
+    with closing(SqliteDatabase.open_as_is(folder / DATABASE_FILE)) as database, database.read() as connection:
         return verify(connection).faults
 
 
@@ -150,7 +148,7 @@ class TestDisk:
             (disk / "filler").write_bytes(bytes(free.f_bavail * free.f_frsize - room_bytes))
 
         def count_left() -> int:
-            with closing(SqliteDatabase.look_at(disk / "data" / DATABASE_FILE)) as database, database.read() as left:
+            with closing(SqliteDatabase.open_as_is(disk / "data" / DATABASE_FILE)) as database, database.read() as left:
                 return int(left.exec_driver_sql("SELECT count(*) FROM reference").scalar_one())
 
         with small_disk(tmp_path / "disk", 32) as disk:

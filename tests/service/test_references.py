@@ -81,7 +81,7 @@ def test_a_scene_whose_deletion_is_slow_takes_no_memory(tmp_path: Path, ends: st
         client.add_references("s", [NewReference("r0", PHOTO, CAMERA, pose(0.0))])
         client.localize(PHOTO, CAMERA, "s")
         assert server.engine.references.index_bytes > 0
-        store._leftovers.delete = delete_what_is_left  # type: ignore[method-assign]
+        store._pending_deletions.run = delete_what_is_left  # type: ignore[method-assign]
         if ends == "late":
             with pytest.raises(DeadlineExceeded):
                 client.delete_scene("s", timeout_s=0.5)

@@ -28,11 +28,21 @@ from typer.testing import CliRunner
 from mapless.geodesy import Datum
 from mapless_server.security.principal import DEFAULT_TENANT
 from mapless_server.security.tenancy import SceneKey, key_of
-from mapless_server.store import SceneAttributes, Store, StoreError, codec, tables
-from mapless_server.store.backup import GENERATIONS_SKIPPED, back_up, restore
-from mapless_server.store.postgresql import PostgresqlDatabase
-from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase, choose_library
-from mapless_server.store.verify import verify
+from mapless_server.store import (
+    DATABASE_FILE,
+    PostgresqlDatabase,
+    SceneAttributes,
+    SqliteDatabase,
+    Store,
+    StoreError,
+    back_up,
+    codec,
+    restore,
+    tables,
+    verify,
+)
+from mapless_server.store.backup import GENERATIONS_SKIPPED
+from mapless_server.store.sqlite import choose_library
 from mapless_tools.cli.store import store_app
 
 OFFICE = SceneKey("office")
@@ -80,9 +90,9 @@ def assert_same_contents(store: Store, skipped: int = 0) -> None:
 
 def look_at(place: Place) -> SqliteDatabase | PostgresqlDatabase:
     if isinstance(place, Shared):
-        return PostgresqlDatabase.look_at(place.url)
+        return PostgresqlDatabase.open_as_is(place.url)
     assert isinstance(place, Folder)
-    return SqliteDatabase.look_at(place.data_dir / DATABASE_FILE)
+    return SqliteDatabase.open_as_is(place.data_dir / DATABASE_FILE)
 
 
 @pytest.mark.parametrize("destination", DATABASES)
@@ -147,10 +157,11 @@ def test_a_backup_beside_writers_shows_one_moment(place: Place, tmp_path: Path) 
             for number in range(2):
                 path = tmp_path / f"{number}.sqlite3"
                 source = place.url if isinstance(place, Shared) else str(tmp_path / "data" / DATABASE_FILE)
-                environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+                paths = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
+                environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
                 command = [sys.executable, __file__, source, str(path)]
                 subprocess.run(command, check=True, timeout=60, env=environment)
-                with closing(SqliteDatabase.look_at(path)) as database, database.read() as connection:
+                with closing(SqliteDatabase.open_as_is(path)) as database, database.read() as connection:
                     found = verify(connection)
                 assert found.faults == ()
                 assert found.counts["reference"] >= 200
@@ -286,5 +297,7 @@ def test_commands_do_it_beside_a_server(tmp_path: Path, backup: Path, monkeypatc
 if __name__ == "__main__":
     source, destination = sys.argv[1:]
     is_url = source.startswith("postgresql:")
-    with closing(PostgresqlDatabase.look_at(source) if is_url else SqliteDatabase.look_at(Path(source))) as opened:
+    with closing(
+        PostgresqlDatabase.open_as_is(source) if is_url else SqliteDatabase.open_as_is(Path(source))
+    ) as opened:
         back_up(opened, Path(destination))

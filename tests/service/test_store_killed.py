@@ -29,10 +29,16 @@ from mapless_server import errors
 from mapless_server.method.views import Features, View
 from mapless_server.security.principal import DEFAULT_TENANT
 from mapless_server.security.tenancy import SceneKey
-from mapless_server.store import NewReference, Store, StoreError, removing
-from mapless_server.store.postgresql import PostgresqlDatabase
-from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
-from mapless_server.store.verify import verify
+from mapless_server.store import (
+    DATABASE_FILE,
+    NewReference,
+    PostgresqlDatabase,
+    SqliteDatabase,
+    Store,
+    StoreError,
+    deletion,
+    verify,
+)
 
 SCENE = SceneKey("office")
 EXTRACTOR, DESCRIPTOR = "sift", "vlad"
@@ -102,7 +108,7 @@ def change_until_killed(address: str, prefix: str) -> None:
 
 def delete_until_killed(address: str, prefix: str) -> None:
     """Makes scenes of several references, and deletes them one reference at a time."""
-    removing.PORTION_BYTES = 0
+    deletion.PORTION_BYTES = 0
     with open_when_there(address) as store:
         for index in range(100_000):
             scene = SceneKey(f"{prefix}-{index}")
@@ -138,7 +144,8 @@ class Nursery:
     """Bears one victim at a time."""
 
     def __init__(self, address: str) -> None:
-        environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+        paths = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
         self._process = subprocess.Popen(
             [sys.executable, __file__, address],
             stdin=subprocess.PIPE,
@@ -301,7 +308,9 @@ def kill_and_check(database: str, folder: Path, rounds: int) -> None:
             nursery.end()
         assert ledger.acknowledged >= rounds
         address = place.url if isinstance(place, Shared) else ""
-        looked_at = PostgresqlDatabase.look_at(address) if address else SqliteDatabase.look_at(folder / DATABASE_FILE)
+        looked_at = (
+            PostgresqlDatabase.open_as_is(address) if address else SqliteDatabase.open_as_is(folder / DATABASE_FILE)
+        )
         with closing(looked_at), looked_at.read() as connection:
             assert verify(connection).faults == ()
 

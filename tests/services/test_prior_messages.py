@@ -20,7 +20,7 @@ from mapless_server.services.messages.priors import (
     needs_attributes,
     priors_from_message,
 )
-from mapless_server.store.records import SceneAttributes
+from mapless_server.store import SceneAttributes
 
 NOTHING = SceneAttributes()
 TURN = Quaternion(0.0, 0.0, math.sin(0.35), math.cos(0.35))

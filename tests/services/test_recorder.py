@@ -38,9 +38,8 @@ from mapless_server.services.capture.deletion import Staleness
 from mapless_server.services.capture.files import calls_of
 from mapless_server.services.capture.folder import CaptureFolder, Retention
 from mapless_server.services.capture.recorder import Recorder
-from mapless_server.store import SceneAttributes, SceneRecord, Store, reading
-from mapless_server.store.reading import ReadingStore
-from mapless_server.store.rows import time_us
+from mapless_server.store import SceneAttributes, SceneRecord, Store, reader, time_us
+from mapless_server.store.reader import StoreReader
 
 
 @dataclass
@@ -291,13 +290,13 @@ def test_what_is_deleted_while_its_call_waits_is_not_kept(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, deleted: str
 ) -> None:
     """Of a scene that is made anew neither: a call that used no reference is one of the scene before."""
-    counts, get_scene, let_go = Counts(), ReadingStore.get_scene, threading.Event()
+    counts, get_scene, let_go = Counts(), StoreReader.get_scene, threading.Event()
 
     def slow(self: Any, scene_key: SceneKey) -> SceneRecord:
         let_go.wait(LIMIT_S)
         return get_scene(self, scene_key)
 
-    monkeypatch.setattr(ReadingStore, "get_scene", slow)
+    monkeypatch.setattr(StoreReader, "get_scene", slow)
     with recording(tmp_path, store, counts) as recorder:
         if deleted == "reference":
             answer(recorder, "default", PosedView("k", "scenes/s/references/r0", a_view(), pose(0)))
@@ -319,7 +318,7 @@ def test_what_the_store_cannot_say_is_counted(
     def broken(*_: object) -> Any:
         raise fault
 
-    monkeypatch.setattr(ReadingStore, "get_scene", broken)
+    monkeypatch.setattr(StoreReader, "get_scene", broken)
     with recording(tmp_path, store, counts) as recorder:
         answer(recorder)
     assert (counts.kept, counts.dropped) == (0, {"store": 1})
@@ -377,7 +376,7 @@ def test_the_time_limit_holds_whatever_the_store_does(
                 let_go.wait(LIMIT_S)
             raise RuntimeError("no such table")
 
-        monkeypatch.setattr(ReadingStore, "get_scene", broken)
+        monkeypatch.setattr(StoreReader, "get_scene", broken)
         answer(recorder)
         wait_until(lambda: checks[0] == 1)
         wait_until(lambda: len(recorder.folder) == 0)
@@ -404,7 +403,7 @@ def test_a_fault_of_the_store_ends_no_check(
         answer(recorder)
         wait_until(lambda: counts.kept == 1)
         with monkeypatch.context() as patch:
-            patch.setattr(ReadingStore, "get_scene", broken)
+            patch.setattr(StoreReader, "get_scene", broken)
             wait_until(lambda: checks[0] >= 5)
         store.delete_scene(key_of("default", "s"))
         wait_until(lambda: len(recorder.folder) == 0)
@@ -425,7 +424,7 @@ def test_the_start_waits_for_no_store_and_retries_each_round(
         for tenant in ("default", "acme", "other"):
             answer(recorder, tenant)
     assert len(captured_in(tmp_path / "captured")) == 3
-    monkeypatch.setattr(ReadingStore, "get_scene", away)
+    monkeypatch.setattr(StoreReader, "get_scene", away)
     with recording(tmp_path, store, Counts()) as recorder:  # returns, although nobody lets the store go
         wait_until(lambda: asked[0] == 1)
         assert len(recorder.folder) == 3
@@ -490,13 +489,13 @@ def test_what_is_wrong_with_one_scene_keeps_nothing_of_another(tmp_path: Path, f
 
 def test_stored_data_is_not_read_again_and_queries_keep_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Features of each of two extractors are read once for all calls, and neither hits nor misses are counted."""
-    read, features = Counter[str](), reading._features
+    read, features = Counter[str](), reader._read_features
 
     def counted(connection: Any, ids: Any, extractor: str) -> Any:
         read[threading.current_thread().name] += len(ids)
         return features(connection, ids, extractor)
 
-    monkeypatch.setattr(reading, "_features", counted)
+    monkeypatch.setattr(reader, "_read_features", counted)
     store = Store.open(tmp_path / "data")
     folder = tmp_path / "captured"
     with (

@@ -22,7 +22,7 @@ from mapless.scenes import Calibration, unit_vector
 from mapless_server import errors
 from mapless_server.security.principal import DEFAULT_TENANT
 from mapless_server.security.tenancy import SceneKey
-from mapless_server.store import ContradictingDown, SceneAttributes, Store, codec, leftovers, queries
+from mapless_server.store import ContradictingDown, SceneAttributes, Store, codec, deletion, queries
 
 OFFICE, HALL, NOWHERE = map(SceneKey, ("office", "hall", "nowhere"))
 DATUM = Datum(47.1 / 3, -8.1 / 3, 400.1 / 3, Quaternion(0.0, 0.0, 0.6, 0.8))
@@ -113,7 +113,7 @@ def test_a_scene_deleted_and_created_again_has_forgotten(
     store: Store, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
     """Whether it is deleted in one portion, or in several."""
-    monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", 2)
+    monkeypatch.setattr(deletion, "REFERENCES_AT_A_TIME", 2)
     store.create_scene(OFFICE, SceneAttributes(DATUM, DOWN))
     if count:
         store.add_references(OFFICE, [make_reference(f"r{i}") for i in range(count)])

@@ -25,8 +25,7 @@ from support.stores import (
 
 from mapless_server import errors
 from mapless_server.security.tenancy import SceneKey
-from mapless_server.store import IndexedReference, NewReference, Store, changing
-from mapless_server.store.verify import verify
+from mapless_server.store import IndexedReference, NewReference, Store, verify
 
 OFFICE, HALL = SceneKey("office"), SceneKey("hall")
 NAME = "vlad"
@@ -280,7 +279,7 @@ def test_features_of_one_more_extractor_are_no_change(store: Store) -> None:
 def test_who_comes_after_deletions_are_forgotten_reads_all(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tombstones do not pile up; whether remembered or not, following is reading whole."""
     remembered = 4
-    monkeypatch.setattr(changing, "GENERATIONS_REMEMBERED", remembered)
+    monkeypatch.setattr("mapless_server.store.store.GENERATIONS_REMEMBERED", remembered)
     with place.open() as store:
         store.create_scene(OFFICE)
         store.add_references(OFFICE, [make_reference(f"r{it}", it, count=1) for it in range(12)])

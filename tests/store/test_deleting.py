@@ -27,12 +27,19 @@ from support.stores import (
 from mapless_server import errors
 from mapless_server.security.principal import DEFAULT_TENANT
 from mapless_server.security.tenancy import SceneKey
-from mapless_server.store import Store, leftovers, postgresql, reading, removing
-from mapless_server.store.backup import back_up, restore
-from mapless_server.store.leftovers import Leftovers
-from mapless_server.store.postgresql import PostgresqlDatabase
-from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
-from mapless_server.store.verify import verify
+from mapless_server.store import (
+    DATABASE_FILE,
+    PostgresqlDatabase,
+    SqliteDatabase,
+    Store,
+    back_up,
+    deletion,
+    postgresql,
+    reader,
+    restore,
+    verify,
+)
+from mapless_server.store.deletion import PendingDeletions
 
 OFFICE, HALL = SceneKey("office"), SceneKey("hall")
 TABLES = ("reference", "image", "features", "global_descriptor", "removed_reference")
@@ -41,7 +48,7 @@ COUNT = 10
 
 @pytest.fixture(params=DATABASES)
 def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Place:
-    monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", 3)
+    monkeypatch.setattr(deletion, "REFERENCES_AT_A_TIME", 3)
     return place_on(request.param, lambda: tmp_path)
 
 
@@ -58,13 +65,13 @@ def row_counts(place: Place) -> dict[str, int]:
 
 
 def before_each_portion(monkeypatch: pytest.MonkeyPatch, do: Callable[[], None]) -> None:
-    real = removing.next_portion
+    real = deletion.next_portion
 
     def next_portion(connection: Connection, at_most: int) -> Sequence[str]:
         do()
         return real(connection, at_most)
 
-    monkeypatch.setattr(removing, "next_portion", next_portion)
+    monkeypatch.setattr(deletion, "next_portion", next_portion)
 
 
 def fail() -> None:
@@ -126,12 +133,12 @@ def leave_some(place: Place, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def leave_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is left when a store is opened."""
-    monkeypatch.setattr(Leftovers, "resume", lambda _: None)
+    monkeypatch.setattr(PendingDeletions, "resume", lambda _: None)
 
 
 def wait_for_thread(store: Store) -> None:
-    assert store._leftovers._thread is not None
-    store._leftovers._thread.join(30)
+    assert store._pending_deletions._thread is not None
+    store._pending_deletions._thread.join(30)
 
 
 def test_a_crash_midway_leaves_what_the_next_delete_removes(
@@ -150,9 +157,9 @@ def test_a_crash_midway_leaves_what_the_next_delete_removes(
         with store.database.read() as connection:
             assert verify(connection).faults == ()
         source: Any = (
-            PostgresqlDatabase.look_at(place.url)
+            PostgresqlDatabase.open_as_is(place.url)
             if isinstance(place, Shared)
-            else SqliteDatabase.look_at(tmp_path / "data" / DATABASE_FILE)
+            else SqliteDatabase.open_as_is(tmp_path / "data" / DATABASE_FILE)
         )
         with closing(source):
             assert back_up(source, tmp_path / "backup").faults == ()
@@ -188,7 +195,7 @@ def test_remains_are_deleted_in_the_background_after_opening(place: Place, monke
             wait_for_thread(store)
     assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
     with place.open() as store:
-        assert store._leftovers._thread is None
+        assert store._pending_deletions._thread is None
 
 
 def assert_true(it: bool) -> None:
@@ -197,23 +204,23 @@ def assert_true(it: bool) -> None:
 
 def test_closing_ends_it_after_a_portion_and_a_start_goes_on(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     leave_some(place, monkeypatch)
-    monkeypatch.setattr(leftovers, "PAUSE_S", 30.0)
+    monkeypatch.setattr(deletion, "PAUSE_S", 30.0)
     with place.open():
         pass
     assert 0 < row_counts(place)["reference"] <= COUNT
-    monkeypatch.setattr(leftovers, "PAUSE_S", 0.0)
+    monkeypatch.setattr(deletion, "PAUSE_S", 0.0)
     with place.open() as store:
         wait_for_thread(store)
     assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
 
 
-@pytest.mark.parametrize("broken", ["is_left", "next_portion"])
+@pytest.mark.parametrize("broken", ["is_pending", "next_portion"])
 def test_where_that_fails_the_store_opens_and_logs_it(
     place: Place, broken: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     leave_some(place, monkeypatch)
     with monkeypatch.context() as patch:
-        patch.setattr(removing, broken, lambda *_: fail())
+        patch.setattr(deletion, broken, lambda *_: fail())
         with place.open() as store:
             assert store.list_scenes(DEFAULT_TENANT, 10) == []
     assert "stays until the next start or deletion of a scene: the store is not there" in caplog.text
@@ -225,10 +232,10 @@ def test_a_store_that_can_only_be_read_leaves_it(
 ) -> None:
     place = Folder(tmp_path)
     leave_some(place, monkeypatch)
-    monkeypatch.setattr(SqliteDatabase, "open", lambda it: SqliteDatabase._open_to_read(it / DATABASE_FILE))
+    monkeypatch.setattr(SqliteDatabase, "open", lambda it: SqliteDatabase._open_read_only(it / DATABASE_FILE))
     with place.open() as store:
-        assert store._leftovers._thread is None
-    assert "what is left" not in caplog.text
+        assert store._pending_deletions._thread is None
+    assert "interrupted" not in caplog.text
 
 
 @pytest.mark.parametrize(("portion_bytes", "expected"), [(0, range(COUNT, 0, -1)), (40_000, range(COUNT, 0, -2))])
@@ -236,8 +243,8 @@ def test_a_portion_is_bounded_by_its_bytes_and_has_one_at_least(
     place: Place, monkeypatch: pytest.MonkeyPatch, portion_bytes: int, expected: range
 ) -> None:
     """Each has 5000 bytes of a photograph and more than 10 000 of features."""
-    monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", 100)
-    monkeypatch.setattr(removing, "PORTION_BYTES", portion_bytes)
+    monkeypatch.setattr(deletion, "REFERENCES_AT_A_TIME", 100)
+    monkeypatch.setattr(deletion, "PORTION_BYTES", portion_bytes)
     seen: list[int] = []
     with place.open() as store:
         fill(store, OFFICE)
@@ -259,7 +266,7 @@ def test_between_portions_others_may_write(place: Place) -> None:
     written: list[float] = []
     with place.open() as store:
         fill(store, OFFICE)
-        store._leftovers._closing = Pause()
+        store._pending_deletions._closing = Pause()
         store.delete_scene(OFFICE)
         assert len(store.list_scenes(DEFAULT_TENANT, 10)) == len(written) == 3
 
@@ -267,7 +274,7 @@ def test_between_portions_others_may_write(place: Place) -> None:
 def test_the_journal_stays_as_small_as_a_portion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Though what is deleted is overwritten, for which it goes through the journal."""
     place, journal = Folder(tmp_path), tmp_path / f"{DATABASE_FILE}-wal"
-    monkeypatch.setattr(removing, "PORTION_BYTES", 2**18)
+    monkeypatch.setattr(deletion, "PORTION_BYTES", 2**18)
     with place.open() as store:
         store.create_scene(OFFICE)
         large = [replace(make_reference(f"r{it}", it), image=bytes(200_000)) for it in range(15)]
@@ -281,7 +288,7 @@ class TestFullDisk:
     """Where there is room in the journal for one reference, but not for two."""
 
     def fill_up(self, monkeypatch: pytest.MonkeyPatch, room: int) -> list[int]:
-        real, tried = removing.remove, []
+        real, tried = deletion.delete_references, []
 
         def remove(connection: Connection, *keys: str) -> None:
             tried.append(len(keys))
@@ -289,7 +296,7 @@ class TestFullDisk:
                 raise errors.Overloaded("the store's disk is full", reason="STORE_FULL")
             real(connection, *keys)
 
-        monkeypatch.setattr(removing, "remove", remove)
+        monkeypatch.setattr(deletion, "delete_references", remove)
         return tried
 
     def test_references_are_deleted_one_by_one(self, place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -341,7 +348,7 @@ class TestMemory:
     def test_what_is_being_read_meanwhile_is_not_remembered(
         self, place: Place, what: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        real = reading._features
+        real = reader._read_features
 
         def delete_meanwhile(*arguments: Any) -> Any:
             found = real(*arguments)
@@ -354,7 +361,7 @@ class TestMemory:
         with place.open() as store:
             fill(store, OFFICE)
             with monkeypatch.context() as patch:
-                patch.setattr(reading, "_features", delete_meanwhile)
+                patch.setattr(reader, "_read_features", delete_meanwhile)
                 assert len(store.load_references(OFFICE, ["r1", "r0"], EXTRACTOR).references) == 2
             assert self.used_bytes(store)[:2] == (0, 0)
 
@@ -378,7 +385,7 @@ def test_servers_that_delete_at_the_same_time_help_one_another(place: Place, mon
 
 
 def test_a_statement_s_limit_does_not_keep_a_scene_alive(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", 3)
+    monkeypatch.setattr(deletion, "REFERENCES_AT_A_TIME", 3)
     place = place_on("postgresql", lambda: tmp_path)
     monkeypatch.setitem(postgresql._SESSION_OPTIONS, "statement_timeout", "300ms")
     with place.open() as store:

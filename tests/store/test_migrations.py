@@ -23,12 +23,20 @@ from support.stores import (
 )
 
 from mapless_server.security.tenancy import SceneKey
-from mapless_server.store import SceneAttributes, Store, StoreError, rows
-from mapless_server.store.backup import back_up, restore
+from mapless_server.store import (
+    DATABASE_FILE,
+    SCHEMA_VERSION,
+    PostgresqlDatabase,
+    SceneAttributes,
+    SqliteDatabase,
+    Store,
+    StoreError,
+    back_up,
+    restore,
+    rows,
+)
 from mapless_server.store.migrations import migrate, run_steps
-from mapless_server.store.postgresql import PostgresqlDatabase
-from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
-from mapless_server.store.tables import SCHEMA_VERSION, features, image, metadata, reference, scene_generation
+from mapless_server.store.tables import features, image, metadata, reference, scene_generation
 
 OFFICE = SceneKey("office")
 
@@ -113,7 +121,7 @@ def test_a_store_of_the_second_release_has_no_attributes(place: Place, tmp_path:
         connection.execute(insert(scene_generation).values(scene_id="hall", generation=1))
     place.execute(create, "office")
     if isinstance(place, Folder):
-        with closing(SqliteDatabase.look_at(place.data_dir / DATABASE_FILE)) as database:
+        with closing(SqliteDatabase.open_as_is(place.data_dir / DATABASE_FILE)) as database:
             assert back_up(database, tmp_path / "backup").faults == ()
         with Store.open(tmp_path / "other") as store:
             assert restore(tmp_path / "backup", store.database).faults == ()
@@ -183,10 +191,10 @@ def test_a_step_that_fails_changes_nothing(place: Place, monkeypatch: pytest.Mon
 def test_looking_changes_nothing(place: Place) -> None:
     make_version_1(place)
     if isinstance(place, Shared):
-        PostgresqlDatabase.look_at(place.url).close()
+        PostgresqlDatabase.open_as_is(place.url).close()
     else:
         assert isinstance(place, Folder)
-        SqliteDatabase.look_at(place.data_dir / DATABASE_FILE).close()
+        SqliteDatabase.open_as_is(place.data_dir / DATABASE_FILE).close()
     assert place.fetch("SELECT schema_version FROM store_version") == [(1,)]
 
 

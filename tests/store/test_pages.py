@@ -13,9 +13,7 @@ from support.stores import EXTRACTOR, make_reference, view_of
 
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
 from mapless_server.security.tenancy import SceneKey
-from mapless_server.store import Store, leftovers
-from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
-from mapless_server.store.verify import verify
+from mapless_server.store import DATABASE_FILE, SqliteDatabase, Store, deletion, verify
 
 SCENE = SceneKey("office")
 IDS = ["a", "b", "c"]
@@ -51,7 +49,7 @@ def lose(folder: Path, what: str, reference_id: str) -> None:
 
 
 def faults_of(folder: Path) -> tuple[str, ...]:
-    with closing(SqliteDatabase.look_at(folder / DATABASE_FILE)) as database, database.read() as connection:
+    with closing(SqliteDatabase.open_as_is(folder / DATABASE_FILE)) as database, database.read() as connection:
         return verify(connection).faults
 
 
@@ -106,7 +104,7 @@ def test_any_loss_is_reported_and_the_reference_can_be_replaced(folder: Path, wh
 
 @pytest.mark.parametrize("at_a_time", [1, 2, 100])
 def test_a_scene_with_lost_pages_can_be_deleted(folder: Path, at_a_time: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(leftovers, "REFERENCES_AT_A_TIME", at_a_time)
+    monkeypatch.setattr(deletion, "REFERENCES_AT_A_TIME", at_a_time)
     lose(folder, "features", "b")
     lose(folder, "features", "c")
     with Store.open(folder) as store:
@@ -118,7 +116,7 @@ def test_a_scene_with_lost_pages_can_be_deleted(folder: Path, at_a_time: int, mo
         assert store.get_scene(SCENE).reference_count == 3
         store.delete_scene(SCENE)
         assert store.list_scenes("default", 10) == []
-    with closing(SqliteDatabase.look_at(folder / DATABASE_FILE)) as database, database.read() as connection:
+    with closing(SqliteDatabase.open_as_is(folder / DATABASE_FILE)) as database, database.read() as connection:
         left = connection.exec_driver_sql("SELECT count(*) FROM reference").scalar()
     assert left == 2, "of those that cannot be deleted"
 

@@ -33,8 +33,7 @@ from mapless_server import errors
 from mapless_server.method.views import Features, View
 from mapless_server.security.principal import DEFAULT_TENANT
 from mapless_server.security.tenancy import SceneKey
-from mapless_server.store import NewReference, Store, codec
-from mapless_server.store.cache import LruCache
+from mapless_server.store import LruCache, NewReference, Store, codec
 
 DENIALS = {
     "sqlite": (

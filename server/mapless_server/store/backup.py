@@ -1,7 +1,7 @@
-"""Copies of a store: to a file while it is served, and from a file into an empty store, of either database.
+"""Backups: a store is copied to a file while it is served, and from a file into an empty store of either database.
 
-A backup is one SQLite file, from whichever database, so that it is also the way from one to the other. It shows one
-moment. It has its name only once every row of it was read again and found to be as it was stored.
+A backup is one SQLite file, from whichever database, so it also moves a store from one to the other. It shows one
+moment, and gets its name only after every row of it has been read again and found to be as stored.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from sqlalchemy.exc import DBAPIError
 
 from mapless_server.errors import RequestError
 
-from . import queries, removing
+from . import deletion, queries
 from .database import Database, StoreError
 from .migrations import read_version
 from .sqlite import SqliteDatabase, choose_library
 from .tables import SCHEMA_VERSION, alembic_version, removed_reference, scene, scene_generation, store_version
-from .verify import BLOBS_AT_A_TIME, Progress, Verification, ignore_progress, verify
+from .verification import BLOBS_AT_A_TIME, Progress, Verification, ignore_progress, verify
 
 GENERATIONS_SKIPPED = 1_000_000
-"""A restored scene counts on past what it may have come to after the backup, so that no generation means two things."""
+"""A restored scene continues after what it may have reached since the backup, so that generations stay unique."""
 
 _BYTES_AT_A_TIME = 8 * 2**20
 _ROWS_AT_A_TIME = 1000
 _PAGES_AT_A_TIME = 250
 _NOT_RESTORED = (store_version, alembic_version, scene_generation, removed_reference)
-"""What the store has of its own, and tombstones, of which nobody asks who reads the scene as a whole."""
+"""Tables that the new store has of its own, and tombstones, which no reader of a restored scene needs."""
 
 
 def back_up(database: Database, path: Path, on_progress: Progress = ignore_progress) -> Verification:
-    """Copy a store to a file, as of one moment; servers may go on reading and writing it.
+    """Copies a store to a file, as of one moment; servers may go on reading and writing it.
 
-    What is damaged in the store itself is damaged in its copy, too, and named by what is returned.
+    What is damaged in the store is damaged in the copy, too, and listed in the result.
 
     Raises:
         StoreError: the file exists or cannot be written, or differs from the store.
@@ -48,10 +48,10 @@ def back_up(database: Database, path: Path, on_progress: Progress = ignore_progr
         raise StoreError(f"{path} exists already")
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
     try:
-        with _faults_said(f"backup {path} cannot be made"):
-            unfinished.touch(mode=0o600)  # everybody's photographs, which the store keeps from other users, too
+        with _faults_as_store_errors(f"backup {path} cannot be made"):
+            unfinished.touch(mode=0o600)  # it contains photographs, which other users must not read
             with database.read() as source:
-                database.take_your_time(source)
+                database.lift_limits(source)
                 version = read_version(source)  # from here on, the transaction sees one moment
                 assert version is not None
                 if source.dialect.name == "sqlite":
@@ -68,23 +68,26 @@ def back_up(database: Database, path: Path, on_progress: Progress = ignore_progr
 
 
 def restore(path: Path, database: Database, on_progress: Progress = ignore_progress) -> Verification:
-    """Copy a backup into a store without scenes: all of it, or nothing.
+    """Copies a backup into a store without scenes: all of it, or nothing.
 
     Raises:
         StoreError: the backup is damaged, of a newer program or no backup; the store has scenes or cannot be written.
     """
-    with _faults_said(f"backup {path} cannot be restored"), closing(SqliteDatabase.look_at(path)) as backup:
+    with (
+        _faults_as_store_errors(f"backup {path} cannot be restored"),
+        closing(SqliteDatabase.open_as_is(path)) as backup,
+    ):
         with backup.read() as source:
             found = verify(source, on_progress)
         if found.faults:
             raise StoreError(f"backup {path} is damaged ({len(found.faults)} faults), first: {found.faults[0]}")
         with (
-            _in_this_schema(backup, path, found.version) as current,
+            _in_current_schema(backup, path, found.version) as current,
             current.read() as source,
             database.write() as target,
         ):
-            database.take_your_time(target)
-            removing.forget_removed(target)
+            database.lift_limits(target)
+            deletion.delete_detached(target)
             if target.scalar(select(func.count()).select_from(scene)):
                 raise StoreError(f"database {database.name} has scenes; a backup needs an empty store")
             _copy_rows(source, target, _tables_of(source, _NOT_RESTORED), on_progress)
@@ -92,20 +95,20 @@ def restore(path: Path, database: Database, on_progress: Progress = ignore_progr
             written = verify(target, on_progress)
             if written.faults or not found.counts.items() <= written.counts.items():
                 raise StoreError(f"database {database.name} does not keep what is written to it")
-            removing.forget_removed(target)
+            deletion.delete_detached(target)
     return written
 
 
 def _copy_pages(source: Connection, path: Path, on_progress: Progress) -> None:
-    """By SQLite's own means; in a transaction that has begun to read, the copy does not see what others write."""
+    """Copies with SQLite's backup API; `source` has begun to read, so the copy does not see later changes."""
     raw = source.connection.driver_connection
     assert raw is not None
 
-    def tell(_status: int, remaining: int, total: int) -> None:
+    def progress(_status: int, remaining: int, total: int) -> None:
         on_progress("copying pages", total - remaining, total)
 
     with closing(choose_library().connect(path)) as target:
-        raw.backup(target, pages=_PAGES_AT_A_TIME, progress=tell)
+        raw.backup(target, pages=_PAGES_AT_A_TIME, progress=progress)
         target.execute("PRAGMA journal_mode=DELETE")  # one file, which can be read where nothing can be written
 
 
@@ -123,10 +126,10 @@ def _copy_rows(source: Connection, target: Connection, tables: list[Table], on_p
             on_progress(f"copying {table.name}", done, total)
 
 
-def _tables_of(copy: Connection, left_out: Sequence[Table] = ()) -> list[Table]:
-    """The tables of a file as they are, of whatever schema; in the order in which they are to be filled."""
+def _tables_of(copy: Connection, omitted: Sequence[Table] = ()) -> list[Table]:
+    """The tables of a file, of whatever schema version, in the order in which they must be filled."""
     schema = MetaData()
-    schema.reflect(copy, only=lambda name, _: name not in {it.name for it in left_out})
+    schema.reflect(copy, only=lambda name, _: name not in {it.name for it in omitted})
     return schema.sorted_tables
 
 
@@ -145,7 +148,7 @@ def _portions(source: Connection, table: Table) -> Iterator[list[dict[str, Any]]
 
 
 def _skip_generations(source: Connection, target: Connection) -> None:
-    """Scenes count on past both lives; whoever knows one as of either reads it as a whole."""
+    """Raises the generations above those of both databases, so that callers which know either read the whole scene."""
     column = scene_generation.c
     former, saved = queries.read_generations(target), queries.read_generations(source)
     target.execute(delete(scene_generation).where(column.scene_id.in_(saved.keys() & former.keys())))
@@ -153,25 +156,25 @@ def _skip_generations(source: Connection, target: Connection) -> None:
         raised = {key: max(saved[key], former.get(key, 0)) + GENERATIONS_SKIPPED for key in saved}
         target.execute(insert(scene_generation), [{"scene_id": key, "generation": it} for key, it in raised.items()])
     latest = select(column.generation).where(column.scene_id == scene.c.scene_id).scalar_subquery()
-    target.execute(update(scene).where(~removing.is_set_apart(scene.c.scene_id)).values(first_generation=latest))
+    target.execute(update(scene).where(~deletion.is_detached(scene.c.scene_id)).values(first_generation=latest))
 
 
 def _verify_copy(source: Connection, path: Path, on_progress: Progress) -> Verification:
-    """What is found in a copy; StoreError if that is not what is in the store."""
-    with closing(SqliteDatabase.look_at(path)) as database, database.read() as copy:
+    """Verifies a copy; StoreError if it differs from the store."""
+    with closing(SqliteDatabase.open_as_is(path)) as database, database.read() as copy:
         found = verify(copy, on_progress)
         counts = [select(func.count()).select_from(table) for table in _tables_of(copy)]
         if any(copy.scalar(count) != source.scalar(count) for count in counts):
             raise StoreError("the copy lacks rows of the store")
-    # Rare, so it may take as long again: was it damaged before, or by us?
+    # Rare, so it may take as long again: was the store damaged before, or only the copy?
     if found.faults and verify(source, on_progress).faults != found.faults:
         raise StoreError(f"the copy is damaged: {found.faults[0]}")
     return found
 
 
 @contextmanager
-def _in_this_schema(backup: SqliteDatabase, path: Path, version: int) -> Iterator[Database]:
-    """The backup itself, or, if it is of an older program, a copy that is brought up to date."""
+def _in_current_schema(backup: SqliteDatabase, path: Path, version: int) -> Iterator[Database]:
+    """The backup itself, or, if it is of an older program, a migrated copy."""
     if version == SCHEMA_VERSION:
         yield backup
         return
@@ -183,7 +186,7 @@ def _in_this_schema(backup: SqliteDatabase, path: Path, version: int) -> Iterato
 
 
 @contextmanager
-def _faults_said(what: str) -> Iterator[None]:
+def _faults_as_store_errors(what: str) -> Iterator[None]:
     try:
         yield
     except StoreError:

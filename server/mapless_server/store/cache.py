@@ -1,4 +1,4 @@
-"""A thread-safe cache that forgets what was used longest ago."""
+"""A thread-safe cache that evicts the least recently used values."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ Value = TypeVar("Value")
 
 
 class LruCache(Generic[Value]):
-    """Holds values of at most ``capacity_bytes`` together; 0 holds nothing.
+    """Holds values of at most `capacity_bytes` together; 0 holds nothing.
 
     Attributes:
         hits, misses: of `get`.
-        evictions: values forgotten for want of room.
+        evictions: values dropped for lack of room.
+        used_bytes: sum of the sizes of the values held.
     """
 
     def __init__(self, capacity_bytes: int) -> None:
@@ -23,15 +24,9 @@ class LruCache(Generic[Value]):
         if capacity_bytes < 0:
             raise ValueError(f"cache capacity must not be negative, is {capacity_bytes} bytes")
         self._capacity_bytes = capacity_bytes
-        self.hits = self.misses = self.evictions = 0
-        self._used_bytes = 0
+        self.hits = self.misses = self.evictions = self.used_bytes = 0
         self._entries: OrderedDict[Hashable, tuple[Value, int]] = OrderedDict()
         self._lock = threading.Lock()
-
-    @property
-    def used_bytes(self) -> int:
-        """Sum of the sizes of the values held."""
-        return self._used_bytes
 
     def get(self, key: Hashable) -> Value | None:
         """The value, which becomes the most recently used, or None."""
@@ -45,27 +40,26 @@ class LruCache(Generic[Value]):
             return entry[0]
 
     def forget(self, is_gone: Callable[[Any, Value], bool]) -> list[Any]:
-        """Forget what nobody will ask for any more, by key and value; not counted as evictions. Looks at each.
+        """Drops the entries whose key and value `is_gone` accepts, looking at each; returns their keys.
 
-        Returns:
-            The keys of what was forgotten.
+        They are not counted as evictions.
         """
         with self._lock:
             gone = [key for key, (value, _) in self._entries.items() if is_gone(key, value)]
             for key in gone:
                 _, size_bytes = self._entries.pop(key)
-                self._used_bytes -= size_bytes
+                self.used_bytes -= size_bytes
         return gone
 
     def put(self, key: Hashable, value: Value, size_bytes: int) -> None:
-        """Hold a value, unless it is larger than the whole cache."""
+        """Holds a value, unless it is larger than the whole cache."""
         if size_bytes > self._capacity_bytes:
             return
         with self._lock:
             _, replaced_bytes = self._entries.pop(key, (None, 0))
             self._entries[key] = (value, size_bytes)
-            self._used_bytes += size_bytes - replaced_bytes
-            while self._used_bytes > self._capacity_bytes:
-                _, (_, forgotten_bytes) = self._entries.popitem(last=False)
-                self._used_bytes -= forgotten_bytes
+            self.used_bytes += size_bytes - replaced_bytes
+            while self.used_bytes > self._capacity_bytes:
+                _, (_, dropped_bytes) = self._entries.popitem(last=False)
+                self.used_bytes -= dropped_bytes
                 self.evictions += 1

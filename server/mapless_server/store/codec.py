@@ -1,14 +1,14 @@
-"""Cameras, poses, features and what is known of scenes as stored: exact to the bit, and never believed unchecked.
+"""Cameras, poses, features and scene attributes as bytes: exact to the bit, and checked when they are read.
 
-Geometry, and what is known of a scene as a whole, is JSON text: Python writes the shortest decimal that reads back as
-the same float64. A view is one blob:
+Geometry and scene attributes are JSON text: Python writes the shortest decimal that reads back as the same float64. A
+view is one blob:
 
     byte 0       format version
     bytes 4..8   length of the header, uint32
     header       JSON (camera, count, dimension), padded with spaces so that the arrays are aligned
     arrays       keypoints (N, 2), sizes (N,), descriptors (N, D), float32
 
-A global descriptor is its numbers as float16, and nothing else: similarities of unit vectors change by less than 0.001.
+A global descriptor is its numbers as float16: similarities of unit vectors change by less than 0.001.
 
 Everything is little-endian.
 """
@@ -51,7 +51,7 @@ class Damaged(Exception):
 
 
 def sha256_for(owner: str, data: bytes) -> str:
-    """Hexadecimal SHA-256 of ``data`` together with whom it belongs to, so that bytes of another row do not pass."""
+    """Hexadecimal SHA-256 of `data` and its owner, so that bytes of another row do not pass the check."""
     digest = hashlib.sha256(owner.encode() + b"\0")
     digest.update(data)
     return digest.hexdigest()
@@ -68,13 +68,13 @@ def encode_geometry(camera: Camera, world_from_camera: RigidTransform) -> bytes:
 
 
 def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, RigidTransform]:
-    """The camera and pose that ``encode_geometry`` was given; read-only arrays.
+    """The camera and pose that `encode_geometry` was given; read-only arrays.
 
     Raises:
-        Damaged: the checksum does not match, or it was made of something else.
+        Damaged: the checksum or the form of the data is wrong.
     """
     check(owner, data, sha256, "camera and pose")
-    with _of_known_form("camera and pose"):
+    with _checked_form("camera and pose"):
         content = json.loads(data)
         pose = content["world_from_camera"]
         rotation, translation = np.array(pose["rotation"], float), np.array(pose["translation"], float)
@@ -84,7 +84,7 @@ def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, Rigid
 
 
 def encode_attributes(attributes: SceneAttributes) -> bytes | None:
-    """What is known of a scene as JSON; None where that is nothing."""
+    """Scene attributes as JSON; None if there are none."""
     if attributes == SceneAttributes():
         return None
     content = asdict(attributes)
@@ -94,16 +94,16 @@ def encode_attributes(attributes: SceneAttributes) -> bytes | None:
 
 
 def decode_attributes(owner: str, data: bytes | None, sha256: str | None) -> SceneAttributes:
-    """What ``encode_attributes`` was given.
+    """The attributes that `encode_attributes` was given.
 
     Raises:
-        Damaged: the checksum does not match, or it was made of something else.
+        Damaged: the checksum or the form of the data is wrong.
     """
     if data is None and sha256 is None:
         return SceneAttributes()
     check(owner, data, sha256 or "", "datum, down and calibration")
     assert data is not None
-    with _of_known_form("datum, down and calibration"):
+    with _checked_form("datum, down and calibration"):
         content = json.loads(data)
         datum, down, calibration = content["datum"], content["down_in_world"], content["calibration"]
         if calibration and calibration["create_time"]:
@@ -133,13 +133,13 @@ def encode_view(view: View) -> bytes:
 
 
 def decode_view(owner: str, blob: bytes, sha256: str) -> View:
-    """The view that ``encode_view`` was given; its arrays are read-only and share the blob's memory.
+    """The view that `encode_view` was given; its arrays are read-only and share the blob's memory.
 
     Raises:
         Damaged: the checksum does not match, or the format is unknown.
     """
     check(owner, blob, sha256, "features")
-    with _of_known_form("features"):
+    with _checked_form("features"):
         version, header_length = _PREFIX.unpack_from(blob)
         if version != VIEW_FORMAT_VERSION:
             raise Damaged(f"features (format {version} is unknown)")
@@ -153,8 +153,8 @@ def decode_view(owner: str, blob: bytes, sha256: str) -> View:
 
 
 def decode_poses(geometries: Sequence[bytes]) -> list[RigidTransform]:
-    """The poses alone of many cameras and poses, whose checksums must have been checked; read-only arrays."""
-    # As one array it takes one call, not one each.
+    """The poses of many encoded geometries, whose checksums must have been checked; read-only arrays."""
+    # One call for all is faster than one for each.
     poses = [it["world_from_camera"] for it in json.loads(b"[" + b",".join(geometries) + b"]")]
     rotations = np.array([pose["rotation"] for pose in poses], float)
     translations = np.array([pose["translation"] for pose in poses], float)
@@ -182,7 +182,7 @@ def decode_descriptors(blobs: Sequence[bytes]) -> list[NDArray[np.float32]]:
     """Many global descriptors, whose checksums must have been checked; read-only arrays."""
     if not blobs:
         return []
-    if len(set(map(len, blobs))) > 1:  # the same name means the same length, unless somebody gave it to two things
+    if len(set(map(len, blobs))) > 1:  # only if two descriptors were given the same name
         return [decode_descriptors([blob])[0] for blob in blobs]
     vectors = np.frombuffer(b"".join(blobs), _FLOAT16).reshape(len(blobs), -1).astype(np.float32)
     vectors.setflags(write=False)
@@ -191,14 +191,14 @@ def decode_descriptors(blobs: Sequence[bytes]) -> list[NDArray[np.float32]]:
 
 def check(owner: str, data: object, sha256: str, what: str) -> None:
     """Raises Damaged if these are not the bytes that were stored for this owner."""
-    # One flipped bit can make SQLite take a blob for text, so the type is as little to be trusted as the content.
+    # One flipped bit can make SQLite take a blob for text, so the type is checked, too.
     if not isinstance(data, bytes) or sha256_for(owner, data) != sha256:
         raise Damaged(what)
 
 
 @contextmanager
-def _of_known_form(what: str) -> Iterator[None]:
-    """What another program wrote, with a checksum that is right, is Damaged too."""
+def _checked_form(what: str) -> Iterator[None]:
+    """Raises Damaged for data that another program wrote with a correct checksum."""
     try:
         yield
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError, struct.error) as error:

@@ -1,4 +1,4 @@
-"""The seam between the store and what keeps it: SQLite in a folder, or a PostgreSQL that several servers share."""
+"""What the store needs of a database: SQLite in a folder, or a PostgreSQL that several servers share."""
 
 from __future__ import annotations
 
@@ -13,28 +13,17 @@ class StoreError(Exception):
 
 
 class Database(Protocol):
-    """Transactions of one database; safe for many threads. Its faults are those of `errors` that a caller can act on.
+    """Transactions of one database; thread-safe. Raises RequestError for faults that a caller can act on.
 
     Attributes:
-        is_shared: whether other processes may change it. If so, nothing remembered is believed without its generation.
+        is_shared: whether other processes may change it; then cached rows are valid for their generation only.
         only_reads: whether every change is refused.
         name: for messages.
     """
 
-    @property
-    def is_shared(self) -> bool:
-        """See the class."""
-        ...
-
-    @property
-    def only_reads(self) -> bool:
-        """See the class."""
-        ...
-
-    @property
-    def name(self) -> str:
-        """See the class."""
-        ...
+    is_shared: bool
+    only_reads: bool
+    name: str
 
     def read(self) -> AbstractContextManager[Connection]:
         """A transaction that sees one moment of the database throughout."""
@@ -43,22 +32,19 @@ class Database(Protocol):
     def write(self) -> AbstractContextManager[Connection]:
         """A transaction that is on the disk, whole, when the block is left, or not at all if it raises.
 
-        Where the database lets several writers in, each statement sees what was committed before it began. The changes
-        of a scene are ordered by its generation, which each raises before it looks at anything: that row is their lock.
+        Where the database admits several writers, each statement sees what was committed before it began. The changes
+        of a scene are ordered by its generation, which each raises before it reads anything: that row is their lock.
         """
         ...
 
-    def take_your_time(self, connection: Connection) -> None:
-        """Lift the limits of a transaction, which is no call that somebody waits for."""
+    def lift_limits(self, connection: Connection) -> None:
+        """Lifts the time limits of a transaction that no caller waits for."""
         ...
 
-    def make_room(self) -> None:
-        """Free what the database takes of the disk beside its data, as far as that can be done soon.
-
-        The caller has no transaction.
-        """
+    def free_space(self) -> None:
+        """Frees what the database takes of the disk beside its data, as far as that is quick; outside transactions."""
         ...
 
     def close(self) -> None:
-        """Close all connections; nothing may be reading or writing."""
+        """Closes all connections; nothing may be reading or writing."""
         ...

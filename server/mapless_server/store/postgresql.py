@@ -1,12 +1,12 @@
-"""Everything that is particular to PostgreSQL: how it is reached, how long it is waited for, what its faults mean.
+"""The store's database on PostgreSQL: connections, transactions, time limits.
 
 Reading is REPEATABLE READ and read-only, so that a call sees one moment. Writing is READ COMMITTED: everything that
-changes a scene first locks the row of its generation (see `queries.begin_change`), so that what SERIALIZABLE would find
-out at the end, and have us try again, cannot come up.
+changes a scene first locks the row of its generation (see `queries.begin_change`), so the conflicts that SERIALIZABLE
+would detect at the end cannot occur.
 
-A commit is acknowledged when it is on the disk. A commit whose acknowledgement is lost on the way is reported as
-Unavailable, though it may have happened: who tries again then meets AlreadyExists, or NotFound when deleting. When the
-database goes away, calls fail and its connections are thrown away; when it is back, the next call gets a new one.
+A commit is acknowledged when it is on the disk. A commit whose acknowledgement is lost is reported as Unavailable,
+though it may have happened: trying again then raises AlreadyExists, or NotFound when deleting. When the database goes
+away, calls fail and its connections are dropped; when it is back, the next call gets a new one.
 """
 
 from __future__ import annotations
@@ -17,28 +17,26 @@ from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError
-from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
-from mapless_server.errors import Overloaded, RequestError, Unavailable
+from mapless_server.errors import RequestError
 
-from .damage import DamagedPages, is_damage
 from .database import StoreError
+from .faults import postgresql_faults_translated
 from .migrations import migrate, read_version
 from .tables import SCHEMA_VERSION
 
 DRIVER = "postgresql+psycopg"
 CONNECTIONS_KEPT = 4
 CONNECTIONS_AT_MOST = 16
-"""Of one server: PostgreSQL lets 100 in unless told otherwise, which is six servers."""
+"""Of one server: by default PostgreSQL accepts 100, which are six servers."""
 CONNECTION_WAIT_S = 5.0
-"""For one of our own connections that is in use: less than callers wait."""
-RETRY_AFTER_S = 1.0
+"""For a free connection of this server's own; less than callers wait."""
 
 _CONNECT_OPTIONS: dict[str, Any] = {
     "application_name": "mapless-server",
     "connect_timeout": 5,
     "client_encoding": "utf8",
-    # A host that vanishes says nothing: it is given up after 10 + 3 * 5 s in silence, or 15 s after it was spoken to.
+    # A host that disappears is given up after 10 + 3 * 5 s of silence, or 15 s after data was sent to it.
     "keepalives_idle": 10,
     "keepalives_interval": 5,
     "keepalives_count": 3,
@@ -49,21 +47,16 @@ _SESSION_OPTIONS = {
     "synchronous_commit": "on",
     "statement_timeout": "60s",
     "lock_timeout": "5s",
-    # A server that hangs in the middle of a change must not keep the scene's lock from the others.
+    # A server that hangs in the middle of a change must release the scene's lock.
     "idle_in_transaction_session_timeout": "60s",
 }
 _MIGRATION_LOCK = 0x6D61706C657373
 """Any number that other programs on the same database do not use: "mapless"."""
 _UNLIMITED = ("statement_timeout", "lock_timeout", "idle_in_transaction_session_timeout")
 
-# By the class of their SQLSTATE or by all of it: https://www.postgresql.org/docs/current/errcodes-appendix.html
-_FULL = ("53100",)
-_BUSY = ("40001", "40P01", "55P03", "57014")
-_AWAY = ("08", "25006", "25P03", "53", "57P")
-
 
 class PostgresqlDatabase:
-    """One database of a PostgreSQL, shared with other servers; safe for many threads."""
+    """Implements Database with a PostgreSQL database that other servers may share."""
 
     is_shared = True
     only_reads = False
@@ -75,19 +68,19 @@ class PostgresqlDatabase:
 
     @staticmethod
     def open(database_url: str) -> PostgresqlDatabase:
-        """Connect, and bring an empty or older database to the schema of this program.
+        """Connects, and migrates an empty or older database to this program's schema.
 
         Args:
             database_url: "postgresql://user:password@host:5432/database"; libpq's options may follow after "?".
 
         Raises:
-            StoreError: the URL is wrong, the database is not there, or it holds something else than our store.
+            StoreError: the URL is invalid, the database cannot be reached, or it contains something else.
         """
         return PostgresqlDatabase._opened(database_url, migrates=True)
 
     @staticmethod
-    def look_at(database_url: str) -> PostgresqlDatabase:
-        """Connect to a store as it is, whatever its schema.
+    def open_as_is(database_url: str) -> PostgresqlDatabase:
+        """Connects to a store without migrating it.
 
         Raises:
             StoreError: as `open`, or the database is empty.
@@ -112,21 +105,21 @@ class PostgresqlDatabase:
     @contextmanager
     def read(self) -> Iterator[Connection]:
         """Implements Database."""
-        with _faults_translated(), self._engine.begin() as connection:
+        with postgresql_faults_translated(), self._engine.begin() as connection:
             yield connection
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
         """Implements Database."""
-        with _faults_translated(), self._writing_engine.begin() as connection:
+        with postgresql_faults_translated(), self._writing_engine.begin() as connection:
             yield connection
 
-    def take_your_time(self, connection: Connection) -> None:
+    def lift_limits(self, connection: Connection) -> None:
         """Implements Database."""
         for setting in _UNLIMITED:
             connection.exec_driver_sql(f"SET LOCAL {setting} = 0")
 
-    def make_room(self) -> None:
+    def free_space(self) -> None:
         """Implements Database."""
 
     def close(self) -> None:
@@ -144,22 +137,22 @@ class PostgresqlDatabase:
             if found == SCHEMA_VERSION or not migrates:
                 return
         with self.write() as connection:
-            self.take_your_time(connection)
-            # Of several servers that start at once, one migrates, and the others find it done.
+            self.lift_limits(connection)
+            # Of several servers that start at once, one migrates; the others wait and find it done.
             connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_MIGRATION_LOCK})")
             migrate(connection)
 
 
 def parse_url(database_url: str) -> URL:
-    """What a text says of a database; StoreError, which repeats nothing of it, if it is no address of one."""
+    """The URL with this program's driver. Raises StoreError, which does not repeat the text, if it is invalid."""
     try:
         url = make_url(database_url)
     except (ArgumentError, ValueError):
         url = None
-    # The text is never repeated: what is wrong with it may be that its password is taken for something else.
+    # The text is never repeated: it may be invalid because its password is taken for something else.
     if url is None or url.drivername not in ("postgresql", "postgres", DRIVER) or not url.database:
         raise StoreError("database_url must be like postgresql://user:password@host:5432/database")
-    # Hosts are looked up and named in messages, and here a part of the password would be taken for one.
+    # Hosts are looked up and named in messages, and part of the password would be taken for one.
     if "@" in f"{url.host}{url.database}":
         raise StoreError("database_url has an @ too many: one in the user's name or password must be written %40")
     return url.set(drivername=DRIVER)
@@ -172,7 +165,7 @@ def _create_engine(url: URL, cursors_are_binary: bool = True) -> Engine:
     except ImportError:
         raise StoreError("PostgreSQL needs psycopg: pip install 'mapless[postgres]'") from None
 
-    # As text, bytes would come as hexadecimal digits: twice as many, and to be read one by one.
+    # In text format, bytes would be sent as hexadecimal digits, twice as long and slow to parse.
     wire_format = Format.BINARY if cursors_are_binary else Format.TEXT
 
     def cursor(*args: Any, **kwargs: Any) -> psycopg.Cursor[Any]:
@@ -205,35 +198,6 @@ def _create_engine(url: URL, cursors_are_binary: bool = True) -> Engine:
         connection.server_cursor_factory = server_cursor
 
     return engine
-
-
-@contextmanager
-def _faults_translated() -> Iterator[None]:
-    """Turn the faults of the database that a caller can act on into answers; the rest is INTERNAL."""
-    try:
-        yield
-    except PoolTimeoutError as error:
-        raise Unavailable("the store is busy", reason="STORE_UNAVAILABLE", retry_after_s=RETRY_AFTER_S) from error
-    except DBAPIError as error:
-        answer = _answer_to(error)
-        if answer is None:
-            raise
-        raise answer from error.orig
-
-
-def _answer_to(error: DBAPIError) -> RequestError | None:
-    state: str = getattr(error.orig, "sqlstate", None) or ""
-    if state.startswith(_FULL):
-        return Overloaded("the store's disk is full", reason="STORE_FULL")
-    if is_damage(error):
-        return DamagedPages()
-    if state.startswith(_BUSY):
-        return Unavailable("the store is busy", reason="STORE_UNAVAILABLE", retry_after_s=RETRY_AFTER_S)
-    # The library's own faults have no state: it cannot connect, or the connection broke.
-    is_away = error.connection_invalidated or type(error.orig).__name__ == "OperationalError"
-    if state.startswith(_AWAY) or (not state and is_away):
-        return Unavailable("the store is not there", reason="STORE_UNAVAILABLE", retry_after_s=RETRY_AFTER_S)
-    return None
 
 
 def _first_line(error: object) -> str:

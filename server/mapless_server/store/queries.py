@@ -1,4 +1,4 @@
-"""The statements that several calls of the store share. Each runs in the caller's transaction."""
+"""Statements that several operations of the store share; each runs in the caller's transaction."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.security.principal import DEFAULT_TENANT
 from mapless_server.security.tenancy import KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
 
-from .removing import is_set_apart
+from .deletion import is_detached
 from .tables import features, global_descriptor, image, reference, removed_reference, scene, scene_generation
 
 _IDS_PER_STATEMENT = 500
@@ -20,7 +20,7 @@ _IDS_PER_STATEMENT = 500
 
 
 def select_scenes() -> Select[Any]:
-    """Columns of ``scene`` and ``generation``."""
+    """Columns of `scene` and `generation`."""
     return (
         select(scene, scene_generation.c.generation)
         .select_from(scene)
@@ -29,7 +29,7 @@ def select_scenes() -> Select[Any]:
 
 
 def select_scenes_of(tenant: str, after: str) -> Select[Any]:
-    """The same for the scenes of one tenant whose id is greater than ``after``, by id."""
+    """The same for the scenes of one tenant with ids greater than `after`, ordered by id."""
     key = scene.c.scene_id
     # Not LIKE: to SQLite, "acme/%" is "ACME/%".
     is_theirs = ~key.contains(KEY_SEPARATOR) if tenant == DEFAULT_TENANT else key < end_of_keys(tenant)
@@ -37,33 +37,24 @@ def select_scenes_of(tenant: str, after: str) -> Select[Any]:
 
 
 def find_scene(connection: Connection, scene_key: SceneKey) -> Row[Any]:
-    """The row of ``select_scenes`` for one scene. Raises NotFound."""
-    row = connection.execute(select_scenes().where(scene.c.scene_id == scene_key)).one_or_none()
-    if row is None:
-        raise _scene_not_found(scene_key)
-    return row
+    """The row of `select_scenes` for one scene. Raises NotFound."""
+    return _one(connection, select_scenes().where(scene.c.scene_id == scene_key), _scene_not_found(scene_key))
+
+
+def find_attributes(connection: Connection, scene_key: SceneKey) -> Row[Any]:
+    """Columns `scene_id`, `attributes` and `attributes_sha256` of a scene. Raises NotFound."""
+    statement: Select[Any] = select(scene.c.scene_id, scene.c.attributes, scene.c.attributes_sha256)
+    return _one(connection, statement.where(scene.c.scene_id == scene_key), _scene_not_found(scene_key))
 
 
 def read_generation(connection: Connection, scene_key: SceneKey) -> int:
     """Generation of a scene. Raises NotFound."""
-    generation: int | None = connection.scalar(
-        select(scene_generation.c.generation)
-        .join(scene, scene.c.scene_id == scene_generation.c.scene_id)
-        .where(scene.c.scene_id == scene_key)
+    statement: Select[Any] = select(scene_generation.c.generation).join(
+        scene, scene.c.scene_id == scene_generation.c.scene_id
     )
-    if generation is None:
-        raise _scene_not_found(scene_key)
+    row = _one(connection, statement.where(scene.c.scene_id == scene_key), _scene_not_found(scene_key))
+    generation: int = row.generation
     return generation
-
-
-def find_attributes(connection: Connection, scene_key: SceneKey) -> Row[Any]:
-    """Columns ``scene_id``, ``attributes`` and ``attributes_sha256`` of a scene. Raises NotFound."""
-    column = scene.c
-    statement: Select[Any] = select(column.scene_id, column.attributes, column.attributes_sha256)
-    row = connection.execute(statement.where(column.scene_id == scene_key)).one_or_none()
-    if row is None:
-        raise _scene_not_found(scene_key)
-    return row
 
 
 def read_generations(connection: Connection) -> dict[str, int]:
@@ -73,10 +64,10 @@ def read_generations(connection: Connection) -> dict[str, int]:
 
 
 def raise_generation(connection: Connection, scene_key: SceneKey) -> int:
-    """Count a change of a scene, which need not exist; the new generation.
+    """Counts a change of a scene, which need not exist; returns the new generation.
 
-    This comes before anything is looked at: the counter's row is the lock that orders the changes of a scene where the
-    database lets several writers in.
+    Every change does this before it reads anything: where the database admits several writers, the counter's row is the
+    lock that orders the changes of a scene.
     """
     column = scene_generation.c
     first = _upsert(connection, scene_generation).values(scene_id=scene_key, generation=1)
@@ -87,11 +78,7 @@ def raise_generation(connection: Connection, scene_key: SceneKey) -> int:
 
 
 def begin_change(connection: Connection, scene_key: SceneKey, added_count: int = 0) -> int:
-    """Count a change of a scene that must exist, and the references that it adds. Raises NotFound.
-
-    Returns:
-        The new generation.
-    """
+    """Counts a change of a scene and the references that it adds; returns the new generation. Raises NotFound."""
     generation = raise_generation(connection, scene_key)
     count = scene.c.reference_count + added_count
     change = update(scene).where(scene.c.scene_id == scene_key).values(reference_count=count)
@@ -101,7 +88,7 @@ def begin_change(connection: Connection, scene_key: SceneKey, added_count: int =
 
 
 def forget_removals(connection: Connection, scene_key: SceneKey, until_generation: int) -> None:
-    """Forget which references were deleted up to a generation: who knows the scene as of before reads it as a whole."""
+    """Deletes the tombstones up to a generation: callers that know an earlier one then read the whole scene."""
     removed = removed_reference.c
     old = delete(removed_reference).where(removed.scene_id == scene_key, removed.generation <= until_generation)
     if connection.execute(old).rowcount:
@@ -136,7 +123,7 @@ def find_key(connection: Connection, scene_key: SceneKey, reference_id: str) -> 
 
 
 def refuse_taken_ids(connection: Connection, scene_key: SceneKey, reference_ids: Sequence[str]) -> None:
-    """Raises AlreadyExists for the first id that is stored already or stands twice."""
+    """Raises AlreadyExists for the first id that is stored already or occurs twice."""
     taken = set(find_keys(connection, scene_key, reference_ids))
     for index, reference_id in enumerate(reference_ids):
         if reference_id in taken:
@@ -148,22 +135,84 @@ def refuse_taken_ids(connection: Connection, scene_key: SceneKey, reference_ids:
 
 
 def rows_by_key(connection: Connection, keys: Sequence[str]) -> dict[str, Row[Any]]:
-    """Rows of ``reference``, by key."""
-    statement = select(reference)
-    return {
-        row.key: row
-        for portion in _portions(keys)
-        for row in connection.execute(statement.where(reference.c.key.in_(portion)))
-    }
+    """Rows of `reference`, by key."""
+    return _by_key(connection, select(reference), keys)
 
 
 def features_by_key(connection: Connection, keys: Sequence[str], extractor: str) -> dict[str, Row[Any]]:
-    """Rows of ``reference`` joined with ``features``, by key, of those that have features of this extractor."""
+    """Rows of `reference` joined with `features`, by key, of those that have features of this extractor."""
     statement: Select[Any] = (
         select(reference, features.c.extractor, features.c.data, features.c.sha256)
         .join(features, features.c.reference_key == reference.c.key)
         .where(features.c.extractor == extractor)
     )
+    return _by_key(connection, statement, keys)
+
+
+def find_by_key(connection: Connection, key: str, *columns: ColumnElement[Any]) -> Row[Any]:
+    """Columns of the reference with this key. Raises NotFound if it was deleted."""
+    return _one(connection, select(*columns).where(_exists(key)), _reference_deleted())
+
+
+def lock_reference(connection: Connection, key: str) -> Row[Any]:
+    """Columns `scene_id` and `reference_id` of a reference, which is not deleted before the transaction ends.
+
+    Raises NotFound if it was deleted before.
+    """
+    statement: Select[Any] = select(reference.c.scene_id, reference.c.reference_id).where(_exists(key))
+    return _one(connection, statement.with_for_update(read=True, key_share=True), _reference_deleted())
+
+
+def find_image(connection: Connection, key: str) -> Row[Any]:
+    """Columns `reference_id`, `image_sha256` and `data` of a reference. Raises NotFound if it was deleted."""
+    statement: Select[Any] = (
+        select(reference.c.reference_id, reference.c.image_sha256, image.c.data)
+        .outerjoin(image, image.c.reference_key == reference.c.key)
+        .where(_exists(key))
+    )
+    return _one(connection, statement, _reference_deleted())
+
+
+def has_features(connection: Connection, key: str, extractor: str) -> bool:
+    """Whether a reference that was not deleted has features of this extractor."""
+    column = features.c
+    statement = select(column.extractor).join(reference, reference.c.key == column.reference_key)
+    return connection.scalar(statement.where(_exists(key), column.extractor == extractor)) is not None
+
+
+def has_descriptor(connection: Connection, key: str, name: str) -> bool:
+    """Whether a reference has a global descriptor of this name."""
+    column = global_descriptor.c
+    return connection.scalar(select(column.name).where(column.reference_key == key, column.name == name)) is not None
+
+
+def insert_new(connection: Connection, table: Table, row: Mapping[str, Any]) -> bool:
+    """Inserts a row unless one with its primary key exists; whether it was inserted."""
+    addition = _upsert(connection, table).values(row).on_conflict_do_nothing()
+    return connection.execute(addition, execution_options={"preserve_rowcount": True}).rowcount == 1
+
+
+def reference_not_found(scene_key: SceneKey, reference_id: str, field: str) -> NotFound:
+    """The error for a reference that does not exist."""
+    return NotFound(f"there is no reference {reference_id!r} in scene {scene_id_of(scene_key)!r}", field=field)
+
+
+def _reference_deleted() -> NotFound:
+    return NotFound("a reference was deleted while it was used")
+
+
+def _scene_not_found(scene_key: SceneKey) -> NotFound:
+    return NotFound(f"there is no scene {scene_id_of(scene_key)!r}", field="scene")
+
+
+def _one(connection: Connection, statement: Select[Any], missing: NotFound) -> Row[Any]:
+    row = connection.execute(statement).one_or_none()
+    if row is None:
+        raise missing
+    return row
+
+
+def _by_key(connection: Connection, statement: Select[Any], keys: Sequence[str]) -> dict[str, Row[Any]]:
     return {
         row.key: row
         for portion in _portions(keys)
@@ -171,89 +220,14 @@ def features_by_key(connection: Connection, keys: Sequence[str], extractor: str)
     }
 
 
-def hold_reference(connection: Connection, key: str) -> Row[Any]:
-    """Columns ``scene_id`` and ``reference_id`` of a reference, which nobody deletes before the transaction is over.
-
-    Raises NotFound if it was deleted.
-    """
-    statement: Select[Any] = select(reference.c.scene_id, reference.c.reference_id).where(_is_there(key))
-    row = connection.execute(statement.with_for_update(read=True, key_share=True)).one_or_none()
-    if row is None:
-        raise reference_deleted()
-    return row
-
-
-def find_scene_key(connection: Connection, key: str) -> SceneKey:
-    """Scene of the reference with this key. Raises NotFound if it was deleted."""
-    scene_key: str | None = connection.scalar(select(reference.c.scene_id).where(_is_there(key)))
-    if scene_key is None:
-        raise reference_deleted()
-    return SceneKey(scene_key)
-
-
-def find_reference_id(connection: Connection, key: str) -> str:
-    """Id of the reference with this key. Raises NotFound if it was deleted."""
-    reference_id: str | None = connection.scalar(select(reference.c.reference_id).where(_is_there(key)))
-    if reference_id is None:
-        raise reference_deleted()
-    return reference_id
-
-
-def find_image(connection: Connection, key: str) -> Row[Any]:
-    """Columns ``reference_id``, ``image_sha256`` and ``data`` of a reference. Raises NotFound if it was deleted."""
-    statement: Select[Any] = (
-        select(reference.c.reference_id, reference.c.image_sha256, image.c.data)
-        .outerjoin(image, image.c.reference_key == reference.c.key)
-        .where(_is_there(key))
-    )
-    row = connection.execute(statement).one_or_none()
-    if row is None:
-        raise reference_deleted()
-    return row
-
-
-def has_features(connection: Connection, key: str, extractor: str) -> bool:
-    """Whether there are features of this extractor."""
-    column = features.c
-    statement = select(column.extractor).join(reference, reference.c.key == column.reference_key)
-    statement = statement.where(_is_there(key), column.extractor == extractor)
-    return connection.scalar(statement) is not None
-
-
-def has_descriptor(connection: Connection, key: str, name: str) -> bool:
-    """Whether there is a global descriptor of this name."""
-    column = global_descriptor.c
-    return connection.scalar(select(column.name).where(column.reference_key == key, column.name == name)) is not None
-
-
-def insert_new(connection: Connection, table: Table, row: Mapping[str, Any]) -> bool:
-    """Insert a row unless one with its primary key is there already; whether it was inserted."""
-    addition = _upsert(connection, table).values(row).on_conflict_do_nothing()
-    return connection.execute(addition, execution_options={"preserve_rowcount": True}).rowcount == 1
-
-
-def _is_there(key: str) -> ColumnElement[bool]:
-    """The one row of ``reference`` with a key, unless its scene was deleted."""
-    return (reference.c.key == key) & ~is_set_apart(reference.c.scene_id)
+def _exists(key: str) -> ColumnElement[bool]:
+    """The row of `reference` with a key, unless its scene was deleted."""
+    return (reference.c.key == key) & ~is_detached(reference.c.scene_id)
 
 
 def _upsert(connection: Connection, table: Table) -> Any:
-    """An insertion that may say what happens on conflict: both databases can, each by a class of its own."""
+    """An INSERT that supports ON CONFLICT, which both dialects have as a class of their own."""
     return postgresql.insert(table) if connection.dialect.name == "postgresql" else sqlite.insert(table)
-
-
-def reference_not_found(scene_key: SceneKey, reference_id: str, field: str) -> NotFound:
-    """The answer for a reference that does not exist."""
-    return NotFound(f"there is no reference {reference_id!r} in scene {scene_id_of(scene_key)!r}", field=field)
-
-
-def reference_deleted() -> NotFound:
-    """The answer to a key that is nobody's any more."""
-    return NotFound("a reference was deleted while it was used")
-
-
-def _scene_not_found(scene_key: SceneKey) -> NotFound:
-    return NotFound(f"there is no scene {scene_id_of(scene_key)!r}", field="scene")
 
 
 def _portions(ids: Sequence[str]) -> Iterator[Sequence[str]]:

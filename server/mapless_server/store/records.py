@@ -1,4 +1,4 @@
-"""What goes into the store and what comes out of it."""
+"""The values that the store takes and returns."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from mapless_server.method.views import View
 from mapless_server.security.tenancy import SceneKey, scene_id_of
 
 MAX_DOWN_DISAGREEMENT_DEG = 10.0
-"""Datums are turned by compass or by hand, so some degrees are no wonder; 90 are a world whose y is up, not its z."""
+"""Datums are oriented by compass or by hand, to some degrees; 90 degrees mean a world whose y is up, not z."""
 
 
 class ContradictingDown(ValueError):
-    """A scene's datum says that another way is down than its own down."""
+    """A scene's datum and its down_in_world contradict each other."""
 
 
 @dataclass(frozen=True)
 class SceneAttributes:
-    """What is known of a scene as a whole; each may be unknown.
+    """Attributes of a scene as a whole; None where unknown.
 
     Attributes:
         datum: where its world is on the Earth.
-        down_in_world: unit vector to where things fall; None: what the datum says, if there is one.
-        calibration: how far off answers were found to be.
+        down_in_world: unit vector in the direction of gravity; None for the datum's, if there is one.
+        calibration: measured errors of answers.
 
     Raises:
         ContradictingDown: datum and down_in_world do not belong to the same world.
@@ -48,12 +48,12 @@ class SceneAttributes:
         angle_deg = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
         if angle_deg > MAX_DOWN_DISAGREEMENT_DEG:
             raise ContradictingDown(
-                f"is {angle_deg:.0f} degrees off what the datum says is down; its enu_from_world must turn the world's "
-                "axes to east, north and up"
+                f"is {angle_deg:.0f} degrees off the datum's down; its enu_from_world must turn the world's axes to "
+                "east, north and up"
             )
 
     def down(self) -> Array | None:
-        """Unit vector (3,) to where things fall, in the world; None if nobody has said."""
+        """Unit vector (3,) in the direction of gravity, world; None if unknown."""
         if self.down_in_world is not None:
             return np.array(self.down_in_world)
         return None if self.datum is None else self.datum.down_in_world()
@@ -66,12 +66,12 @@ class SceneRecord:
     Attributes:
         scene_key: unique among the scenes that exist.
         generation: raised by every change of the scene or its references. A scene that is deleted and created again
-            counts on, so (scene_key, generation) never means two different contents. Features of one more extractor
-            are no change: they follow from the image and the extractor's name, and answers are named after both. One
-            more global descriptor is: which references are found depends on which of them have it.
+            continues its count, so (scene_key, generation) never identifies two different contents. Adding features of
+            another extractor is no change: they follow from the image and the extractor's name. Adding a global
+            descriptor is one: the references that are retrieved depend on which of them have it.
         reference_count: number of references.
         create_time: UTC.
-        attributes: what is known of it as a whole.
+        attributes: of the scene as a whole.
     """
 
     scene_key: SceneKey
@@ -82,7 +82,7 @@ class SceneRecord:
 
     @property
     def scene_id(self) -> str:
-        """What its tenant calls it."""
+        """The tenant's name of it."""
         return scene_id_of(self.scene_key)
 
 
@@ -92,11 +92,11 @@ class NewReference:
 
     Attributes:
         reference_id: unique within its scene.
-        image: the file's bytes as they came.
+        image: the image file's bytes, unchanged.
         camera: in pixels of that image.
         world_from_camera: its pose, metric.
         views: by the name of the extractor, "sift-2048-1024px-0.02": processed camera and features, float32 arrays. At
-            least one; the first one's features are those that are counted.
+            least one; the features of the first are counted.
         descriptors: global descriptors by name, (D,) each; kept as float16.
     """
 
@@ -115,7 +115,7 @@ class ReferenceRecord:
     Attributes:
         scene_key: of its scene.
         reference_id: unique within the scene.
-        key: identifies this very reference for good; one that is deleted and added again has another key.
+        key: unique for ever; a reference that is deleted and added again has another key.
         camera: in pixels of the stored image.
         world_from_camera: its pose, metric.
         image_sha256: of the image's bytes, hexadecimal.
@@ -134,13 +134,13 @@ class ReferenceRecord:
 
     @property
     def scene_id(self) -> str:
-        """What its tenant calls the scene."""
+        """The tenant's name of the scene."""
         return scene_id_of(self.scene_key)
 
 
 @dataclass(frozen=True, eq=False)
 class DescribedReference:
-    """A stored reference and what one extractor found in its image; read-only arrays."""
+    """A stored reference with one extractor's features of its image; read-only arrays."""
 
     record: ReferenceRecord
     view: View
@@ -152,7 +152,7 @@ class SceneSnapshot:
 
     Attributes:
         generation: of the scene.
-        references: those that have features of the extractor asked for, in the order asked for.
+        references: those that have features of the requested extractor, in the order requested.
         undescribed: those that have none, likewise.
     """
 
@@ -163,14 +163,13 @@ class SceneSnapshot:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class IndexedReference:
-    """What choosing among references needs to know of one.
+    """What retrieval needs of a reference.
 
     Attributes:
         reference_id: unique within the scene.
-        key: identifies this very reference for good.
+        key: unique for ever.
         world_from_camera: its pose, metric; read-only arrays.
-        descriptor: the global descriptor of the name asked for, (D,), read-only, as float16 keeps it; None where there
-            is none.
+        descriptor: the requested global descriptor, (D,), read-only, rounded to float16; None where there is none.
     """
 
     reference_id: str
@@ -181,15 +180,14 @@ class IndexedReference:
 
 @dataclass(frozen=True, eq=False)
 class SceneChanges:
-    """What became of a scene since a generation, read at one moment.
+    """What has changed in a scene since a generation, read at one moment.
 
     Attributes:
-        generation: of the scene at that moment; the one to ask with next time.
-        added: references to put in, by id. One that is known already has got a descriptor since and takes the place of
-            what was known.
-        removed: keys of references that are gone; they may never have been known.
-        is_whole: what was known before is void, and `added` is the whole scene.
-        damaged: ids of references whose pose or descriptor is not what was stored; they are left out, by id.
+        generation: of the scene at that moment, for the next request.
+        added: references to add, ordered by id. One that the caller knows already has got a descriptor and is replaced.
+        removed: keys of references that were deleted; the caller may not know some of them.
+        is_whole: whether `added` is the whole scene, and replaces everything that the caller knows.
+        damaged: ids of references that are omitted because their pose or descriptor is damaged, ordered.
     """
 
     generation: int

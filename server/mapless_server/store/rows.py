@@ -1,4 +1,4 @@
-"""Between what callers see and what the tables hold; everything read is checked here."""
+"""Conversion between the rows of the tables and `records`; checks everything that is read."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MICROSECOND = timedelta(microseconds=1)
 
 
 def time_us(time: datetime) -> int:
-    """Microseconds since 1970: databases do not agree on what a time zone is."""
+    """Microseconds since 1970: databases differ in how they store time zones."""
     return (time - _EPOCH) // _MICROSECOND
 
 
@@ -34,20 +34,20 @@ def time_of(time_us: int) -> datetime:
 
 
 def scene_record(row: Row[Any]) -> SceneRecord:
-    """From a row of ``queries.select_scenes``. Raises DataLoss if what is known of the scene as a whole is damaged."""
+    """From a row of `queries.select_scenes`. Raises DataLoss if the attributes are damaged."""
     key, created = SceneKey(row.scene_id), time_of(row.create_time_us)
     return SceneRecord(key, row.generation, row.reference_count, created, scene_attributes(row))
 
 
 def attributes_row(scene_key: SceneKey, attributes: SceneAttributes) -> dict[str, Any]:
-    """Columns of the table ``scene``."""
+    """Columns of the table `scene`."""
     data = codec.encode_attributes(attributes)
     sha256 = None if data is None else codec.sha256_for(attributes_owner(scene_key), data)
     return {"attributes": data, "attributes_sha256": sha256}
 
 
 def scene_attributes(row: Row[Any]) -> SceneAttributes:
-    """From a row of the table ``scene``. Raises DataLoss if they are damaged."""
+    """From a row of the table `scene`. Raises DataLoss if they are damaged."""
     try:
         return codec.decode_attributes(attributes_owner(row.scene_id), row.attributes, row.attributes_sha256)
     except codec.Damaged as error:
@@ -56,12 +56,12 @@ def scene_attributes(row: Row[Any]) -> SceneAttributes:
 
 
 def attributes_owner(scene_key: str) -> str:
-    """Whom the bytes of what is known of a scene belong to; no reference's key has a space."""
+    """Owner of a scene's attributes, for `codec.sha256_for`; no reference's key contains a space."""
     return f"scene {scene_key}"
 
 
 def new_record(scene_key: SceneKey, new: NewReference, create_time: datetime) -> ReferenceRecord:
-    """The record of a reference about to be stored, with a key nobody had before; ValueError if it has no features."""
+    """The record of a reference about to be stored, with a new key; ValueError if it has no features."""
     if not new.views:
         raise ValueError(f"reference {new.reference_id!r} has no features of any extractor")
     return ReferenceRecord(
@@ -77,7 +77,7 @@ def new_record(scene_key: SceneKey, new: NewReference, create_time: datetime) ->
 
 
 def reference_row(record: ReferenceRecord) -> dict[str, Any]:
-    """For the table ``reference``, but for the generation. Raises ValueError if a number is not finite."""
+    """For the table `reference`, except the generation. Raises ValueError if a number is not finite."""
     geometry = codec.encode_geometry(record.camera, record.world_from_camera)
     return {
         "key": record.key,
@@ -92,7 +92,7 @@ def reference_row(record: ReferenceRecord) -> dict[str, Any]:
 
 
 def reference_record(row: Row[Any]) -> ReferenceRecord:
-    """From a row of the table ``reference``. Raises DataLoss if it is damaged."""
+    """From a row of the table `reference`. Raises DataLoss if it is damaged."""
     try:
         camera, world_from_camera = codec.decode_geometry(row.key, row.geometry, row.geometry_sha256)
     except codec.Damaged as error:
@@ -110,7 +110,7 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
 
 
 def features_row(key: str, extractor: str, view: View) -> dict[str, Any]:
-    """For the table ``features``. Raises ValueError if an array is not float32 or a number not finite."""
+    """For the table `features`. Raises ValueError if an array is not float32 or a number not finite."""
     data = codec.encode_view(view)
     return {
         "reference_key": key,
@@ -121,7 +121,7 @@ def features_row(key: str, extractor: str, view: View) -> dict[str, Any]:
 
 
 def descriptor_row(key: str, name: str, vector: NDArray[np.float32]) -> dict[str, Any]:
-    """For the table ``global_descriptor``. Raises ValueError if it is no vector or a number not finite."""
+    """For the table `global_descriptor`. Raises ValueError if it is no vector or a number not finite."""
     data = codec.encode_descriptor(vector)
     return {
         "reference_key": key,
@@ -132,29 +132,29 @@ def descriptor_row(key: str, name: str, vector: NDArray[np.float32]) -> dict[str
 
 
 def features_owner(key: str, extractor: str) -> str:
-    """Whom the bytes of features belong to."""
+    """Owner of features, for `codec.sha256_for`."""
     return f"{key}/{extractor}"
 
 
 def descriptor_owner(key: str, name: str) -> str:
-    """Whom the bytes of a global descriptor belong to; nothing else of a reference has a number sign in its name."""
+    """Owner of a global descriptor, for `codec.sha256_for`."""
     return f"{key}#{name}"
 
 
 def indexed_references(found: Sequence[Row[Any]], descriptor_name: str) -> tuple[list[IndexedReference], list[str]]:
-    """From rows as ``changes.py`` selects them, all at once for speed; and the ids of those that are damaged."""
-    whole = [row for row in found if _is_whole(row, descriptor_name)]
-    poses = codec.decode_poses([row.geometry for row in whole])
-    vectors = iter(codec.decode_descriptors([row.data for row in whole if row.sha256 is not None]))
+    """From rows as `changes` selects them, all at once for speed; and the ids of those that are damaged."""
+    intact = [row for row in found if _is_intact(row, descriptor_name)]
+    poses = codec.decode_poses([row.geometry for row in intact])
+    vectors = iter(codec.decode_descriptors([row.data for row in intact if row.sha256 is not None]))
     references = [
         IndexedReference(row.reference_id, row.key, pose, None if row.sha256 is None else next(vectors))
-        for row, pose in zip(whole, poses, strict=True)
+        for row, pose in zip(intact, poses, strict=True)
     ]
-    intact = {row.key for row in whole}
-    return references, [row.reference_id for row in found if row.key not in intact]
+    intact_keys = {row.key for row in intact}
+    return references, [row.reference_id for row in found if row.key not in intact_keys]
 
 
-def _is_whole(row: Row[Any], descriptor_name: str) -> bool:
+def _is_intact(row: Row[Any], descriptor_name: str) -> bool:
     try:
         codec.check(row.key, row.geometry, row.geometry_sha256, "camera and pose")
         if row.sha256 is not None:
@@ -165,7 +165,7 @@ def _is_whole(row: Row[Any], descriptor_name: str) -> bool:
 
 
 def described_reference(row: Row[Any]) -> DescribedReference:
-    """From a row of ``queries.features_by_key``. Raises DataLoss if it is damaged."""
+    """From a row of `queries.features_by_key`. Raises DataLoss if it is damaged."""
     record = reference_record(row)
     try:
         view = codec.decode_view(features_owner(row.key, row.extractor), row.data, row.sha256)
@@ -175,7 +175,7 @@ def described_reference(row: Row[Any]) -> DescribedReference:
 
 
 def image(row: Row[Any]) -> bytes:
-    """From a row of ``queries.find_image``. Raises DataLoss if it is damaged."""
+    """From a row of `queries.find_image`. Raises DataLoss if it is damaged."""
     data: object = row.data
     if not isinstance(data, bytes) or hashlib.sha256(data).hexdigest() != row.image_sha256:
         raise data_loss(row.reference_id, "image")
@@ -183,5 +183,5 @@ def image(row: Row[Any]) -> bytes:
 
 
 def data_loss(reference_id: str, what: str) -> DataLoss:
-    """The answer where stored bytes are not what was stored."""
+    """The error for a reference whose bytes are not what was stored."""
     return DataLoss(f"reference {reference_id!r} is damaged in the store ({what}); delete it and add it again")

@@ -1,7 +1,7 @@
-"""Everything that is particular to SQLite: which library, how each connection is set, who may write.
+"""The store's database on SQLite: which library, how each connection is configured, who may write.
 
-The file lies on a local disk (network file systems break SQLite's locks) and belongs to one server at a time. On a disk
-that can only be read any number of servers may read it.
+The file must be on a local disk (network file systems break SQLite's locks) and is used by one server at a time. From a
+read-only disk, any number of servers may read it.
 """
 
 from __future__ import annotations
@@ -23,23 +23,22 @@ from sqlalchemy.exc import DBAPIError
 
 from mapless_server.errors import FailedPrecondition, RequestError
 
-from .damage import is_damage
 from .database import StoreError
+from .faults import is_damage, sqlite_faults_translated
 from .folder_lock import FolderLock
 from .migrations import migrate, read_version
-from .sqlite_faults import faults_translated
 from .tables import SCHEMA_VERSION
 
 logger = logging.getLogger(__name__)
 
 DATABASE_FILE = "mapless.sqlite3"
 BUSY_TIMEOUT_MS = 5000
-"""How long a connection waits for another's lock. Our writers queue before SQLite does; this is for tools beside us."""
-MAKE_ROOM_TIMEOUT_MS = 100
-"""For those who read what is not in the file yet; a backup reads for longer, and is not waited for."""
+"""How long a connection waits for another's lock. The server's own writers queue before; this is for other programs."""
+FREE_SPACE_TIMEOUT_MS = 100
+"""Waiting for readers of the journal; a backup reads for longer, and is not waited for."""
 JOURNAL_KEPT_BYTES = 8 * 2**20
-"""A journal that a large change has made longer is cut when it is begun anew. Deleting needs less."""
-ROOM_TO_OPEN_BYTES = 64 * 1024
+"""A journal that a large change has made longer is truncated when it is restarted. Deleting needs less."""
+SPACE_TO_OPEN_BYTES = 64 * 1024
 """What SQLite needs beside the file to open it."""
 
 _URI_PREFIX = "file:"
@@ -47,7 +46,7 @@ _BEGIN_OPTION = "sqlite_begin_statement"
 
 
 def has_wal_reset_bug(version: tuple[int, int, int]) -> bool:
-    """Whether this SQLite can corrupt a WAL database that several connections write and checkpoint.
+    """Whether this version can corrupt a WAL database that several connections write and checkpoint.
 
     See https://sqlite.org/wal.html#walresetbug: fixed in 3.51.3 and, on their branches, 3.44.6 and 3.50.7.
     """
@@ -56,29 +55,29 @@ def has_wal_reset_bug(version: tuple[int, int, int]) -> bool:
 
 
 class SqliteDatabase:
-    """The database file of one data folder, locked against other servers; safe for many threads."""
+    """Implements Database with the file of a data folder, locked against other servers."""
 
     is_shared = False
 
     def __init__(self, engine: Engine, folder_lock: FolderLock | None, only_reads: bool = False) -> None:
         self.name = str(engine.url.database).removeprefix(_URI_PREFIX)
         self._engine = engine
-        # BEGIN IMMEDIATE takes the write lock at once. A transaction that reads first and then wants to write would be
-        # refused without waiting when another has written in between.
+        # BEGIN IMMEDIATE takes the write lock at once. A transaction that first reads and then writes would fail
+        # without waiting if another has written in between.
         self._writing_engine = engine.execution_options(**{_BEGIN_OPTION: "BEGIN IMMEDIATE"})
-        # SQLite lets writers poll for its lock, in no order; here they queue.
+        # SQLite's writers poll for its lock, in no order; here they queue.
         self._write_lock = threading.Lock()
         self._folder_lock = folder_lock
         self.only_reads = only_reads
 
     @staticmethod
     def open(folder: Path) -> SqliteDatabase:
-        """Open the database of a data folder; both are created if missing.
+        """Opens the database of a data folder, migrated to this program's schema; creates both if missing.
 
-        A database on a disk that can only be read is read, and every change of it is refused.
+        From a read-only disk it is read, and every change is refused.
 
         Raises:
-            StoreError: the folder or file cannot be used, is in use, or holds something else than our store.
+            StoreError: the folder or file cannot be used, is in use, or contains something else.
         """
         path = folder / DATABASE_FILE
         try:
@@ -86,14 +85,15 @@ class SqliteDatabase:
             folder_lock = FolderLock.take(folder, DATABASE_FILE)
         except OSError as error:
             if error.errno == errno.EROFS and path.is_file():
-                return SqliteDatabase._open_to_read(path)
+                return SqliteDatabase._open_read_only(path)
             raise StoreError(f"data folder {folder} cannot be used: {error.strerror}") from error
         return SqliteDatabase._opened(path, folder_lock)
 
     @staticmethod
-    def _open_to_read(path: Path) -> SqliteDatabase:
-        """A database that nobody can write, not even SQLite the files beside it that it shares with other processes."""
-        left = [it for it in (path.with_name(f"{path.name}-wal"), path.with_name(f"{path.name}-journal")) if _holds(it)]
+    def _open_read_only(path: Path) -> SqliteDatabase:
+        """Opens a database on a read-only disk, where SQLite cannot write the files beside it either."""
+        beside = (path.with_name(f"{path.name}-wal"), path.with_name(f"{path.name}-journal"))
+        left = [it for it in beside if it.is_file() and it.stat().st_size]
         if left:
             raise StoreError(
                 f"database {path} cannot be opened: it was not closed in order, and the disk can only be read, so that "
@@ -104,7 +104,7 @@ class SqliteDatabase:
         except OSError as error:
             raise StoreError(f"database {path} cannot be read: {error.strerror}") from error
         database = SqliteDatabase(create_sqlite_engine(path, only_reads=True, never_changes=True), folder_lock, True)
-        with database._faults_at_opening(), database.read() as connection:
+        with database._faults_as_store_errors(), database.read() as connection:
             version = read_version(connection)
             if version != SCHEMA_VERSION:
                 raise ValueError(
@@ -115,7 +115,7 @@ class SqliteDatabase:
 
     @staticmethod
     def open_scratch(path: Path, version: int = SCHEMA_VERSION) -> SqliteDatabase:
-        """A file that is worth nothing before it is finished, so that nothing is waited for; of a schema's version.
+        """Opens a file that is worthless until it is complete, without waiting for the disk; creates it if missing.
 
         Raises:
             StoreError: as `open`.
@@ -123,16 +123,16 @@ class SqliteDatabase:
         return SqliteDatabase._opened(path, None, version, is_scratch=True)
 
     @staticmethod
-    def look_at(path: Path) -> SqliteDatabase:
-        """Read a database as it is, whatever its schema: that of a server that is running, or a backup.
+    def open_as_is(path: Path) -> SqliteDatabase:
+        """Opens a database for reading without migrating it: that of a server that is running, or a backup.
 
         Raises:
-            StoreError: there is no such file, or it holds something else than our store.
+            StoreError: there is no such file, or it contains something else.
         """
         if not path.is_file():
             raise StoreError(f"there is no database {path}")
         database = SqliteDatabase(create_sqlite_engine(path, only_reads=True), None)
-        with database._faults_at_opening(), database.read() as connection:
+        with database._faults_as_store_errors(), database.read() as connection:
             if read_version(connection) is None:
                 raise ValueError("it is empty")
         return database
@@ -142,20 +142,20 @@ class SqliteDatabase:
         path: Path, folder_lock: FolderLock | None, version: int = SCHEMA_VERSION, is_scratch: bool = False
     ) -> SqliteDatabase:
         database = SqliteDatabase(create_sqlite_engine(path, is_scratch=is_scratch), folder_lock)
-        with database._faults_at_opening():
+        with database._faults_as_store_errors():
             database._migrate(version)
         return database
 
     @contextmanager
-    def _faults_at_opening(self) -> Iterator[None]:
+    def _faults_as_store_errors(self) -> Iterator[None]:
         try:
             yield
         except DBAPIError as error:
             self.close()
-            raise StoreError(f"database {self.name} cannot be opened: {_why(error, self.name)}") from error
+            raise StoreError(f"database {self.name} cannot be opened: {_explain(error, self.name)}") from error
         except RequestError as error:
             self.close()
-            cause = _why(error.__cause__, self.name) if isinstance(error.__cause__, DBAPIError) else error
+            cause = _explain(error.__cause__, self.name) if isinstance(error.__cause__, DBAPIError) else error
             raise StoreError(f"database {self.name} cannot be opened: {cause}") from error
         except ValueError as error:
             self.close()
@@ -166,8 +166,8 @@ class SqliteDatabase:
 
     def _migrate(self, version: int) -> None:
         with self._writing_engine.connect() as connection:
-            # Where SQLite cannot alter a table it is given a new one, and deleting the old must not delete what refers
-            # to it. This can be said outside of a transaction only.
+            # Where SQLite cannot alter a table, the table is replaced, and dropping the old one must not delete what
+            # refers to it. The setting has an effect outside of transactions only.
             _execute(connection, "PRAGMA foreign_keys=OFF")
             try:
                 with connection.begin():
@@ -180,8 +180,8 @@ class SqliteDatabase:
     @contextmanager
     def read(self) -> Iterator[Connection]:
         """Implements Database."""
-        # Ended by rolling back, as closing does: SQLite that has met a damaged page refuses to commit even nothing.
-        with faults_translated(), self._engine.connect() as connection:
+        # Rolled back, as closing does: after a damaged page SQLite refuses to commit even an empty transaction.
+        with sqlite_faults_translated(), self._engine.connect() as connection:
             connection.begin()
             yield connection
 
@@ -190,25 +190,25 @@ class SqliteDatabase:
         """Implements Database."""
         if self.only_reads:
             raise FailedPrecondition("the store can only be read", reason="STORE_READ_ONLY")
-        with faults_translated(), self._write_lock, self._writing_engine.begin() as connection:
+        with sqlite_faults_translated(), self._write_lock, self._writing_engine.begin() as connection:
             yield connection
 
-    def take_your_time(self, connection: Connection) -> None:
+    def lift_limits(self, connection: Connection) -> None:
         """Implements Database."""
 
-    def make_room(self) -> None:
+    def free_space(self) -> None:
         """Implements Database."""
-        suppressed = suppress(self._engine.dialect.loaded_dbapi.Error)  # what cannot be put in place stays where it is
-        with faults_translated(), self._write_lock, self._engine.connect() as connection, suppressed:
-            # Who writes waits while this waits for who reads.
-            _execute(connection, f"PRAGMA busy_timeout={MAKE_ROOM_TIMEOUT_MS}")
+        suppressed = suppress(self._engine.dialect.loaded_dbapi.Error)  # the journal then stays as it is
+        with sqlite_faults_translated(), self._write_lock, self._engine.connect() as connection, suppressed:
+            # Writers wait while this waits for readers.
+            _execute(connection, f"PRAGMA busy_timeout={FREE_SPACE_TIMEOUT_MS}")
             try:
                 _execute(connection, "PRAGMA wal_checkpoint(RESTART)")
             finally:
                 _execute(connection, f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
 
     def close(self) -> None:
-        """Close all connections and let other servers in; nothing may be reading or writing."""
+        """Closes all connections and unlocks the folder; nothing may be reading or writing."""
         self._engine.dispose()
         if self._folder_lock is not None:
             self._folder_lock.release()
@@ -216,25 +216,20 @@ class SqliteDatabase:
 
 
 def _execute(connection: Connection, statement: str) -> None:
-    """Outside of any transaction."""
+    """Executes outside of any transaction."""
     driver_connection = connection.connection.driver_connection
     assert driver_connection is not None
     driver_connection.execute(statement)
 
 
-def _holds(path: Path) -> bool:
-    """Whether there is a file with something in it."""
-    return path.is_file() and path.stat().st_size > 0
-
-
-def _why(error: DBAPIError, name: str) -> str:
-    """The database's text, and what an operator can do where it does not say so itself."""
+def _explain(error: DBAPIError, name: str) -> str:
+    """The database's text, and what an operator can do about it."""
     fault = str(error.orig)
     if is_damage(error):
         return f"{fault}; restore a backup into a new folder"
     with suppress(OSError):
         disk = os.statvfs(Path(name).parent)
-        if "disk I/O error" in fault and disk.f_bavail * disk.f_frsize < ROOM_TO_OPEN_BYTES:
+        if "disk I/O error" in fault and disk.f_bavail * disk.f_frsize < SPACE_TO_OPEN_BYTES:
             return f"{fault}: the disk is full"
     return fault
 
@@ -242,13 +237,13 @@ def _why(error: DBAPIError, name: str) -> str:
 def create_sqlite_engine(
     path: Path, only_reads: bool = False, is_scratch: bool = False, never_changes: bool = False
 ) -> Engine:
-    """Connections to a file, each set as a store that must not lose anything needs it.
+    """Connections to a file, each configured for a store that must not lose anything.
 
     Args:
         path: the file, created if missing.
-        only_reads: the file must be there, and is left as it is.
+        only_reads: the file must exist, and is not changed.
         is_scratch: the file may be lost.
-        never_changes: nobody writes it, so that no lock is taken, and nothing made beside it.
+        never_changes: no process writes it, so no lock is taken and no file created beside it.
     """
     library = choose_library()
     safe_mode = has_wal_reset_bug(library.sqlite_version_info)
@@ -263,20 +258,20 @@ def create_sqlite_engine(
         journal_mode, synchronous = "off", "OFF"
     url = URL.create("sqlite", database=str(path))
     if only_reads:
-        # As a URI, a file that is missing is not created. It may be written all the same: readers share WAL's index.
+        # With a URI a missing file is not created. The mode is not read-only, because readers share WAL's index.
         url = URL.create("sqlite", database=f"{_URI_PREFIX}{quote(str(path))}", query={"mode": "rw", "uri": "true"})
     if never_changes:
         url = url.update_query_dict({"mode": "ro", "immutable": "1"})
     engine = create_engine(
         url,
         module=library,
-        max_overflow=-1,  # each worker thread holds one connection at most, so the threads are the bound
+        max_overflow=-1,  # bounded by the number of threads, which use one connection each
         hide_parameters=True,  # an error's text must not carry image bytes into the log
     )
 
     @event.listens_for(engine, "connect")
     def set_connection(connection: Any, _record: object) -> None:
-        connection.isolation_level = None  # the library must not begin transactions by rules of its own
+        connection.isolation_level = None  # the library must not begin transactions by itself
         cursor = connection.cursor()
         for setting in (
             f"busy_timeout={BUSY_TIMEOUT_MS}",
@@ -286,7 +281,7 @@ def create_sqlite_engine(
             "cell_size_check=ON",
             "mmap_size=0",
             f"journal_size_limit={JOURNAL_KEPT_BYTES}",
-            "secure_delete=ON",  # else deleted photographs lie in the file until something else is written there
+            "secure_delete=ON",  # otherwise deleted photographs stay in the file until they are overwritten
         ):
             cursor.execute(f"PRAGMA {setting}")
         if only_reads:
@@ -304,10 +299,10 @@ def create_sqlite_engine(
 
 
 def choose_library() -> ModuleType:
-    """The packaged SQLite if it is there, else the interpreter's; one without the WAL-reset bug if there is one.
+    """The packaged SQLite if it is installed, otherwise the interpreter's; preferably one without the WAL-reset bug.
 
-    A process must open a database with one library only: SQLite's file locks hold between processes, and the threads of
-    one process are kept apart by what a library has in memory.
+    A process must open a database with one library only: SQLite's file locks work between processes; the threads of one
+    process are synchronized by the library's memory.
     """
     libraries = [importlib.import_module("sqlite3.dbapi2")]
     with suppress(ImportError):

@@ -1,38 +1,63 @@
-"""The store: what the service calls. Every public method is one transaction, and safe from any thread."""
+"""The store as other rooms use it: opened, read and changed."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, insert, select, update
+
+from mapless.geodesy import Datum
+from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
+from mapless_server.errors import AlreadyExists, NotFound
+from mapless_server.method.views import View
+from mapless_server.security.tenancy import SceneKey, scene_id_of
+
+from . import deletion, queries, rows, tables
 from .cache import LruCache
-from .changing import ChangingStore
 from .database import Database
+from .deletion import PendingDeletions
+from .faults import DamagedPages
 from .postgresql import PostgresqlDatabase
-from .reading import ReadingStore
-from .records import DescribedReference
+from .reader import NAME_CACHE_BYTES, StoreReader, observed
+from .records import DescribedReference, NewReference, ReferenceRecord, SceneAttributes, SceneRecord
 from .sqlite import SqliteDatabase
 
 DEFAULT_CACHE_BYTES = 512 * 2**20
 """About 500 references with 2048 SIFT features each; 0 reads the database every time."""
 
+GENERATIONS_REMEMBERED = 100_000
+"""How far back `list_changes` knows what was deleted, some 10 MB per scene; older callers read the whole scene."""
 
-class Store(ReadingStore, ChangingStore):
-    """Scenes and their references, in one database: of a data folder, or one that several servers share.
+NO_ATTRIBUTES = SceneAttributes()
 
-    A scene's key says whose it is. Answers and messages name it by its id, which is all that its tenant knows.
 
-    DataLoss is raised wherever stored bytes turn out not to be what was stored; other references are still served, and
-    the damaged one can be deleted. Unavailable is raised while the database is not there or busy; the next call tries
-    anew. A change that ends so may yet have been made: who tries again then meets AlreadyExists.
+class Store(StoreReader):
+    """Scenes and their references, in the database of a data folder or in one that several servers share.
 
-    Attributes:
-        observer: hears of every operation.
+    Thread-safe. Each method is one transaction: readers see all of a change or nothing. A scene's key includes its
+    tenant; messages name it by its id, which is all that the tenant knows.
+
+    DataLoss is raised where stored bytes are not what was stored; other references are still served, and the damaged
+    one can be deleted. Unavailable is raised while the database is away or busy; the next call tries again. A change
+    that ends so may have been made: trying again then raises AlreadyExists.
     """
+
+    def __init__(
+        self, database: Database, described: LruCache[DescribedReference], name_cache_bytes: int = NAME_CACHE_BYTES
+    ) -> None:
+        super().__init__(database, described, name_cache_bytes)
+        self._pending_deletions = PendingDeletions(database)
 
     @staticmethod
     def open(data_dir: Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
-        """Open the store of a data folder; creates both if missing.
+        """Opens the store of a data folder; creates both if missing.
 
         Args:
             data_dir: a folder on a local disk that no other server uses.
@@ -47,7 +72,7 @@ class Store(ReadingStore, ChangingStore):
 
     @staticmethod
     def connect(database_url: str, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
-        """Open the store of a PostgreSQL database, which other servers may use, too; tables are made if missing.
+        """Opens the store of a PostgreSQL database, which other servers may use, too; creates tables if missing.
 
         Args:
             database_url: "postgresql://user:password@host:5432/database"; libpq's options may follow after "?".
@@ -62,31 +87,20 @@ class Store(ReadingStore, ChangingStore):
 
     @staticmethod
     def _resumed(database: Database, described: LruCache[DescribedReference]) -> Store:
-        """A store that goes on with what the one before it has left."""
         store = Store(database, described)
-        store._leftovers.resume()
+        store._pending_deletions.resume()
         return store
 
-    @property
-    def database(self) -> Database:
-        """What it is kept in."""
-        return self._database
-
     def uncached(self) -> Store:
-        """The same database for one who reads what queries do not: their memory and its counts are left alone.
+        """The same database without caches, for reading what queries do not: the caches and their counts are kept.
 
         It lives as long as this store, is not closed, and is only read.
         """
         return Store(self._database, LruCache(0), name_cache_bytes=0)
 
-    @property
-    def reference_cache(self) -> LruCache[DescribedReference]:
-        """The features held in memory."""
-        return self._described
-
     def close(self) -> None:
-        """Release the data folder; no call may be in progress or follow."""
-        self._leftovers.close()
+        """Releases the data folder; no call may be in progress or follow."""
+        self._pending_deletions.close()
         self._database.close()
 
     def __enter__(self) -> Store:
@@ -96,3 +110,199 @@ class Store(ReadingStore, ChangingStore):
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+    @observed
+    def create_scene(self, scene_key: SceneKey, attributes: SceneAttributes = NO_ATTRIBUTES) -> SceneRecord:
+        """Creates a scene without references.
+
+        Raises:
+            AlreadyExists: the id is taken.
+        """
+        now, scene = _now(), tables.scene
+        with self._changing() as connection:
+            generation = queries.raise_generation(connection, scene_key)
+            if connection.scalar(select(scene.c.scene_id).where(scene.c.scene_id == scene_key)) is not None:
+                raise AlreadyExists(f"scene {scene_id_of(scene_key)!r} exists already", field="scene_id")
+            row = {"scene_id": scene_key, "create_time_us": rows.time_us(now), "first_generation": generation}
+            connection.execute(insert(scene).values(row | rows.attributes_row(scene_key, attributes)))
+            return rows.scene_record(queries.find_scene(connection, scene_key))
+
+    @observed
+    def update_scene(
+        self,
+        scene_key: SceneKey,
+        *,
+        datum: Datum | UnchangedType | None = UNCHANGED,
+        down_in_world: Vector | UnchangedType | None = UNCHANGED,
+        calibration: Calibration | UnchangedType | None = UNCHANGED,
+    ) -> SceneRecord:
+        """Changes attributes of a scene; None removes one. If all three are given, damaged ones are replaced.
+
+        Raises:
+            NotFound: there is no such scene.
+            DataLoss: an attribute that is not given is damaged.
+            ContradictingDown: datum and down_in_world do not belong to the same world.
+        """
+        if isinstance(calibration, Calibration):
+            calibration = replace(calibration, create_time=_now())
+        given: dict[str, Any] = {"datum": datum, "down_in_world": down_in_world, "calibration": calibration}
+        changes = {name: value for name, value in given.items() if value is not UNCHANGED}
+        with self._changing() as connection:
+            queries.begin_change(connection, scene_key)
+            is_new = len(changes) == len(given)
+            found = NO_ATTRIBUTES if is_new else rows.scene_attributes(queries.find_attributes(connection, scene_key))
+            row = rows.attributes_row(scene_key, replace(found, **changes))
+            connection.execute(update(tables.scene).where(tables.scene.c.scene_id == scene_key).values(row))
+            return rows.scene_record(queries.find_scene(connection, scene_key))
+
+    @observed
+    def delete_scene(self, scene_key: SceneKey) -> frozenset[str]:
+        """Deletes a scene and all its references.
+
+        It is gone after one transaction. Its rows are then deleted in portions, so that others need not wait; if that
+        is interrupted, it is completed when the store is opened again, or by the next call of this method.
+
+        Returns:
+            Keys of those of its references that were in memory.
+
+        Raises:
+            NotFound: there is no such scene.
+            Overloaded: the disk is full; the scene may be gone all the same, and some of its rows left.
+        """
+        try:
+            with self._changing() as connection:
+                queries.begin_change(connection, scene_key)
+                self._database.lift_limits(connection)
+                deletion.detach_scene(connection, scene_key)
+        except NotFound:
+            self._pending_deletions.run()
+            raise
+        self._last_deletion = object()
+        # The keys are never used again; their entries would only take room until they are evicted.
+        gone = self._described.forget(lambda _, it: it.record.scene_key == scene_key)
+        self._resolved.forget(lambda key, _: key[0] == scene_key)
+        self._attributes.forget(lambda key, _: key == scene_key)
+        self._pending_deletions.run()
+        return frozenset(key for key, _ in gone)
+
+    @observed
+    def add_references(self, scene_key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
+        """Adds references, all or none, each with all its features and descriptors; one change of the scene.
+
+        Returns:
+            The new references in the order given.
+
+        Raises:
+            NotFound: there is no such scene.
+            AlreadyExists: an id is taken or occurs twice; the field is "requests[i].reference_id".
+            ValueError: features are not float32, a number of a camera, pose or descriptor is not finite, no reference
+                is given, or one without any features.
+        """
+        if not references:
+            raise ValueError("no reference to add")
+        now = _now()
+        # Encoding takes milliseconds per reference, so it is done before other writers have to wait.
+        records = [rows.new_record(scene_key, new, now) for new in references]
+        reference_rows = [rows.reference_row(record) for record in records]
+        image_rows, features_rows, descriptor_rows = [], [], []
+        for record, new in zip(records, references, strict=True):
+            image_rows.append({"reference_key": record.key, "data": new.image})
+            features_rows += [rows.features_row(record.key, *described) for described in new.views.items()]
+            descriptor_rows += [rows.descriptor_row(record.key, *named) for named in new.descriptors.items()]
+        with self._changing() as connection:
+            generation = queries.begin_change(connection, scene_key, len(records))
+            queries.refuse_taken_ids(connection, scene_key, [new.reference_id for new in references])
+            connection.execute(insert(tables.reference), [row | {"generation": generation} for row in reference_rows])
+            connection.execute(insert(tables.image), image_rows)
+            connection.execute(insert(tables.features), features_rows)
+            if descriptor_rows:
+                connection.execute(insert(tables.global_descriptor), descriptor_rows)
+        return records
+
+    @observed
+    def add_features(self, key: str, extractor: str, view: View) -> None:
+        """Stores another extractor's features of a reference's image; no change of the scene, see SceneRecord.
+
+        Args:
+            key: of the reference; its id may by now be that of another image.
+            extractor: whose features.
+            view: processed camera and features.
+
+        Raises:
+            NotFound: the reference was deleted.
+            AlreadyExists: the reference has features of this extractor.
+            ValueError: features are not float32, or a number of the camera is not finite.
+        """
+        row = rows.features_row(key, extractor, view)
+        with self._changing() as connection:
+            reference_id = queries.lock_reference(connection, key).reference_id
+            if not queries.insert_new(connection, tables.features, row):
+                raise AlreadyExists(f"reference {reference_id!r} has features of {extractor!r} already")
+
+    @observed
+    def add_descriptor(self, key: str, name: str, vector: NDArray[np.float32]) -> None:
+        """Stores a global descriptor that a reference lacks, and keeps an existing one; a change of its scene.
+
+        `list_changes` then lists the reference among those added.
+
+        Args:
+            key: of the reference.
+            name: of the global descriptor.
+            vector: (D,), finite.
+
+        Raises:
+            NotFound: the reference was deleted.
+            ValueError: it is no vector, or a number is not finite as float16.
+        """
+        row = rows.descriptor_row(key, name, vector)
+        reference = tables.reference
+        with self._database.read() as connection:
+            scene_key = SceneKey(queries.find_by_key(connection, key, reference.c.scene_id).scene_id)
+            if queries.has_descriptor(connection, key, name):
+                return
+        with self._changing() as connection:
+            generation = queries.begin_change(connection, scene_key)
+            queries.lock_reference(connection, key)
+            if queries.insert_new(connection, tables.global_descriptor, row):
+                connection.execute(update(reference).where(reference.c.key == key).values(generation=generation))
+
+    @observed
+    def delete_reference(self, scene_key: SceneKey, reference_id: str) -> str:
+        """Deletes a reference with its image and features, even a damaged one, whose pages are then lost.
+
+        Returns:
+            Its key.
+
+        Raises:
+            NotFound: there is no such scene or reference.
+        """
+        try:
+            key = self._delete_reference(scene_key, reference_id, deletion.delete_references)
+        except DamagedPages:
+            key = self._delete_reference(scene_key, reference_id, deletion.move_aside)
+        self._last_deletion = object()
+        self._described.forget(lambda _, it: it.record.key == key)
+        return key
+
+    def _delete_reference(
+        self, scene_key: SceneKey, reference_id: str, delete: Callable[[Connection, str], None]
+    ) -> str:
+        with self._changing() as connection:
+            generation = queries.begin_change(connection, scene_key, -1)
+            key = queries.find_key(connection, scene_key, reference_id)
+            delete(connection, key)
+            tombstone = {"scene_id": scene_key, "generation": generation, "reference_key": key}
+            connection.execute(insert(tables.removed_reference).values(tombstone))
+            queries.forget_removals(connection, scene_key, generation - GENERATIONS_REMEMBERED)
+        return key
+
+    @observed
+    def try_writing(self) -> None:
+        """Writes what changes nothing; raises as every change does if the store cannot be written."""
+        version = tables.store_version
+        with self._changing() as connection:
+            connection.execute(update(version).values(schema_version=version.c.schema_version))
+
+
+def _now() -> datetime:
+    return datetime.now(timezone.utc)

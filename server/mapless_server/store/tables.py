@@ -1,4 +1,4 @@
-"""The schema as it is now, in types that SQLite and PostgreSQL share; migrations/ has how it came about."""
+"""The current schema, in types that SQLite and PostgreSQL share; `migrations` has its history."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ SCHEMA_VERSION = 3
 
 metadata = MetaData()
 
-# Pages are cut by comparing ids, so both databases must compare them by code point.
+# Lists are paginated by comparing ids, so both databases must compare them by code point.
 _Id = String(128).with_variant(String(128, collation="C"), "postgresql")
-# A column called scene_id holds the scene's key, of which the tenant and a slash are part, see tenancy.py.
+# A column called scene_id holds the scene's key, which includes the tenant and a slash, see security.tenancy.
 _SceneKey = String(257).with_variant(String(257, collation="C"), "postgresql")
 _Key = String(32)
 _Sha256 = String(64)
@@ -35,7 +35,7 @@ store_version = Table(
     Column("schema_version", Integer, primary_key=True, autoincrement=False),
 )
 
-# Alembic's own, as it makes it: which of its steps were run.
+# Alembic's own, as it creates it: which of its steps were run.
 alembic_version = Table(
     "alembic_version",
     metadata,
@@ -48,16 +48,16 @@ scene = Table(
     metadata,
     Column("scene_id", _SceneKey, primary_key=True),
     Column("create_time_us", BigInteger, nullable=False),
-    # Counted by every change: counting rows takes as long as there are rows.
+    # Updated by every change, because counting rows is slow.
     Column("reference_count", BigInteger, nullable=False, server_default=_NONE_YET),
-    # Changes are known since this generation: who knows the scene as of an earlier one reads it as a whole.
+    # Changes are known since this generation; callers that know an earlier one read the whole scene.
     Column("first_generation", BigInteger, nullable=False, server_default=_NONE_YET),
-    # What is known of it as a whole, see codec.py; both are null where that is nothing.
+    # See codec.py; both are null for a scene without attributes.
     Column("attributes", LargeBinary),
     Column("attributes_sha256", _Sha256),
 )
 
-# Outlives the scene, so that a scene created again under the same id does not repeat generations of its former life.
+# Outlives the scene, so that a scene created again with the same id does not repeat generations.
 scene_generation = Table(
     "scene_generation",
     metadata,
@@ -76,13 +76,13 @@ reference = Table(
     Column("image_sha256", _Sha256, nullable=False),
     Column("feature_count", Integer, nullable=False),
     Column("create_time_us", BigInteger, nullable=False),
-    # Of the scene when this reference was added, or got its latest global descriptor.
+    # Of the scene when this reference was added or got its latest global descriptor.
     Column("generation", BigInteger, nullable=False, server_default=_NONE_YET),
     UniqueConstraint("scene_id", "reference_id"),
     Index("reference_by_generation", "scene_id", "generation"),
 )
 
-# References that were deleted in the latest generations of a scene, see GENERATIONS_REMEMBERED.
+# Tombstones: references that were deleted in the latest generations of a scene, see store.GENERATIONS_REMEMBERED.
 removed_reference = Table(
     "removed_reference",
     metadata,
@@ -91,7 +91,7 @@ removed_reference = Table(
     Column("reference_key", _Key, primary_key=True),
 )
 
-# Images and features stand apart from `reference`, so that listing references does not drag their bytes along.
+# Images and features have tables of their own, so that listing references does not read their bytes.
 image = Table(
     "image",
     metadata,

@@ -32,7 +32,7 @@ from mapless_server.networks.weights import find_weights
 from mapless_server.scenes.retrieval.index import Entries, SceneIndex
 from mapless_server.scenes.retrieval.ranking import RankOptions, rank_references
 from mapless_server.scenes.retrieval.vlad import DIMENSION, VladDescriptor
-from mapless_server.store.records import IndexedReference, SceneChanges
+from mapless_server.store import IndexedReference, SceneChanges
 from mapless_tools.dataset import Dataset, read_folder
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.plan import EvaluationOptions, split_frames

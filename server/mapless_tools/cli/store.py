@@ -12,8 +12,7 @@ import typer
 from mapless_server.serve.command import fail
 
 if TYPE_CHECKING:
-    from mapless_server.store.database import Database
-    from mapless_server.store.verify import Progress, Verification
+    from mapless_server.store import Database, Progress, Verification
 
 store_app = typer.Typer(help="The store: bring it up to date, check it, back it up, restore it.", no_args_is_help=True)
 
@@ -27,7 +26,7 @@ DataDir = Annotated[Path | None, typer.Option(help="Folder of the store; default
 def migrate_command(config: Config = None, data_dir: DataDir = None) -> None:
     """Bring the store to this program's schema, as the server does when it starts; makes one where there is none."""
     with _faults_said(), closing(_open(config, data_dir)) as database:
-        from mapless_server.store.tables import SCHEMA_VERSION
+        from mapless_server.store import SCHEMA_VERSION
 
         print(f"database {database.name} has schema version {SCHEMA_VERSION}")
 
@@ -39,16 +38,15 @@ def verify_command(
     data_dir: DataDir = None,
 ) -> None:
     """Read every row of the store or of a backup and say what is damaged; exit code 1 if anything is."""
-    from mapless_server.store.sqlite import SqliteDatabase
-    from mapless_server.store.verify import verify
+    from mapless_server.store import SqliteDatabase, verify
 
     with (
         _faults_said(),
         _progress() as on_progress,
-        closing(SqliteDatabase.look_at(file) if file else _look(config, data_dir)) as database,
+        closing(SqliteDatabase.open_as_is(file) if file else _look(config, data_dir)) as database,
         database.read() as connection,
     ):
-        database.take_your_time(connection)
+        database.lift_limits(connection)
         found = verify(connection, on_progress)
     _report(found, "whole")
 
@@ -60,7 +58,7 @@ def backup_command(
     data_dir: DataDir = None,
 ) -> None:
     """Copy the store to one file, whether it is served or not; exit code 1 if something in the store is damaged."""
-    from mapless_server.store.backup import back_up
+    from mapless_server.store import back_up
 
     with _faults_said(), _progress() as on_progress, closing(_look(config, data_dir)) as database:
         found = back_up(database, file, on_progress)
@@ -74,11 +72,10 @@ def restore_command(
     data_dir: DataDir = None,
 ) -> None:
     """Check a backup and copy it into the store, which must be empty: all of it or nothing."""
-    from mapless_server.store.backup import restore
-    from mapless_server.store.sqlite import SqliteDatabase
+    from mapless_server.store import SqliteDatabase, restore
 
     with _faults_said(), _progress() as on_progress:
-        SqliteDatabase.look_at(file).close()  # before a store is made for it
+        SqliteDatabase.open_as_is(file).close()  # before a store is made for it
         with closing(_open(config, data_dir)) as database:
             found = restore(file, database, on_progress)
     _report(found, "restored, read again and found whole")
@@ -86,8 +83,7 @@ def restore_command(
 
 def _open(config: Path | None, data_dir: Path | None) -> Database:
     """The settings' store, brought up to date; created if missing."""
-    from mapless_server.store.postgresql import PostgresqlDatabase
-    from mapless_server.store.sqlite import SqliteDatabase
+    from mapless_server.store import PostgresqlDatabase, SqliteDatabase
 
     url, folder = _settings(config, data_dir)
     return PostgresqlDatabase.open(url) if url else SqliteDatabase.open(folder)
@@ -95,11 +91,10 @@ def _open(config: Path | None, data_dir: Path | None) -> Database:
 
 def _look(config: Path | None, data_dir: Path | None) -> Database:
     """The settings' store as it is, whoever else uses it."""
-    from mapless_server.store.postgresql import PostgresqlDatabase
-    from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
+    from mapless_server.store import DATABASE_FILE, PostgresqlDatabase, SqliteDatabase
 
     url, folder = _settings(config, data_dir)
-    return PostgresqlDatabase.look_at(url) if url else SqliteDatabase.look_at(folder / DATABASE_FILE)
+    return PostgresqlDatabase.open_as_is(url) if url else SqliteDatabase.open_as_is(folder / DATABASE_FILE)
 
 
 def _settings(config: Path | None, data_dir: Path | None) -> tuple[str | None, Path]:
@@ -116,7 +111,7 @@ def _faults_said() -> Iterator[None]:
     """What goes wrong with the store ends the command with one line."""
     from mapless_server.errors import RequestError
     from mapless_server.settings import ConfigError
-    from mapless_server.store.database import StoreError
+    from mapless_server.store import StoreError
 
     try:
         yield

@@ -25,8 +25,7 @@ from mapless_server.scenes.retrieval.ranking import RankOptions
 from mapless_server.security.tenancy import SceneKey, scene_id_of
 from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CapturedReference, DamagedCapture
 from mapless_server.services.capture.files import blob_path
-from mapless_server.store import SceneAttributes, codec
-from mapless_server.store.cache import LruCache
+from mapless_server.store import LruCache, SceneAttributes, codec
 
 RETRIEVAL = "retrieval"
 """The stage in which references are chosen."""

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.store.records import IndexedReference, SceneChanges
+from mapless_server.store import IndexedReference, SceneChanges
 
 from .descriptor import Vector
 

@@ -18,8 +18,7 @@ from itertools import groupby
 
 from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.security.tenancy import SceneKey
-from mapless_server.store import SceneRecord, Store
-from mapless_server.store.rows import time_us
+from mapless_server.store import SceneRecord, Store, time_us
 
 from .folder import CaptureFolder
 from .held import Held

@@ -20,8 +20,7 @@ from mapless_server.engine.query import Query, Result, Tier
 from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.rpc.call import Call
 from mapless_server.security.tenancy import key_of
-from mapless_server.store import SceneAttributes, Store
-from mapless_server.store.rows import time_us
+from mapless_server.store import SceneAttributes, Store, time_us
 
 from .calls import BlobGone, CapturedCall, Request, Response, diagnostics_of
 from .deletion import Deletion

@@ -26,7 +26,7 @@ from mapless_server.method.priors.known import (
     check_covariance,
 )
 from mapless_server.scenes.retrieval.narrowing import Cone, Narrowing, Sphere
-from mapless_server.store.records import SceneAttributes
+from mapless_server.store import SceneAttributes
 
 UNKNOWN_HEIGHT_SIGMA_M = 1000.0
 """Of a receiver that tells no height: within three of these, above or below the datum, stand all buildings."""

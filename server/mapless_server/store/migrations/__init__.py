@@ -1,16 +1,15 @@
-"""How the schema came to be what it is, one file a step, run by alembic when a store is opened.
+"""Migrations of the schema, one file per step, run by alembic when a store is opened.
 
 Several servers share a database, and they are replaced one after the other. So a change of the schema is made in steps,
 each in a release of its own, and at every moment the servers of the last two releases work side by side:
 
-1. *Expand*: add tables, columns with a default, indices. Servers that run already neither see nor hurt them.
+1. *Expand*: add tables, columns with a default, indices. Running servers ignore them.
 2. *Migrate*: fill what was added, in the same step if it is quick; new servers write both, and read the new.
-3. *Contract*: take away what no server of the last release uses any more.
+3. *Contract*: remove what no server of the last release uses.
 
-A step never edits what a released one did: it is a new file. A server refuses a schema newer than itself when it opens
-it, since it cannot know what it would have to keep up to date; one that has it open already goes on working through an
-expansion. A step has the number of the schema as its revision, and writes that number into `store_version`, too, by
-which programs know it that have no alembic.
+A released step is never edited: a change is a new file. A server refuses to open a schema newer than its own, since it
+cannot know what it would have to keep up to date; a server that has it open already works on through an expansion. A
+step's revision is the number of the schema, which it also writes into `store_version`, for programs without alembic.
 
 Revision 2 keeps counts that servers of revision 1 would not: revision 1 was on SQLite only, where no second server is.
 """
@@ -46,10 +45,10 @@ def read_version(connection: Connection) -> int | None:
 
 
 def migrate(connection: Connection, to_version: int = SCHEMA_VERSION) -> int | None:
-    """Bring a database to this program's schema, in the connection's transaction, beside which nobody may run another.
+    """Migrates a database in the connection's transaction, which must be the only one.
 
-    An empty one gets the schema as it is now, which is quicker; a test holds that the steps lead to the same. Only who
-    copies an older database needs another version.
+    An empty one gets the current schema at once, which is quicker; a test checks that the steps lead to the same. Only
+    copies of older databases need another version.
 
     Returns:
         The version found, None in an empty database.
@@ -69,7 +68,7 @@ def migrate(connection: Connection, to_version: int = SCHEMA_VERSION) -> int | N
 
 
 def run_steps(connection: Connection, from_version: int | None, to_version: int) -> None:
-    """Run the steps from one version (None: an empty database) to another, in the connection's transaction."""
+    """Runs the steps from one version (None: an empty database) to another, in the connection's transaction."""
     from alembic import command
     from alembic.config import Config
 
@@ -77,11 +76,11 @@ def run_steps(connection: Connection, from_version: int | None, to_version: int)
     config.set_main_option("script_location", "mapless_server.store:migrations")
     config.attributes["connection"] = connection
     if from_version is not None and not inspect(connection).has_table(alembic_version.name):
-        command.stamp(config, str(from_version))  # made before there was alembic
+        command.stamp(config, str(from_version))  # from before alembic was used
     command.upgrade(config, str(to_version))
 
 
 def write_version(connection: Connection, version: int) -> None:
-    """The last thing that a step does."""
+    """Records the version; the last thing that a step does."""
     connection.execute(store_version.delete())
     connection.execute(insert(store_version).values(schema_version=version))

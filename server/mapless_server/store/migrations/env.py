@@ -1,9 +1,9 @@
-"""What alembic runs: every step due, in the transaction that the caller has begun and will end."""
+"""Run by alembic: executes every pending step, in the caller's transaction."""
 
 from __future__ import annotations
 
 from alembic import context
 
-# As a batch, SQLite is given a table anew where it cannot alter it.
+# In batch mode, a table that SQLite cannot alter is replaced.
 context.configure(connection=context.config.attributes["connection"], render_as_batch=True)
 context.run_migrations()

@@ -17,7 +17,7 @@ _SHA256 = sa.String(64)
 
 
 def upgrade() -> None:
-    """Of an empty database."""
+    """Fills an empty database."""
     op.create_table("store_version", sa.Column("schema_version", sa.Integer(), primary_key=True, autoincrement=False))
     op.create_table(
         "scene",

@@ -1,4 +1,4 @@
-"""Expand: global descriptors, what changed since a generation, and references counted as they come and go."""
+"""Expand: global descriptors, changes since a generation, and the number of references."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _KEY = sa.String(32)
 
 
 def upgrade() -> None:
-    """Columns are added with a default, which both databases do without touching the rows."""
+    """Adds columns with a default, which both databases do without rewriting the rows."""
     op.add_column("scene", _number("reference_count"))
     op.add_column("scene", _number("first_generation"))
     op.add_column("reference", _number("generation"))
@@ -33,7 +33,7 @@ def upgrade() -> None:
         sa.Column("data", sa.LargeBinary(), nullable=False),
         sa.Column("sha256", sa.String(64), nullable=False),
     )
-    # What was deleted before is not known: whoever knows a scene as of an earlier generation reads it as a whole.
+    # Earlier deletions are not known: callers that know an earlier generation read the whole scene.
     op.execute(
         "UPDATE scene SET "
         "reference_count = (SELECT count(*) FROM reference WHERE reference.scene_id = scene.scene_id), "

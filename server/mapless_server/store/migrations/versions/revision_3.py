@@ -1,4 +1,4 @@
-"""Expand: what is known of a scene as a whole."""
+"""Expand: attributes of a scene as a whole."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ down_revision = "2"
 
 
 def upgrade() -> None:
-    """Columns that are null where nothing is known, as servers of revision 2 leave them."""
+    """Adds columns that are null without attributes, as servers of revision 2 leave them."""
     op.add_column("scene", sa.Column("attributes", sa.LargeBinary(), nullable=True))
     op.add_column("scene", sa.Column("attributes_sha256", sa.String(64), nullable=True))
     write_version(op.get_bind(), 3)

@@ -1,7 +1,6 @@
-"""How the store does with one large scene: operations alone, without the service around them.
+"""Measures the store's operations on one large scene of synthetic references, one after the other in one thread.
 
-Run it as `python -m mapless_server.store.measure`; the references are synthetic, so that it is the store that is
-measured. Each figure is over operations one after the other from one thread.
+Run it as `python -m mapless_tools.bench.store_operations`.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ from rich.progress import track
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.method.views import Features, View
 from mapless_server.security.tenancy import SceneKey
-
-from . import NewReference, Store
+from mapless_server.store import NewReference, Store
 
 SCENE = SceneKey("scale")
 EXTRACTOR = "synthetic"

@@ -1,0 +1,197 @@
+"""Deletion of scenes: a scene is detached at once, so that nobody finds it, and its rows are deleted in portions.
+
+Detaching changes one short row per reference; deleting means megabytes. If the server is stopped in between, the rows
+that are left are deleted when the store is opened again, or with the next scene that is deleted.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import uuid
+from bisect import bisect_right
+from collections.abc import Sequence
+from itertools import accumulate
+
+from sqlalchemy import ColumnElement, Connection, ScalarSelect, Table, delete, func, insert, select, update
+
+from mapless_server.errors import Overloaded
+from mapless_server.security.tenancy import SceneKey
+
+from .database import Database
+from .faults import DamagedPages
+from .tables import features, global_descriptor, image, reference, scene
+
+logger = logging.getLogger(__name__)
+
+PORTION_BYTES = 4 * 2**20
+"""Photographs, features and descriptors that are deleted in one transaction, unless a single reference has more.
+
+SQLite overwrites what it deletes, so it writes as much to its journal, which needs the space until the transaction is
+over. This is as much as it collects there anyway: the journal stays small, and others wait for a fraction of a second.
+"""
+REFERENCES_AT_A_TIME = 100
+"""Most references per transaction; other writers of SQLite wait as long."""
+PAUSE_S = 0.01
+"""Between transactions, so that other writers get SQLite's lock, which is given in no order."""
+
+_DETACHED = "-/"
+"""Prefix of the keys of detached scenes: no tenant's name is a hyphen."""
+_DETACHED_END = "-0"
+"""The first text, by code point, after all of them."""
+_DAMAGED = f"{_DETACHED}damaged"
+"""Key of the references that were deleted but whose pages cannot be freed, since the database cannot read them."""
+
+
+class PendingDeletions:
+    """Deletes the rows of detached scenes; thread-safe."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def resume(self) -> None:
+        """Starts a thread that completes interrupted deletions, if there are any; never raises."""
+        if self._database.only_reads:
+            return
+        try:
+            is_pending = self._is_pending()
+        except Exception as error:
+            _log_failure(error)
+            return
+        if is_pending:
+            logger.info("completing deletions of scenes that were interrupted")
+            self._thread = threading.Thread(target=self._run_thread, name="deletions", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Ends the thread after its current portion."""
+        self._closing.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def run(self) -> None:
+        """Deletes the rows of all detached scenes. References on pages that cannot be freed are moved aside.
+
+        Raises:
+            Overloaded: the disk has not even the space to delete one reference.
+        """
+        if not self._is_pending():
+            return
+        at_most = count = REFERENCES_AT_A_TIME
+        was_full = False
+        while True:
+            # First, because a transaction that runs out of space would leave too little for this.
+            self._database.free_space()
+            keys: list[str] = []
+            try:
+                if not self._delete_portion(count, keys):
+                    return
+                count, was_full = at_most, False
+            except DamagedPages:
+                if count == 1:
+                    self._move_aside(keys)
+                count, was_full = 1 if count > 1 else at_most, False
+            except Overloaded:
+                if was_full:
+                    raise
+                at_most, count, was_full = 1, 1, True
+            if self._closing.wait(PAUSE_S):
+                return
+
+    def _is_pending(self) -> bool:
+        with self._database.read() as connection:
+            return is_pending(connection)
+
+    def _delete_portion(self, count: int, keys: list[str]) -> bool:
+        """Whether there is more to delete; `keys` receives those of the portion before it is deleted."""
+        with self._database.write() as connection:  # changes nothing that readers see
+            keys += next_portion(connection, count)
+            delete_references(connection, *keys)
+            delete_empty(connection)
+            return bool(keys) and is_pending(connection)
+
+    def _move_aside(self, keys: list[str]) -> None:
+        if not keys:  # not the reference is damaged, but the table or index in which it is looked up
+            raise DamagedPages
+        with self._database.write() as connection:
+            move_aside(connection, keys[0])
+
+    def _run_thread(self) -> None:
+        try:
+            self.run()
+        except Exception as error:
+            _log_failure(error)
+
+
+def _log_failure(error: Exception) -> None:
+    logger.warning("what is left of deleted scenes stays until the next start or deletion of a scene: %s", error)
+
+
+# The statements; each runs in the caller's transaction.
+
+
+def detach_scene(connection: Connection, scene_key: SceneKey) -> str:
+    """Deletes a scene but keeps its references' rows, under the returned key; the caller has the scene's lock."""
+    key = f"{_DETACHED}{uuid.uuid4().hex}"
+    # It gets no generation, so no other statement takes it for a scene.
+    connection.execute(insert(scene).values(scene_id=key, create_time_us=0))
+    connection.execute(update(reference).where(reference.c.scene_id == scene_key).values(scene_id=key))
+    connection.execute(delete(scene).where(scene.c.scene_id == scene_key))
+    return key
+
+
+def move_aside(connection: Connection, key: str) -> None:
+    """Detaches a reference for good, because its damaged pages prevent its deletion."""
+    if connection.scalar(select(scene.c.scene_id).where(scene.c.scene_id == _DAMAGED)) is None:
+        connection.execute(insert(scene).values(scene_id=_DAMAGED, create_time_us=0))
+    connection.execute(update(reference).where(reference.c.key == key).values(scene_id=_DAMAGED, reference_id=key))
+
+
+def is_pending(connection: Connection) -> bool:
+    """Whether rows of detached scenes are still to be deleted."""
+    column = scene.c.scene_id
+    return connection.scalar(select(column).where(is_detached(column), column != _DAMAGED).limit(1)) is not None
+
+
+def next_portion(connection: Connection, at_most: int) -> Sequence[str]:
+    """Keys of the references to delete next: at most so many, and not more than `PORTION_BYTES` together.
+
+    What another server is deleting at this moment is skipped.
+    """
+    column = reference.c
+    pending = select(column.key).where(is_detached(column.scene_id), column.scene_id != _DAMAGED).order_by(column.key)
+    keys = connection.scalars(pending.limit(at_most).with_for_update(skip_locked=True)).all()
+    if len(keys) <= 1:  # where pages are damaged even the size may not be readable
+        return keys
+    size_bytes = _size_bytes(image) + _size_bytes(features) + _size_bytes(global_descriptor)
+    sizes = connection.scalars(select(size_bytes).where(column.key.in_(keys)).order_by(column.key))
+    return keys[: max(1, bisect_right(list(accumulate(sizes)), PORTION_BYTES))]
+
+
+def _size_bytes(table: Table) -> ScalarSelect[int]:
+    """Size of a reference's rows in a table; the bytes themselves are not read for it."""
+    total = select(func.coalesce(func.sum(func.length(table.c.data)), 0))
+    return total.where(table.c.reference_key == reference.c.key).scalar_subquery()
+
+
+def delete_references(connection: Connection, *keys: str) -> None:
+    """Deletes references with everything that belongs to them."""
+    connection.execute(delete(reference).where(reference.c.key.in_(keys)))
+
+
+def delete_empty(connection: Connection) -> None:
+    """Deletes detached scenes without references."""
+    is_empty = ~select(reference.c.key).where(reference.c.scene_id == scene.c.scene_id).exists()
+    connection.execute(delete(scene).where(is_detached(scene.c.scene_id), is_empty))
+
+
+def delete_detached(connection: Connection) -> None:
+    """Deletes all detached scenes at once."""
+    connection.execute(delete(scene).where(is_detached(scene.c.scene_id)))
+
+
+def is_detached(scene_id: ColumnElement[str]) -> ColumnElement[bool]:
+    """Whether a row belongs to a detached scene."""
+    return (scene_id >= _DETACHED) & (scene_id < _DETACHED_END)

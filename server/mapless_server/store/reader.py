@@ -1,0 +1,364 @@
+"""The reading half of the store, and what it caches."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial, wraps
+from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, TypeVar
+
+from sqlalchemy import Connection, Row, Select, select
+
+from mapless_server.errors import AlreadyExists, NotFound, RequestError
+from mapless_server.security.tenancy import SceneKey
+
+from . import queries, rows, tables
+from .cache import LruCache
+from .changes import read_changes
+from .database import Database
+from .faults import DamagedPages, unless_damaged
+from .records import DescribedReference, ReferenceRecord, SceneAttributes, SceneChanges, SceneRecord, SceneSnapshot
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+NAME_CACHE_BYTES = 16 * 2**20
+NAME_BYTES = 300
+"""About the size of a reference's id and key in memory."""
+RECORD_BYTES = 700
+"""About the size of a ReferenceRecord in memory, arrays and strings included."""
+ATTRIBUTES_BYTES = 2000
+"""About the size of SceneAttributes in memory."""
+
+UNWRITABLE = frozenset({"STORE_READ_ONLY", "STORE_FULL", "STORE_UNAVAILABLE"})
+"""Reasons of faults after which the next change would most likely fail, too."""
+
+
+class StoreObserver(Protocol):
+    """Receives the store's events, in any thread that uses it; must return at once and never raise."""
+
+    def stored(self, operation: str, seconds: float) -> None:
+        """An operation ended, successfully or not."""
+
+    def store_failed(self) -> None:
+        """It failed by a fault that is not the caller's: damage, a full disk, a database that is busy."""
+
+
+def observed(operation: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any, P], T]:
+    """Reports a method of the store to its observer, under the method's name."""
+
+    @wraps(operation)
+    def wrapper(self: StoreReader, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        start_s = time.monotonic()
+        try:
+            return operation(self, *args, **kwargs)
+        except Exception as error:
+            if self.observer is not None and not isinstance(error, NotFound | AlreadyExists):
+                self.observer.store_failed()
+            raise
+        finally:
+            if self.observer is not None:
+                self.observer.stored(operation.__name__, time.monotonic() - start_s)
+
+    return wrapper
+
+
+class _Resolved(NamedTuple):
+    """What a scene's reference ids meant in a state of the store: the scene's generation, and a key for each id."""
+
+    state: object
+    generation: int
+    keys: tuple[str, ...]
+
+
+class StoreReader:
+    """Reads scenes and references; each method sees one moment of the database.
+
+    Attributes:
+        observer: receives an event for every operation; None for no observer.
+        write_fault: why the last change could not be written, one of `UNWRITABLE`; empty if it could.
+    """
+
+    def __init__(
+        self, database: Database, described: LruCache[DescribedReference], name_cache_bytes: int = NAME_CACHE_BYTES
+    ) -> None:
+        self._database = database
+        self.observer: StoreObserver | None = None
+        self.write_fault = ""
+        # By (key, extractor): references never change and keys are never reused, so no entry is ever stale.
+        self._described = described
+        # By scene key and ids. Where this process alone writes, an entry is valid until anything is written (`_state`),
+        # and the database is not asked at all; where others write too, as long as the generation is the same.
+        self._resolved: LruCache[_Resolved] = LruCache(name_cache_bytes)
+        self._attributes: LruCache[tuple[object, SceneAttributes]] = LruCache(name_cache_bytes)
+        self._state = object()
+        self._last_deletion = object()
+
+    @property
+    def database(self) -> Database:
+        """The database underneath."""
+        return self._database
+
+    @property
+    def reference_cache(self) -> LruCache[DescribedReference]:
+        """The features held in memory."""
+        return self._described
+
+    @contextmanager
+    def _changing(self) -> Iterator[Connection]:
+        """A transaction that writes; invalidates what is cached by `_state`, however it ends."""
+        try:
+            with self._database.write() as connection:
+                yield connection
+            self.write_fault = ""
+        except RequestError as error:
+            if error.reason in UNWRITABLE:
+                self.write_fault = error.reason
+            raise
+        finally:
+            self._state = object()
+
+    @observed
+    def get_scene(self, scene_key: SceneKey) -> SceneRecord:
+        """A scene.
+
+        Raises:
+            NotFound: there is no such scene.
+            DataLoss: its attributes are damaged.
+        """
+        with self._database.read() as connection:
+            return rows.scene_record(queries.find_scene(connection, scene_key))
+
+    @observed
+    def get_generation(self, scene_key: SceneKey) -> int:
+        """Generation of a scene, even if its attributes are damaged. Raises NotFound."""
+        with self._database.read() as connection:
+            return queries.read_generation(connection, scene_key)
+
+    @observed
+    def get_attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        """Attributes of a scene as a whole; cached where this process alone writes, since every query needs them.
+
+        Raises:
+            NotFound: there is no such scene.
+            DataLoss: they are damaged.
+        """
+        state = self._state
+        cached = None if self._database.is_shared else self._attributes.get(scene_key)
+        if cached is not None and cached[0] is state:
+            return cached[1]
+        with self._database.read() as connection:
+            row = queries.find_attributes(connection, scene_key)
+        attributes = rows.scene_attributes(row)
+        if not self._database.is_shared:
+            self._attributes.put(scene_key, (state, attributes), ATTRIBUTES_BYTES)
+        return attributes
+
+    @observed
+    def list_scenes(self, tenant: str, limit: int, after: str = "") -> list[SceneRecord]:
+        """At most `limit` scenes of a tenant, ordered by id, with ids greater than `after`.
+
+        Raises:
+            DataLoss: the attributes of one of them are damaged.
+        """
+        page = queries.select_scenes_of(tenant, after).limit(limit)
+        with self._database.read() as connection:
+            return [rows.scene_record(row) for row in connection.execute(page)]
+
+    @observed
+    def has_features(self, key: str, extractor: str) -> bool:
+        """Whether a reference has features of this extractor; False if it was deleted."""
+        with self._database.read() as connection:
+            return queries.has_features(connection, key, extractor)
+
+    @observed
+    def get_reference(self, scene_key: SceneKey, reference_id: str) -> ReferenceRecord:
+        """A reference without its image.
+
+        Raises:
+            NotFound: there is no such scene or reference.
+            DataLoss: its camera and pose are damaged.
+        """
+        with self._database.read() as connection:
+            key = queries.find_key(connection, scene_key, reference_id)
+            row = connection.execute(select(tables.reference).where(tables.reference.c.key == key)).one()
+        return rows.reference_record(row)
+
+    @observed
+    def read_image(self, scene_key: SceneKey, reference_id: str) -> bytes:
+        """The image's bytes as they were added.
+
+        Raises:
+            NotFound: there is no such scene or reference.
+            DataLoss: the bytes are damaged.
+        """
+        with self._database.read() as connection:
+            return _read_image(connection, queries.find_key(connection, scene_key, reference_id))
+
+    @observed
+    def read_image_of(self, key: str) -> bytes:
+        """The image's bytes as they were added, by the reference's key.
+
+        Raises:
+            NotFound: the reference was deleted.
+            DataLoss: the bytes are damaged.
+        """
+        with self._database.read() as connection:
+            return _read_image(connection, key)
+
+    @observed
+    def list_references(self, scene_key: SceneKey, limit: int, after: str = "") -> list[ReferenceRecord]:
+        """At most `limit` references of a scene, ordered by id, with ids greater than `after`.
+
+        Raises:
+            NotFound: there is no such scene.
+            DataLoss: camera and pose of one of them are damaged.
+        """
+        found = self._read_page(select(tables.reference), scene_key, limit, after)
+        return [rows.reference_record(row) for row in found]
+
+    @observed
+    def list_reference_ids(self, scene_key: SceneKey, limit: int, after: str = "") -> list[str]:
+        """The ids alone, of damaged references too.
+
+        Raises:
+            NotFound: there is no such scene.
+        """
+        found = self._read_page(select(tables.reference.c.reference_id), scene_key, limit, after)
+        return [row.reference_id for row in found]
+
+    def _read_page(self, statement: Select[Any], scene_key: SceneKey, limit: int, after: str) -> Sequence[Row[Any]]:
+        column = tables.reference.c
+        page = statement.where(column.scene_id == scene_key, column.reference_id > after)
+        with self._database.read() as connection:
+            queries.read_generation(connection, scene_key)
+            return connection.execute(page.order_by(column.reference_id).limit(limit)).all()
+
+    @observed
+    def find_keys(self, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
+        """Keys by id, of those of these references that exist, damaged ones too.
+
+        Raises:
+            NotFound: there is no such scene.
+        """
+        with self._database.read() as connection:
+            queries.read_generation(connection, scene_key)
+            return queries.find_keys(connection, scene_key, reference_ids)
+
+    @observed
+    def load_references(
+        self, scene_key: SceneKey, reference_ids: Sequence[str] | None, extractor: str
+    ) -> SceneSnapshot:
+        """References with their features, which of them have none, and the generation, all read at one moment.
+
+        References that were loaded before come from memory.
+
+        Args:
+            scene_key: the scene.
+            reference_ids: which references, in the order wanted; None for all, ordered by id.
+            extractor: whose features.
+
+        Raises:
+            NotFound: there is no such scene (field "scene") or reference (field "references[i]").
+            DataLoss: features, camera or pose of one of them are damaged.
+        """
+        state, last_deletion = self._state, self._last_deletion
+        names = None if reference_ids is None else tuple(reference_ids)
+        resolved = None if names is None else self._resolved.get((scene_key, names))
+        cached: dict[str, DescribedReference | None] = {}  # each is looked up once: hits and misses are counted
+        if resolved is not None and resolved.state is state and not self._database.is_shared:
+            cached, snapshot = self._cached(resolved, extractor)
+            if snapshot is not None:
+                return snapshot
+        with self._database.read() as connection:
+            generation = queries.read_generation(connection, scene_key)
+            if resolved is not None and resolved.generation == generation and self._database.is_shared:
+                cached, snapshot = self._cached(resolved, extractor)
+                if snapshot is not None:
+                    return snapshot
+            if reference_ids is None:
+                key_of = queries.list_keys(connection, scene_key)
+                reference_ids = list(key_of)
+            else:
+                key_of = queries.find_keys(connection, scene_key, reference_ids)
+            for index, reference_id in enumerate(reference_ids):
+                if reference_id not in key_of:
+                    raise queries.reference_not_found(scene_key, reference_id, field=f"references[{index}]")
+            wanted = [key_of[reference_id] for reference_id in reference_ids]
+            cached |= {key: self._described.get((key, extractor)) for key in wanted if key not in cached}
+            described = {key: it for key, it in cached.items() if it is not None}
+            id_of = {key_of[it]: it for it in reference_ids}
+            read = _read_features(connection, {key: id_of[key] for key in wanted if key not in described}, extractor)
+            lacking = [key for key in wanted if key not in described and key not in read]
+            undescribed = queries.rows_by_key(connection, lacking)
+        if names is not None:
+            size_bytes = NAME_BYTES * (1 + len(names))
+            self._resolved.put((scene_key, names), _Resolved(state, generation, tuple(wanted)), size_bytes)
+        for key, row in read.items():
+            described[key] = rows.described_reference(row)
+            self._described.put((key, extractor), described[key], len(row.data) + RECORD_BYTES)
+        if self._last_deletion is not last_deletion:  # these may have been deleted, and dropped from the caches before
+            self._described.forget(lambda key, _: key[0] in read)
+            self._resolved.forget(lambda key, _: key == (scene_key, names))
+        return SceneSnapshot(
+            generation,
+            tuple(described[key] for key in wanted if key in described),
+            tuple(rows.reference_record(undescribed[key]) for key in lacking),
+        )
+
+    @observed
+    def list_changes(self, scene_key: SceneKey, since_generation: int | None, descriptor_name: str) -> SceneChanges:
+        """What has changed in a scene since a generation, read at one moment.
+
+        Args:
+            scene_key: the scene.
+            since_generation: the one that the caller knows; None for the whole scene.
+            descriptor_name: whose global descriptors.
+
+        Raises:
+            NotFound: there is no such scene.
+        """
+        with self._database.read() as connection:
+            return read_changes(connection, scene_key, since_generation, descriptor_name)
+
+    def _cached(
+        self, resolved: _Resolved, extractor: str
+    ) -> tuple[dict[str, DescribedReference | None], SceneSnapshot | None]:
+        """What is cached of references, by key; and as a snapshot, if all of them are."""
+        cached = {key: self._described.get((key, extractor)) for key in resolved.keys}
+        found = tuple(it for it in map(cached.get, resolved.keys) if it is not None)
+        is_complete = len(found) == len(resolved.keys)
+        return cached, SceneSnapshot(resolved.generation, found) if is_complete else None
+
+
+def _read_image(connection: Connection, key: str) -> bytes:
+    row = unless_damaged(connection, lambda: queries.find_image(connection, key), lambda: None)
+    if row is None:
+        reference_id = queries.find_by_key(connection, key, tables.reference.c.reference_id).reference_id
+        raise rows.data_loss(reference_id, "image")
+    return rows.image(row)
+
+
+def _read_features(connection: Connection, id_of: Mapping[str, str], extractor: str) -> dict[str, Row[Any]]:
+    """Rows of `queries.features_by_key`, by key. Raises DataLoss that names the first reference that cannot be read."""
+
+    def read(keys: Sequence[str]) -> dict[str, Row[Any]]:
+        return queries.features_by_key(connection, keys, extractor)
+
+    def read_each() -> dict[str, Row[Any]]:
+        found: dict[str, Row[Any]] = {}
+        for key, reference_id in id_of.items():
+            row = unless_damaged(connection, partial(read, [key]), lambda: None)
+            if row is None:
+                unless_damaged(connection, partial(queries.rows_by_key, connection, [key]), _raise_damaged)
+                raise rows.data_loss(reference_id, "features")
+            found |= row
+        return found
+
+    return unless_damaged(connection, lambda: read(list(id_of)), read_each) if id_of else {}
+
+
+def _raise_damaged() -> NoReturn:
+    """Not the data of one reference are damaged, but the table or index in which references are looked up."""
+    raise DamagedPages
