@@ -5,12 +5,14 @@ from __future__ import annotations
 import gzip
 import hashlib
 import io
+import math
 import os
 import pickle
 import re
 import resource
 import subprocess
 import sys
+import tempfile
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -38,7 +40,7 @@ from mapless_server.networks.weights import (
 from mapless_server.networks.weights.catalogue import HubFile, Licence, Weights, WheelMember
 from mapless_server.networks.weights.folder import Status, look_up, workplace
 from mapless_server.networks.weights.install import add, check, fetch
-from mapless_server.networks.weights.safetensors_header import opened, read_header
+from mapless_server.networks.weights.safetensors_header import Header, opened, read_header
 from mapless_server.settings import Settings, default_weights_dir
 
 CONTENT = safetensors({"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.zeros(2, np.float16)})
@@ -79,24 +81,22 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def header_of(content: bytes, tmp_path: Path) -> Any:
-    path = tmp_path / "file.safetensors"
+def header_of(content: bytes, folder: Path) -> Header:
+    path = folder / "file.safetensors"
     path.write_bytes(content)
-    with opened(path) as stream:
-        return read_header(stream, str(path))
+    return read_header(path)
 
 
 # ---- the format
 
 
-def test_a_header_tells_dtypes_shapes_and_ranges(tmp_path: Path) -> None:
+def test_a_header_has_types_and_shapes_in_the_order_of_bytes(tmp_path: Path) -> None:
     header = header_of(CONTENT, tmp_path)
-    assert {name: (e.dtype, e.shape, e.begin, e.end) for name, e in header.entries.items()} == {
-        "a.weight": ("F32", (2, 3), 0, 24),
-        "b": ("F16", (2,), 24, 28),
-    }
-    assert CONTENT.startswith(header.raw)
-    assert len(CONTENT) == len(header.raw) + 28
+    assert [(name, it.dtype, it.shape) for name, it in header.entries.items()] == [
+        ("a.weight", "F32", (2, 3)),
+        ("b", "F16", (2,)),
+    ]
+    assert header.size_bytes == len(CONTENT) - 28
 
 
 def test_a_length_that_begins_like_a_pickle_is_none(tmp_path: Path) -> None:
@@ -122,29 +122,24 @@ def zip_archive() -> bytes:
         (b"version https://git-lfs.github.com/spec/v1\n", "it is a Git LFS pointer"),
         (gzip.compress(CONTENT), "it is gzip"),
         (b"\x05", "not a safetensors file"),
-        (b"\xff" * 7 + b"\x7f{", "not a safetensors file"),
-        (CONTENT[:60], "cut short: it ends within its header"),
-        (CONTENT[:-1], "cut short: 27 of 28 bytes"),
-        (CONTENT + b"!", "1 bytes after its tensors"),
+        (b"\xff" * 7 + b"\x7f{", "header is damaged: header too large"),
+        (CONTENT[:60], "cut short within its header"),
+        (CONTENT[:-1], "cut short, or longer than its tensors"),
+        (CONTENT + b"!", "cut short, or longer than its tensors"),
         (with_header(b'{"a":'), "damaged"),
         (with_header(b'{"a":' * 50_000), "damaged"),
-        (with_header(b'{"a":1,"a":2}'), "a name occurs twice"),
-        (with_header({"a": 3}), "a lacks its dtype"),
-        (with_header({"a": {"dtype": "F32", "shape": [2]}}), "a lacks its dtype"),
-        (with_header({"a": entry(dtype="F8_E4M3", end=2)}, bytes(2)), "dtype F8_E4M3"),
-        (with_header({"a": entry(dtype=[])}, bytes(8)), "dtype []"),  # type: ignore[arg-type]
-        (with_header({"a": entry(shape=(-2,))}, bytes(8)), "numbers that are none"),
-        (with_header({"a": entry(shape=(2, True))}, bytes(8)), "numbers that are none"),
-        (with_header({"a": entry(shape=(3,))}, bytes(8)), "not those of its shape"),
-        (with_header({"a": entry(begin=8, end=16)}, bytes(16)), "a gap or an overlap at byte 0"),
-        (with_header({"a": entry(), "b": entry(begin=4, end=12)}, bytes(12)), "a gap or an overlap at byte 8"),
+        (with_header({"a": {"dtype": "F32", "shape": [2]}}), "header is damaged: .*data_offsets"),
+        (with_header({"a": entry(shape=(-2,))}, bytes(8)), "header is damaged: .*-2"),
+        (with_header({"a": entry(shape=(3,))}, bytes(8)), "header is damaged: invalid shape"),
+        (with_header({"a": entry(begin=8, end=16)}, bytes(16)), "header is damaged: invalid offset for tensor `a`"),
+        (with_header({"a": entry(), "b": entry(begin=4, end=12)}, bytes(12)), "invalid offset for tensor `b`"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_what_is_no_safetensors_file_is_refused_with_what_it_is(content: bytes, words: str, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError) as caught:
         header_of(content, tmp_path)
-    assert words in str(caught.value)
+    assert re.search(words, str(caught.value))
     assert "file.safetensors" in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -152,12 +147,14 @@ def test_what_is_no_safetensors_file_is_refused_with_what_it_is(content: bytes, 
 @given(position=st.integers(0, len(CONTENT) - 1), byte=st.integers(0, 255), length=st.integers(0, len(CONTENT)))
 def test_a_damaged_file_is_read_or_refused_cleanly(position: int, byte: int, length: int) -> None:
     content = (CONTENT[:position] + bytes([byte]) + CONTENT[position + 1 :])[:length]
-    stream = io.BytesIO(content)
-    try:
-        header = read_header(stream, "f")
-    except CheckpointError:
-        return
-    assert sum(e.end - e.begin for e in header.entries.values()) == len(content) - len(header.raw)
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            header = header_of(content, Path(folder))
+        except CheckpointError:
+            return
+    item_bytes = {"F64": 8, "I64": 8, "F32": 4, "I32": 4, "F16": 2, "I16": 2, "U16": 2, "BF16": 2}
+    data = sum(math.prod(it.shape) * item_bytes[it.dtype] for it in header.entries.values())
+    assert header.size_bytes + data == len(content)
 
 
 def test_what_the_system_refuses_is_said(tmp_path: Path) -> None:
@@ -464,8 +461,7 @@ def test_a_wheel_is_fetched_once_and_its_members_converted(monkeypatch: pytest.M
         for member in ("a.pth", "b.pth"):
             weights = carried(member, original, name=member, file_name=f"{member}.safetensors")
             path = fetch(weights, folder, temporary).path
-            with opened(path) as stream:
-                entries = read_header(stream, str(path)).entries
+            entries = read_header(path).entries
             assert {name: (e.dtype, e.shape) for name, e in entries.items()} == {
                 "w": ("F32", (3, 2)),
                 "count": ("I64", ()),

@@ -66,19 +66,23 @@ def load_strictly(
             module, or numbers that are not finite. The module is then as it was.
     """
     state = module.state_dict()
+    header = read_header(file)
+    who = f"{file} does not fit {type(module).__name__}"
+    check_fit(header, expected_tensors(module), optional.keys(), ignored_prefixes, who)
     with opened(file) as stream:
-        header = read_header(stream, str(file))
-        who = f"{file} does not fit {type(module).__name__}"
-        check_fit(header, expected_tensors(module), optional.keys(), ignored_prefixes, who)
-        digest = hashlib.sha256(header.raw)
+        digest = hashlib.sha256(stream.read(header.size_bytes))
         loaded = {name: tensor.to(device) for name, tensor in _defaults(state, header.entries, optional).items()}
         for name, entry in header.entries.items():
+            if entry.dtype not in _DTYPES:
+                raise CheckpointError(f"{file} holds numbers of type {entry.dtype}, in {name}: no network takes them")
             tensor = _read(stream, entry, file)
             digest.update(_bytes_of(tensor))
             if name in state:
                 if not _is_finite(tensor):
                     raise CheckpointError(f"{file} holds numbers that are not finite, in {name}")
                 loaded[name] = tensor.to(device, state[name].dtype)
+        if stream.read(1):
+            raise CheckpointError(f"{file} changed while it was read")
     module.load_state_dict(loaded, strict=True, assign=True)
     return digest.hexdigest()
 
@@ -107,7 +111,7 @@ def _read(stream: BufferedReader, entry: Entry, file: Path) -> torch.Tensor:
     tensor = torch.empty(entry.shape, dtype=_DTYPES[entry.dtype], device="cpu")
     view = _bytes_of(tensor)
     if stream.readinto(view) != len(view):
-        raise CheckpointError(f"{file} became shorter while it was read")
+        raise CheckpointError(f"{file} changed while it was read")
     return tensor
 
 

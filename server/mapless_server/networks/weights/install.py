@@ -128,8 +128,7 @@ def _original(file: Path, weights: Weights) -> WheelMember | None:
         CheckpointError: it is neither.
     """
     try:
-        with opened(file) as stream:
-            read_header(stream, str(file))
+        read_header(file)
     except CheckpointError:
         if isinstance(weights.source, WheelMember) and file.is_file() and is_original(file, weights.source):
             return weights.source
@@ -160,11 +159,10 @@ def _read_through(
         write(block)
         progress(len(block))
 
+    header = read_header(file, called)
+    if weights.network:  # gigabytes: before they are read
+        not_compared = compare_names(header, weights, called)
     with opened(file) as stream:
-        header = read_header(stream, called)
-        if weights.network:  # gigabytes: before they are read
-            not_compared = compare_names(header, weights, called)
-        stream.seek(0)
         sha256 = sha256_of(stream, to)
     is_official = None if weights.sha256 is None else sha256 == weights.sha256
     if is_official:
