@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera
 from mapless_server.method.features import make_extractor
 from mapless_server.networks.weights import find_weights
-from mapless_server.scenes.retrieval.vocabulary import LEARNED, Vocabulary, learned
+from mapless_server.scenes.retrieval.vocabulary import (
+    LEARNED,
+    REDUCED,
+    SEED,
+    WORDS,
+    Floats,
+    Vocabulary,
+    nearest_words,
+)
 
 from .rendered_room.photographs import lit_room, photograph, scatter
 
@@ -66,6 +74,33 @@ def of_kind(kind: str, photographs: Sequence[View], weights_dir: Path) -> Vocabu
     print(f"{kind}: {len(descriptors)} features", flush=True)
     drawn = np.random.default_rng(0).choice(len(descriptors), min(DESCRIPTORS, len(descriptors)), replace=False)
     return learned(descriptors[np.sort(drawn)])
+
+
+def learned(descriptors: Floats, iterations: int = 25) -> Vocabulary:
+    """A vocabulary from descriptors (N, d), N at least WORDS: principal directions, and k-means.
+
+    Its numbers are rounded to float16, as the file keeps them.
+    """
+    random = np.random.default_rng(SEED)
+    mean = descriptors.mean(axis=0)
+    _, directions = np.linalg.eigh(np.cov(descriptors, rowvar=False))
+    directions = directions[:, ::-1][:, :REDUCED]
+    # Directions have no sign of their own: the largest number is positive, whatever the library that found them.
+    directions = directions * np.sign(directions[np.abs(directions).argmax(axis=0), np.arange(directions.shape[1])])
+    mean, projection = _rounded(mean), _rounded(directions)
+    points: Floats = ((descriptors - mean) @ projection).astype(np.float32)
+    words: Floats = points[random.choice(len(points), WORDS, replace=False)]
+    for _ in range(iterations):
+        nearest = nearest_words(points, words)
+        members = nearest[:, None] == np.arange(WORDS)
+        # A word that is nearest to no point stays where it is.
+        sums, counts = members.T.astype(np.float32) @ points, members.sum(axis=0)[:, None]
+        words = np.where(counts > 0, sums / np.maximum(counts, 1), words).astype(np.float32)
+    return Vocabulary(mean, projection, _rounded(words))
+
+
+def _rounded(array: NDArray[np.floating]) -> Floats:
+    return array.astype(np.float16).astype(np.float32)
 
 
 def write(path: Path, vocabularies: dict[str, Vocabulary]) -> None:

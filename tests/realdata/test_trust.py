@@ -13,17 +13,8 @@ import pytest
 from mapless_server.method.answer import Localization, LocalizeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.method.trust.focal import FocalOptions, wrong_focal
-from mapless_tools.calibrate.pairs import (
-    METRIC,
-    OTHERS,
-    Measured,
-    Place,
-    answered,
-    cross_pairs,
-    read_places,
-    right_pairs,
-)
 from mapless_tools.dataset import Dataset
+from research.places import METRIC, OTHERS, Measured, Place, answered, cross_pairs, read_places, right_pairs
 
 from .conftest import DATA
 

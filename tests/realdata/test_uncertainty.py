@@ -11,8 +11,8 @@ from scipy.special import bdtrik
 
 from mapless_server.method.answer import Localization, LocalizeOptions
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
-from mapless_tools.calibrate.pairs import answered, read_places, right_pairs
 from mapless_tools.dataset import Dataset
+from research.places import answered, read_places, right_pairs
 
 pytestmark = pytest.mark.realdata
 

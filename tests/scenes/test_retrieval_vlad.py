@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.resources import files
 
 import numpy as np
@@ -17,8 +18,6 @@ from mapless_server.scenes.retrieval.vocabulary import (
     LEARNED,
     Vocabulary,
     dataless,
-    learned,
-    nearest_words,
     shipped,
 )
 
@@ -102,8 +101,7 @@ class TestNames:
         assert made.extractor == extractor.name
 
     def test_another_vocabulary_is_another_name(self) -> None:
-        found = descriptors("learn", 2000).astype(np.float32)
-        one, other = learned(found), learned(found[:1500])
+        one, other = dataless(128), replace(dataless(128), mean=np.full(128, 0.01, np.float32))
         names = {VladDescriptor("x", vocabulary).name for vocabulary in (one, other, None, shipped("sift"))}
         assert len(names) == 4
         assert VladDescriptor("y", one).name != VladDescriptor("x", one).name
@@ -123,18 +121,6 @@ class TestVocabularies:
 
     def test_other_kinds_have_none(self) -> None:
         assert shipped("superpoint") is None
-
-    def test_learning_finds_planted_clusters(self) -> None:
-        """32 far clusters: every word ends in one, and all that are close together share a word."""
-        random = random_for("clusters")
-        centres = unit_rows(random.standard_normal((40, 64)))[:32]
-        members = np.repeat(centres, 50, axis=0) + 0.01 * random.standard_normal((1600, 64))
-        vocabulary = learned(members.astype(np.float32))
-        points = (members - vocabulary.mean) @ vocabulary.projection
-        nearest = nearest_words(points, vocabulary.words).reshape(32, 50)
-        agree = np.mean([np.bincount(row).max() / 50 for row in nearest])
-        assert agree > 0.8
-        assert learned(members.astype(np.float32)).digest() == vocabulary.digest()
 
     def test_arrays_that_do_not_fit_are_refused(self) -> None:
         good = dataless(16)

@@ -26,7 +26,7 @@ from mapless_tools.calibrate.page import page
 from mapless_tools.calibrate.queries import Outcome
 from mapless_tools.calibrate.report import CalibrationReport, to_json, worst
 from mapless_tools.calibrate.run import calibration_of
-from mapless_tools.calibrate.selective import at_coverage, auroc, risk_coverage
+from mapless_tools.calibrate.selective import auroc, risk_coverage
 from mapless_tools.calibrate.worlds import other_world
 from mapless_tools.dataset import Dataset
 
@@ -242,13 +242,6 @@ class TestSelective:
         points = risk_coverage(self.SCORES, self.RIGHT)
         assert [(it.accepted, it.wrong) for it in points] == [(1, 0), (3, 1), (4, 1), (5, 2)]
         assert [it.coverage for it in points] == pytest.approx([1 / 3, 2 / 3, 1, 1])
-
-    def test_a_coverage_is_reached_by_as_few_as_it_takes(self) -> None:
-        point = at_coverage(self.SCORES, self.RIGHT, 0.6)
-        assert point is not None
-        assert (point.score, point.accepted) == (0.8, 3)
-        assert point.risk == pytest.approx(1 / 3)
-        assert at_coverage(self.SCORES, (False,) * 5, 0.9) is None
 
 
 def outcome(

@@ -60,10 +60,3 @@ def risk_coverage(scores: Sequence[float], right: Sequence[bool]) -> list[Operat
         wrong = i + 1 - rights
         points.append(Operating(float(sorted_scores[i]), rights / all_right, wrong / (i + 1), i + 1, wrong))
     return points
-
-
-def at_coverage(scores: Sequence[float], right: Sequence[bool], coverage: float) -> Operating | None:
-    """The strictest operating point that accepts at least this share of the right answers; None without any."""
-    if not any(right):
-        return None
-    return next(point for point in risk_coverage(scores, right) if point.coverage >= coverage)

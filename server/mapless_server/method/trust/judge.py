@@ -10,7 +10,7 @@ many of a caller's photographs show the place at all.
 One mistake of the caller's is looked for by itself, because answers to it look as good as right ones and are not: a
 wrong focal length (`focal`).
 
-Weights and quantiles come from `calibration.trust_fit`, which tells wrong poses (of other places, mirrored photographs,
+Weights and quantiles come from `research.trust`, which tells wrong poses (of other places, mirrored photographs,
 references with wrong poses, hardly any overlap) from right ones by logistic regression with weights of one sign.
 """
 

@@ -12,7 +12,7 @@ from mapless.geometry import Array
 
 TAIL_95 = 1.4
 """Errors have heavier tails than the normal distribution: by so much the radius for 95 % is larger than the
-covariance's, which is right at 68 %. Measured by `mapless_tools.calibrate.generic`."""
+covariance's, which is right at 68 %. Measured by `research.radii`."""
 
 
 @dataclass(frozen=True)

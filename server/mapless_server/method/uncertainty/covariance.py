@@ -27,7 +27,7 @@ quarter (the tests). What is drawn towards i^2 H^-1 claims more than that where 
 on photographs: their errors are larger in directions that are told badly than the references' disagreement shows.
 
 What remains are two factors on standard deviations, one for positions and one for angles, and one for the tail: errors
-have heavier ones than the normal distribution. `mapless_tools.calibrate.generic` measures all three on scenes with
+have heavier ones than the normal distribution. `research.radii` measures all three on scenes with
 known poses, each tested on a scene that it was not measured on.
 """
 
@@ -52,7 +52,7 @@ class UncertaintyOptions:
             thirds nothing changes that could be told on some hundred photographs.
         shared_matches: so many independent matches are as good as any number. Without this bound positions of the two
             surveyed scenes, where a thousand matches agree, are claimed twice as exact as they are.
-        position_factor, rotation_factor: on standard deviations; as `calibration.generic` prints them.
+        position_factor, rotation_factor: on standard deviations; as `research.radii` prints them.
         max_matches: of the photograph that are looked at, evenly thinned; twice as many take twice the time, and the
             references' errors are in all of them.
         loss_scale_sigma: of the Cauchy loss that weighs matches, for poses that no adjustment has weighed.

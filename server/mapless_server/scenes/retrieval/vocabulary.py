@@ -1,9 +1,9 @@
 """What VLAD is made with: where descriptors of local features lie, learned once and shipped, or from no data at all.
 
-The shipped vocabularies were learned from photographs that our own code renders (see `learn`), so they carry nobody's
-pictures. Measured with SIFT in the kitchen of 7-Scenes (100 references, 120 queries), by the share of the first ten
-that stand within 0.5 m and 30 degrees: 0.95 with the rendered vocabulary, 0.94 with one learned from other real places,
-0.82 with one that needs no data. All three have such a reference among the first ten for every query.
+The shipped vocabularies were learned from photographs that our own code renders (`research.learn_vocabulary`).
+Measured with SIFT in the kitchen of 7-Scenes (100 references, 120 queries), by the share of the first ten that stand
+within 0.5 m and 30 degrees: 0.95 with the rendered vocabulary, 0.94 with one learned from other real places, 0.82 with
+one that needs no data. All three have such a reference among the first ten for every query.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LEARNED = ("sift", "aliked", "xfeat")
 """Kinds of features that a vocabulary is shipped for; each has three arrays in the file, see `Vocabulary`."""
 
 FILE = "vocabularies.npz"
-_SEED = 20260101
+SEED = 20260101
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ def shipped(kind: str) -> Vocabulary | None:
 @lru_cache
 def dataless(dimension: int) -> Vocabulary:
     """One for unit descriptors of any kind, from seeded random numbers: they are taken to point anywhere."""
-    random = np.random.default_rng([_SEED, dimension])
+    random = np.random.default_rng([SEED, dimension])
     projection = random.standard_normal((dimension, REDUCED)) / np.sqrt(dimension)
     # Centroids of what is spread evenly lie close to the middle: it is their directions that tell the cells apart.
     words = random.standard_normal((WORDS, REDUCED))
@@ -80,33 +80,6 @@ def dataless(dimension: int) -> Vocabulary:
     return Vocabulary(*(array.astype(np.float32) for array in arrays))
 
 
-def learned(descriptors: Floats, iterations: int = 25) -> Vocabulary:
-    """A vocabulary from descriptors (N, d), N at least WORDS: principal directions, and k-means.
-
-    What it has is rounded to float16, as the file keeps it.
-    """
-    random = np.random.default_rng(_SEED)
-    mean = descriptors.mean(axis=0)
-    _, directions = np.linalg.eigh(np.cov(descriptors, rowvar=False))
-    directions = directions[:, ::-1][:, :REDUCED]
-    # Directions have no sign of their own: the largest number is positive, whatever the library that found them.
-    directions = directions * np.sign(directions[np.abs(directions).argmax(axis=0), np.arange(directions.shape[1])])
-    mean, projection = _rounded(mean), _rounded(directions)
-    points: Floats = ((descriptors - mean) @ projection).astype(np.float32)
-    words: Floats = points[random.choice(len(points), WORDS, replace=False)]
-    for _ in range(iterations):
-        nearest = nearest_words(points, words)
-        members = nearest[:, None] == np.arange(WORDS)
-        # A word that nobody is nearest to stays where it is.
-        sums, counts = members.T.astype(np.float32) @ points, members.sum(axis=0)[:, None]
-        words = np.where(counts > 0, sums / np.maximum(counts, 1), words).astype(np.float32)
-    return Vocabulary(mean, projection, _rounded(words))
-
-
 def nearest_words(points: NDArray[np.floating], words: NDArray[np.floating]) -> NDArray[np.intp]:
     """For each of N points (N, REDUCED) the nearest of W words (W, REDUCED)."""
     return np.asarray((points @ words.T - 0.5 * (words * words).sum(axis=1)).argmax(axis=1))
-
-
-def _rounded(array: NDArray[np.floating]) -> Floats:
-    return array.astype(np.float16).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The generic calibration, measured: `python -m mapless_tools.calibrate.generic FOLDER_OF_SCENES`.
+"""The factors of claimed radii, measured: `python -m research.radii FOLDER_OF_SCENES`.
 
 The model of `method.uncertainty` has two factors on standard deviations and one on the tail, which no theory gives.
 They come from scenes with known poses, every scene counting alike however many photographs it has:
@@ -7,16 +7,14 @@ They come from scenes with known poses, every scene counting alike however many 
     tail                  and the 95 % radius times both holds `TAIL_SHARE` of them, position or rotation, whichever
                           needs more: an unseen scene may be worse than these.
 
-What they are worth is told by leaving out one scene at a time: fitted on the others, how many of its answers are within
-the radii. Shares of few photographs are rough; the table gives the range that an honest 68 % would fall into as well.
+They are tested by leaving out one scene at a time: fitted on the others, how many of its answers are within the radii.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -29,7 +27,7 @@ from mapless_server.method.answer import Localization, LocalizeOptions
 from mapless_server.method.uncertainty.accuracy import error_radius
 from mapless_server.method.uncertainty.covariance import UncertaintyOptions
 
-from .pairs import METRIC, answered, read_places, right_pairs
+from .places import METRIC, answered, read_places, right_pairs, weights_alike
 
 KS = (10, 5, 3)
 SETTINGS = tuple((name, count) for name, count in METRIC if count is None or count >= max(KS))
@@ -50,8 +48,6 @@ class Answered:
         scene: its folder.
         k: references asked for, of `KS`; the photographs of a small scene have fewer.
         position_68, position_95, rotation_68, rotation_95: error by radius.
-        error_m, error_deg: the errors themselves.
-        inlier_count: matches that agree with the pose.
     """
 
     scene: str
@@ -60,9 +56,6 @@ class Answered:
     position_95: float
     rotation_68: float
     rotation_95: float
-    error_m: float
-    error_deg: float
-    inlier_count: int
 
 
 @dataclass(frozen=True)
@@ -87,24 +80,23 @@ def collect(data: Path) -> Iterator[Answered]:
     """Localizes the scenes' photographs; minutes."""
     places = read_places(data, dict.fromkeys(name for name, _ in SETTINGS))
     for name, count in SETTINGS:
-        print(f"{name}, {count or 'each left out'} ...", file=sys.stderr, flush=True)
         for it in answered(right_pairs(places[name], count, KS), UNFITTED):
             outcome = it.answer.outcome
             if isinstance(outcome, Localization) and outcome.covariance is not None and it.off is not None:
-                error_m, error_deg = it.off
-                position, rotation = outcome.covariance[:3, :3], outcome.covariance[3:, 3:]
-                radii = [error_radius(c, p) for c in (position, np.degrees(np.degrees(rotation))) for p in (0.68, 0.95)]
-                first, second, third, fourth = np.divide([error_m, error_m, error_deg, error_deg], radii).tolist()
-                k = min(k for k in KS if k >= it.pair.k)
-                yield Answered(name, k, first, second, third, fourth, error_m, error_deg, outcome.inlier_count)
+                position, rotation = outcome.covariance[:3, :3], np.degrees(np.degrees(outcome.covariance[3:, 3:]))
+                ratios = (
+                    error / error_radius(covariance, p)
+                    for error, covariance in zip(it.off, (position, rotation), strict=True)
+                    for p in (0.68, 0.95)
+                )
+                yield Answered(name, min(k for k in KS if k >= it.pair.k), *ratios)
 
 
 def fit(answers: Sequence[Answered]) -> Fit:
     """The constants that fit these answers, every scene counting alike."""
-    weights = _alike(answers)
-    position, rotation = (
-        _quantile([getattr(it, name) for it in answers], weights, 0.68) for name in ("position_68", "rotation_68")
-    )
+    weights = weights_alike([it.scene for it in answers])
+    position = _quantile([it.position_68 for it in answers], weights, 0.68)
+    rotation = _quantile([it.rotation_68 for it in answers], weights, 0.68)
     tails = (
         _quantile([it.position_95 / position for it in answers], weights, TAIL_SHARE),
         _quantile([it.rotation_95 / rotation for it in answers], weights, TAIL_SHARE),
@@ -113,55 +105,25 @@ def fit(answers: Sequence[Answered]) -> Fit:
 
 
 def left_out(answers: Sequence[Answered]) -> Iterator[str]:
-    """Lines of a table: each scene with the constants that the others give."""
+    """Lines of a table: each scene with the constants that the others give, and the range of an honest 68 %."""
     yield "| scene left out | K | answers | position 68 % | 95 % | rotation 68 % | 95 % | an honest 68 % |"
     yield "|---|---|---|---|---|---|---|---|"
     for scene in dict.fromkeys(it.scene for it in answers):
         constants = fit([it for it in answers if it.scene != scene])
         for ks in (*((k,) for k in KS), KS):
-            mine = [it for it in answers if it.scene == scene and it.k in ks]
-            if mine:
-                shares = np.mean([constants.held(it) for it in mine], axis=0)
-                low, high = (100 * np.ceil(bdtrik(p, len(mine), 0.68)) / len(mine) for p in (0.025, 0.975))
+            own = [it for it in answers if it.scene == scene and it.k in ks]
+            if own:
+                shares = np.mean([constants.held(it) for it in own], axis=0)
+                low, high = (100 * np.ceil(bdtrik(p, len(own), 0.68)) / len(own) for p in (0.025, 0.975))
                 cells = " | ".join(f"{100 * share:.0f} %" for share in shares)
                 label = ", ".join(map(str, ks))
-                yield f"| {scene} | {label} | {len(mine)} | {cells} | {low:.0f} to {high:.0f} % |"
-
-
-def by_covariate(answers: Sequence[Answered]) -> Iterator[str]:
-    """Lines of a table: what is left once the factors are in, by scene and number of references."""
-    constants = fit(answers)
-    yield "| scene | K | position | rotation |"
-    yield "|---|---|---|---|"
-    for scene in dict.fromkeys(it.scene for it in answers):
-        for k in KS:
-            mine = [it for it in answers if it.scene == scene and it.k == k]
-            if mine:
-                position = np.quantile([it.position_68 for it in mine], 0.68) / constants.position
-                rotation = np.quantile([it.rotation_68 for it in mine], 0.68) / constants.rotation
-                yield f"| {scene} | {k} | {position:.2f} | {rotation:.2f} |"
-
-
-def _alike(answers: Sequence[Answered]) -> Array:
-    """Weights (N,) of sum 1, with which every scene counts alike."""
-    _, index, counts = np.unique([it.scene for it in answers], return_inverse=True, return_counts=True)
-    return np.asarray(1 / (len(counts) * counts[index]))
+                yield f"| {scene} | {label} | {len(own)} | {cells} | {low:.0f} to {high:.0f} % |"
 
 
 def _quantile(values: Sequence[float], weights: Array, probability: float) -> float:
     order = np.argsort(values)
     reached = np.searchsorted(np.cumsum(weights[order]), probability - 1e-12)
     return float(np.asarray(values)[order[min(int(reached), len(order) - 1)]])
-
-
-def read(path: Path) -> list[Answered]:
-    """Those that `write` wrote."""
-    return [Answered(**it) for it in json.loads(path.read_text(encoding="utf-8"))]
-
-
-def write(path: Path, answers: Iterable[Answered]) -> None:
-    """As JSON, to fit again without localizing again."""
-    path.write_text(json.dumps([asdict(it) for it in answers]), encoding="utf-8")
 
 
 def main() -> None:
@@ -171,17 +133,15 @@ def main() -> None:
     parser.add_argument("--samples", type=Path, help="read from this file if it is there, else written to it")
     arguments = parser.parse_args()
     if arguments.samples and arguments.samples.is_file():
-        answers = read(arguments.samples)
+        answers = [Answered(**it) for it in json.loads(arguments.samples.read_text())]
     else:
         answers = list(collect(arguments.data))
         if arguments.samples:
-            write(arguments.samples, answers)
+            arguments.samples.write_text(json.dumps([asdict(it) for it in answers]))
     constants = fit(answers)
     print(f"position_factor = {constants.position:.2f}, rotation_factor = {constants.rotation:.2f}")
     print(f"TAIL_95 = {constants.tail:.2f}\n")
-    print(
-        "\n".join([*left_out(answers), "", "68 % quantile of error by calibrated radius:", "", *by_covariate(answers)])
-    )
+    print("\n".join(left_out(answers)))
 
 
 if __name__ == "__main__":

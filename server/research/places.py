@@ -1,0 +1,213 @@
+"""Photographs with known poses and references for them: of their own place, few and far apart, and of another place.
+
+The method's own modules work on them in this process, without a server. Folders have `cameras.json`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapless.geometry import Array, RigidTransform
+from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.method.answer import Answer, Localization, LocalizeOptions
+from mapless_server.method.coarse.make import make_reconstructor
+from mapless_server.method.correspond import OPTIONS, make_matcher
+from mapless_server.method.features import FeatureExtractor, make_extractor
+from mapless_server.method.localize import localize
+from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.priors.known import NO_PRIORS, Priors
+from mapless_server.method.retrieve import choose_references
+from mapless_server.method.views import PosedView, View
+from mapless_tools.dataset import Frame, read_folder
+from mapless_tools.evaluate.metrics import pose_error
+
+RIGHT_M, RIGHT_DEG = 0.10, 5.0
+"""An answer with a larger error is wrong."""
+KITCHEN = "7scenes-redkitchen-seq01-first600"
+METRIC: tuple[tuple[str, int | None], ...] = (
+    ("fountain-P11", None),
+    ("herz-jesus-P8", None),
+    (KITCHEN, 30),
+    (KITCHEN, 10),
+    (KITCHEN, 5),
+    ("tum-fr3-office", None),
+    ("kitti-drive-a", None),
+)
+"""Folders and how many frames, evenly spread, are references; None leaves one out."""
+OTHERS = ("fox-portrait", "reichstag-internet")
+"""Their unit is no metre; they serve as other places."""
+KS = (10, 5, 3)
+QUERIES, FRAMES = 40, 150
+CROSS_REFERENCES = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A scene's photographs, with their features.
+
+    Attributes:
+        name: of its folder.
+        views, poses: by the frame's index.
+    """
+
+    name: str
+    views: dict[int, View]
+    poses: dict[int, RigidTransform]
+
+    def posed(self, indices: Iterable[int]) -> tuple[PosedView, ...]:
+        """References at some indices, as the method wants them."""
+        return tuple(
+            PosedView(f"{self.name}-{i}", f"scenes/{self.name}/references/{i}", self.views[i], self.poses[i])
+            for i in indices
+        )
+
+    def most_matching(self, query: View, indices: Sequence[int], count: int, features: str = "sift") -> list[int]:
+        """Those of some references that share the most feature matches with a query."""
+        chosen = choose_references(query, self.posed(indices), count, ratio=OPTIONS[features].query_ratio)
+        return [indices[i] for i in chosen]
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A query and the references that it is given, the most similar first.
+
+    Attributes:
+        title: of the setting, for tables.
+        k: how many references were asked for.
+        query, references: photographs.
+        true_pose: of the query; None in another place.
+        priors: what the method is told of the pose.
+    """
+
+    title: str
+    k: int
+    query: View
+    references: tuple[PosedView, ...]
+    true_pose: RigidTransform | None
+    priors: Priors = NO_PRIORS
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A pair's answer and its error, in metres and degrees; None if no pose was found, accepted or not.
+
+    The error is infinite where the references are of another place: any pose is wrong.
+    """
+
+    pair: Pair
+    answer: Answer
+    off: tuple[float, float] | None
+
+    @property
+    def right(self) -> bool:
+        """Whether there is a pose that is near enough to the truth."""
+        return self.off is not None and self.off[0] <= RIGHT_M and self.off[1] <= RIGHT_DEG
+
+
+def read_places(data: Path, names: Iterable[str]) -> dict[str, Place]:
+    """The scenes of some folders, with SIFT features; of long sequences evenly spread frames."""
+    return {name: read_place(data / name) for name in names}
+
+
+def read_place(folder: Path, extractor: FeatureExtractor | None = None, wanted: Sequence[int] | None = None) -> Place:
+    """The scene of a folder; `wanted` are indices of frames, by default every so many-th."""
+    extractor, frames = extractor or make_extractor("sift"), read_folder(folder).frames
+    indices = range(0, len(frames), max(1, len(frames) // FRAMES)) if wanted is None else wanted
+    with ThreadPoolExecutor(2) as pool:
+        views = pool.map(lambda i: view_of(extractor, frames[i]), indices)
+        place = Place(
+            folder.name, dict(zip(indices, views, strict=True)), {i: frames[i].world_from_camera for i in indices}
+        )
+    print(f"{place.name}: {len(place.views)} photographs", file=sys.stderr, flush=True)
+    return place
+
+
+def view_of(extractor: FeatureExtractor, frame: Frame) -> View:
+    """A photograph with its features."""
+    return extractor.extract(decode_image(frame.image_path.read_bytes(), ImageLimits()), frame.camera)
+
+
+def right_pairs(
+    place: Place, reference_count: int | None, ks: Sequence[int] = KS, frames_apart: int = 0
+) -> Iterator[Pair]:
+    """Queries of a scene with k of its references each, or all where it has fewer.
+
+    Args:
+        place: the scene.
+        reference_count: references, evenly spread, and queries between them; None leaves one out.
+        ks: numbers of references.
+        frames_apart: references within so many frames of the query are not used.
+    """
+    indices = sorted(place.views)
+    references, queries = indices, indices
+    if reference_count is not None:
+        references = spread(indices, reference_count)
+        queries = spread([i for i in indices[1:-1] if i not in references], QUERIES)
+    title = place.name if reference_count is None else f"{place.name}, {reference_count}"
+    available = len(references) - (1 if reference_count is None else 0)
+    wanted = dict.fromkeys(min(k, available) for k in ks)
+    for query in queries:
+        others = [i for i in references if i != query and abs(i - query) > frames_apart]
+        if len(others) < 2:
+            continue
+        chosen = place.posed(place.most_matching(place.views[query], others, max(wanted)))
+        for k in wanted:
+            yield Pair(title, k, place.views[query], chosen[:k], place.poses[query])
+
+
+def cross_pairs(places: Sequence[Place], queries_each: int, k: int = 10) -> Iterator[Pair]:
+    """Queries of each scene, evenly spread, with references of every other."""
+    for place in places:
+        queries = spread(sorted(place.views), queries_each)
+        for other in places:
+            if other is not place:
+                references = spread(sorted(other.views), CROSS_REFERENCES)
+                for query in queries:
+                    view = place.views[query]
+                    chosen = other.posed(other.most_matching(view, references, k))
+                    yield Pair(f"{place.name} in {other.name}", k, view, chosen, None)
+
+
+def answered(
+    pairs: Iterable[Pair], options: LocalizeOptions | None = None, features: str = "sift"
+) -> Iterator[Measured]:
+    """Localizes each; a line on standard error for each setting."""
+    pipeline = Pipeline(make_reconstructor("geometric", Path()), make_matcher(features, 2))
+    title = ""
+    try:
+        for pair in pairs:
+            if pair.title != title:
+                title = pair.title
+                print(f"{title} ...", file=sys.stderr, flush=True)
+            answer = localize(pair.query, pair.references, pipeline, options or LocalizeOptions(), priors=pair.priors)
+            yield Measured(pair, answer, _error(pair, answer))
+    finally:
+        pipeline.matcher.close()
+
+
+def spread(items: Sequence[int], count: int) -> list[int]:
+    """At most `count` of the items, evenly spread, the first and the last included."""
+    return [items[i] for i in dict.fromkeys(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))]
+
+
+def weights_alike(scenes: Sequence[str]) -> Array:
+    """Weights (N,) of sum one, with which every scene counts alike."""
+    names, index, counts = np.unique(np.array(scenes, dtype=object), return_inverse=True, return_counts=True)
+    return np.asarray(1 / (len(names) * counts[index]))
+
+
+def _error(pair: Pair, answer: Answer) -> tuple[float, float] | None:
+    """Of the pose that is answered, or that was found and rejected."""
+    if isinstance(answer.outcome, Localization):
+        pose = answer.outcome.world_from_camera
+    elif answer.support is not None and answer.support.estimate is not None:
+        pose = answer.support.estimate.world_from_camera.shifted(answer.support.origin)
+    else:
+        return None
+    return pose_error(pair.true_pose, pose) if pair.true_pose is not None else (np.inf, np.inf)
