@@ -9,7 +9,7 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.groups.sightings import GroupImage
+from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.match import MatchOptions, PointMatches
 from mapless_server.method.observations import KeypointNoise
 from mapless_server.method.pnp import PoseStage

@@ -16,7 +16,7 @@ from mapless_server.method.groups.checks import metric_as_said, mounted_as_said
 from mapless_server.method.groups.hints import hinted_group
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOptions, solve_sequence
-from mapless_server.method.groups.sightings import GroupImage
+from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.rejection import Rejection
 from mapless_server.scheduling import Job
 

@@ -23,7 +23,7 @@ from ..optimize import MinimizeOptions, minimize
 from ..pnp import reprojection_errors_px
 from .freedom import F, Freedom
 from .problem import GroupProblem, JointOptions
-from .sightings import MatchedSighting, Sighting
+from .images import MatchedSighting, Sighting
 
 __all__ = ["Freedom", "JointEstimate", "JointOptions", "adjust_in_rounds", "adjust_jointly", "covariance_in_world"]
 

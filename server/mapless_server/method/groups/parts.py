@@ -19,7 +19,7 @@ from ..match import PointMatches
 from ..pnp import reprojection_errors_px
 from ..tracks import Tracks
 from .freedom import Freedom
-from .sightings import Sighting
+from .images import Sighting
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from ..optimize import solve_step
 from ..views import PosedView
 from .freedom import F, Freedom
 from .parts import Part, Shared, part_of
-from .sightings import Sighting
+from .images import Sighting
 
 
 @dataclass(frozen=True)

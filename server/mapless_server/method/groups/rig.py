@@ -20,7 +20,7 @@ from ..rigid import perturbed
 from ..trust.gate import GateOptions
 from .generalized import inlier_count, rig_ransac
 from .joint import JointOptions, adjust_in_rounds, covariance_in_world
-from .sightings import GroupImage, MatchedSighting, Sighting, group_doubts, rejection_without_matches, sightings_of
+from .images import GroupImage, MatchedSighting, Sighting, group_doubts, rejection_without_matches, sightings_of
 
 
 @dataclass(frozen=True)

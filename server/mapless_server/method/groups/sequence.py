@@ -27,7 +27,7 @@ from ..trust.gate import GateOptions
 from .drift import DriftOptions, SequenceFreedom, world_from_session_at
 from .generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from .joint import JointEstimate, JointOptions, adjust_in_rounds, covariance_in_world
-from .sightings import GroupImage, MatchedSighting, Sighting, group_doubts, rejection_without_matches, sightings_of
+from .images import GroupImage, MatchedSighting, Sighting, group_doubts, rejection_without_matches, sightings_of
 
 
 @dataclass(frozen=True)
