@@ -115,7 +115,7 @@ def test_the_pull_of_too_weak_priors_is_undone() -> None:
     solved = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
     assert isinstance(solved, PoseEstimate)
     pulled_to = moved(solved.world_from_camera, np.array([0.01, 0, 0, 0.002, 0, 0]))
-    pulled = replace(solved, world_from_camera=pulled_to, errors_px=solved.errors_px + 1, unpulled=solved)
+    pulled = replace(solved, world_from_camera=pulled_to, errors_px=solved.errors_px + 1, without_priors=solved)
     priors = Priors(gravity=gravity_at(scene.world_from_query, 3.0))
     given = scene.query, scene.references, structure, matches
     answer, alone = adjust_pose(*given, pulled, AdjustOptions(), priors), adjust_pose(*given, solved, AdjustOptions())

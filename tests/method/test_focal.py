@@ -43,7 +43,7 @@ def test_a_wrong_focal_length_is_told_and_the_true_one_found(factor: float) -> N
     assert told is not None
     true_px = scene.query.camera.focal_x_px
     assert told.given_px == pytest.approx(factor * true_px)
-    assert abs(np.log(told.told_px / true_px)) < 4 * told.sigma
+    assert abs(np.log(told.estimated_px / true_px)) < 4 * told.sigma
     assert told.sigma < 0.02
     assert told.agreeing > told.agreeing_before
 

@@ -19,9 +19,9 @@ from mapless_server.method.trust.gate import (
     doubts,
     false_alarms,
     findable_count,
+    format_false_alarms,
     hull_share,
     log10_false_alarms,
-    told_false_alarms,
 )
 
 INLIER_PX = PnpOptions().inlier_px
@@ -136,8 +136,8 @@ def test_three_matches_agree_with_a_pose_by_construction() -> None:
     for k in range(4):
         assert false_alarms(50, k, 1e-6) == math.inf
     assert false_alarms(50, 20, 1.0) == math.inf
-    assert told_false_alarms(math.inf) == "any number of such poses expected"
-    assert told_false_alarms(2.34) == "10^2.3 such poses expected"
+    assert format_false_alarms(math.inf) == "any number of such poses expected"
+    assert format_false_alarms(2.34) == "10^2.3 such poses expected"
 
 
 def test_false_alarms_fall_with_inliers_and_rise_with_matches() -> None:

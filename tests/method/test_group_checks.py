@@ -10,7 +10,7 @@ import pytest
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.groups.checks import metric_as_said, mounted_as_said
+from mapless_server.method.groups.checks import check_mounting, check_unit
 from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.pnp import PoseStage
@@ -24,7 +24,7 @@ def alone(inliers: int) -> Answer:
 
 
 def rig(*kept: int) -> RigEstimate:
-    matched = [SimpleNamespace(sighting=SimpleNamespace(image=i), inliers=np.ones(n)) for i, n in enumerate(kept)]
+    matched = [SimpleNamespace(source=SimpleNamespace(image=i), inliers=np.ones(n)) for i, n in enumerate(kept)]
     return RigEstimate(HERE, np.eye(6), cast(Any, tuple(matched)), np.zeros(3))
 
 
@@ -35,7 +35,7 @@ def walk(step_m: float, sigma_m: float = 0.01) -> SequenceEstimate:
 
 
 def test_photographs_that_lose_their_inliers_contradict_the_rig() -> None:
-    found = mounted_as_said(rig(1, 0, 688), [alone(681), alone(438), alone(690)])
+    found = check_mounting(rig(1, 0, 688), [alone(681), alone(438), alone(690)])
     assert isinstance(found, Rejection)
     assert found.reason is RejectionReason.GATE
     assert "1 of 681 in images[0], 0 of 438 in images[1]" in found.message
@@ -46,12 +46,12 @@ def test_photographs_that_lose_their_inliers_contradict_the_rig() -> None:
 @pytest.mark.parametrize("lost", [alone(29), Answer(Rejection(RejectionReason.GATE, "chance"))])
 def test_photographs_that_knew_little_alone_contradict_nothing(lost: Answer) -> None:
     estimate = rig(600, 3)
-    assert mounted_as_said(estimate, [alone(640), lost]) is estimate
+    assert check_mounting(estimate, [alone(640), lost]) is estimate
 
 
 @pytest.mark.parametrize("unit_m", [0.01, 0.5, 2.0])
 def test_a_way_of_another_length_says_the_unit(unit_m: float) -> None:
-    found = metric_as_said(walk(0.5), walk(0.5 / unit_m).world_from_camera)
+    found = check_unit(walk(0.5), walk(0.5 / unit_m).world_from_camera)
     assert isinstance(found, Rejection)
     assert found.reason is RejectionReason.SCALE_UNRELIABLE
     assert f"its unit is {unit_m:.2f} m" in found.message
@@ -60,4 +60,4 @@ def test_a_way_of_another_length_says_the_unit(unit_m: float) -> None:
 @pytest.mark.parametrize(("drift", "sigma_m"), [(1.0, 0.001), (1.1, 0.001), (0.85, 0.001), (2.0, 0.3)])
 def test_drift_and_what_is_not_known_well_are_let_pass(drift: float, sigma_m: float) -> None:
     estimate = walk(0.5, sigma_m)
-    assert metric_as_said(estimate, walk(0.5 * drift).world_from_camera) is estimate
+    assert check_unit(estimate, walk(0.5 * drift).world_from_camera) is estimate

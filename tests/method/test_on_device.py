@@ -162,7 +162,7 @@ def test_computing_stays_on_the_device_and_reads_no_value(variant: str) -> None:
     uploaded = upload(inputs, meta)
     with Watch("meta") as watch:
         outputs = compute(there, uploaded, CASES["noise"].scene.query.camera, options)
-    assert outputs.weighed.metres_per_unit.device == meta
+    assert outputs.candidates.metres_per_unit.device == meta
     assert watch.launched.total() < 3500  # at a few microseconds each
 
 
@@ -202,7 +202,7 @@ def test_what_travels() -> None:
     assert outputs.points is not None
     assert fetched.points is not None
     np.testing.assert_array_equal(fetched.points.seen, outputs.points.seen.numpy())
-    np.testing.assert_array_equal(fetched.weighed.query_rotation, outputs.weighed.query_rotation.numpy())
+    np.testing.assert_array_equal(fetched.candidates.query_rotation, outputs.candidates.query_rotation.numpy())
 
 
 # Rejections

@@ -37,7 +37,7 @@ def test_a_rig_is_found_in_the_callers_world(wrong_share: float) -> None:
     images = images_of(random_for("rig", wrong_share), CAMERAS, wrong_share=wrong_share)
     found = estimate(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
     assert_pose_close(found.world_from_rig, caller_pose(WORLD_FROM_RIG), metres=0.006, degrees=0.1)
-    assert [it.sighting.image for it in found.matched] == [0, 1, 2]
+    assert [it.source.image for it in found.matched] == [0, 1, 2]
     assert min(int(it.inliers.sum()) for it in found.matched) > 100
 
 
@@ -68,7 +68,7 @@ def test_a_blank_image_does_not_matter() -> None:
     whole = estimate(solve_rig([images[0], NOTHING, images[2]], RIG_FROM_CAMERA, OPTIONS))
     without = estimate(solve_rig([images[0], images[2]], [RIG_FROM_CAMERA[0], RIG_FROM_CAMERA[2]], OPTIONS))
     np.testing.assert_allclose(whole.world_from_rig.matrix(), without.world_from_rig.matrix(), atol=1e-9)
-    assert [it.sighting.image for it in whole.matched] == [0, 2]
+    assert [it.source.image for it in whole.matched] == [0, 2]
 
 
 def test_one_camera_is_a_rig() -> None:

@@ -80,7 +80,7 @@ def test_frames_that_say_nothing_are_carried_on_by_the_device() -> None:
     assert error_m(found.world_from_camera[-1], truth[-1]) < 0.02
     sigma_m = np.sqrt(np.trace(found.covariances[:, :3, :3], axis1=1, axis2=2))
     assert sigma_m[5] > sigma_m[4] > sigma_m[3]
-    assert [it.sighting.image for it in found.matched] == [0, 1, 2, 3]
+    assert [it.source.image for it in found.matched] == [0, 1, 2, 3]
 
 
 def test_a_jump_of_the_device_is_not_believed() -> None:

@@ -56,7 +56,7 @@ def test_a_wrong_focal_length_is_reported_with_the_right_one(photographs: Photog
         assert it.answer.support is not None
         told = wrong_focal(it.answer.support, FocalOptions())
         assert told is not None
-        assert told.told_px == pytest.approx(given.focal_x_px, rel=0.01)
+        assert told.estimated_px == pytest.approx(given.focal_x_px, rel=0.01)
         assert isinstance(it.answer.outcome, Rejection)
         assert it.answer.outcome.hint is not None
         assert it.answer.outcome.hint.advice is Advice.CHECK_CALIBRATION

@@ -12,11 +12,11 @@ from typing import TypeVar
 from mapless.geometry import RigidTransform
 from mapless_server.errors import Overloaded, RequestError
 from mapless_server.method.answer import LocalizeOptions
-from mapless_server.method.groups.checks import metric_as_said, mounted_as_said
+from mapless_server.method.groups.checks import check_mounting, check_unit
 from mapless_server.method.groups.hints import hinted_group
+from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOptions, solve_sequence
-from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.rejection import Rejection
 from mapless_server.scheduling import Job
 
@@ -66,7 +66,7 @@ async def localize_rig(
     images = group.images()
     found = await engine.join(lambda: solve_rig(images, rig_from_camera, RigOptions()), caller)
     if not isinstance(found, Rejection):
-        found = mounted_as_said(found, [result.answer for result in group.results])
+        found = check_mounting(found, [result.answer for result in group.results])
     return group.hinted(found)
 
 
@@ -85,7 +85,7 @@ async def localize_sequence(
     images, options = group.images(), SequenceOptions()
     found = await engine.join(lambda: solve_sequence(images, session_from_camera, estimate_scale, options), caller)
     if not isinstance(found, Rejection) and not estimate_scale:
-        found = metric_as_said(found, session_from_camera)
+        found = check_unit(found, session_from_camera)
     return group.hinted(found)
 
 

@@ -28,7 +28,7 @@ from .pnp import PoseEstimate, PoseStage, reprojection_errors_px
 from .priors.known import NO_PRIORS, Priors
 from .structure import Structure
 from .uncertainty.covariance import UncertaintyOptions, one_match_covariance, uncertainty_of
-from .uncertainty.linearization import grounds_of, tracks_with_query
+from .uncertainty.linearization import jackknife_input, tracks_with_query
 from .views import PosedView, View
 
 
@@ -40,7 +40,7 @@ class AdjustOptions:
         loss_scale_sigma: of the Cauchy loss, which forgets gross errors rather than merely bounding them.
         prior_share: how far references may move: the standard deviation of the prior, in image pixels, as a share of
             the noise level found in the structure. What the residuals show is an upper bound of what poses are off.
-        error_inflation: by how much standard deviations that are told from the sum over residuals are too small, as a
+        error_inflation: by how much standard deviations from the sum over residuals are too small, as a
             rule: it decides what priors weigh. The answer's covariance does not rest on it (see `uncertainty`).
         inlier_px: as of the pose solver; the inliers of the answer are those of its own pose.
         min_kept_share: an adjustment that loses more of the inliers has run off, and is not answered.
@@ -99,17 +99,17 @@ def adjust_pose(
         The estimate with another pose and covariance; unchanged when there is nothing to gain.
     """
 
-    def adjusted(start: PoseEstimate, pulling: Priors) -> PoseEstimate | None:
-        return _adjusted(query, references, structure, matches, start, options, pulling)
+    def adjusted(start: PoseEstimate, active: Priors) -> PoseEstimate | None:
+        return _adjusted(query, references, structure, matches, start, options, active)
 
     # Where priors turn out not to be used, the answer is, to the last bit, the one without them.
-    unpulled = estimate.unpulled or estimate
-    alone = adjusted(unpulled, NO_PRIORS)
+    without_priors = estimate.without_priors or estimate
+    alone = adjusted(without_priors, NO_PRIORS)
     if not priors:
-        return alone or unpulled
+        return alone or without_priors
     checks = priors.check(alone.world_from_camera, alone.covariance) if alone else estimate.prior_checks
     used = priors.consistent(checks)
-    answer = (adjusted(estimate, used) or estimate) if used else (alone or unpulled)
+    answer = (adjusted(estimate, used) or estimate) if used else (alone or without_priors)
     return replace(answer, prior_checks=checks)
 
 
@@ -122,7 +122,7 @@ def _adjusted(
     options: AdjustOptions,
     priors: Priors,
 ) -> PoseEstimate | None:
-    """The estimate at the optimum that priors pull; None if there is none nearby, or too few matches for any."""
+    """The estimate at the optimum with priors; None if there is none nearby, or too few matches for any."""
     used = np.flatnonzero(estimate.errors_px < options.max_error_px)
     if len(used) < 3:  # two equations each, for six unknowns
         return None
@@ -158,8 +158,8 @@ def _conclude(
     one_match = one_match_covariance(query.camera, pose, x_in_world, structure.noise.level_px)
     motions = np.concatenate([problem.reference_motion(bundle), np.zeros((1, 6))])
     rows, point = problem.rows(bundle), problem.observations.point
-    grounds = grounds_of(rows, point, problem.view, options.uncertainty.max_matches, motions)
-    uncertainty = uncertainty_of(grounds, pose, one_match, options.uncertainty)
+    jackknife = jackknife_input(rows, point, problem.view, options.uncertainty.max_matches, motions)
+    uncertainty = uncertainty_of(jackknife, pose, one_match, options.uncertainty)
     if uncertainty is None:
         return None
     covariance = uncertainty.covariance

@@ -2,7 +2,7 @@
 
 As in the paper, the refined pose replaces the initial one only if it explains at least as many matches. Whether the
 winner is believed is not decided here (see `gate` and `judge`). What is known of the pose beforehand brings more
-candidates and a pull of its own (see `informed`).
+candidates, and terms of its own in the cost (see `informed`).
 """
 
 from __future__ import annotations
@@ -84,9 +84,9 @@ class PoseEstimate:
         errors_px: (M,) reprojection errors; NaN for points behind the camera.
         covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians.
         prior_checks: of each prior.
-        uncertainty: what the covariance was told from, before priors sharpened it; None where it was told from the
+        uncertainty: what the covariance was computed from, before priors sharpened it; None where it is from the
             residuals alone, and errors that go together are not in it yet (see `pose_covariance`).
-        unpulled: the estimate before priors pulled it; None where none did.
+        without_priors: the estimate before priors were used; None where none were.
     """
 
     world_from_camera: RigidTransform
@@ -96,7 +96,7 @@ class PoseEstimate:
     covariance: Array
     prior_checks: tuple[PriorCheck, ...] = ()
     uncertainty: Uncertainty | None = None
-    unpulled: PoseEstimate | None = None
+    without_priors: PoseEstimate | None = None
 
 
 def solve_pose(
@@ -111,7 +111,7 @@ def solve_pose(
 
     Returns:
         The refined or the initial pose, whichever has more inliers (the refined one on a tie); with priors, a pose that
-        they bring if that is better, pulled by those that are consistent with it. Rejections: TOO_FEW_MATCHES,
+        they bring if that is better, refined with those that are consistent with it. Rejections: TOO_FEW_MATCHES,
         PNP_FAILED when no pose explains any four.
     """
     if len(matches) < options.min_matches:
@@ -127,16 +127,18 @@ def solve_pose(
         return _estimate(camera, x_in_world, pixels, stage, pose, options)
     informed = informed_pose(camera, x_in_world, pixels, pose, priors, options.informed)
     assert informed  # `pose` at the least
-    if informed.unpulled is not pose:
+    if informed.without_priors is not pose:
         stage = PoseStage.REFINED
-    unpulled = _estimate(camera, x_in_world, pixels, stage, informed.unpulled, options)
-    if not informed.used or isinstance(unpulled, Rejection):
-        return unpulled if isinstance(unpulled, Rejection) else replace(unpulled, prior_checks=informed.checks)
-    pulled = _estimate(camera, x_in_world, pixels, PoseStage.REFINED, informed.world_from_camera, options)
-    if isinstance(pulled, Rejection):
-        return pulled
-    covariance = informed.used.sharpened(pulled.covariance, pulled.world_from_camera)
-    return replace(pulled, covariance=covariance, prior_checks=informed.checks, unpulled=unpulled)
+    without_priors = _estimate(camera, x_in_world, pixels, stage, informed.without_priors, options)
+    if isinstance(without_priors, Rejection):
+        return without_priors
+    if not informed.used:
+        return replace(without_priors, prior_checks=informed.checks)
+    found = _estimate(camera, x_in_world, pixels, PoseStage.REFINED, informed.world_from_camera, options)
+    if isinstance(found, Rejection):
+        return found
+    covariance = informed.used.sharpened(found.covariance, found.world_from_camera)
+    return replace(found, covariance=covariance, prior_checks=informed.checks, without_priors=without_priors)
 
 
 def _estimate(

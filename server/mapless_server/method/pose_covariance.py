@@ -22,7 +22,7 @@ from .uncertainty.covariance import (
     scale_covariance,
     uncertainty_of,
 )
-from .uncertainty.linearization import grounds_of, linearize, tracks_with_query
+from .uncertainty.linearization import jackknife_input, linearize, tracks_with_query
 from .views import PosedView
 
 
@@ -74,5 +74,5 @@ def _unadjusted(
     rows = linearize(observe(tracks, views, structure.noise), structure.x_in_world[chosen], options.loss_scale_sigma)
     pose, x_in_world = estimate.world_from_camera, structure.x_in_world[matches.point[estimate.inliers]]
     one_match = one_match_covariance(query.camera, pose, x_in_world, structure.noise.level_px)
-    grounds = grounds_of(rows, tracks.point, tracks.view, options.max_matches)
-    return uncertainty_of(grounds, pose, one_match, options, is_initial)
+    jackknife = jackknife_input(rows, tracks.point, tracks.view, options.max_matches)
+    return uncertainty_of(jackknife, pose, one_match, options, is_initial)

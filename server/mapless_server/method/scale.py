@@ -21,7 +21,7 @@ from mapless.geometry import RigidTransform, Similarity
 from .correspond import Correspondences
 from .reconstruction import Reconstruction
 from .rejection import Rejection, RejectionReason
-from .scale_equations import ScaleOptions, Weighed, gather, predict, trajectory_radius, weigh
+from .scale_equations import ScaleCandidates, ScaleOptions, gather, predict, scale_candidates, trajectory_radius
 from .views import PosedView
 
 
@@ -82,8 +82,8 @@ def estimate_scale(
         return rejection
     known = gather(references, correspondences, options)
     with np.errstate(divide="ignore", invalid="ignore"):  # what is not finite is for `judge`
-        weighed = weigh(known, predicted, options)
-    return judge(weighed, len(references), options)
+        candidates = scale_candidates(known, predicted, options)
+    return judge(candidates, len(references), options)
 
 
 def check_references(references: Sequence[PosedView], options: ScaleOptions) -> Rejection | None:
@@ -99,41 +99,41 @@ def check_references(references: Sequence[PosedView], options: ScaleOptions) -> 
     return None
 
 
-def judge(weighed: Weighed, reference_count: int, options: ScaleOptions) -> MetricScale | Rejection:
-    """The scale; or why what was weighed gives none."""
-    broken = not_finite(weighed, reference_count)
+def judge(candidates: ScaleCandidates, reference_count: int, options: ScaleOptions) -> MetricScale | Rejection:
+    """The scale; or why the candidates give none."""
+    broken = not_finite(candidates, reference_count)
     if broken:
         return Rejection(RejectionReason.SCALE_UNRELIABLE, broken)
-    if not weighed.radius_per_depth >= options.min_radius_per_depth:
+    if not candidates.radius_per_depth >= options.min_radius_per_depth:
         message = (
-            f"{reference_count} references predicted within {weighed.radius_per_depth:.2g} of the scene's depth of "
+            f"{reference_count} references predicted within {candidates.radius_per_depth:.2g} of the scene's depth of "
             f"their centroid, {options.min_radius_per_depth:g} needed"
         )
         return Rejection(RejectionReason.DEGENERATE_REFERENCES, message)
-    if np.isfinite(weighed.metres_per_unit):
-        rotation, scale = weighed.local_rotation, float(weighed.metres_per_unit)
+    if np.isfinite(candidates.metres_per_unit):
+        rotation, scale = candidates.local_rotation, float(candidates.metres_per_unit)
         return MetricScale(
             scale,
-            ScaleStage.TRIANGULATION if weighed.by_triangulation else ScaleStage.TRAJECTORY,
-            float(weighed.deviation),
-            int(weighed.anchor),
-            Similarity(scale, rotation, weighed.local_centre),
-            RigidTransform(weighed.query_rotation, weighed.query_centre),
+            ScaleStage.TRIANGULATION if candidates.by_triangulation else ScaleStage.TRAJECTORY,
+            float(candidates.deviation),
+            int(candidates.anchor),
+            Similarity(scale, rotation, candidates.local_centre),
+            RigidTransform(candidates.query_rotation, candidates.query_centre),
         )
     if not options.by_triangulation:
         message = f"no pair of {reference_count} references has two known and two predicted places"
     else:
         message = (
-            f"{weighed.ratio_count:.0f} depths triangulated between {reference_count} references with baselines of "
+            f"{candidates.ratio_count:.0f} depths triangulated between {reference_count} references with baselines of "
             f"{options.min_baseline_m:g} to {options.max_baseline_m:g} m, {options.min_ratios} needed"
         )
     return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
 
 
-def not_finite(weighed: Weighed, reference_count: int) -> str | None:
+def not_finite(candidates: ScaleCandidates, reference_count: int) -> str | None:
     """A network that fails numerically answers NaN; nothing of it may come near a pose. None if it did not fail."""
-    if weighed.broken_poses:
-        return f"{weighed.broken_poses:.0f} of {reference_count + 1} predicted poses are not finite"
-    if not weighed.known_depths:
+    if candidates.broken_poses:
+        return f"{candidates.broken_poses:.0f} of {reference_count + 1} predicted poses are not finite"
+    if not candidates.known_depths:
         return f"no depth is known at any keypoint of {reference_count} references"
     return None

@@ -12,7 +12,7 @@ S_tri; S_traj          `triangulation_scale`; `trajectory_scale`
 R_align; P_q^init      `alignment_rotation`; `align`
 =====================  ======================================================
 
-What is known is gathered from the references on the host; `weigh`, which compares it with what was predicted, works on
+What is known is gathered from the references on the host; `scale_candidates` compares it with what was predicted, on
 NumPy's arrays and on torch's tensors (see `arrays`).
 """
 
@@ -141,7 +141,7 @@ class Predicted:
 
 
 @dataclass(frozen=True, eq=False)
-class Weighed:
+class ScaleCandidates:
     """What the conclusion needs to know; arrays of one number where no shape is given.
 
     Attributes:
@@ -221,7 +221,7 @@ def pairs_of(count: int, max_cameras: int) -> NDArray[np.intp]:
     return cameras[np.stack(np.triu_indices(len(cameras), 1), axis=1)]
 
 
-def weigh(known: Known, predicted: Predicted, options: ScaleOptions) -> Weighed:
+def scale_candidates(known: Known, predicted: Predicted, options: ScaleOptions) -> ScaleCandidates:
     """Compares what is known with what was predicted."""
     xp, count = namespace(predicted.depth), len(known.centre)
     finite = xp.isfinite(xp.concatenate([predicted.rotation.reshape(count + 1, 9), predicted.centre], 1)).all(1)
@@ -248,7 +248,7 @@ def weigh(known: Known, predicted: Predicted, options: ScaleOptions) -> Weighed:
 
     scale = xp.where(by_triangulation, first, second)
     world_from_local = align(scale, rotation, world_from_anchor[1], local_from_anchor[1])
-    return Weighed(
+    return ScaleCandidates(
         (~finite).sum(),
         has_depth.sum(),
         radius / median(predicted.depth, has_depth),

@@ -25,7 +25,7 @@ from ..reconstruction import ReconstructedView, Reconstruction
 from ..rejection import Rejection, RejectionReason
 from ..structure import Structure, StructureOptions, observe, trustworthy
 from ..tracks import build_tracks
-from ..trust.gate import GateOptions, log10_false_alarms, told_false_alarms
+from ..trust.gate import GateOptions, format_false_alarms, log10_false_alarms
 from ..views import PosedView, View
 from . import Bucket, Outcome, Request
 
@@ -132,7 +132,7 @@ class GeometricReconstructor:
             return None, inliers
         message = (
             f"{inliers.sum()} of {len(matches)} matches with the references' points agree on a pose, which chance"
-            f" could do ({told_false_alarms(expected)})"
+            f" could do ({format_false_alarms(expected)})"
         )
         return _no_overlap(message, matches), inliers
 

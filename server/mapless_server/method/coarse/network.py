@@ -1,10 +1,10 @@
-"""The coarse stage by a network: pi^3, the paper's, or Pi3X, which is also told intrinsics and the references' poses.
+"""The coarse stage by a network: pi^3, the paper's, or Pi3X, which also takes intrinsics and the references' poses.
 
     photographs > pictures > tokens > network > DeviceReconstruction
       (views)    (grids)  (kept for             (scale and the rest,
                            references)           on either side)
 
-What a network says holds up to a similarity, also when it was told poses: the scale stage aligns it in any case.
+What a network says holds up to a similarity, also when it was given poses: the scale stage aligns it in any case.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ class TokenKey:
         image_sha256: of the encoded photograph.
         source: the photograph's camera; how it is undistorted follows from it.
         grid: size of the picture.
-        camera: of the picture; a conditioned network is told it.
+        camera: of the picture; a conditioned network takes it.
     """
 
     network: str

@@ -32,7 +32,7 @@ SIGNIFICANT_SIGMAS = 4.0
 """By which the way's length has to miss the session's."""
 
 
-def mounted_as_said(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstimate | Rejection:
+def check_mounting(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstimate | Rejection:
     """The estimate, unless photographs that know where they are contradict it.
 
     Args:
@@ -42,7 +42,7 @@ def mounted_as_said(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstima
     Returns:
         Else GATE, with the numbers of the photographs.
     """
-    kept = {it.sighting.image: int(it.inliers.sum()) for it in estimate.matched}
+    kept = {it.source.image: int(it.inliers.sum()) for it in estimate.matched}
     sure = {
         image: answer.outcome.inlier_count
         for image, answer in enumerate(alone)
@@ -57,7 +57,7 @@ def mounted_as_said(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstima
     return Rejection(RejectionReason.GATE, message, Hint(STAGE, Advice.CHECK_CALIBRATION, advice))
 
 
-def metric_as_said(
+def check_unit(
     estimate: SequenceEstimate, session_from_camera: Sequence[RigidTransform]
 ) -> SequenceEstimate | Rejection:
     """The estimate of a session that is said to be metric, unless the photographs' way is of another length.

@@ -18,7 +18,7 @@ from ..match import MatchOptions, PointMatches, search
 from ..rejection import Rejection, RejectionReason
 from ..structure import Structure
 from ..support import Support
-from ..trust.gate import GateOptions, false_alarms, findable_count, hull_share, told_false_alarms
+from ..trust.gate import GateOptions, false_alarms, findable_count, format_false_alarms, hull_share
 from ..views import PosedView, View
 from .generalized import CameraMatches
 
@@ -37,7 +37,7 @@ class GroupImage:
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class MatchedImage:
     """A photograph with matches, in the world of its group.
 
     Attributes:
@@ -75,18 +75,18 @@ class Sighting:
 
 
 @dataclass(frozen=True, eq=False)
-class MatchedSighting:
-    """A sighting, its matches under the pose of the group, and which of them agree.
+class PosedImage:
+    """A matched image, its matches under the pose of the group, and which of them agree.
 
     Attributes:
-        sighting: see there.
+        source: the matched image.
         world_from_camera: where the group's pose puts it.
         matches: of the photograph with the points.
         inliers: (M,) which agree.
         errors_px: (M,) reprojection errors; NaN for points behind the camera.
     """
 
-    sighting: Sighting
+    source: MatchedImage
     world_from_camera: RigidTransform
     matches: PointMatches
     inliers: NDArray[np.bool_]
@@ -94,14 +94,14 @@ class MatchedSighting:
 
     def inliers_by_reference(self) -> tuple[int, ...]:
         """Per reference, inliers on points that it observes."""
-        structure, count = self.sighting.structure, len(self.sighting.references)
+        structure, count = self.source.structure, len(self.source.references)
         agreeing = np.zeros(len(structure.x_in_world), bool)
         agreeing[self.matches.point[self.inliers]] = True
         seen = structure.tracks.view[agreeing[structure.tracks.point]]
         return tuple(np.bincount(seen, minlength=count).tolist())
 
 
-def sightings_of(images: Sequence[GroupImage]) -> tuple[Array, list[Sighting]]:
+def matched_images_of(images: Sequence[GroupImage]) -> tuple[Array, list[MatchedImage]]:
     """The photographs that have matches, and the origin (3,) of their common world, metres, in the caller's."""
     with_matches = [
         (i, image, image.answer.support)
@@ -111,10 +111,10 @@ def sightings_of(images: Sequence[GroupImage]) -> tuple[Array, list[Sighting]]:
     if not with_matches:
         return np.zeros(3), []
     origin = with_matches[0][2].origin
-    return origin, [_sighting(i, image, support, origin) for i, image, support in with_matches]
+    return origin, [_matched_image(i, image, support, origin) for i, image, support in with_matches]
 
 
-def _sighting(index: int, image: GroupImage, support: Support, origin: Array) -> Sighting:
+def _matched_image(index: int, image: GroupImage, support: Support, origin: Array) -> MatchedImage:
     offset = support.origin - origin
     outcome = image.answer.outcome
     structure = replace(support.structure, x_in_world=support.structure.x_in_world + offset)
@@ -126,21 +126,21 @@ def _sighting(index: int, image: GroupImage, support: Support, origin: Array) ->
         support.matches.point[kept], support.matches.keypoint[kept], guided[kept], support.matches.radius_px
     )
     own_pose = outcome.world_from_camera.shifted(-origin) if isinstance(outcome, Localization) else None
-    return Sighting(index, support.query, references, structure, tracked, own_pose, image.match)
+    return MatchedImage(index, support.query, references, structure, tracked, own_pose, image.match)
 
 
 def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
     """Of a group none of whose photographs has matches: that of the one that came furthest."""
     order = list(RejectionReason)
-    told = [(i, image.answer.outcome) for i, image in enumerate(images)]
-    rejected = [(order.index(outcome.reason), i, outcome) for i, outcome in told if isinstance(outcome, Rejection)]
+    outcomes = [(i, image.answer.outcome) for i, image in enumerate(images)]
+    rejected = [(order.index(outcome.reason), i, outcome) for i, outcome in outcomes if isinstance(outcome, Rejection)]
     if not rejected:
         return Rejection(RejectionReason.TOO_FEW_MATCHES, "no image has 2D-3D matches")
     _, i, furthest = max(rejected, key=lambda it: (it[0], -it[1]))
     return Rejection(furthest.reason, f"no image has 2D-3D matches; image {i}: {furthest.message}", furthest.hint)
 
 
-def group_doubts(matched: Sequence[MatchedSighting], inlier_px: float, options: GateOptions) -> str | None:
+def group_doubts(matched: Sequence[PosedImage], inlier_px: float, options: GateOptions) -> str | None:
     """What speaks against the pose of a group, in one sentence; None if nothing does. `gate.doubts` of the sums."""
     inlier_total = sum(int(it.inliers.sum()) for it in matched)
     count = (
@@ -148,18 +148,18 @@ def group_doubts(matched: Sequence[MatchedSighting], inlier_px: float, options: 
     )
     expected = group_log10_false_alarms(matched, inlier_px)
     if expected > options.max_log10_false_alarms:
-        return f"{count}, which chance could do ({told_false_alarms(expected)})"
-    visible = sum(findable_count(it.sighting.query, it.sighting.structure, it.world_from_camera) for it in matched)
+        return f"{count}, which chance could do ({format_false_alarms(expected)})"
+    visible = sum(findable_count(it.source.query, it.source.structure, it.world_from_camera) for it in matched)
     if inlier_total < min(options.min_found_share * visible, options.enough_inliers):
         return f"{count}, but they should show {visible} points: repeated structure somewhere else, most likely"
-    shares = (hull_share(it.sighting.query, it.matches, it.inliers) for it in matched if it.inliers.sum() >= 3)
+    shares = (hull_share(it.source.query, it.matches, it.inliers) for it in matched if it.inliers.sum() >= 3)
     covered = sum(shares)
     if covered < options.min_hull_share:
         return f"{count}, but they cover only {100 * covered:.1f} % of an image"
     return None
 
 
-def group_log10_false_alarms(matched: Sequence[MatchedSighting], inlier_px: float) -> float:
+def group_log10_false_alarms(matched: Sequence[PosedImage], inlier_px: float) -> float:
     """`gate.log10_false_alarms` of all matches together, each taken to hit by chance as easily as the easiest."""
     disc = inlier_px**2
     expected = []
@@ -171,9 +171,9 @@ def group_log10_false_alarms(matched: Sequence[MatchedSighting], inlier_px: floa
     return min(expected)
 
 
-def _searched_area(matched: MatchedSighting, guided: bool) -> float:
+def _searched_area(matched: PosedImage, guided: bool) -> float:
     """In which a match was searched, square pixels over pi."""
     if guided:
         return matched.matches.radius_px**2
-    camera = matched.sighting.query.camera
+    camera = matched.source.query.camera
     return camera.width_px * camera.height_px / np.pi

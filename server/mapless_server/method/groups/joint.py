@@ -22,8 +22,8 @@ from ..match import PointMatches
 from ..optimize import MinimizeOptions, minimize
 from ..pnp import reprojection_errors_px
 from .freedom import F, Freedom
+from .images import MatchedImage, PosedImage
 from .problem import GroupProblem, JointOptions
-from .images import MatchedSighting, Sighting
 
 __all__ = ["Freedom", "JointEstimate", "JointOptions", "adjust_in_rounds", "adjust_jointly", "covariance_in_world"]
 
@@ -35,12 +35,12 @@ class JointEstimate(Generic[F]):
     Attributes:
         freedom: at the optimum.
         covariance: (N, N) of its parameters.
-        matched: photographs with their matches, in the order of the sightings.
+        matched: photographs with their matches, in the order of the matched images.
     """
 
     freedom: F
     covariance: Array
-    matched: tuple[MatchedSighting, ...]
+    matched: tuple[PosedImage, ...]
 
     @property
     def inlier_count(self) -> int:
@@ -48,23 +48,25 @@ class JointEstimate(Generic[F]):
         return sum(int(it.inliers.sum()) for it in self.matched)
 
 
-def adjust_in_rounds(sightings: Sequence[Sighting], freedom: F, options: JointOptions, rounds: int) -> JointEstimate[F]:
+def adjust_in_rounds(
+    matched_images: Sequence[MatchedImage], freedom: F, options: JointOptions, rounds: int
+) -> JointEstimate[F]:
     """Searches for matches near where the poses so far put the points, and adjusts the poses, in turns."""
     for _ in range(rounds):
-        poses = [freedom.camera_from_world(it.image).inverse() for it in sightings]
-        matches = [it.matches_at(pose) for it, pose in zip(sightings, poses, strict=True)]
-        estimate = adjust_jointly(sightings, matches, freedom, options)
+        poses = [freedom.camera_from_world(it.image).inverse() for it in matched_images]
+        matches = [it.matches_at(pose) for it, pose in zip(matched_images, poses, strict=True)]
+        estimate = adjust_jointly(matched_images, matches, freedom, options)
         freedom = estimate.freedom.relaxed()
     return estimate
 
 
 def adjust_jointly(
-    sightings: Sequence[Sighting], matches: Sequence[PointMatches], freedom: F, options: JointOptions
+    matched_images: Sequence[MatchedImage], matches: Sequence[PointMatches], freedom: F, options: JointOptions
 ) -> JointEstimate[F]:
     """Refines the poses of a group.
 
     Args:
-        sightings: the photographs that have matches.
+        matched_images: the photographs that have matches.
         matches: of each with its points; those that are too far from the pose so far take no part.
         freedom: the poses so far, and how they may move.
         options: see there.
@@ -72,28 +74,28 @@ def adjust_jointly(
     Returns:
         The refined poses; those that were given where no match takes part.
     """
-    problem = GroupProblem(sightings, matches, freedom, options)
+    problem = GroupProblem(matched_images, matches, freedom, options)
     steps = MinimizeOptions(options.iterations, options.adjust.min_decrease)
     point = minimize(problem, problem.start, steps) if problem.blocks else problem.start
     points = {block.image: (problem.chosen[i], point.points[i]) for i, block in enumerate(problem.blocks)}
     matched = []
-    for sighting, its_matches in zip(sightings, matches, strict=True):
-        x_in_world = sighting.structure.x_in_world
-        if sighting.image in points:
-            chosen, moved = points[sighting.image]
+    for source, its_matches in zip(matched_images, matches, strict=True):
+        x_in_world = source.structure.x_in_world
+        if source.image in points:
+            chosen, moved = points[source.image]
             x_in_world = x_in_world.copy()
             x_in_world[chosen] = moved
-        matched.append(_matched(sighting, its_matches, x_in_world, point.freedom, options.adjust.inlier_px))
+        matched.append(_matched(source, its_matches, x_in_world, point.freedom, options.adjust.inlier_px))
     return JointEstimate(point.freedom, problem.covariance(point), tuple(matched))
 
 
 def _matched(
-    sighting: Sighting, matches: PointMatches, x_in_world: Array, freedom: Freedom, inlier_px: float
-) -> MatchedSighting:
-    pose = freedom.camera_from_world(sighting.image).inverse()
-    pixels = sighting.query.features.keypoints[matches.keypoint].astype(np.float64)
-    errors_px = reprojection_errors_px(sighting.query.camera, pose, x_in_world[matches.point], pixels)
-    return MatchedSighting(sighting, pose, matches, errors_px < inlier_px, errors_px)
+    source: MatchedImage, matches: PointMatches, x_in_world: Array, freedom: Freedom, inlier_px: float
+) -> PosedImage:
+    pose = freedom.camera_from_world(source.image).inverse()
+    pixels = source.query.features.keypoints[matches.keypoint].astype(np.float64)
+    errors_px = reprojection_errors_px(source.query.camera, pose, x_in_world[matches.point], pixels)
+    return PosedImage(source, pose, matches, errors_px < inlier_px, errors_px)
 
 
 def covariance_in_world(covariance: Array, world_from_body: RigidTransform) -> Array:

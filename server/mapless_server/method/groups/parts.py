@@ -1,7 +1,7 @@
 """What each photograph contributes to the adjustment of its group: points, tracks, and how often each was measured.
 
 A reference's keypoint that serves several photographs is one measurement, not several: its information is divided among
-them. So points that are the same one, known by two photographs, need not be told to be.
+them. So points that are the same one, known by two photographs, need not be found.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..match import PointMatches
 from ..pnp import reprojection_errors_px
 from ..tracks import Tracks
 from .freedom import Freedom
-from .images import Sighting
+from .images import MatchedImage
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,23 +27,25 @@ class Part:
     """What a photograph contributes.
 
     Attributes:
-        sighting: the photograph.
+        source: the photograph.
         world_from_camera: its pose at the start.
         chosen: (P_b,) points of its structure that it is matched with.
         tracks: of these, over its references and, last, the photograph itself.
     """
 
-    sighting: Sighting
+    source: MatchedImage
     world_from_camera: RigidTransform
     chosen: NDArray[np.intp]
     tracks: Tracks
 
 
-def part_of(sighting: Sighting, matches: PointMatches, freedom: Freedom, max_error_px: float, max_matches: int) -> Part:
+def part_of(
+    source: MatchedImage, matches: PointMatches, freedom: Freedom, max_error_px: float, max_matches: int
+) -> Part:
     """With the matches that are near enough, evenly thinned."""
-    structure, pose = sighting.structure, freedom.camera_from_world(sighting.image).inverse()
-    pixels = sighting.query.features.keypoints[matches.keypoint].astype(np.float64)
-    errors_px = reprojection_errors_px(sighting.query.camera, pose, structure.x_in_world[matches.point], pixels)
+    structure, pose = source.structure, freedom.camera_from_world(source.image).inverse()
+    pixels = source.query.features.keypoints[matches.keypoint].astype(np.float64)
+    errors_px = reprojection_errors_px(source.query.camera, pose, structure.x_in_world[matches.point], pixels)
     used = np.flatnonzero(errors_px < max_error_px)
     used = used[:: max(1, -(-len(used) // max_matches))]
     chosen = np.unique(matches.point[used])
@@ -51,10 +53,10 @@ def part_of(sighting: Sighting, matches: PointMatches, freedom: Freedom, max_err
     is_chosen[chosen] = True
     seen = structure.tracks.select(is_chosen)
     point = np.concatenate([seen.point, np.searchsorted(chosen, matches.point[used])])
-    view = np.concatenate([seen.view, np.full(len(used), len(sighting.references))])
+    view = np.concatenate([seen.view, np.full(len(used), len(source.references))])
     keypoint = np.concatenate([seen.keypoint, matches.keypoint[used]])
     order = np.lexsort((view, point))
-    return Part(sighting, pose, chosen, Tracks(point[order], view[order], keypoint[order]))
+    return Part(source, pose, chosen, Tracks(point[order], view[order], keypoint[order]))
 
 
 class Shared:
@@ -72,10 +74,10 @@ class Shared:
 
 def _measurements(part: Part) -> list[object]:
     """What identifies each observation: the photograph and the keypoint."""
-    views = [it.view for it in part.sighting.references]
+    views = [it.view for it in part.source.references]
     # A photograph of the group that was sent twice was measured once.
-    names: list[object] = [it.key for it in part.sighting.references]
-    names.append(part.sighting.query.features.keypoints.tobytes())
-    keypoints = [it.features.keypoints for it in (*views, part.sighting.query)]
+    names: list[object] = [it.key for it in part.source.references]
+    names.append(part.source.query.features.keypoints.tobytes())
+    keypoints = [it.features.keypoints for it in (*views, part.source.query)]
     rows = zip(part.tracks.view.tolist(), part.tracks.keypoint.tolist(), strict=True)
     return [(names[v], *keypoints[v][k].tolist()) for v, k in rows]

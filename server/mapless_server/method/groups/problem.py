@@ -17,8 +17,8 @@ from ..match import PointMatches
 from ..optimize import solve_step
 from ..views import PosedView
 from .freedom import F, Freedom
+from .images import MatchedImage
 from .parts import Part, Shared, part_of
-from .images import Sighting
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class GroupProblem(Generic[F]):
 
     def __init__(
         self,
-        sightings: Sequence[Sighting],
+        matched_images: Sequence[MatchedImage],
         matches: Sequence[PointMatches],
         freedom: F,
         options: JointOptions,
@@ -101,14 +101,14 @@ class GroupProblem(Generic[F]):
         self.chosen: list[NDArray[np.intp]] = []
         points: list[Array] = []
         parts = [
-            part_of(sighting, its_matches, freedom, options.adjust.max_error_px, options.max_matches)
-            for sighting, its_matches in zip(sightings, matches, strict=True)
+            part_of(source, its_matches, freedom, options.adjust.max_error_px, options.max_matches)
+            for source, its_matches in zip(matched_images, matches, strict=True)
         ]
         taking_part = [part for part in parts if len(part.chosen)]
         shared = Shared(taking_part)
         for part in taking_part:
             self.chosen.append(part.chosen)
-            points.append(part.sighting.structure.x_in_world[part.chosen])
+            points.append(part.source.structure.x_in_world[part.chosen])
             self.blocks.append(self._block(part, shared))
         self.information = np.array(self._information).ravel()
         references = Poses.of(reference.world_from_camera for _, reference in self._references.values())
@@ -120,16 +120,16 @@ class GroupProblem(Generic[F]):
         return len(self._references)
 
     def _block(self, part: Part, shared: Shared) -> Block:
-        sighting, structure = part.sighting, part.sighting.structure
-        views = [*sighting.references, PosedView("", "", sighting.query, part.world_from_camera)]
+        source, structure = part.source, part.source.structure
+        views = [*source.references, PosedView("", "", source.query, part.world_from_camera)]
         observations, start, depth_m = bundle_of(part.tracks, views, structure, part.chosen)
         observations = replace(observations, sigma_px=observations.sigma_px * np.sqrt(shared.times(part)))
-        references = np.array([self._index(it, structure.noise.level_px, depth_m) for it in sighting.references])
+        references = np.array([self._index(it, structure.noise.level_px, depth_m) for it in source.references])
         free = np.zeros((len(references), 6))
         problem = BundleProblem(
             observations, part.tracks.view, start.poses[:-1], free, self.options.adjust.loss_scale_sigma
         )
-        return Block(sighting.image, problem, references)
+        return Block(source.image, problem, references)
 
     def _index(self, reference: PosedView, level_px: float, depth_m: float) -> int:
         """Which of the group's references it is; a new one is held to its pose as `adjust` does."""

@@ -19,8 +19,8 @@ from ..rejection import Rejection, RejectionReason
 from ..rigid import perturbed
 from ..trust.gate import GateOptions
 from .generalized import inlier_count, rig_ransac
+from .images import GroupImage, MatchedImage, PosedImage, group_doubts, matched_images_of, rejection_without_matches
 from .joint import JointOptions, adjust_in_rounds, covariance_in_world
-from .images import GroupImage, MatchedSighting, Sighting, group_doubts, rejection_without_matches, sightings_of
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class RigEstimate:
 
     world_from_rig: RigidTransform
     covariance: Array
-    matched: tuple[MatchedSighting, ...]
+    matched: tuple[PosedImage, ...]
     origin: Array
 
 
@@ -112,14 +112,14 @@ def solve_rig(
         The estimate. Rejections: of the image that came furthest where none has matches; TOO_FEW_MATCHES; PNP_FAILED
         when no pose explains any four; GATE when chance could have done as well.
     """
-    origin, sightings = sightings_of(images)
-    if not sightings:
+    origin, matched_images = matched_images_of(images)
+    if not matched_images:
         return rejection_without_matches(images)
-    start = _start(sightings, rig_from_camera, options)
+    start = _start(matched_images, rig_from_camera, options)
     if isinstance(start, Rejection):
         return start
     freedom = RigFreedom(start.inverse(), tuple(rig_from_camera))
-    estimate = adjust_in_rounds(sightings, freedom, options.joint, options.rounds)
+    estimate = adjust_in_rounds(matched_images, freedom, options.joint, options.rounds)
     if estimate.inlier_count < 4:
         return Rejection(RejectionReason.PNP_FAILED, "no pose of the rig explains four matches")
     doubt = group_doubts(estimate.matched, options.pnp.inlier_px, options.gate)
@@ -131,10 +131,10 @@ def solve_rig(
 
 
 def _start(
-    sightings: Sequence[Sighting], rig_from_camera: Sequence[RigidTransform], options: RigOptions
+    matched_images: Sequence[MatchedImage], rig_from_camera: Sequence[RigidTransform], options: RigOptions
 ) -> RigidTransform | Rejection:
     """The pose that explains most matches: of the solver, or one that an image is answered with alone."""
-    cameras = [it.camera_matches(rig_from_camera[it.image]) for it in sightings]
+    cameras = [it.camera_matches(rig_from_camera[it.image]) for it in matched_images]
     total = sum(len(camera.pixels) for camera in cameras)
     if total < options.pnp.min_matches:
         message = f"{total} 2D-3D matches in {len(cameras)} images, {options.pnp.min_matches} needed"
@@ -142,7 +142,7 @@ def _start(
     found = rig_ransac(cameras, options.pnp)
     candidates = [] if found is None else [found]
     candidates += [
-        it.own_pose.compose(rig_from_camera[it.image].inverse()) for it in sightings if it.own_pose is not None
+        it.own_pose.compose(rig_from_camera[it.image].inverse()) for it in matched_images if it.own_pose is not None
     ]
     counts = [inlier_count(cameras, pose, options.pnp.inlier_px) for pose in candidates]
     if max(counts, default=0) < 4:

@@ -26,8 +26,8 @@ from ..rejection import Rejection, RejectionReason
 from ..trust.gate import GateOptions
 from .drift import DriftOptions, SequenceFreedom, world_from_session_at
 from .generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
+from .images import GroupImage, MatchedImage, PosedImage, group_doubts, matched_images_of, rejection_without_matches
 from .joint import JointEstimate, JointOptions, adjust_in_rounds, covariance_in_world
-from .images import GroupImage, MatchedSighting, Sighting, group_doubts, rejection_without_matches, sightings_of
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class SequenceEstimate:
     world_from_camera: tuple[RigidTransform, ...]
     covariances: Array
     step_weights: Array
-    matched: tuple[MatchedSighting, ...]
+    matched: tuple[PosedImage, ...]
     origin: Array
 
 
@@ -121,22 +121,22 @@ def solve_sequence(
         when nothing explains any four; SCALE_UNRELIABLE when the scale is to be found and the session does not move
         enough to tell it; GATE when chance could have done as well.
     """
-    origin, sightings = sightings_of(images)
-    if not sightings:
+    origin, matched_images = matched_images_of(images)
+    if not matched_images:
         return rejection_without_matches(images)
     session = _Session(tuple(session_from_camera), estimate_scale, options)
     if estimate_scale and not session.moves:
         return Rejection(RejectionReason.SCALE_UNRELIABLE, "the session does not move: nothing tells its unit")
-    total = sum(len(it.tracked) for it in sightings)
+    total = sum(len(it.tracked) for it in matched_images)
     if total < options.pnp.min_matches:
-        message = f"{total} 2D-3D matches in {len(sightings)} frames, {options.pnp.min_matches} needed"
+        message = f"{total} 2D-3D matches in {len(matched_images)} frames, {options.pnp.min_matches} needed"
         return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
-    guess = session.first_guess(sightings)
+    guess = session.first_guess(matched_images)
     if guess is None:
         return Rejection(RejectionReason.PNP_FAILED, f"nothing explains more than a few of {total} matches")
-    poses = session.poses(sightings, guess)
+    poses = session.poses(matched_images, guess)
     freedom = SequenceFreedom.of(poses, session_from_camera, guess.scale, estimate_scale, options.drift)
-    estimate = adjust_in_rounds(sightings, freedom, options.joint, options.rounds)
+    estimate = adjust_in_rounds(matched_images, freedom, options.joint, options.rounds)
     return _rejection(estimate, options) or _result(estimate, session.frames, origin)
 
 
@@ -196,19 +196,19 @@ class _Session:
         extent = float(np.ptp(centres, axis=0).max())
         return extent > self.options.min_motion * float(np.abs(centres).max())
 
-    def first_guess(self, sightings: Sequence[Sighting]) -> Similarity | None:
+    def first_guess(self, matched_images: Sequence[MatchedImage]) -> Similarity | None:
         """How the session lies in the world, the guess that explains most matches; None if none explains four."""
-        cameras = [it.camera_matches(self.frames[it.image]) for it in sightings]
+        cameras = [it.camera_matches(self.frames[it.image]) for it in matched_images]
         total = sum(len(camera.pixels) for camera in cameras)
-        candidates = self._of_single_frames(sightings)
+        candidates = self._of_single_frames(matched_images)
         counts = [inlier_count(cameras, it, self.options.loose_px) for it in candidates]
         if max(counts, default=0) < self.options.enough_share * total:
             candidates += self._of_all_matches(cameras)
             counts = [inlier_count(cameras, it, self.options.loose_px) for it in candidates]
         return candidates[int(np.argmax(counts))] if max(counts, default=0) >= 4 else None
 
-    def _of_single_frames(self, sightings: Sequence[Sighting]) -> list[Similarity]:
-        posed = [(it.own_pose, self.frames[it.image]) for it in sightings if it.own_pose is not None]
+    def _of_single_frames(self, matched_images: Sequence[MatchedImage]) -> list[Similarity]:
+        posed = [(it.own_pose, self.frames[it.image]) for it in matched_images if it.own_pose is not None]
         if not self.scale_is_free:
             return [world_from_session_at(pose, frame, 1.0) for pose, frame in posed]
         guesses = []
@@ -227,9 +227,9 @@ class _Session:
         rigid = rig_ransac(cameras, options.pnp)
         return [] if rigid is None else [Similarity(1.0, rigid.rotation, rigid.translation)]
 
-    def poses(self, sightings: Sequence[Sighting], guess: Similarity) -> list[RigidTransform]:
+    def poses(self, matched_images: Sequence[MatchedImage], guess: Similarity) -> list[RigidTransform]:
         """world_from_camera of every frame: its own if it can be believed, else carried on from the nearest such."""
-        own = {it.image: it.own_pose for it in sightings if it.own_pose is not None}
+        own = {it.image: it.own_pose for it in matched_images if it.own_pose is not None}
         believed = self._believed(own, guess)
         poses = []
         for i, frame in enumerate(self.frames):

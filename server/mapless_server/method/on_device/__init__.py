@@ -114,7 +114,7 @@ def _judged(
         message = f"{reconstruction.backend}: {broken}"
         log.warning("%s", message)
         return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
-    scale = judge(outputs.weighed, reference_count, options.scale)
+    scale = judge(outputs.candidates, reference_count, options.scale)
     if isinstance(scale, Rejection):
         return scale
     if outputs.points is None or options.structure is None or options.match is None:
@@ -166,7 +166,7 @@ def _cells(map_cameras: Sequence[Camera], references: Sequence[PosedView]) -> ND
 
 def _not_finite(outputs: Outputs, reference_count: int) -> str | None:
     """What of the network's output is broken, in one sentence; None if nothing is."""
-    of_poses = not_finite(outputs.weighed, reference_count)
+    of_poses = not_finite(outputs.candidates, reference_count)
     if of_poses is None and outputs.broken_pixels:
         return f"{outputs.broken_pixels:.0f} predicted pixels are not finite"
     return of_poses

@@ -14,7 +14,7 @@ from ..coarse.device import DeviceReconstruction
 from ..keypoints import positive
 from ..match import MatchOptions
 from ..observations import back_project
-from ..scale_equations import Known, Predicted, ScaleOptions, Weighed, weigh
+from ..scale_equations import Known, Predicted, ScaleCandidates, ScaleOptions, scale_candidates
 from ..structure import StructureOptions, refine_points
 from .match import DevicePoints, MatchInputs, match_on_device
 from .structure import DeviceTracks, StructureInputs, observe_on_device
@@ -70,12 +70,12 @@ class Outputs:
 
     Attributes:
         broken_pixels: see DeviceReconstruction.
-        weighed: the scale.
+        candidates: of the scale.
         points: None if they were not asked for.
     """
 
     broken_pixels: AnyArray
-    weighed: Weighed
+    candidates: ScaleCandidates
     points: Points | None
 
 
@@ -89,23 +89,23 @@ def compute(reconstruction: DeviceReconstruction, inputs: Inputs, query_camera: 
         options: of the stages.
     """
     predicted = _predict(reconstruction, inputs.cell)
-    weighed = weigh(inputs.known, predicted, options.scale)
+    candidates = scale_candidates(inputs.known, predicted, options.scale)
     broken_pixels = reconstruction.broken_pixels()
     if not (inputs.structure and inputs.match and options.structure and options.match):
-        return Outputs(broken_pixels, weighed, None)
+        return Outputs(broken_pixels, candidates, None)
 
     prepared = inputs.structure
-    depth_m = weighed.metres_per_unit * predicted.depth[prepared.keypoint[:, 0]]
+    depth_m = candidates.metres_per_unit * predicted.depth[prepared.keypoint[:, 0]]
     start = back_project(prepared.first_centre, prepared.first_ray, depth_m)
     refined = refine_points(observe_on_device(prepared, options.structure.first_noise), start, options.structure)
     tracks = refined.observations.tracks
     assert isinstance(tracks, DeviceTracks)
     points = DevicePoints(refined.x_in_world, prepared.keypoint, tracks.seen & refined.trusted[:, None])
     keypoint, guided = match_on_device(
-        inputs.match, points, weighed.query_rotation, weighed.query_centre, query_camera, options.match
+        inputs.match, points, candidates.query_rotation, candidates.query_centre, query_camera, options.match
     )
-    level_px = refined.noise.level_px * torch.ones_like(weighed.metres_per_unit)
-    return Outputs(broken_pixels, weighed, Points(points.x_in_world, level_px, points.seen, keypoint, guided))
+    level_px = refined.noise.level_px * torch.ones_like(candidates.metres_per_unit)
+    return Outputs(broken_pixels, candidates, Points(points.x_in_world, level_px, points.seen, keypoint, guided))
 
 
 def _predict(reconstruction: DeviceReconstruction, cell: Tensor) -> Predicted:

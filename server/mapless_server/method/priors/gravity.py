@@ -58,7 +58,7 @@ def ransac_with_gravity(
         camera: pinhole.
         x_in_world: (N, 3) points.
         pixels: (N, 2) where they are seen.
-        priors: with gravity. All of them pull in the refinement.
+        priors: with gravity. All of them take part in the refinement.
         inlier_px: largest reprojection error of a right match.
         options: see there.
     """

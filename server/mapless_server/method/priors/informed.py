@@ -1,8 +1,8 @@
-"""Poses that what is known beforehand finds, whether one of them is better, and how far priors pull the best one.
+"""Poses that priors find, whether one of them is better, and the best one refined with the priors.
 
 A pose that priors bring must explain more than the one that the photograph gave; what priors say against a pose counts
 like one match and no more. The winner is compared with each prior by the pose that the photograph alone gives in its
-place, and pulled by those that are consistent with it. So a wrong prior costs nothing: it is found to be one and not
+place, and refined with those that are consistent with it. So a wrong prior costs nothing: it is found to be one and not
 used, and then the answer is, to the last bit, the one without it.
 """
 
@@ -54,18 +54,18 @@ class InformedOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Pulled:
+class InformedPose:
     """A pose with everything that is consistent with it.
 
     Attributes:
         world_from_camera: metric.
-        unpulled: the same before priors pulled it.
+        without_priors: the same before priors were used.
         checks: of each prior.
-        used: those that pulled.
+        used: those that took part.
     """
 
     world_from_camera: RigidTransform
-    unpulled: RigidTransform
+    without_priors: RigidTransform
     checks: tuple[PriorCheck, ...]
     used: Priors
 
@@ -77,7 +77,7 @@ def informed_pose(
     found: RigidTransform | None,
     priors: Priors,
     options: InformedOptions,
-) -> Pulled | None:
+) -> InformedPose | None:
     """The best pose that the photograph and the priors find together; None if neither finds any.
 
     Args:
@@ -97,7 +97,7 @@ def informed_pose(
         least = math.inf if found is None else _cost(camera, x_in_world, pixels, found, priors, options)
         if min(costs) < least - options.worst_cost:
             best = others[int(np.argmin(costs))]
-    return None if best is None else pull(camera, x_in_world, pixels, best, priors, options)
+    return None if best is None else use_priors(camera, x_in_world, pixels, best, priors, options)
 
 
 def _from_priors(
@@ -129,14 +129,14 @@ def _cost(
     return float(squared.sum()) + priors.penalty(world_from_camera)
 
 
-def pull(
+def use_priors(
     camera: Camera,
     x_in_world: Array,
     pixels: Array,
     world_from_camera: RigidTransform,
     priors: Priors,
     options: InformedOptions,
-) -> Pulled:
+) -> InformedPose:
     """A pose that at least `min_inliers` matches support, with priors checked and the consistent ones used."""
     alone = refine_pose(camera, x_in_world, pixels, world_from_camera, NO_PRIORS, options.refine)
     before, after = (supporting(camera, x_in_world, pixels, it, options) for it in (world_from_camera, alone))
@@ -146,10 +146,10 @@ def pull(
     covariance = np.linalg.inv(found / options.refine.prior_weight + SOMEWHERE)
     checks = priors.check(alone, np.asarray(covariance, np.float64))
     used = priors.consistent(checks)
-    pulled = world_from_camera
+    refined = world_from_camera
     if used:
-        pulled = refine_pose(camera, x_in_world, pixels, world_from_camera, used, options.refine)
-    return Pulled(pulled, world_from_camera, checks, used)
+        refined = refine_pose(camera, x_in_world, pixels, world_from_camera, used, options.refine)
+    return InformedPose(refined, world_from_camera, checks, used)
 
 
 def supporting(

@@ -279,8 +279,8 @@ class Priors:
         """Those that are used, each as uncertain as its distance shows it to be.
 
         One that is further out than the average consistent prior, m^2 > n, is believed less: its covariance is
-        multiplied by m^2 / n (Birge's ratio). That costs honest priors little, and takes most of its pull from one that
-        is wrong by less than a conflict.
+        multiplied by m^2 / n (Birge's ratio). That costs honest priors little, and one that is wrong by less than a
+        conflict loses most of its weight.
         """
         used = {check.kind: check for check in checks if check.used}
         kept = {
@@ -325,7 +325,7 @@ class Priors:
         return math.log10((1 - math.cos(angle)) / 2)
 
     def sharpened(self, covariance: Array, world_from_camera: RigidTransform) -> Array:
-        """The covariance (6, 6) of a pose that these priors pull, of one (6, 6) that knows nothing of them."""
+        """The covariance (6, 6) of a pose refined with these priors, from one (6, 6) without them."""
         if not self:
             return covariance
         _, information = self.gradient_and_information(world_from_camera)

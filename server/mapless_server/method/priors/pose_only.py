@@ -56,7 +56,7 @@ def refine_pose(
         x_in_world: (N, 3) points; those behind the camera to begin with take no part.
         pixels: (N, 2) where they are seen.
         world_from_camera: where to begin.
-        priors: those that are to pull.
+        priors: those that take part.
         options: see there.
     """
     in_front = world_from_camera.inverse().apply(x_in_world)[:, 2] > 0

@@ -38,7 +38,7 @@ class AmbiguityOptions:
 
     Attributes:
         min_share: a rival explains at least this share of as many keypoints as the winner. A place that has half the
-            votes of another is told from it by that alone.
+            votes of another is distinguished from it by that alone.
         min_keypoints: and no fewer keypoints than this.
         max_log10_false_alarms: as of the gate, with a reserve: every answer is asked for a rival.
         min_own_share: least share of its matches from references that agree with it more than with the winner. A few

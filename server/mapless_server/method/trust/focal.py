@@ -4,7 +4,7 @@ A wrong focal length is the classic mistake of whoever crops or resizes photogra
 is seen, or away from it, and its own residuals tell little of that: the motion absorbs most of the error. But not all
 where points lie at several depths. So the pose is solved again with one more unknown, s = ln(f / f given), the points
 where they are (see `resection`), from the answered pose and with all its matches: a wrong focal length makes outliers
-of right ones, and the loss begins wide and narrows to find them again. How far off s may be is told by a sandwich,
+of right ones, and the loss begins wide and narrows to find them again. How far off s may be is estimated by a sandwich,
 H^-1 (sum_g b_g b_g^T) H^-1, b_g the gradients of the matches in group g (Liang and Zeger 1986), once with references
 for groups and once with parts of the image: what neighbours share does not average out over their number. Where depth
 hardly varies, or all is far away, it is large, and nothing is said.
@@ -90,7 +90,7 @@ class Focal:
     given_px: float
 
     @property
-    def told_px(self) -> float:
+    def estimated_px(self) -> float:
         """Focal length along x that the photograph says."""
         return self.given_px * math.exp(self.log_ratio)
 
@@ -168,16 +168,16 @@ def _sigma(problem: Resection, fit: Fit, seen_by: NDArray[np.bool_], grid: int) 
     column = solve_step(hessian, np.eye(7)[6])
     if column is None or not column[6] < 0:
         return None
-    pull = gradient @ column  # (N,), how far each match alone moves s
+    shift = gradient @ column  # (N,), how far each match alone moves s
     shares = seen_by / np.maximum(1, seen_by.sum(axis=1, keepdims=True))
     size_px = np.array([problem.camera.width_px, problem.camera.height_px])
     cell = np.clip((problem.pixels / size_px * grid).astype(int), 0, grid - 1) @ [grid, 1]
     by_cell = np.zeros(grid**2)
-    np.add.at(by_cell, cell, pull)
-    return math.sqrt(-float(column[6]) + _scatter(pull @ shares) + _scatter(by_cell))
+    np.add.at(by_cell, cell, shift)
+    return math.sqrt(-float(column[6]) + _scatter(shift @ shares) + _scatter(by_cell))
 
 
-def _scatter(pulls: Array) -> float:
-    """Variance of a sum of independent pulls (G,) whose mean is zero, of which those at zero are not there."""
-    count = max(2, int((pulls != 0).sum()))
-    return float((pulls**2).sum()) * count / (count - 1)
+def _scatter(shifts: Array) -> float:
+    """Variance of a sum of independent shifts (G,) whose mean is zero, of which those at zero are not there."""
+    count = max(2, int((shifts != 0).sum()))
+    return float((shifts**2).sum()) * count / (count - 1)

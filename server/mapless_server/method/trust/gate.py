@@ -1,8 +1,8 @@
 """Whether a pose is one at all: what wrong matches alone could support as well is not.
 
 Wrong matches must not be expected to support a pose so well (a-contrario model estimation, Moisan and Stival 2004), and
-repeated texture, whose wrong matches do agree with each other, is told by two things that a true pose has and it has
-not: what should be seen is found, and not in one corner only.
+repeated texture, whose wrong matches do agree with each other, lacks two things that a true pose has: what should be
+seen is found, and not in one corner only.
 
 This is the coarse sieve, before anything dear is computed; how far to trust what passes it is the judge's (`judge`).
 """
@@ -80,7 +80,7 @@ def doubts(
     expected = log10_false_alarms(query.camera, matches, inliers, inlier_px) + log10_chance
     count = f"{inliers.sum()} of {len(matches)} matches agree on a pose"
     if expected > options.max_log10_false_alarms:
-        return f"{count}, which chance could do ({told_false_alarms(expected)})"
+        return f"{count}, which chance could do ({format_false_alarms(expected)})"
     less = options.agreeing_factor if log10_chance < 0 else 1.0
     findable = findable_count(query, structure, world_from_camera)
     if inliers.sum() < min(less * options.min_found_share * findable, options.enough_inliers):
@@ -134,7 +134,7 @@ def false_alarms(match_count: int, inlier_count: int, chance: float) -> float:
     return float((np.log(n - 3) + _log_choose(n, k) + _log_choose(k, 3) + (k - 3) * np.log(chance)) / np.log(10))
 
 
-def told_false_alarms(log10_expected: float) -> str:
+def format_false_alarms(log10_expected: float) -> str:
     """The number for a person; three matches agree with a pose by construction, which no number tells."""
     if log10_expected == np.inf:
         return "any number of such poses expected"

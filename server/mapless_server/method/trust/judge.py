@@ -130,14 +130,14 @@ def _distrusted(evidence: Evidence, trust: float, coverage: float) -> Rejection:
     shown = math.floor(1000 * trust) / 1000  # never as much as what it is below
     message = (
         f"its trust of {shown:g} is below the {round(1 - coverage, 6):g} that a coverage of {coverage:g} asks for: "
-        f"{told(evidence)}"
+        f"{format_evidence(evidence)}"
     )
     return Rejection(RejectionReason.GATE, message)
 
 
 def _miscalibrated(support: Support, focal: Focal) -> Rejection:
     message = (
-        f"the photograph says {focal.told_px / focal.given_px:.3f} times the focal length that its intrinsics say "
+        f"the photograph says {focal.estimated_px / focal.given_px:.3f} times the focal length that its intrinsics say "
         f"(standard deviation {focal.sigma:.2g}): {focal.agreeing} of the matches looked at agree with the former, "
         f"{focal.agreeing_before} with the latter"
     )
@@ -149,7 +149,7 @@ def _miscalibrated(support: Support, focal: Focal) -> Rejection:
     return Rejection(RejectionReason.GATE, message, Hint("judge", Advice.CHECK_CALIBRATION, advice, best))
 
 
-def told(evidence: Evidence) -> str:
+def format_evidence(evidence: Evidence) -> str:
     """The evidence for a person."""
     return (
         f"{evidence.inlier_count} of {evidence.match_count} matches agree, {100 * evidence.found_share:.0f} % of the "

@@ -24,7 +24,7 @@ both are seen in units of the latter (Ledoit and Wolf 2004, with another measure
 
 Against planted noise, of pixels and of reference poses, the sum of C and the photograph's part is right within a
 quarter (the tests). What is drawn towards i^2 H^-1 claims more than that where noise is as planted, and is what holds
-on photographs: their errors are larger in directions that are told badly than the references' disagreement shows.
+on photographs: their errors are larger in poorly determined directions than the references' disagreement shows.
 
 What remains are two factors on standard deviations, one for positions and one for angles, and one for the tail: errors
 have heavier ones than the normal distribution. `research.radii` measures all three on scenes with
@@ -39,7 +39,7 @@ import numpy as np
 
 from mapless.geometry import Array, Camera, RigidTransform
 
-from .dispersion import Dispersion, Grounds, disperse
+from .dispersion import Dispersion, JackknifeInput, disperse
 from .perturbation import pose_hessian, world_covariance, world_jacobian
 
 
@@ -49,13 +49,13 @@ class UncertaintyOptions:
 
     Attributes:
         shrinkage: a, of the dispersion towards the shape of independent matches: halfway. Between a third and two
-            thirds nothing changes that could be told on some hundred photographs.
+            thirds no difference is measurable on some hundred photographs.
         shared_matches: so many independent matches are as good as any number. Without this bound positions of the two
             surveyed scenes, where a thousand matches agree, are claimed twice as exact as they are.
         position_factor, rotation_factor: on standard deviations; as `research.radii` prints them.
         max_matches: of the photograph that are looked at, evenly thinned; twice as many take twice the time, and the
             references' errors are in all of them.
-        loss_scale_sigma: of the Cauchy loss that weighs matches, for poses that no adjustment has weighed.
+        loss_scale_sigma: of the Cauchy loss that weighs matches, for poses without an adjustment.
         max_error_px: matches further from such a pose say nothing.
     """
 
@@ -96,7 +96,7 @@ class Uncertainty:
 
 
 def uncertainty_of(
-    grounds: Grounds,
+    jackknife: JackknifeInput,
     world_from_camera: RigidTransform,
     one_match: Array,
     options: UncertaintyOptions,
@@ -105,7 +105,7 @@ def uncertainty_of(
     """The references', the offset's and the shared part of a pose's covariance, with the factors.
 
     Args:
-        grounds: what it rests on; its unknowns a left perturbation (v, w) of camera_from_world.
+        jackknife: the observations it rests on; its unknowns a left perturbation (v, w) of camera_from_world.
         world_from_camera: the pose.
         one_match: (6, 6) covariance of the pose, in the world, if it rested on one match of average place at the
             structure's noise.
@@ -113,9 +113,9 @@ def uncertainty_of(
         is_offset: whether the pose is known not to be at its optimum.
 
     Returns:
-        None where the grounds determines no pose.
+        None where the observations determine no pose.
     """
-    dispersion = disperse(grounds)
+    dispersion = disperse(jackknife)
     if dispersion is None:
         return None
     to_world = world_jacobian(world_from_camera)

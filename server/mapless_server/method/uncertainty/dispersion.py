@@ -55,7 +55,7 @@ LEAST_LEFT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class LinearizedObservations:
     """Observations of points, linearized; residuals and derivatives in standard deviations.
 
     Attributes:
@@ -72,7 +72,7 @@ class Sightings:
 
 
 @dataclass(frozen=True, eq=False)
-class Grounds:
+class JackknifeInput:
     """What a pose, or poses that are solved for together, rest on.
 
     Attributes:
@@ -85,9 +85,9 @@ class Grounds:
             the photograph's own pixels' average out.
     """
 
-    query: Sightings
+    query: LinearizedObservations
     by_pose: Array
-    references: Sightings
+    references: LinearizedObservations
     reference: NDArray[np.intp]
     reference_count: int
     thinning: int = 1
@@ -122,27 +122,29 @@ class Dispersion:
         return float(np.sqrt(np.trace(self.information @ self.covariance) / len(self.information)))
 
 
-def disperse(grounds: Grounds) -> Dispersion | None:
+def disperse(jackknife: JackknifeInput) -> Dispersion | None:
     """Leaves out one reference at a time; None where all together determine no pose."""
-    seen, query = grounds.references, grounds.query
+    seen, query = jackknife.references, jackknife.query
     size = 1 + int(max(query.point.max(initial=0), seen.point.max(initial=0)))
-    of_seen, pull = _information(seen), _gradient(seen)
+    of_seen, gradients = _information(seen), _gradient(seen)
     of_point = np.stack([np.bincount(seen.point, row, size) for row in of_seen]).astype(np.float64)
-    pull_of_point = np.stack([np.bincount(seen.point, row, size) for row in pull]).astype(np.float64)
+    gradient_of_point = np.stack([np.bincount(seen.point, row, size) for row in gradients]).astype(np.float64)
 
-    everything = _eliminate(query, of_point[:, query.point], pull_of_point[:, query.point])
+    everything = _eliminate(query, of_point[:, query.point], gradient_of_point[:, query.point])
     row, other = _pairs(query.point, seen.point, size)
     point = query.point[row]
-    some = Sightings(point, query.by_point[row], query.residual[row], query.weight[row])
-    without = _eliminate(some, of_point[:, point] - of_seen[:, other], pull_of_point[:, point] - pull[:, other])
-    change = np.zeros((grounds.reference_count, 5, len(query.point)))
+    some = LinearizedObservations(point, query.by_point[row], query.residual[row], query.weight[row])
+    without = _eliminate(
+        some, of_point[:, point] - of_seen[:, other], gradient_of_point[:, point] - gradients[:, other]
+    )
+    change = np.zeros((jackknife.reference_count, 5, len(query.point)))
     # A point is seen once by a reference: no pair falls upon another.
-    change[grounds.reference[other], :, row] = (without - everything[:, row]).T
-    found = _steps(query, grounds.by_pose, everything, change)
-    return found and replace(found, photograph=found.photograph / grounds.thinning)
+    change[jackknife.reference[other], :, row] = (without - everything[:, row]).T
+    found = _steps(query, jackknife.by_pose, everything, change)
+    return found and replace(found, photograph=found.photograph / jackknife.thinning)
 
 
-def _steps(query: Sightings, by_pose: Array, everything: Array, change: Array) -> Dispersion | None:
+def _steps(query: LinearizedObservations, by_pose: Array, everything: Array, change: Array) -> Dispersion | None:
     """From each observation's W and u (5, N), and their change (K, 5, N) without each reference."""
     unknowns = by_pose.shape[2]
     x, y = by_pose[:, 0], by_pose[:, 1]
@@ -177,7 +179,7 @@ def _is_definite(information: Array) -> bool:
     return bool(np.linalg.eigvalsh(information / np.outer(unit, unit))[0] > LEAST_EIGENVALUE)
 
 
-def _pixel_noise(query: Sightings, marginal: Array) -> Array:
+def _pixel_noise(query: LinearizedObservations, marginal: Array) -> Array:
     """s^2 W w^-1 W of each observation, its elements xx, xy, yy (3, N), from those of W."""
     xx, xy, yy = marginal
     left = (xx + yy) / (2 * query.weight)
@@ -197,14 +199,14 @@ def _pairs(query_point: NDArray[np.intp], seen_point: NDArray[np.intp], size: in
     return row, order[first + np.arange(len(row))]
 
 
-def _eliminate(query: Sightings, information: Array, gradient: Array) -> Array:
+def _eliminate(query: LinearizedObservations, information: Array, gradient: Array) -> Array:
     """W_xx, W_xy, W_yy, u_x, u_y (5, N) of observations whose points have this information (6, N) and gradient (3, N).
 
     Zero where a point is not determined even with the query's own observation.
     """
     weight = query.weight
     inverse = _inverse(information + _information(query))
-    pull = gradient + _gradient(query)
+    both = gradient + _gradient(query)
     a, b = query.by_point[:, 0].T, query.by_point[:, 1].T
     inverse_a, inverse_b = _times(inverse, a), _times(inverse, b)
     squared = weight**2
@@ -213,24 +215,24 @@ def _eliminate(query: Sightings, information: Array, gradient: Array) -> Array:
             weight - squared * (a * inverse_a).sum(axis=0),
             -squared * (b * inverse_a).sum(axis=0),
             weight - squared * (b * inverse_b).sum(axis=0),
-            weight * (query.residual[:, 0] - (inverse_a * pull).sum(axis=0)),
-            weight * (query.residual[:, 1] - (inverse_b * pull).sum(axis=0)),
+            weight * (query.residual[:, 0] - (inverse_a * both).sum(axis=0)),
+            weight * (query.residual[:, 1] - (inverse_b * both).sum(axis=0)),
         ]
     )
     return np.where(np.isfinite(result).all(axis=0), result, 0.0)
 
 
-def _information(sightings: Sightings) -> Array:
+def _information(observations: LinearizedObservations) -> Array:
     """W A^T A of each, its elements xx, yy, zz, xy, xz, yz (6, N)."""
-    x, y, z = np.moveaxis(sightings.by_point, 2, 0)  # (N, 2) each
+    x, y, z = np.moveaxis(observations.by_point, 2, 0)  # (N, 2) each
     pairs = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
-    return np.stack([sightings.weight * (p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1]) for p, q in pairs])
+    return np.stack([observations.weight * (p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1]) for p, q in pairs])
 
 
-def _gradient(sightings: Sightings) -> Array:
+def _gradient(observations: LinearizedObservations) -> Array:
     """W A^T r of each, (3, N)."""
-    x, y = (sightings.residual * sightings.weight[:, None]).T
-    return np.asarray(sightings.by_point[:, 0].T * x + sightings.by_point[:, 1].T * y)
+    x, y = (observations.residual * observations.weight[:, None]).T
+    return np.asarray(observations.by_point[:, 0].T * x + observations.by_point[:, 1].T * y)
 
 
 def _inverse(matrices: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Observations linearized at poses and points: what the adjustment solves with, and what uncertainty is told from."""
+"""Observations linearized at poses and points: input of the adjustment and of the uncertainty."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..observations import Observations
 from ..robust import cauchy_weight
 from ..structure import Structure
 from ..tracks import Tracks
-from .dispersion import Grounds, Sightings
+from .dispersion import JackknifeInput, LinearizedObservations
 from .perturbation import motion_jacobian
 
 
@@ -44,13 +44,13 @@ def linearize(observations: Observations, x_in_world: Array, loss_scale_sigma: f
     return Linearization(residual, weight, by_point, by_camera_point @ motion_jacobian(x_in_camera))
 
 
-def grounds_of(
+def jackknife_input(
     rows: Linearization,
     point: NDArray[np.intp],
     view: NDArray[np.intp],
     max_matches: int,
     motions: Array | None = None,
-) -> Grounds:
+) -> JackknifeInput:
     """What the last view's pose rests on.
 
     Args:
@@ -74,10 +74,12 @@ def grounds_of(
     if motions is not None:
         residual = residual - (rows.by_pose * motions[view][:, None, :]).sum(axis=2)
 
-    def some(chosen: NDArray[np.bool_]) -> Sightings:
-        return Sightings(point[chosen], rows.by_point[chosen], residual[chosen], rows.weight[chosen])
+    def some(chosen: NDArray[np.bool_]) -> LinearizedObservations:
+        return LinearizedObservations(point[chosen], rows.by_point[chosen], residual[chosen], rows.weight[chosen])
 
-    return Grounds(some(is_asked), rows.by_pose[is_asked], some(~is_asked), view[~is_asked], asked, max(thinning, 1))
+    return JackknifeInput(
+        some(is_asked), rows.by_pose[is_asked], some(~is_asked), view[~is_asked], asked, max(thinning, 1)
+    )
 
 
 def tracks_with_query(

@@ -1,4 +1,4 @@
-"""Errors of a pose: in which coordinates they are told, and how a covariance changes from one to the other.
+"""Errors of a pose: their coordinates, and how a covariance changes from one to the other.
 
 What we answer is the covariance of world_from_camera in ROS's order (x y z rx ry rz): the camera's centre c moves by
 d = (x, y, z), and the camera turns by Exp(r), r = (rx, ry, rz), about the fixed axes of the world,

@@ -16,7 +16,7 @@ from mapless_server.method.views import PosedView
 
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood, sight
 from .options import AuditOptions
-from .resection import Explanation, Freedom, Sighting, explain
+from .resection import Explanation, Freedom, ObservedPoints, explain
 from .verdict import Verdict
 
 _RANSAC = PnpOptions(min_iterations=1000, inlier_px=6.0)
@@ -33,14 +33,14 @@ class Look:
     Attributes:
         subject: the reference looked at.
         neighbourhood: the others, and the points they know.
-        sighting: those of them that the subject shows.
+        observed: those of them that the subject shows.
         explanations: by what they may change; empty with too few matches.
         options: of the audit.
     """
 
     subject: PosedView
     neighbourhood: Neighbourhood
-    sighting: Sighting
+    observed: ObservedPoints
     explanations: dict[Freedom, Explanation]
     options: AuditOptions
 
@@ -51,7 +51,7 @@ class Look:
             return False
         camera, inliers = self.subject.view.camera, self.explanations[Freedom.BOTH].inlier_count
         chance = np.pi * _RANSAC.inlier_px**2 / (camera.width_px * camera.height_px)
-        expected = false_alarms(len(self.sighting), inliers, float(chance))
+        expected = false_alarms(len(self.observed), inliers, float(chance))
         return inliers >= self.options.min_inliers and expected <= self.options.max_log10_false_alarms
 
     @cached_property
@@ -148,14 +148,14 @@ class Look:
 def look_at(subject: PosedView, neighbours: Sequence[PosedView], pairs: PairMatches, options: AuditOptions) -> Look:
     """Looks at a reference from these others, whose poses it believes as far as they agree with one another."""
     neighbourhood = build_neighbourhood(neighbours, pairs, options.epipolar_px, options.structure)
-    sighting = sight(subject, neighbourhood, pairs)
+    observed = sight(subject, neighbourhood, pairs)
     explanations = {}
-    if len(sighting) >= _RANSAC.min_matches:
+    if len(observed) >= _RANSAC.min_matches:
         camera, given = subject.view.camera, subject.world_from_camera
-        found = ransac(camera, sighting.x_in_world, sighting.pixel, None, _RANSAC)
+        found = ransac(camera, observed.x_in_world, observed.pixel, None, _RANSAC)
         starts = (given,) if found is None else (given, found)
-        explanations = {freedom: explain(sighting, camera, starts, freedom, options.resection) for freedom in Freedom}
-    return Look(subject, neighbourhood, sighting, explanations, options)
+        explanations = {freedom: explain(observed, camera, starts, freedom, options.resection) for freedom in Freedom}
+    return Look(subject, neighbourhood, observed, explanations, options)
 
 
 def pose_difference(first: RigidTransform, second: RigidTransform) -> tuple[float, float]:

@@ -24,7 +24,7 @@ from mapless_server.method.structure import Structure, StructureOptions, observe
 from mapless_server.method.tracks import Tracks, build_tracks
 from mapless_server.method.views import Matches, PosedView
 
-from .resection import Sighting
+from .resection import ObservedPoints
 
 
 class PairMatches:
@@ -94,15 +94,15 @@ def build_neighbourhood(
     return Neighbourhood(tuple(references), structure, covariance[trusted])
 
 
-def sight(subject: PosedView, neighbourhood: Neighbourhood, pairs: PairMatches) -> Sighting:
+def sight(subject: PosedView, neighbourhood: Neighbourhood, pairs: PairMatches) -> ObservedPoints:
     """The neighbourhood's points that the subject's photograph shows, by descriptors alone."""
     if not len(neighbourhood.structure.x_in_world):
-        return Sighting(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0))
+        return ObservedPoints(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0))
     matches = tuple(pairs.match(subject, reference) for reference in neighbourhood.references)
     counts = [len(r.view.features) for r in neighbourhood.references]
     found = vote(neighbourhood.structure, counts, Correspondences({}, matches))
     features = subject.view.features
-    return Sighting(
+    return ObservedPoints(
         features.keypoints[found.keypoint].astype(np.float64),
         neighbourhood.structure.x_in_world[found.point],
         neighbourhood.point_covariance[found.point],

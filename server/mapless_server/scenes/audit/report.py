@@ -23,7 +23,7 @@ def describe(
         verdict=verdict,
         message=_message(numbers, verdict, other, same, change),
         neighbour_count=len(look.neighbourhood.references),
-        match_count=len(look.sighting),
+        match_count=len(look.observed),
         inlier_count=numbers.inlier_count,
         error_px=numbers.error_px,
         position_offset_m=numbers.offset_m,
@@ -39,7 +39,7 @@ class _Numbers:
     """Of the explanation that a verdict rests on."""
 
     def __init__(self, look: Look, verdict: Verdict) -> None:
-        self.match_count = len(look.sighting)
+        self.match_count = len(look.observed)
         self.neighbour_count = len(look.neighbourhood.references)
         self.inlier_count = look.explanations[Freedom.BOTH].inlier_count if look.explanations else 0
         self.error_px = self.offset_m = self.turn_deg = self.focal_ratio = None  # type: float | None

@@ -55,7 +55,7 @@ class ResectionOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class ObservedPoints:
     """Points that a photograph shows.
 
     Attributes:
@@ -101,7 +101,7 @@ class Explanation:
 
 
 def explain(
-    sighting: Sighting,
+    observed: ObservedPoints,
     camera: Camera,
     starts: tuple[RigidTransform, ...],
     freedom: Freedom,
@@ -109,20 +109,20 @@ def explain(
 ) -> Explanation:
     """The best fit of those begun at each start; where the pose is not free, the first start is the pose."""
     candidates = [
-        _minimize(sighting, camera, start, freedom, options) for start in (starts if 0 in freedom.value else starts[:1])
+        _minimize(observed, camera, start, freedom, options) for start in (starts if 0 in freedom.value else starts[:1])
     ]
     return min(candidates, key=lambda candidate: candidate.cost)
 
 
 def _minimize(
-    sighting: Sighting, camera: Camera, start: RigidTransform, freedom: Freedom, options: ResectionOptions
+    observed: ObservedPoints, camera: Camera, start: RigidTransform, freedom: Freedom, options: ResectionOptions
 ) -> Explanation:
     camera_from_world, loss_scale = start.inverse(), options.loss_scale_sigma
-    sigma_px = _sigma_px(sighting, camera, camera_from_world)
+    sigma_px = _sigma_px(observed, camera, camera_from_world)
     problem = Resection(
         camera,
-        sighting.x_in_world,
-        sighting.pixel,
+        observed.x_in_world,
+        observed.pixel,
         sigma_px,
         loss_scale,
         freedom.value,
@@ -134,7 +134,7 @@ def _minimize(
     fit = minimize(problem, problem.at(camera_from_world), steps)
     fitted = with_focal(camera, math.exp(fit.log_ratio))
     # Weighed by what points look like from where it ended, so that explanations from different starts can be compared.
-    problem = replace(problem, sigma_px=_sigma_px(sighting, fitted, fit.camera_from_world))
+    problem = replace(problem, sigma_px=_sigma_px(observed, fitted, fit.camera_from_world))
     fit = problem.at(fit.camera_from_world, fit.log_ratio)
     length = np.linalg.norm(fit.residual, axis=1)
     return Explanation(
@@ -152,13 +152,13 @@ def with_focal(camera: Camera, ratio: float) -> Camera:
     return replace(camera, focal_x_px=camera.focal_x_px * ratio, focal_y_px=camera.focal_y_px * ratio)
 
 
-def _sigma_px(sighting: Sighting, camera: Camera, camera_from_world: RigidTransform) -> Array:
+def _sigma_px(observed: ObservedPoints, camera: Camera, camera_from_world: RigidTransform) -> Array:
     """(M,) of each match's residual, the larger axis of the projected point's ellipse added to the keypoint's noise."""
-    x_in_camera = camera_from_world.apply(sighting.x_in_world)
+    x_in_camera = camera_from_world.apply(observed.x_in_world)
     focal = np.array([camera.focal_x_px, camera.focal_y_px])
     jacobian = normalize_jacobian(x_in_camera) * focal[:, None] @ camera_from_world.rotation
-    projected = jacobian @ sighting.point_covariance @ np.swapaxes(jacobian, 1, 2)
+    projected = jacobian @ observed.point_covariance @ np.swapaxes(jacobian, 1, 2)
     half_trace = (projected[:, 0, 0] + projected[:, 1, 1]) / 2
     half_difference = (projected[:, 0, 0] - projected[:, 1, 1]) / 2
     largest = half_trace + np.hypot(half_difference, projected[:, 0, 1])
-    return np.asarray(np.sqrt(sighting.keypoint_sigma_px**2 + np.nan_to_num(largest)))
+    return np.asarray(np.sqrt(observed.keypoint_sigma_px**2 + np.nan_to_num(largest)))

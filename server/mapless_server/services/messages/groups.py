@@ -16,9 +16,9 @@ from mapless_server.engine.engine import EngineOptions
 from mapless_server.engine.groups import GroupResult
 from mapless_server.engine.query import Query
 from mapless_server.method.answer import Variant
+from mapless_server.method.groups.images import PosedImage
 from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate
-from mapless_server.method.groups.images import MatchedSighting
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_server.scenes.retrieval.narrowing import Narrowing
@@ -189,7 +189,7 @@ def _in_axes(world_from_session: Similarity, axes: Axes) -> RigidTransform:
 
 def _set_support(
     message: pb.RigLocalization | pb.SequenceLocalization,
-    matched: Sequence[MatchedSighting],
+    matched: Sequence[PosedImage],
     covariance: Array,
 ) -> None:
     """What the two kinds of answers have in common."""
@@ -205,7 +205,7 @@ def _set_support(
 def _reports(
     outcome: RigEstimate | SequenceEstimate | Rejection, group: GroupResult, queries: Sequence[Query]
 ) -> list[pb.ImageReport]:
-    matched = {} if isinstance(outcome, Rejection) else {it.sighting.image: it for it in outcome.matched}
+    matched = {} if isinstance(outcome, Rejection) else {it.source.image: it for it in outcome.matched}
     reports = []
     for i, (result, query) in enumerate(zip(group.results, queries, strict=True)):
         alone = result.answer
