@@ -26,7 +26,7 @@ from mapless_server.networks.weights.catalogue import CATALOGUE
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.binding import Verdict, advise
-from mapless_server.serve.run import CLOSING_LIMIT_S, LAST_WORDS_S
+from mapless_server.serve.run import CLOSING_LIMIT_S, NOTIFY_S
 from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.settings import PREFIX, Settings, load_settings
 
@@ -188,7 +188,7 @@ def test_the_server_takes_its_environment(folder: str, monkeypatch: pytest.Monke
     assert advice.verdict is (Verdict.WARNING if folder == "base" else Verdict.FINE)
     assert settings.workers == int(container["resources"]["limits"]["cpu"])
     assert pod["spec"]["enableServiceLinks"] is False
-    wanted = settings.drain_delay_s + settings.drain_grace_s + CLOSING_LIMIT_S + LAST_WORDS_S
+    wanted = settings.drain_delay_s + settings.drain_grace_s + CLOSING_LIMIT_S + NOTIFY_S
     sleep = container.get("lifecycle", {}).get("preStop", {}).get("sleep", {}).get("seconds", 0)
     assert pod["spec"]["terminationGracePeriodSeconds"] > sleep + wanted
 

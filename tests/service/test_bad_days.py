@@ -92,7 +92,7 @@ def health_of(client: HealthClient) -> tuple[bool, ...]:
 @pytest.fixture(autouse=True)
 def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
     """At its store, the server."""
-    monkeypatch.setattr(running, "watch_store", partial(watch_store, every_s=0.02))
+    monkeypatch.setattr(running, "watch_store", partial(watch_store, interval_s=0.02))
 
 
 @contextmanager

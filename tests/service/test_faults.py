@@ -277,7 +277,7 @@ class TestMethods:
             assert next(watch).status == NOT_SERVING
             assert server.wait() == 70
             assert "the stage refine has computed for" in server.log
-            assert "the server cannot go on and ends" in server.log
+            assert "the server ends after an unrecoverable failure" in server.log
             with pytest.raises(grpc.RpcError, match="UNAVAILABLE"):
                 next(watch)
 
@@ -293,7 +293,7 @@ class TestMethods:
             server.process.send_signal(signal.SIGTERM)
             assert server.wait() == 70
             assert isinstance(hangs.exception(30), Unavailable)
-            assert "the server cannot go on and ends" in server.log
+            assert "the server ends after an unrecoverable failure" in server.log
 
     def test_one_that_hangs_keeps_no_server_from_stopping(self, tmp_path: Path) -> None:
         """Not noticed as hanging; and with the real limit, in the time that deploy/kubernetes gives."""

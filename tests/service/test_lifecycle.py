@@ -177,7 +177,7 @@ def test_a_server_that_cannot_start_says_why_in_one_line(tmp_path: Path, argumen
     given |= dict(zip(arguments[::2], arguments[1::2], strict=True))
     flat = [part for pair in given.items() for part in pair]
     done = subprocess.run(
-        [sys.executable, "-m", "mapless_tools", "serve", *flat],
+        [sys.executable, "-m", "mapless_server", "--no-metrics", *flat],
         capture_output=True,
         text=True,
         timeout=60,
@@ -193,7 +193,7 @@ def test_a_server_that_cannot_start_says_why_in_one_line(tmp_path: Path, argumen
 def test_a_taken_port_is_not_shared(server: RunningServer, tmp_path: Path) -> None:
     port = server.address.rpartition(":")[2]
     done = subprocess.run(
-        [sys.executable, "-m", "mapless_tools", "serve", "--port", port, "--data-dir", str(tmp_path)],
+        [sys.executable, "-m", "mapless_server", "--no-metrics", "--port", port, "--data-dir", str(tmp_path)],
         capture_output=True,
         text=True,
         timeout=60,
@@ -211,7 +211,7 @@ def test_a_product_uses_one_thread_unless_set_otherwise(environment: dict[str, s
         import sys
         from mapless_server.serve.libraries import configure_libraries
         from mapless_server.settings import Settings
-        from mapless_tools.cli import app
+        import mapless_tools.cli.app
         assert not {"numpy", "scipy", "cv2", "grpc"} & {*sys.modules}
         configure_libraries(Settings())
         import os

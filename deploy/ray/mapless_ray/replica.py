@@ -13,7 +13,7 @@ import ray
 
 from mapless_server.observability.logs import configure_logging
 from mapless_server.serve.assembly import MakeEngine, make_engine
-from mapless_server.serve.run import SWITCH_INTERVAL_S, end_broken
+from mapless_server.serve.run import SWITCH_INTERVAL_S, exit_failed
 from mapless_server.serve.running import running_server
 from mapless_server.settings import Settings, load_settings
 
@@ -69,7 +69,7 @@ class MaplessReplica:
     async def _end_when_broken(self) -> None:
         """Ends the process, which Serve notices at once, rather than wait for its health checks."""
         await asyncio.wait({self._running.failed})
-        await end_broken()
+        await exit_failed()
 
     async def check_health(self) -> None:
         """Serve asks this; raising makes it replace the replica."""

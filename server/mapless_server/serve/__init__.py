@@ -1,5 +1,6 @@
 """The process: from settings to a server that listens, and its end.
 
-May import every room of the package. Begin with `run.serve`, then `running.running_server`, which holds in order what
-must be closed in reverse; `assembly` makes the engine from the settings.
+May import every room of the package. Begin with `run.serve`, which runs until a signal, then `running.running_server`,
+which opens in order what must be closed in reverse; `assembly` makes engine and store from the settings, and `command`
+is the command line. Modules are imported one by one, since `libraries` must be applied before the others are imported.
 """

@@ -1,6 +1,6 @@
-"""From settings to an engine and its store: what serves, and what does without where something is missing.
+"""Makes the engine and its store from the settings, and replaces what `auto` would use and is not installed.
 
-Nothing here imports torch unless the settings ask for a network.
+Nothing here imports torch unless the settings name a network.
 """
 
 from __future__ import annotations
@@ -35,16 +35,15 @@ from mapless_server.store import Store, StoreError
 log = logging.getLogger(__name__)
 
 CHEAP_FEATURES, STRONG_FEATURES = "sift", "aliked"
-"""What `auto` chooses from; both may be used for any purpose.
+"""The features of `auto`; the licences of both allow any use.
 
-On a CPU the first answers, and the second where the first is in doubt: of 159 photographs, 120 of them with 3 to 5
+On a CPU the first is used, and the second where the first is in doubt: of 159 photographs, 120 of them with 3 to 5
 references far apart, SIFT loses 16 at 0.1 s a photograph, ALIKED 3 at 1 to 3 s, and ALIKED after SIFT the same 3 though
-only 53 need it. On a GPU the second is as quick as the first, and answers alone.
+only 53 need it. On a GPU the second is as fast as the first, and is used alone.
 """
 
-
 CACHED_AUDIT_PAIRS = 2000
-"""Pairs of references whose matches audits keep, about 10 KB a pair."""
+"""Pairs of references whose matches audits keep in memory, about 10 KB a pair."""
 
 RETRIEVAL = ("auto", "vlad", "megaloc")
 
@@ -56,14 +55,14 @@ class StartupError(Exception):
 
 
 def image_limits(settings: Settings) -> ImageLimits:
-    """The limits of images that the settings ask for."""
+    """The limits of images in the settings."""
     return ImageLimits(
         max_bytes=settings.max_image_mib * 2**20, max_pixels=round(settings.max_image_megapixels * 1_000_000)
     )
 
 
 def engine_options(settings: Settings) -> EngineOptions:
-    """The engine's options that the settings ask for."""
+    """The engine's options in the settings."""
     return EngineOptions(
         workers=settings.workers,
         max_batch=settings.max_batch,
@@ -93,7 +92,7 @@ MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], Engine]
 
 
 def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
-    """The engine that the settings ask for; StartupError if they name what is not known or not there."""
+    """The engine of the settings; StartupError if they name something unknown or missing."""
     try:
         tiers = make_tiers(settings)
         descriptor = make_descriptor(settings, tiers[0].extractor)
@@ -113,7 +112,7 @@ def engine_over(
     method: Method | None = None,
     descriptor: GlobalDescriptor | None = None,
 ) -> Engine:
-    """An engine and the references in memory that it works on.
+    """An engine and the references in memory that it reads.
 
     Args:
         store: of the references.
@@ -140,7 +139,7 @@ def engine_over(
 
 
 def feature_names(features: str, device: str) -> tuple[str, ...]:
-    """The features that a setting means on "cpu" or "cuda...", the cheapest first.
+    """The features of the setting on "cpu" or "cuda...", the cheapest first.
 
     Raises:
         ValueError: unknown features.
@@ -153,14 +152,13 @@ def feature_names(features: str, device: str) -> tuple[str, ...]:
 
 
 def make_tiers(settings: Settings) -> tuple[Tier, ...]:
-    """The tiers that the settings ask for, the cheapest first.
+    """The tiers of the settings, the cheapest first.
 
-    Of the features that `auto` means, those without weights or packages are left out, and the log says so; at the worst
-    the cheap ones serve alone.
+    `auto` leaves out features without weights or packages, and logs it; at the worst the cheap ones are used alone.
 
     Raises:
         ValueError: unknown features or backend, or there is no such device.
-        WeightsError: weights are not there, or do not fit.
+        WeightsError: weights are missing, or do not fit.
         ImportError: a package that a network needs is not installed.
     """
     device = device_for(settings)
@@ -175,20 +173,13 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
 
 
 def make_descriptor(settings: Settings, extractor: FeatureExtractor) -> GlobalDescriptor:
-    """What references are chosen by; `extractor` is the first tier's.
+    """The descriptor by which references are chosen; `extractor` is the first tier's. Errors as `make_tiers`.
 
-    `auto` is MegaLoc where networks run on a CUDA device and its weights are present: on a CPU it takes seconds.
-
-    Raises:
-        ValueError: unknown kind of retrieval, or there is no such device.
-        WeightsError: weights are not there, or do not fit.
-        ImportError: a package that the network needs is not installed.
+    `auto` is MegaLoc if networks run on a CUDA device and its weights are present: on a CPU it takes seconds.
     """
     if settings.retrieval not in RETRIEVAL:
         raise ValueError(f"unknown retrieval {settings.retrieval!r}; known: {', '.join(RETRIEVAL)}")
-    if settings.retrieval == "vlad":
-        return VladDescriptor.of(extractor)
-    if settings.retrieval == "auto" and device_for(settings) == "cpu":
+    if settings.retrieval == "vlad" or (settings.retrieval == "auto" and device_for(settings) == "cpu"):
         return VladDescriptor.of(extractor)
     try:
         from mapless_server.scenes.retrieval.megaloc import MegaLocDescriptor
@@ -206,14 +197,14 @@ def make_first_features(settings: Settings) -> tuple[str, FeatureExtractor]:
 
 
 def what_is_missing(error: ImportError | WeightsMissing) -> str:
-    """What is not there and what to do about it, for the operator."""
+    """The missing package or weights, and how to get them, for the operator."""
     return install_hint(error) if isinstance(error, ImportError) else str(error)
 
 
 def device_for(settings: Settings) -> str:
-    """What networks run on; errors as `choose_device`.
+    """The device of networks; errors as `choose_device`.
 
-    Where there are none it does not matter, and finding out would take torch, a third of the server's memory.
+    Without networks it is the CPU: looking for others would import torch, a third of the server's memory.
     """
     if settings.device == "auto" and settings.backend == "geometric" and settings.features == CHEAP_FEATURES:
         return "cpu"
@@ -221,7 +212,7 @@ def device_for(settings: Settings) -> str:
 
 
 def choose_device(device: str) -> str:
-    """What networks run on; `auto` is a CUDA device if torch is there and finds one, else the CPU.
+    """The device of networks; `auto` is a CUDA device if torch is installed and finds one, else the CPU.
 
     Raises:
         ValueError: there is no such device.
@@ -230,14 +221,14 @@ def choose_device(device: str) -> str:
     if chosen != "cpu":
         import torch
 
-        # On new GPUs torch prefers cuDNN's attention, which plans for half a second whenever LightGlue meets another
-        # number of keypoints; to be set once, before there are threads.
+        # On new GPUs torch prefers cuDNN's attention, which plans for half a second for each new number of keypoints of
+        # LightGlue. To be set before there are threads.
         torch.backends.cuda.enable_cudnn_sdp(False)
     return chosen
 
 
 def gpu_memory() -> dict[str, float]:
-    """Bytes of the device that networks use, by kind; empty without one. Imports nothing."""
+    """Memory of the CUDA device in use, bytes by kind; empty without one. Does not import torch."""
     torch = sys.modules.get("torch")
     if torch is None or not torch.cuda.is_initialized():
         return {}
@@ -283,15 +274,14 @@ def _make_extractor(name: str, settings: Settings, device: str) -> FeatureExtrac
 
 
 def _make_matcher(name: str, settings: Settings, device: str) -> Matcher:
-    """Nearest neighbours, or on a GPU LightGlue if its weights are there.
+    """Nearest neighbours, or LightGlue on a GPU if its weights are present.
 
     On a CPU LightGlue takes two seconds a pair and gains nothing measurable.
     """
     network = f"{name}-lightglue"
-    if device == "cpu" or network not in WITH_WEIGHTS:
-        return make_matcher(name, available_cores())
-    try:
-        return make_matcher(name, available_cores(), find_weights(network, settings.weights_dir), device)
-    except WeightsMissing as error:
-        log.warning("features %s: matched by nearest neighbours: %s", name, error)
-        return make_matcher(name, available_cores())
+    if device != "cpu" and network in WITH_WEIGHTS:
+        try:
+            return make_matcher(name, available_cores(), find_weights(network, settings.weights_dir), device)
+        except WeightsMissing as error:
+            log.warning("features %s: matched by nearest neighbours: %s", name, error)
+    return make_matcher(name, available_cores())

@@ -1,4 +1,4 @@
-"""What libraries read from the environment when they are imported; a command sets it before it imports them."""
+"""Environment variables that libraries read when they are imported; commands set them before that."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from mapless_server.settings import Settings
 
 
 def configure_libraries(settings: Settings) -> None:
-    """Sets what libraries read from the environment once, when they are imported; what is set already stays."""
+    """Sets the variables; the operator's own values stay."""
     environment = {
-        # Calls run side by side, and matching shares out its own work. The matrices are small, and BLAS threads wait
-        # for one another in a busy loop: with two, on two cores of which one was taken, a call took 1.9 s, not 0.4.
+        # Calls run in parallel, and matching has threads of its own. The matrices are small, and threads of BLAS wait
+        # for one another in a busy loop: with two, on two cores of which one was busy, a call took 1.9 s instead of
+        # 0.4.
         "OPENBLAS_NUM_THREADS": "1",
         "MKL_NUM_THREADS": "1",
-        # Stands behind our own reading of headers.
+        # In addition to our own check of image headers.
         "OPENCV_IO_MAX_IMAGE_PIXELS": str(round(settings.max_image_megapixels * 1_000_000)),
-        # What is wrong with a file or an address, we say ourselves.
+        # Errors of files and addresses are reported by mapless.
         "OPENCV_LOG_LEVEL": "SILENT",
         "GRPC_VERBOSITY": "NONE",
     }

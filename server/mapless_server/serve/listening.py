@@ -1,4 +1,4 @@
-"""The gRPC server of one process: the address it listens on, and what it allows connections."""
+"""The gRPC server of one process: the address it listens on, and the limits of its connections."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from mapless_server.services.handlers import Services
 from mapless_server.settings import Settings
 
 MAX_CONCURRENT_RPCS = 2048
-"""Calls at a time, from all connections. Far above what the queue admits; health probes count, and calls of which only
-the headers have come, each of which `receiving` gives but a time."""
+"""Calls at a time, of all connections. Far above what the queue admits: health probes count, and calls of which only
+the headers have come, whose time `rpc.receiving` limits."""
 MAX_CALLS_PER_CONNECTION = 128
-"""Far below that, so that no connection can use it up; a client with more at a time sends them one after another."""
+"""Far below that, so that one connection cannot take all; a client sends further calls as earlier ones end."""
 
 _LAST_BYTES_S = 0.5
-"""For answers that are on their way when the last call has ended."""
+"""Time for answers in transit when the last call has ended."""
 
 
 class AddressTaken(Exception):
@@ -50,11 +50,11 @@ class GrpcServer:
             raise AddressTaken(f"cannot listen on {address}: in use, or not an address of ours") from error
 
     async def start(self) -> None:
-        """Takes calls."""
+        """Accepts calls."""
         await self._server.start()
 
     async def stop(self) -> None:
-        """Takes no more calls; those whose answers are on their way get a moment."""
+        """Accepts no more calls; answers in transit get a moment."""
         await self._server.stop(_LAST_BYTES_S)
 
     async def close(self) -> None:
@@ -67,7 +67,7 @@ def _options(settings: Settings) -> list[tuple[str, int]]:
     return [
         ("grpc.max_receive_message_length", max_message_bytes),
         ("grpc.max_send_message_length", max_message_bytes),
-        # With reuseport, the default, a second server silently shares the port and takes half of the calls.
+        # With reuseport, the default, a second server shares the port silently and gets half of the calls.
         ("grpc.so_reuseport", 0),
         ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
         ("grpc.max_metadata_size", 16 * 1024),
@@ -75,11 +75,11 @@ def _options(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.http2.min_ping_interval_without_data_ms", 30_000),
         ("grpc.http2.max_ping_strikes", 2),
         ("grpc.keepalive_permit_without_calls", 0),
-        # Notices clients that went away without a word, so that what they asked for is not computed.
+        # Detects clients that vanished, so that their queries are not computed.
         ("grpc.keepalive_time_ms", 60_000),
         ("grpc.keepalive_timeout_ms", 20_000),
         ("grpc.max_connection_idle_ms", 15 * 60_000),
-        # Clients come back by another connection, and perhaps to another server that was added meanwhile.
+        # Clients connect again, perhaps to a server that was added meanwhile.
         ("grpc.max_connection_age_ms", 30 * 60_000),
         ("grpc.max_connection_age_grace_ms", round(1000 * settings.max_deadline_s)),
     ]

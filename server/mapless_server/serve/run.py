@@ -1,4 +1,4 @@
-"""Runs the server until it is told to stop, or something inside it breaks."""
+"""Runs the server until a signal stops it, or a failure inside it."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from .running import running_server
 log = logging.getLogger(__name__)
 
 FATAL_EXIT_CODE = 70
-"""EX_SOFTWARE: something inside is broken; whoever supervises the process starts it anew."""
+"""EX_SOFTWARE: the process failed, and its supervisor should restart it."""
 
-LAST_WORDS_S = 1.0
-"""For callers and health watchers to be told before a broken process ends."""
+NOTIFY_S = 1.0
+"""Time to notify callers and health watchers before a failed process ends."""
 
 CLOSING_LIMIT_S = 15.0
-"""After the calls' own time, for threads to be through with their step, traces and the store; then whatever still runs
-hangs. With the drain's times it must be less than what the supervisor gives, see deploy/kubernetes."""
+"""Time after the drain for threads to end their step, for traces and for the store; then the process hangs. Together
+with the drain's times it must be less than the supervisor's limit, see deploy/kubernetes."""
 
 SWITCH_INTERVAL_S = 0.001
-"""How long a computing thread keeps the interpreter from the event loop; Python's own 5 ms add up to late answers."""
+"""Longest time that a computing thread blocks the event loop; Python's default of 5 ms adds up to late answers."""
 
 
 async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
-    """Serves until SIGTERM or SIGINT, then lets running calls finish; StartupError if it cannot begin.
+    """Serves until SIGTERM or SIGINT, then lets running calls finish; StartupError if it cannot start.
 
-    If something inside breaks that cannot be mended, even while it stops, or hangs when all calls have had their time,
-    the process ends with FATAL_EXIT_CODE.
+    After an unrecoverable failure, also while it stops, or if it hangs after the drain, the process ends with
+    FATAL_EXIT_CODE.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     stop = asyncio.Event()
@@ -53,30 +53,30 @@ async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
             await asyncio.wait({starting})
             return
         running = starting.result()
-        # What is there by now stays; going through it again and again would only stop the event loop.
+        # Present objects stay; scanning them again would only block the event loop.
         gc.collect()
         gc.freeze()
-        # Read by programs that start a server on port 0: keep its form.
+        # Parsed by programs that start a server on port 0: keep its form.
         print(f"mapless-server listening on {running.address}", flush=True)
         ended: set[asyncio.Future[Any]] = {stopped, running.failed}
         await asyncio.wait(ended, return_when=asyncio.FIRST_COMPLETED)
         if running.failed.done():
-            await end_broken()
+            await exit_failed()
         log.info("stopping: running calls get %g s", settings.drain_grace_s)
         closing = asyncio.ensure_future(stack.aclose())
         limit_s = settings.drain_delay_s + settings.drain_grace_s + CLOSING_LIMIT_S
         ended = {closing, running.failed}
         await asyncio.wait(ended, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
         if running.failed.done():
-            await end_broken()
+            await exit_failed()
         if not closing.done():
             log.critical("the server hangs: it has not stopped after %g s", limit_s)
-            await end_broken()
+            await exit_failed()
         await closing
 
 
-async def end_broken() -> NoReturn:
-    """Ends the process when callers have been told; whoever supervises it starts it anew."""
-    await asyncio.sleep(LAST_WORDS_S)
+async def exit_failed() -> NoReturn:
+    """Ends the process when callers have been notified, for its supervisor to restart it."""
+    await asyncio.sleep(NOTIFY_S)
     logging.shutdown()
-    os._exit(FATAL_EXIT_CODE)  # threads may hang, so none is waited for
+    os._exit(FATAL_EXIT_CODE)  # not waiting for threads, which may hang

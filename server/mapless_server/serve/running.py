@@ -1,4 +1,4 @@
-"""A running server: its parts put together, and taken apart in order when its block is left."""
+"""A running server: opens its parts in order, and closes them in reverse when its block is left."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ from mapless_server.security.protection import Protection
 from mapless_server.security.reloading import keep_fresh
 from mapless_server.services.capture.calls import CaptureError
 from mapless_server.services.capture.opening import open_recorder
-from mapless_server.services.capture.recorder import Recorder
 from mapless_server.services.handlers import Services
 from mapless_server.settings import Settings
 from mapless_server.store import Store
@@ -42,7 +41,7 @@ _HEARTBEAT_LIMIT_S = 5.0
 
 
 class Listener(Protocol):
-    """Brings the services their calls; bound to its address when it is made.
+    """Receives the calls of the services; bound to its address when it is made.
 
     Attributes:
         address: "host:port".
@@ -51,10 +50,10 @@ class Listener(Protocol):
     address: str
 
     async def start(self) -> None:
-        """Takes calls."""
+        """Accepts calls."""
 
     async def stop(self) -> None:
-        """Takes no more calls; all have been answered, but the last bytes may be on their way."""
+        """Accepts no more calls; all are answered, but the last bytes may be in transit."""
 
     async def close(self) -> None:
         """Ends at once; may follow `stop`."""
@@ -70,8 +69,8 @@ class Running:
     Attributes:
         address: "host:port".
         metrics_address: the same of the metrics; empty if there are none.
-        engine: what computes.
-        failed: done when something inside is broken and nothing will be computed any more.
+        engine: of the services.
+        failed: done after an unrecoverable failure: nothing will be computed any more.
     """
 
     address: str
@@ -86,65 +85,68 @@ async def running_server(
 ) -> AsyncIterator[Running]:
     """A running server, for use within a program; it is drained when the block is left.
 
-    It listens from the first moment on, and is opened when its engine is warm.
+    It listens at once, and serves when its engine is warm.
 
     Args:
         settings: port 0 takes any free one.
-        make: makes the engine, in a thread of its own: networks take long to load. Closed at the end.
-        store: what the engine reads; opened from the settings if None. Closed at the end either way, but not if the
-            settings' protection is refused.
-        listen: makes what brings the calls.
+        make: makes the engine, in a thread, because networks take long to load. The engine is closed at the end.
+        store: of the references; opened from the settings if None. Closed at the end, unless the settings' protection
+            is rejected.
+        listen: makes the listener.
 
     Raises:
-        StartupError: no such backend or features, the data folder or a file cannot be used, a port is taken, or the
+        StartupError: unknown backend or features, the data folder or a file cannot be used, a port is taken, or the
             first localization fails.
     """
-    metrics = Metrics()
     async with AsyncExitStack() as stack:
-        protection = _make_protection(settings)  # before there is a store: a refused start leaves none
-        store = store or open_store(settings)
-        store.observer = metrics
-        stack.push_async_callback(asyncio.to_thread, store.close)
-        tracer = _make_tracer(settings)
-        stack.push_async_callback(asyncio.to_thread, tracer.close, _TRACES_FLUSH_S)
-        metrics_address = _serve_metrics(settings, metrics, store, protection, stack)
-        recorder = await _open_recorder(settings, store, metrics)
-        if recorder is not None:
-            stack.push_async_callback(asyncio.to_thread, recorder.close)
-        authenticate = protection.authenticator.authenticate
-        services = Services(settings, store, metrics, authenticate=authenticate, tracer=tracer, recorder=recorder)
-        stack.push_async_callback(services.close)
-        await services.set_serving(False)
-        listener = _make_listener(listen, settings, services, protection)
-        stack.push_async_callback(listener.close)
-        await listener.start()
-        engine = await asyncio.to_thread(make, settings, store, metrics, protection.quota)
-        stack.push_async_callback(engine.close)
-        failed: asyncio.Future[Fatal] = asyncio.get_running_loop().create_future()
-        _watch_engine(engine, metrics)
-        engine.queue.on_fatal = lambda fatal: _announce_failure(fatal, failed, metrics)
-        _keep(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
-        _keep(stack, keep_fresh(protection.refreshable))
-        _keep(stack, watch_store(store, services.set_changeable))
-        _keep(stack, _stop_serving(services, failed))
-        await _warm_up(settings, engine, metrics)
-        await services.open(engine)
-        stack.push_async_callback(listener.stop)
-        stack.push_async_callback(services.drain, settings.drain_delay_s, settings.drain_grace_s)
-        yield Running(listener.address, metrics_address, engine, failed)
+        try:
+            running = await _start(stack, settings, make, store, listen)
+        except (AddressTaken, CaptureError, SecurityError) as error:
+            raise StartupError(str(error)) from error
+        yield running
+
+
+async def _start(
+    stack: AsyncExitStack, settings: Settings, make: MakeEngine, store: Store | None, listen: Listen
+) -> Running:
+    metrics = Metrics()
+    protection = Protection.of(settings)  # first, so that a rejected start makes no store
+    store = store or open_store(settings)
+    store.observer = metrics
+    stack.push_async_callback(asyncio.to_thread, store.close)
+    tracer = _make_tracer(settings)
+    stack.push_async_callback(asyncio.to_thread, tracer.close, _TRACES_FLUSH_S)
+    metrics_address = _serve_metrics(settings, metrics, store, protection, stack)
+    recorder = await asyncio.to_thread(open_recorder, settings, store, metrics)
+    if recorder is not None:
+        stack.push_async_callback(asyncio.to_thread, recorder.close)
+    authenticate = protection.authenticator.authenticate
+    services = Services(settings, store, metrics, authenticate=authenticate, tracer=tracer, recorder=recorder)
+    stack.push_async_callback(services.close)
+    await services.set_serving(False)
+    listener = listen(settings, services, None if protection.tls is None else protection.tls.server_credentials())
+    stack.push_async_callback(listener.close)
+    await listener.start()
+    engine = await asyncio.to_thread(make, settings, store, metrics, protection.quota)
+    stack.push_async_callback(engine.close)
+    failed: asyncio.Future[Fatal] = asyncio.get_running_loop().create_future()
+    _observe_engine(engine, metrics)
+    engine.queue.on_fatal = lambda fatal: _on_fatal(fatal, failed, metrics)
+    _run_task(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
+    _run_task(stack, keep_fresh(protection.refreshable))
+    _run_task(stack, watch_store(store, services.set_changeable))
+    _run_task(stack, _stop_serving(services, failed))
+    await _warm_up(settings, engine, metrics)
+    await services.open(engine)
+    stack.push_async_callback(listener.stop)
+    stack.push_async_callback(services.drain, settings.drain_delay_s, settings.drain_grace_s)
+    return Running(listener.address, metrics_address, engine, failed)
 
 
 async def _stop_serving(services: Services, failed: asyncio.Future[Fatal]) -> None:
-    """Health says so when the server has failed."""
+    """Reports NOT_SERVING when the server has failed."""
     await asyncio.wait({failed})
     await services.set_serving(False)
-
-
-def _make_protection(settings: Settings) -> Protection:
-    try:
-        return Protection.of(settings)
-    except SecurityError as error:
-        raise StartupError(str(error)) from error
 
 
 def _make_tracer(settings: Settings) -> Tracer:
@@ -163,7 +165,7 @@ def _make_tracer(settings: Settings) -> Tracer:
 def _serve_metrics(
     settings: Settings, metrics: Metrics, store: Store, protection: Protection, stack: AsyncExitStack
 ) -> str:
-    """Where the metrics are served, "host:port"; empty if they are not."""
+    """Serves the metrics; gives "host:port", empty if the settings switch them off."""
     metrics.scraped.reference_cache = lambda: store.reference_cache
     if protection.tls is not None:
         tls = protection.tls
@@ -181,29 +183,15 @@ def _serve_metrics(
     return address
 
 
-def _watch_engine(engine: Engine, metrics: Metrics) -> None:
+def _observe_engine(engine: Engine, metrics: Metrics) -> None:
     first = engine.tiers[0]
     reconstructor = first.pipeline.reconstructor
     metrics.built(__version__, reconstructor.name, first.extractor.name, reconstructor.weights_sha256)
     metrics.scraped.retrieval_index = lambda: engine.references.index_bytes
     metrics.scraped.gpu_memory = gpu_memory
-    cache = getattr(reconstructor, "cache", None)  # of tokens; only networks have one
+    cache = getattr(reconstructor, "cache", None)  # of tokens; networks have one
     if cache is not None:
         metrics.scraped.token_cache = lambda: cache.counters
-
-
-async def _open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorder | None:
-    try:
-        return await asyncio.to_thread(open_recorder, settings, store, metrics)
-    except CaptureError as error:
-        raise StartupError(str(error)) from error
-
-
-def _make_listener(listen: Listen, settings: Settings, services: Services, protection: Protection) -> Listener:
-    try:
-        return listen(settings, services, None if protection.tls is None else protection.tls.server_credentials())
-    except AddressTaken as error:
-        raise StartupError(str(error)) from error
 
 
 async def _warm_up(settings: Settings, engine: Engine, metrics: Metrics) -> None:
@@ -221,18 +209,18 @@ async def _warm_up(settings: Settings, engine: Engine, metrics: Metrics) -> None
     log.info("warm after %.1f s", time.monotonic() - start_s)
 
 
-def _announce_failure(fatal: Fatal, failed: asyncio.Future[Fatal], metrics: Metrics) -> None:
+def _on_fatal(fatal: Fatal, failed: asyncio.Future[Fatal], metrics: Metrics) -> None:
     if not failed.done():
         metrics.failed_fatally()
-        log.critical("the server cannot go on and ends: %s", fatal)
+        log.critical("the server ends after an unrecoverable failure: %s", fatal)
         failed.set_result(fatal)
 
 
-def _keep(stack: AsyncExitStack, work: Coroutine[Any, Any, None]) -> None:
-    """Runs it until the stack is left; should it fail, the log says so at once."""
+def _run_task(stack: AsyncExitStack, work: Coroutine[Any, Any, None]) -> None:
+    """Runs a task until the stack is left; logs its failure at once."""
     task = asyncio.ensure_future(work)
 
-    def complain(_: asyncio.Task[None]) -> None:
+    def log_failure(_: asyncio.Task[None]) -> None:
         if not task.cancelled() and (error := task.exception()) is not None:
             log.critical("a task of the server ended", exc_info=error)
 
@@ -240,5 +228,5 @@ def _keep(stack: AsyncExitStack, work: Coroutine[Any, Any, None]) -> None:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 
-    task.add_done_callback(complain)
+    task.add_done_callback(log_failure)
     stack.push_async_callback(end)

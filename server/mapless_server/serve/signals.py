@@ -1,4 +1,4 @@
-"""What commands do with signals."""
+"""Signals of commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """SIGTERM ends this program as an exception does, so that servers and temporary folders go with it."""
+    """SIGTERM raises SystemExit within the block, so that child servers and temporary folders are removed."""
 
     def leave(*_: Any) -> None:
         sys.exit(128 + signal.SIGTERM)

@@ -1,8 +1,7 @@
-"""Whether scenes can be changed: health says of the ReferenceService alone that it does not serve while they cannot.
+"""Health of the ReferenceService: NOT_SERVING while the store cannot be changed.
 
-Queries go on, of what is in memory and what can be read; so neither the server as a whole nor its other service is to
-be taken out of service because of a disk that is full or can only be read. Of a database that servers share nothing is
-said: while it is away, none of them could do better.
+Queries still read what is in memory and on the disk, so a disk that is full or read-only does not end the service of
+the whole server. A database that servers share is not watched: while it is down, no other server is better.
 """
 
 from __future__ import annotations
@@ -17,20 +16,22 @@ from mapless_server.store import Store
 
 log = logging.getLogger(__name__)
 
-LOOK_EVERY_S = 5.0
-"""Between looks; only a store whose last change failed is then tried by writing to it."""
+CHECK_INTERVAL_S = 5.0
+"""A check writes to the store only if its last change failed."""
 
 
-async def watch_store(store: Store, tell: Callable[[bool], Awaitable[None]], every_s: float = LOOK_EVERY_S) -> None:
-    """Tells whether the store can be changed, when that is other than it was, until it is cancelled.
+async def watch_store(
+    store: Store, notify: Callable[[bool], Awaitable[None]], interval_s: float = CHECK_INTERVAL_S
+) -> None:
+    """Notifies of each change of whether the store can be written, until it is cancelled.
 
     Args:
-        store: what is looked at; it is tried once at the beginning.
-        tell: hears of it; told nothing, it believes that the store can be changed.
-        every_s: between looks.
+        store: written to once at the beginning.
+        notify: called with the new value; the first one is compared with True.
+        interval_s: time between checks.
     """
     if store.database.is_shared:
-        return  # where a database is away, no other server could do better
+        return
     could = True
     await _try(store)
     while True:
@@ -41,13 +42,13 @@ async def watch_store(store: Store, tell: Callable[[bool], Awaitable[None]], eve
                 "the store %s",
                 "can be changed again" if can else f"cannot be changed: {store.write_fault}",
             )
-            await tell(can)
+            await notify(can)
         could = can
-        await asyncio.sleep(every_s)
+        await asyncio.sleep(interval_s)
         if store.write_fault:
             await _try(store)
 
 
 async def _try(store: Store) -> None:
-    with suppress(RequestError):  # the store notes it
+    with suppress(RequestError):  # the store keeps it as its write_fault
         await asyncio.to_thread(store.try_writing)

@@ -1,6 +1,6 @@
-"""A real localization before the first call: what is broken shows at the start, and what is slow once is done.
+"""Localizes a photograph before the first call: finds failures at the start, and does what is slow only once.
 
-Photographs are made on the spot: two walls with random patterns, one before the other, seen from four places.
+The photographs are rendered: two walls with random patterns, one before the other, from four camera centres.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from mapless_server.store import SceneAttributes
 log = logging.getLogger(__name__)
 
 ROUNDS = 2
-"""The first is slow and is forgotten; the second tells the queue what a query usually takes."""
+"""The first is slow, and its times are discarded; the second gives the queue the usual time of a query."""
 
 MAX_ERROR_M = 0.1
-"""The scene is easy: a pose that is further off means that something is broken."""
+"""The scene is easy: a larger error means a failure."""
 
 _LIMIT_S = 600.0  # networks may be compiled by the first photograph
 _CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
@@ -51,8 +51,8 @@ class WarmUpFailed(Exception):
 
 
 async def warm_up(engine: Engine) -> None:
-    """Localizes until the queue knows what to expect; WarmUpFailed if the answer is not right."""
-    # Before the queue's clock runs: describing references is no part of a usual query.
+    """Localizes until the queue can predict the time of a query; WarmUpFailed if the answer is wrong."""
+    # Outside the queue, because describing references is no part of a usual query.
     references = await asyncio.to_thread(_RenderedReferences, [tier.extractor for tier in engine.tiers])
     query_pose = _pose(_QUERY_X_M)
     image = await asyncio.to_thread(_photograph, query_pose)
@@ -65,7 +65,7 @@ async def warm_up(engine: Engine) -> None:
         options=LocalizeOptions(),
     )
     for number in range(ROUNDS):
-        # Of no tenant: nobody's computing time is charged for it.
+        # Without a tenant, so that no quota is charged.
         caller = Caller(Flow("", "warm-up"), time.monotonic() + _LIMIT_S)
         result = await engine.run(engine.query_job(query, caller, references))
         outcome = result.answer.outcome
@@ -79,7 +79,7 @@ async def warm_up(engine: Engine) -> None:
 
 
 class _RenderedReferences:
-    """Stands in for the store."""
+    """The source of references in place of the store."""
 
     def __init__(self, extractors: Sequence[FeatureExtractor]) -> None:
         self._views = {
@@ -124,13 +124,13 @@ def _posed_view(name: str, world_from_camera: RigidTransform, extractor: Feature
 
 
 def _pose(x_m: float) -> RigidTransform:
-    """At a place on a line along the walls, turned a little towards their middle."""
+    """world_from_camera of a camera on a line along the walls, turned a little towards their middle."""
     rotation, _ = cv2.Rodrigues(np.array([0.0, -0.15 * x_m, 0.0]))
     return RigidTransform(np.asarray(rotation, np.float64), np.array([x_m, 0.1 * x_m, 0.0]))
 
 
 def _render(world_from_camera: RigidTransform) -> NDArray[np.uint8]:
-    """What a camera sees of the walls, (H, W, 3) RGB."""
+    """The camera's image of the walls, (H, W, 3) RGB."""
     canvas = np.zeros((_CAMERA.height_px, _CAMERA.width_px, 3), np.uint8)
     camera_from_world = world_from_camera.inverse()
     for seed, (distance_m, half_side_m) in enumerate(_WALLS):
@@ -148,7 +148,7 @@ def _render(world_from_camera: RigidTransform) -> NDArray[np.uint8]:
 
 
 def _texture(seed: int) -> NDArray[np.uint8]:
-    """Blobs of several sizes."""
+    """Smooth noise at three scales, (512, 512, 3)."""
     random = np.random.default_rng(seed)
     layers = [
         cv2.resize(random.uniform(0, 255, (size, size, 3)), (_TEXTURE_PX, _TEXTURE_PX), interpolation=cv2.INTER_CUBIC)
