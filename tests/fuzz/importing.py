@@ -23,7 +23,7 @@ from mapless.names import check_id
 from mapless_tools.dataset import SPLITS, Dataset, read_frame
 from mapless_tools.ingest.formats import ReadOptions, read_dataset, recognize
 from mapless_tools.ingest.formats.collecting import check_camera
-from mapless_tools.ingest.formats.colmap.camera_models import from_camera
+from mapless_tools.ingest.formats.colmap.cameras import from_camera
 from mapless_tools.ingest.formats.colmap.writing import PosedImage
 from mapless_tools.ingest.formats.writing import cameras_files
 

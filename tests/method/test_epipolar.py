@@ -18,9 +18,9 @@ from mapless_server.method.epipolar import consistent_matches, pair_error_px, sa
 from mapless_server.method.views import PosedView, View
 from mapless_tools.dataset import Frame
 from mapless_tools.ingest.check import check_frames
-from mapless_tools.ingest.pair_errors import MatchedPair
-from mapless_tools.ingest.pairs import more_pairs, pairs_by_order, pairs_by_pose
-from mapless_tools.ingest.verdict import Verdict, judge, suspects_of
+from mapless_tools.ingest.check.errors import MatchedPair
+from mapless_tools.ingest.check.pairs import more_pairs, pairs_by_order, pairs_by_pose
+from mapless_tools.ingest.check.verdict import Verdict, judge, suspects_of
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

@@ -11,7 +11,7 @@ import pytest
 from mapless.geometry import RigidTransform
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.ingest.check import check_frames
-from mapless_tools.ingest.verdict import Verdict
+from mapless_tools.ingest.check.verdict import Verdict
 
 pytestmark = pytest.mark.realdata
 

@@ -84,7 +84,7 @@ def test_what_was_found_before_the_end_is_told(
     def connected(*_: Any) -> Iterator[Ending]:
         yield Ending()
 
-    monkeypatch.setattr("mapless_tools.ingest.connection.connected", connected)
+    monkeypatch.setattr("mapless_tools.connection.connected", connected)
     report, html = tmp_path / "report.json", tmp_path / "report.html"
     arguments = ["audit", "hall", "--address", "127.0.0.1:1", "--report", str(report), "--html", str(html)]
     result = CliRunner().invoke(app, arguments)

@@ -61,9 +61,9 @@ def calibrate_command(
     """
     from mapless import MaplessError
     from mapless_tools.child import ServerFailed
+    from mapless_tools.connection import Connection
     from mapless_tools.evaluate.command import usage_errors
     from mapless_tools.evaluate.plan import UsageError
-    from mapless_tools.ingest.connection import Connection
 
     from .run import CalibrateOptions, calibrate, clear_calibration
 

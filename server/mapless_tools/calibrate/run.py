@@ -19,11 +19,11 @@ from mapless_server.serve.signals import terminable
 from mapless_server.services.messages.factors import Factors
 from mapless_server.settings import Settings, load_settings
 from mapless_tools.child import child_server
+from mapless_tools.connection import Connection, connected
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.evaluate.command import usage_errors
 from mapless_tools.evaluate.plan import EvaluationOptions, UsageError, check_images
 from mapless_tools.evaluate.run import CONNECT, plan_for, store_references
-from mapless_tools.ingest.connection import Connection, connected
 from mapless_tools.ingest.formats import read_dataset
 from mapless_tools.output_files import write_json
 from mapless_tools.progress import Progress, progress_bars

@@ -52,7 +52,7 @@ def audit_command(
     from mapless_server.serve.signals import terminable
     from mapless_server.settings import ConfigError, load_settings
     from mapless_tools.child import ServerFailed
-    from mapless_tools.ingest.connection import Connection, connected
+    from mapless_tools.connection import Connection, connected
     from mapless_tools.output_files import check_writable
     from mapless_tools.progress import progress_bars
 

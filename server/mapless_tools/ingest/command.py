@@ -12,8 +12,8 @@ import typer
 
 if TYPE_CHECKING:
     from mapless_server.settings import Settings
+    from mapless_tools.connection import Connection
 
-    from .connection import Connection
     from .formats import Intrinsics
     from .importing import ImportOptions
     from .report import ImportReport
@@ -65,8 +65,8 @@ def import_command(
 ) -> None:
     """Store the posed photographs of a folder as references of a scene; run it again to go on where it was cut off."""
     from mapless_server.settings import ConfigError
+    from mapless_tools.connection import Connection
 
-    from .connection import Connection
     from .formats import ReadOptions
     from .importing import ImportOptions
     from .waiting import UploadOptions
@@ -110,9 +110,9 @@ def export_command(
     from mapless_server.serve.signals import terminable
     from mapless_server.settings import ConfigError
     from mapless_tools.child import ServerFailed
+    from mapless_tools.connection import Connection, connected
     from mapless_tools.progress import progress_bars
 
-    from .connection import Connection, connected
     from .exporting import check_target, export_scene
 
     try:
@@ -185,9 +185,9 @@ def _run_import(
 def _store(report: ImportReport, options: ImportOptions, settings: Settings, connection: Connection) -> None:
     from mapless import MaplessError
     from mapless_tools.child import ServerFailed
+    from mapless_tools.connection import connected
     from mapless_tools.progress import progress_bars
 
-    from .connection import connected
     from .importing import store_frames
 
     try:

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from mapless_tools.dataset import Dataset, Frame, Refusal
 
-from .verdict import Verdict
+from .check import Verdict
 
 SHOWN = 20
 ALREADY_THERE = "already there"

@@ -40,7 +40,7 @@ def view_command(
     from mapless_server.serve.signals import terminable
     from mapless_server.settings import ConfigError, load_settings
     from mapless_tools.child import ServerFailed
-    from mapless_tools.ingest.connection import Connection, reachable
+    from mapless_tools.connection import Connection, reachable
 
     if not is_loopback(host):
         _fail(

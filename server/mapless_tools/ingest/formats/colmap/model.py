@@ -10,8 +10,9 @@ import numpy as np
 
 from mapless.geometry import Array, Camera, Quaternion, RigidTransform
 
-from . import binary, text
-from .camera_models import ColmapCamera
+from . import files as binary
+from . import text
+from .cameras import ColmapCamera
 from .records import ImageRecord
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ..collecting import read_text
-from .camera_models import PARAMETERS, ColmapCamera
+from .cameras import PARAMETERS, ColmapCamera
 from .records import ImageRecord
 
 

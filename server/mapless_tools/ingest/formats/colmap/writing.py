@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from mapless.geometry import Camera, RigidTransform
 
-from .camera_models import from_camera
+from .cameras import from_camera
 
 FILES = ("cameras.txt", "images.txt", "points3D.txt")
 

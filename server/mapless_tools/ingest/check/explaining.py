@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .conventions import CONVENTIONS, FOCAL_SCALES, Correction, corrected, focal_scaled
-from .pair_errors import MatchedPair, PairError, Views, errors_of, summary, summary_with
+from .errors import MatchedPair, PairError, Views, errors_of, summary, summary_with
 
 FOCAL_TOLERANCE = 0.03
 """A focal length that would have to change by less is not the reason."""

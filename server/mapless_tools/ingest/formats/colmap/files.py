@@ -7,7 +7,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from .camera_models import MODEL_NAMES, PARAMETERS, ColmapCamera
+from .cameras import MODEL_NAMES, PARAMETERS, ColmapCamera
 from .records import ImageRecord
 
 _POINT_BYTES = 24  # x, y, point3D_id of an observation

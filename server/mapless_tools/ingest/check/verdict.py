@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .errors import THRESHOLD_PX, MatchedPair, PairError, Views, errors_of, summary
 from .explaining import explain
-from .pair_errors import THRESHOLD_PX, MatchedPair, PairError, Views, errors_of, summary
 
 _WRONG_SHARE = 0.4  # more bad pairs than one photograph in five could make
 _GUILTY_SHARE = 0.6

@@ -19,7 +19,7 @@ from mapless_server.settings import available_cores
 from mapless_tools.dataset import Frame
 from mapless_tools.progress import Progress
 
-from .pair_errors import MatchedPair
+from .errors import MatchedPair
 from .pairs import Pair, more_pairs, pairs_by_order, pairs_by_pose
 from .verdict import Verdict, judge
 

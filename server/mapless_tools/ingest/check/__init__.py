@@ -1,0 +1,9 @@
+"""Whether photographs fit their poses, before they are stored: matched points of neighbours must satisfy the poses.
+
+Imports the method of `mapless_server`, and nothing of the import itself. Begin with `comparing`.
+"""
+
+from .comparing import check_frames
+from .verdict import Verdict
+
+__all__ = ["Verdict", "check_frames"]
