@@ -49,10 +49,10 @@ HOST, DEVICE = "host", "device"
 """The lanes: threads for what the CPU does, and the one that has a network's device."""
 
 DESCRIBE, RETRIEVE, AUDIT, COVERAGE = "describe", "retrieve", "audit", "coverage"
-"""What is computed beside localizing, item by item."""
+"""Computed beside localizing, item by item."""
 
 JOIN = "join"
-"""What is computed of several photographs that were localized, together."""
+"""Poses several photographs together that were localized each by itself."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ class Engine:
 
     @contextmanager
     def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
-        """Counts the photographs of a group as held for as long as its call lasts, whichever of them are queued.
+        """Counts the memory of a group's photographs for as long as its call lasts, whichever of them are queued.
 
         Raises:
             RequestError: there is no room for them.
@@ -188,12 +188,12 @@ class Engine:
             yield
 
     def check_room(self) -> None:
-        """Raises RequestError if no query of anybody would be admitted now: then none has to be looked at."""
+        """Raises RequestError if no query would be admitted now, whatever it is: then its message need not be read."""
         with _as_request_errors():
             self.queue.check_room(Step(PREPARE, "", "", None))
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
-        """What is found in photographs, in order.
+        """Features and descriptors of photographs, in order.
 
         Raises:
             RequestError: a bad image, a full queue, a passed deadline.
@@ -220,9 +220,9 @@ class Engine:
     async def audit(
         self, scene_key: SceneKey, reference_ids: Sequence[str], caller: Caller, are_listed: bool = False
     ) -> tuple[int, list[ReferenceAudit]]:
-        """The scene's generation, and what the neighbours of some of its references say about them, in order.
+        """The scene's generation, and the audits of some of its references by their neighbours, in order.
 
-        Those that are not there are left out if they were listed, not named by the caller.
+        Missing ones are left out if they were listed, not named by the caller.
 
         Raises:
             RequestError: an unknown scene or named reference, a full queue, a passed deadline.
@@ -243,11 +243,11 @@ class Engine:
 
     @property
     def parallel_queries(self) -> int:
-        """How many queries are worth being underway at a time."""
+        """How many queries of one call are worth computing at a time."""
         return max(self.options.workers, self.options.max_batch)
 
     async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
-        """What is computed of several photographs' answers, in its turn, however full the queue is.
+        """Computes from several photographs' answers, in its turn, however full the queue is.
 
         Raises:
             RequestError: a passed deadline.
@@ -270,7 +270,7 @@ class Engine:
         jobs: int | None = None,
         continues: bool = False,
     ) -> list[ResultT]:
-        """Computes items by several jobs, or else as many as there are threads; others have their turn in between."""
+        """Computes items by several jobs, or as many as there are threads; other jobs are computed in between."""
         work = ItemList(items, compute)
         jobs = min(jobs or self.options.workers, len(items))
         step = Step(stage, stage, stage, work)
@@ -302,7 +302,7 @@ class Engine:
         self.references.forget_scene(scene_key)
 
     async def close(self) -> None:
-        """Ends what is being computed at its next step, and drops what waits."""
+        """Ends running computations at their next step, and drops waiting ones."""
         await self.queue.close()
         await asyncio.to_thread(self._close)
 
@@ -333,7 +333,7 @@ async def _unless_refused(submission: Awaitable[Any]) -> Refused | None:
 
 @contextmanager
 def _as_request_errors() -> Iterator[None]:
-    """What the queue raises, as the caller is told."""
+    """Turns what the queue raises into errors of requests."""
     try:
         yield
     except Refused as refused:

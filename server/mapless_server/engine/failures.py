@@ -1,4 +1,4 @@
-"""What an exception of a computation means for the work queue. Knows torch's by name: the server may be without it."""
+"""What an exception of a computation means for the work queue. Knows torch's by name: it need not be installed."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from mapless_server.errors import (
 from mapless_server.scheduling import Failure
 
 _CALLERS = (InvalidArgument, Unauthenticated, PermissionDenied, NotFound, AlreadyExists, FailedPrecondition)
-"""What the caller has to mend. The other errors of requests are told to callers, too, but are the server's."""
+"""The caller's mistakes. Other errors of requests are sent to callers, too, but are the server's."""
 
 _LOST = re.compile(r"CUDA error|CUBLAS_STATUS_(?!ALLOC_FAILED)|CUDNN_STATUS_(?!ALLOC_FAILED)|device-side assert")
-"""After any of these every later call fails too, or worse, gives garbage: the context is poisoned."""
+"""After any of these every later call fails, too, or returns wrong numbers: the CUDA context is lost."""
 
 _FULL = re.compile(r"CUDA out of memory|_STATUS_ALLOC_FAILED|CUDA error: out of memory|DefaultCPUAllocator")
 
 
 def failure_of(error: BaseException) -> Failure:
-    """Whose fault it is, and what is left."""
+    """What failed: the input, this job, memory, or the device."""
     if isinstance(error, _CALLERS):
         return Failure.BAD_INPUT
     names = {kind.__name__ for kind in type(error).__mro__}

@@ -1,11 +1,7 @@
 """The method, on one screen: correspond > coarse > scale > structure > match > pnp (the paper), then adjust (ours).
 
-    prepare > reconstruct > refine
-    (each    (many queries  (each
-     query)   in one go)     query)
-
-`localize` is the three parts in order, for one query; the worker queue calls each of them by itself. The stages from
-the reconstruction to its metric scale work on batches, in `pipeline`; those from the scale to the pose are here.
+`localize` calls its three parts in order, for one query; the worker queue calls each of them by itself:
+`prepare` (correspond), `reconstruct` (coarse and scale, of many queries in one go; in `pipeline`), `refine` (the rest).
 """
 
 from __future__ import annotations
