@@ -15,9 +15,10 @@ from typing import Any, cast
 import pytest
 from support.servers import CAMERA
 
-from mapless_server.engine.engine import JOIN, Engine, EngineOptions
 from mapless_server.engine.groups import localize_each
+from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Caller, Photo, Query, Result
+from mapless_server.engine.queue_engine import JOIN, QueueEngine
 from mapless_server.engine.stages import PREPARE
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError
 from mapless_server.method.answer import LocalizeOptions
@@ -44,7 +45,7 @@ PART = Query(
 )  # fmt: skip
 
 
-class Toy(Engine):
+class Toy(QueueEngine):
     """The engine's queue, with photographs that take a moment each."""
 
     def __init__(self, seconds: float = 0.002, max_queued_s: float = 2.0) -> None:

@@ -24,9 +24,8 @@ from mapless.scenes import UNCHANGED
 from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
-from mapless_server.engine.engine import EngineOptions
-from mapless_server.engine.query import Caller, Photo
-from mapless_server.engine.references import Description
+from mapless_server.engine.interface import EngineOptions
+from mapless_server.engine.query import Caller, Description, Photo
 from mapless_server.method.views import Features, View
 from mapless_server.rpc.call import Call
 from mapless_server.scenes.audit.coverage import Coverage, CoverageVerdict

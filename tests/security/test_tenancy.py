@@ -22,7 +22,7 @@ from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1.geometry_pb2 import Vector3
 from mapless.wire import FieldError
-from mapless_server.engine.references import Description
+from mapless_server.engine.query import Description
 from mapless_server.errors import NotFound, RequestError
 from mapless_server.images.decode import ImageLimits
 from mapless_server.method.views import Features, View

@@ -37,8 +37,9 @@ from mapless.geometry import RigidTransform
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
-from mapless_server.engine.engine import Engine, EngineOptions
+from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Result, Tier
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pnp import PoseStage
@@ -107,7 +108,7 @@ def answer_at(centre: NDArray[np.float64]) -> Answer:
 
 
 def engine_of(localize: Callable[..., Answer], begin: Callable[[], object] = lambda: None) -> MakeEngine:
-    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
         begin()
         tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
         return engine_over(store, tiers, engine_options(settings), metrics, quota, whole(localize))

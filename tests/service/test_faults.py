@@ -56,8 +56,8 @@ from mapless import (
 )
 from mapless.geometry import Camera
 from mapless.v1 import reference_service_pb2 as reference_pb
-from mapless_server.engine.engine import Engine
 from mapless_server.engine.query import Tier
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.observability.metrics import Metrics
@@ -325,7 +325,7 @@ def answering(data_dir: Path, change: Callable[[Answer], Answer]) -> Iterator[st
     stand_in = StandInMethod()
     stand_in.gate.set()
 
-    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
         tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
         method = whole(lambda *asked: change(stand_in(*asked)))
         return engine_over(store, tiers, engine_options(settings), metrics, quota, method)

@@ -20,8 +20,8 @@ from support.small_networks import GRIDS, small_network
 
 from mapless import Client, LocalizationResult, NewReference, Rejected
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.engine.engine import Engine
 from mapless_server.engine.query import Tier
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.features import SiftExtractor
 from mapless_server.method.pipeline import Pipeline
@@ -57,7 +57,7 @@ def serving(data_dir: Path, network: Network, name: str) -> Iterator[tuple[Clien
     store = Store.open(data_dir)
     settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, workers=2, metrics=False, warm_up=False)
 
-    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
         return engine_over(store, [Tier(SiftExtractor(), Pipeline(backend))], engine_options(settings), metrics, quota)
 
     with (

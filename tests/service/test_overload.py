@@ -45,8 +45,8 @@ from mapless import (
 from mapless.errors import from_rpc_error
 from mapless.geometry import Camera, RigidTransform
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.engine.engine import Engine
 from mapless_server.engine.query import Tier
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
@@ -72,7 +72,7 @@ class Overloaded:
     """
 
     address: str
-    engine: Engine
+    engine: QueueEngine
     scrape: Callable[..., float]
 
 
@@ -82,7 +82,7 @@ def overloaded(data_dir: Path, method: Method, tier: Tier | None = None, **optio
     given = {"workers": WORKERS, "warm_up": False, "metrics_port": 0} | options
     settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, **given)
 
-    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
         stand_in = Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))
         return engine_over(store, [tier or stand_in], engine_options(settings), metrics, quota, method)
 

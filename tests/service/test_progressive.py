@@ -35,8 +35,8 @@ from mapless import Client, ConnectOptions, MaplessError, NewReference, RigidTra
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.engine.engine import Engine
 from mapless_server.engine.query import Tier
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
@@ -116,7 +116,7 @@ class Serving:
 
     address: str
     method: Staged
-    engine: Engine
+    engine: QueueEngine
     metrics: Metrics
     stop: Callable[[], None]
     stub: LocalizationServiceStub
@@ -131,7 +131,7 @@ def serving(
     settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, **(defaults | options))
     staged, known = Staged(), list[Metrics]()
 
-    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
         known.append(metrics)
         tiers = [Tier(StandInExtractor(name), Pipeline(cast(Any, StandInReconstructor()))) for name in features]
         return engine_over(store, tiers, engine_options(settings), metrics, quota, staged.method(), StandInDescriptor())

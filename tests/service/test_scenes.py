@@ -16,7 +16,7 @@ from mapless.geodesy import enu_from_y_up
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1.geometry_pb2 import Vector3
-from mapless_server.engine.engine import Engine
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.security.tenancy import key_of
 from mapless_server.store import Store
 
@@ -163,8 +163,8 @@ def test_a_quaternion_is_answered_normalized(client: Client, scene: str) -> None
 def test_what_is_deleted_leaves_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The engine hears of it: of one reference, then of the others with their scene."""
     heard: list[object] = []
-    monkeypatch.setattr(Engine, "forget_references", lambda _, keys: heard.append(set(keys)))
-    monkeypatch.setattr(Engine, "forget_scene", lambda _, scene_key: heard.append(scene_key))
+    monkeypatch.setattr(QueueEngine, "forget_references", lambda _, keys: heard.append(set(keys)))
+    monkeypatch.setattr(QueueEngine, "forget_scene", lambda _, scene_key: heard.append(scene_key))
     store = Store.open(tmp_path)
     with serving(tmp_path, store=store) as server, Client(server.address) as client:
         client.create_scene("s")

@@ -20,8 +20,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
-from mapless_server.engine.engine import Engine
 from mapless_server.engine.query import Tier
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.answer import Answer
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.observability.logs import configure_logging
@@ -158,7 +158,7 @@ def _main(folder: Path, kind: str, given: Sequence[str]) -> None:
                 check()
         return stand_in(*arguments)
 
-    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
         tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
         return engine_over(store, tiers, engine_options(settings), metrics, quota, whole(localize))
 

@@ -17,8 +17,8 @@ from ray.serve import Application
 from mapless.geometry import Similarity
 from mapless_ray.app import deployed
 from mapless_ray.replica import MaplessReplica
-from mapless_server.engine.engine import Engine
 from mapless_server.engine.query import Tier
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pnp import PoseStage
@@ -55,7 +55,7 @@ def localize(*arguments: Any) -> Answer:
     return Answer(found, scale, {"coarse": 0.1, "pnp": 0.05}, counts, counts)
 
 
-def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
     tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
     return engine_over(store, tiers, engine_options(settings), metrics, quota, whole(localize), StandInDescriptor())
 

@@ -23,8 +23,8 @@ from mapless.geometry import Camera, RigidTransform, Similarity, rotation_from_v
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
-from mapless_server.engine.engine import Engine
 from mapless_server.engine.query import Tier
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer, Localization, LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
@@ -180,7 +180,7 @@ class RunningServer:
     metrics_address: str
     method: StandInMethod
     extractors: Sequence[StandInExtractor]
-    engine: Engine
+    engine: QueueEngine
     stop: Callable[[], None]
 
 
@@ -238,7 +238,7 @@ def serving(
     method, extractors = StandInMethod(), [StandInExtractor(name) for name in features]
     method.gate.set()
 
-    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
         tiers = [Tier(extractor, Pipeline(cast(Any, StandInReconstructor()))) for extractor in extractors]
         return engine_over(
             store, tiers, engine_options(settings), metrics, quota, whole(method), StandInDescriptor(descriptor_name)

@@ -20,7 +20,7 @@ from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOpti
 from mapless_server.method.rejection import Rejection
 from mapless_server.scheduling import Job
 
-from .engine import Engine
+from .interface import Engine
 from .query import Caller, Result
 
 Joint = TypeVar("Joint", RigEstimate, SequenceEstimate)

@@ -1,7 +1,8 @@
-"""A query to the engine, and its result."""
+"""What goes into the engine and what comes out of it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from mapless.geometry import Camera
@@ -9,8 +10,9 @@ from mapless_server.method.answer import Answer, LocalizeOptions
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.priors.known import NO_PRIORS, Priors
-from mapless_server.method.views import PosedView
+from mapless_server.method.views import PosedView, View
 from mapless_server.scenes.retrieval.chosen import Choice
+from mapless_server.scenes.retrieval.descriptor import Vector
 from mapless_server.scenes.retrieval.narrowing import Narrowing
 from mapless_server.scheduling import Flow
 from mapless_server.security.tenancy import SceneKey
@@ -119,3 +121,16 @@ class Result:
     choice: Choice | None = None
     attributes: SceneAttributes = field(default_factory=SceneAttributes)
     stage_seconds: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """What is stored of a photograph beside the photograph.
+
+    Attributes:
+        views: camera and features by the extractor's name, the first tier's first; without the pixels.
+        descriptors: global ones, by name.
+    """
+
+    views: Mapping[str, View]
+    descriptors: Mapping[str, Vector]

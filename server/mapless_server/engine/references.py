@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 from mapless_server.errors import DataLoss, NotFound
@@ -16,13 +16,13 @@ from mapless_server.scenes.auditing import SceneExaminer, Tools
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import Loaded, ReferenceLibrary
 from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.scenes.retrieval.descriptor import GlobalDescriptor, Vector
+from mapless_server.scenes.retrieval.descriptor import GlobalDescriptor
 from mapless_server.scenes.retrieval.narrowing import Narrowing
 from mapless_server.scenes.retrieval.ranking import RankOptions, rank_references
 from mapless_server.security.tenancy import SceneKey, scene_id_of
 from mapless_server.store import SceneAttributes
 
-from .query import Photo
+from .query import Description, Photo
 
 
 class QueryViews:
@@ -51,19 +51,6 @@ class QueryViews:
                 sha256 = hashlib.sha256(photo.image).hexdigest()
             self._photograph = Photograph(sha256, photo.camera, lambda: pixels)
         return self._photograph
-
-
-@dataclass(frozen=True, eq=False)
-class Description:
-    """What is stored of a photograph beside the photograph.
-
-    Attributes:
-        views: camera and features by the extractor's name, the first tier's first; without the pixels.
-        descriptors: global ones, by name.
-    """
-
-    views: Mapping[str, View]
-    descriptors: Mapping[str, Vector]
 
 
 class ReferenceSource(Protocol):

@@ -9,8 +9,9 @@ import logging
 import sys
 from collections.abc import Callable, Sequence
 
-from mapless_server.engine.engine import Engine, EngineOptions, check_tiers
+from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Tier
+from mapless_server.engine.queue_engine import QueueEngine, check_tiers
 from mapless_server.engine.references import References
 from mapless_server.engine.stages import Method
 from mapless_server.extras import install_hint
@@ -88,10 +89,10 @@ def open_store(settings: Settings) -> Store:
         raise StartupError(str(error)) from error
 
 
-MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], Engine]
+MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], QueueEngine]
 
 
-def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
     """The engine of the settings; StartupError if they name something unknown or missing."""
     try:
         tiers = make_tiers(settings)
@@ -111,7 +112,7 @@ def engine_over(
     quota: Quota | None = None,
     method: Method | None = None,
     descriptor: GlobalDescriptor | None = None,
-) -> Engine:
+) -> QueueEngine:
     """An engine and the references in memory that it reads.
 
     Args:
@@ -135,7 +136,7 @@ def engine_over(
     pairs = PairMatches(tiers[0].pipeline.matcher.options.reference_ratio, CACHED_AUDIT_PAIRS)
     audit_tools = Tools(library, indexes, descriptor, first, pairs)
     references = References(library, indexes, descriptor, extractors, audit_tools, options.image_limits)
-    return Engine(tiers, references, options, observer, quota, method)
+    return QueueEngine(tiers, references, options, observer, quota, method)
 
 
 def feature_names(features: str, device: str) -> tuple[str, ...]:

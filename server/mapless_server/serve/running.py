@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import grpc
 
 from mapless_server import __version__
-from mapless_server.engine.engine import Engine
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.observability.event_loop import watch_event_loop
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
@@ -75,7 +75,7 @@ class Running:
 
     address: str
     metrics_address: str
-    engine: Engine
+    engine: QueueEngine
     failed: asyncio.Future[Fatal]
 
 
@@ -183,7 +183,7 @@ def _serve_metrics(
     return address
 
 
-def _observe_engine(engine: Engine, metrics: Metrics) -> None:
+def _observe_engine(engine: QueueEngine, metrics: Metrics) -> None:
     first = engine.tiers[0]
     reconstructor = first.pipeline.reconstructor
     metrics.built(__version__, reconstructor.name, first.extractor.name, reconstructor.weights_sha256)
@@ -194,7 +194,7 @@ def _observe_engine(engine: Engine, metrics: Metrics) -> None:
         metrics.scraped.token_cache = lambda: cache.counters
 
 
-async def _warm_up(settings: Settings, engine: Engine, metrics: Metrics) -> None:
+async def _warm_up(settings: Settings, engine: QueueEngine, metrics: Metrics) -> None:
     engine.queue.start()
     if not settings.warm_up:
         return

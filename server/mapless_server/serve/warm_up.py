@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.engine.engine import Engine
 from mapless_server.engine.query import Caller, Photo, Query
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.answer import Localization, LocalizeOptions
 from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
@@ -50,7 +50,7 @@ class WarmUpFailed(Exception):
     """The localization gave no pose, or a wrong one."""
 
 
-async def warm_up(engine: Engine) -> None:
+async def warm_up(engine: QueueEngine) -> None:
     """Localizes until the queue can predict the time of a query; WarmUpFailed if the answer is wrong."""
     # Outside the queue, because describing references is no part of a usual query.
     references = await asyncio.to_thread(_RenderedReferences, [tier.extractor for tier in engine.tiers])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.engine.engine import Engine
 from mapless_server.engine.groups import (
     MAX_FRAMES,
     MAX_RIG_IMAGES,
@@ -15,6 +14,7 @@ from mapless_server.engine.groups import (
     localize_rig,
     localize_sequence,
 )
+from mapless_server.engine.interface import Engine
 from mapless_server.engine.query import Query
 from mapless_server.method.rejection import Rejection
 from mapless_server.observability.metrics import LOCALIZED, Metrics

@@ -17,7 +17,7 @@ from mapless.v1 import (
     reference_service_pb2,
     reference_service_pb2_grpc,
 )
-from mapless_server.engine.engine import Engine
+from mapless_server.engine.interface import Engine
 from mapless_server.errors import Unavailable
 from mapless_server.observability.metrics import Metrics
 from mapless_server.observability.tracing import Tracer
@@ -124,7 +124,7 @@ class Services:
         self._watchers.close()
         await self._guard.wait_until_idle(grace_s)
         if self._engine is not None:
-            self._engine.queue.drain()
+            self._engine.drain()
 
     async def close(self) -> None:
         """Returns when the store is not used any more; to be called when nothing listens."""

@@ -11,7 +11,7 @@ from functools import partial
 from mapless import wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
-from mapless_server.engine.engine import Engine
+from mapless_server.engine.interface import Engine
 from mapless_server.engine.query import Query, Result
 from mapless_server.method.answer import Localization
 from mapless_server.observability.metrics import LOCALIZED, Metrics

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera
-from mapless_server.engine.engine import Engine
 from mapless_server.engine.query import Tier
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer
 from mapless_server.method.pipeline import Coarse, Pipeline, Prepared
@@ -78,7 +78,7 @@ def no_op_method() -> Method:
     )
 
 
-def make_no_op_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> Engine:
+def make_no_op_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
     """An engine with the settings' queue and threads that computes nothing."""
     tiers = [Tier(BlindExtractor(), Pipeline())]
     return engine_over(store, tiers, engine_options(settings), metrics, quota, no_op_method())

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.engine.engine import Engine, EngineOptions
+from mapless_server.engine.interface import Engine, EngineOptions
 from mapless_server.engine.query import UNFINISHED, Caller, Query, Result, Tier
 from mapless_server.engine.references import QueryViews
 from mapless_server.engine.stages import COARSE, PREPARE, REFINE, Method, QueryRun, QueryStages

@@ -12,8 +12,8 @@ from mapless.axes import WORLD_FROM_RIGHT_HANDED, Axes, pose_from
 from mapless.geometry import Array, RigidTransform, Similarity
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
-from mapless_server.engine.engine import EngineOptions
 from mapless_server.engine.groups import GroupResult
+from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Query
 from mapless_server.method.answer import Variant
 from mapless_server.method.groups.images import PosedImage

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from mapless import names, wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError, camera_from_message, joined
-from mapless_server.engine.engine import EngineOptions
+from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query
 from mapless_server.images.decode import ImageLimits, image_size
 from mapless_server.method.answer import LocalizeOptions

@@ -1,15 +1,14 @@
-"""The engine: localizes photographs, describes and audits references, all through one work queue."""
+"""The engine on the work queue: localizes photographs, describes and audits references in its threads."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, TypeVar, cast
 
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError, Unavailable
-from mapless_server.images.decode import ImageLimits
 from mapless_server.method.context import StageContext
 from mapless_server.scenes.audit.coverage import Coverage
 from mapless_server.scenes.audit.verdict import ReferenceAudit
@@ -30,16 +29,15 @@ from mapless_server.scheduling import (
     Stage,
     Step,
     WorkQueue,
-    WorkQueueOptions,
     compute_items,
 )
 from mapless_server.security.tenancy import SceneKey
 
 from .failures import failure_of
-from .query import Caller, Photo, Query, Result, Tier
-from .references import Description, QueryViews, References, ReferenceSource
+from .interface import EngineOptions
+from .query import Caller, Description, Photo, Query, Result, Tier
+from .references import QueryViews, References, ReferenceSource
 from .stages import COARSE, PREPARE, REFINE, Method, QueryRun, QueryStages
-from .tiers import EscalationOptions
 
 ItemT = TypeVar("ItemT")
 Joined = TypeVar("Joined")
@@ -55,39 +53,8 @@ JOIN = "join"
 """Poses several photographs together that were localized each by itself."""
 
 
-@dataclass(frozen=True)
-class EngineOptions:
-    """Limits of the engine.
-
-    Attributes:
-        workers: threads that compute on the CPU.
-        max_batch: queries that a network reconstructs at a time.
-        image_limits: what is decoded.
-        index_cache_bytes: memory for what is held of scenes to choose references by.
-        escalation: when stronger features are tried.
-        coverage: share of right answers to accept where a request does not say.
-        queue: of the work queue.
-    """
-
-    workers: int = 2
-    max_batch: int = 4
-    image_limits: ImageLimits = field(default_factory=ImageLimits)
-    index_cache_bytes: int = 1024 * 2**20
-    escalation: EscalationOptions = field(default_factory=EscalationOptions)
-    coverage: float = 0.99
-    queue: WorkQueueOptions = field(default_factory=WorkQueueOptions)
-
-    def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise ValueError(f"workers must be at least 1, is {self.workers}")
-        if self.max_batch < 1:
-            raise ValueError(f"max_batch must be at least 1, is {self.max_batch}")
-        if not 0 < self.coverage < 1:
-            raise ValueError(f"coverage must be above 0 and below 1, is {self.coverage}")
-
-
-class Engine:
-    """Computes for the services, through one work queue. Its coroutines run on one event loop.
+class QueueEngine:
+    """The engine that computes through one work queue. Its coroutines run on one event loop.
 
     Attributes:
         tiers: features and what works on them, the cheapest first.
@@ -145,6 +112,7 @@ class Engine:
         query: Query,
         caller: Caller,
         source: ReferenceSource | None = None,
+        *,
         on_coarse: Callable[[Result], None] | None = None,
     ) -> Job:
         """The job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
@@ -300,6 +268,10 @@ class Engine:
     def forget_scene(self, scene_key: SceneKey) -> None:
         """Frees the memory of a deleted scene."""
         self.references.forget_scene(scene_key)
+
+    def drain(self) -> None:
+        """Refuses every further job; those admitted are computed."""
+        self.queue.drain()
 
     async def close(self) -> None:
         """Ends running computations at their next step, and drops waiting ones."""

@@ -1,0 +1,127 @@
+"""The engine as services see it: `queue_engine.QueueEngine` when serving, captured calls without a queue in replay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Protocol, TypeVar
+
+from mapless_server.images.decode import ImageLimits
+from mapless_server.scenes.audit.coverage import Coverage
+from mapless_server.scenes.audit.verdict import ReferenceAudit
+from mapless_server.scenes.auditing import Viewpoint
+from mapless_server.scenes.retrieval.chosen import Choice
+from mapless_server.scenes.retrieval.narrowing import Narrowing
+from mapless_server.scheduling import Job, WorkQueueOptions
+from mapless_server.security.tenancy import SceneKey
+
+from .query import Caller, Description, Photo, Query, Result, Tier
+from .tiers import EscalationOptions
+
+Joined = TypeVar("Joined")
+
+
+@dataclass(frozen=True)
+class EngineOptions:
+    """Limits of the engine.
+
+    Attributes:
+        workers: threads that compute on the CPU.
+        max_batch: queries that a network reconstructs at a time.
+        image_limits: what is decoded.
+        index_cache_bytes: memory for what is held of scenes to choose references by.
+        escalation: when stronger features are tried.
+        coverage: share of right answers to accept where a request does not say.
+        queue: of the work queue.
+    """
+
+    workers: int = 2
+    max_batch: int = 4
+    image_limits: ImageLimits = field(default_factory=ImageLimits)
+    index_cache_bytes: int = 1024 * 2**20
+    escalation: EscalationOptions = field(default_factory=EscalationOptions)
+    coverage: float = 0.99
+    queue: WorkQueueOptions = field(default_factory=WorkQueueOptions)
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise ValueError(f"workers must be at least 1, is {self.workers}")
+        if self.max_batch < 1:
+            raise ValueError(f"max_batch must be at least 1, is {self.max_batch}")
+        if not 0 < self.coverage < 1:
+            raise ValueError(f"coverage must be above 0 and below 1, is {self.coverage}")
+
+
+class Engine(Protocol):
+    """Computes for the services; its methods are called on one event loop.
+
+    Those that compute raise RequestError: a bad image, an unknown scene or reference, a full queue, a passed deadline.
+    """
+
+    @property
+    def options(self) -> EngineOptions:
+        """Limits, and defaults of requests."""
+        ...
+
+    @property
+    def tiers(self) -> Sequence[Tier]:
+        """Features and what works on them, the cheapest first."""
+        ...
+
+    @property
+    def parallel_queries(self) -> int:
+        """How many queries of one call are worth computing at a time."""
+        ...
+
+    def query_job(self, query: Query, caller: Caller, *, on_coarse: Callable[[Result], None] | None = None) -> Job:
+        """The job of localizing a photograph; its `records` list the stages that it has been through."""
+        ...
+
+    async def run(self, job: Job) -> Result:
+        """The result of a query's job; a job that was refused may be run again."""
+        ...
+
+    async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
+        """Computes from several photographs' answers, however full the queue is."""
+        ...
+
+    def hold(self, queries: Sequence[Query], caller: Caller) -> AbstractContextManager[None]:
+        """Counts the memory of a group's photographs for as long as its call lasts."""
+        ...
+
+    def check_room(self) -> None:
+        """Raises RequestError if no query would be admitted now, whatever it is."""
+        ...
+
+    async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
+        """Features and descriptors of photographs, in order."""
+        ...
+
+    async def retrieve(
+        self, scene_key: SceneKey, photo: Photo, count: int, narrowing: Narrowing, caller: Caller
+    ) -> Choice:
+        """The references of a scene that resemble a photograph most."""
+        ...
+
+    async def audit(
+        self, scene_key: SceneKey, reference_ids: Sequence[str], caller: Caller, are_listed: bool = False
+    ) -> tuple[int, list[ReferenceAudit]]:
+        """The scene's generation, and the audits of some of its references by their neighbours, in order."""
+        ...
+
+    async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
+        """The scene's generation, and whether a photograph would be localized there."""
+        ...
+
+    def forget_references(self, keys: Collection[str]) -> None:
+        """Frees the memory of deleted references."""
+        ...
+
+    def forget_scene(self, scene_key: SceneKey) -> None:
+        """Frees the memory of a deleted scene."""
+        ...
+
+    def drain(self) -> None:
+        """Refuses every further job; those admitted are computed."""
+        ...
