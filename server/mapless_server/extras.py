@@ -11,7 +11,6 @@ _EXTRA_OF = {
     "matplotlib": "tools",
     "opentelemetry": "otel",
     "PIL": "networks",
-    "safetensors": "networks",
     "torch": "networks",
     "transformers": "superpoint",
     "viser": "view",
