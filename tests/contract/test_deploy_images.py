@@ -6,6 +6,7 @@ No container engine is needed: the files are read. What is true of an image hold
 from __future__ import annotations
 
 import json
+import logging
 import re
 import shlex
 import sys
@@ -18,7 +19,7 @@ import yaml  # type: ignore[import-untyped]
 from sqlalchemy import make_url
 
 from mapless.cli.arguments import make_parser
-from mapless_server.security.binding import Verdict, advise
+from mapless_server.security.binding import assess_binding
 from mapless_server.settings import PREFIX, Settings, load_settings
 from mapless_server.store.postgresql import CONNECTIONS_AT_MOST
 
@@ -203,7 +204,7 @@ def test_an_image_checks_its_health_with_our_client(target: str) -> None:
 def test_an_image_sets_known_settings_and_none_of_security(target: str, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = settings_under(ours(environment_of(target)), monkeypatch)
     assert (settings.tls_certificate, settings.tokens_file, settings.insecure) == (None, None, False)
-    assert verdict_on(settings) is Verdict.REFUSED
+    assert assess_binding(settings)[0] == logging.CRITICAL
     assert settings.metrics_host == settings.host == "0.0.0.0"
 
 
@@ -310,7 +311,7 @@ def test_compose_runs_the_server_within_its_means(document: Json, monkeypatch: p
     address, first, last, port = re.fullmatch(r"(.*):(\d+)(?:-(\d+))?:(\d+)", published).groups()  # type: ignore[union-attr]
     assert (address, int(first), int(port)) == ("127.0.0.1", settings.port, settings.port)
     assert int(last or first) - int(first) + 1 == service.get("deploy", {}).get("replicas", 1)  # a port each
-    assert verdict_on(settings) is Verdict.WARNING  # open, since only this machine reaches it
+    assert assess_binding(settings)[0] == logging.WARNING  # open, since only this machine reaches it
     assert seconds(service["stop_grace_period"]) > settings.drain_delay_s + settings.drain_grace_s
     mounted = {volume.split(":")[1] for volume in service["volumes"]} | set(service["tmpfs"])
     assert mounted == {*json.loads(all_of("cpu", "VOLUME")[-1]), "/tmp"}
@@ -347,14 +348,3 @@ def test_servers_of_compose_reach_the_database_that_is_there(monkeypatch: pytest
 
 def default(setting: str) -> Any:
     return Settings.model_fields[setting].default
-
-
-def verdict_on(settings: Settings) -> Verdict:
-    """Whether the server would start with these."""
-    return advise(
-        settings.host,
-        tls=settings.tls_certificate is not None,
-        client_certificates=settings.tls_client_ca is not None,
-        tokens=settings.tokens_file is not None,
-        insecure=settings.insecure,
-    ).verdict

@@ -5,6 +5,7 @@ Each file by itself, and what kustomize makes of them, where kubectl is there to
 
 from __future__ import annotations
 
+import logging
 import re
 import shutil
 import subprocess
@@ -25,7 +26,7 @@ import yaml  # type: ignore[import-untyped]
 from mapless_server.networks.weights.catalogue import CATALOGUE
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
-from mapless_server.security.binding import Verdict, advise
+from mapless_server.security.binding import assess_binding
 from mapless_server.serve.run import CLOSING_LIMIT_S, NOTIFY_S
 from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.settings import PREFIX, Settings, load_settings
@@ -177,15 +178,8 @@ def test_the_server_takes_its_environment(folder: str, monkeypatch: pytest.Monke
     documents = built(KUBERNETES / folder)
     pod, container = server(documents)
     settings = settings_of(container, monkeypatch)
-    advice = advise(
-        settings.host,
-        tls=settings.tls_certificate is not None,
-        client_certificates=settings.tls_client_ca is not None,
-        tokens=settings.tokens_file is not None,
-        insecure=settings.insecure,
-    )
     # The base asks for tokens and leaves encryption to a mesh; with TLS there is nothing to say.
-    assert advice.verdict is (Verdict.WARNING if folder == "base" else Verdict.FINE)
+    assert assess_binding(settings)[0] == (logging.WARNING if folder == "base" else logging.INFO)
     assert settings.workers == int(container["resources"]["limits"]["cpu"])
     assert pod["spec"]["enableServiceLinks"] is False
     wanted = settings.drain_delay_s + settings.drain_grace_s + CLOSING_LIMIT_S + NOTIFY_S

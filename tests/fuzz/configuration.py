@@ -14,7 +14,7 @@ from pathlib import Path
 from random import Random
 from unittest.mock import patch
 
-from mapless_server.security.binding import advise
+from mapless_server.security.binding import assess_binding
 from mapless_server.settings import PREFIX, ConfigError, LoadedSettings, Settings, load_settings
 from mapless_server.store import StoreError, postgresql
 
@@ -68,7 +68,7 @@ def _check_settings(environment: dict[str, str], load: Callable[[], LoadedSettin
     assert settings.max_image_mib <= settings.max_message_mib
     assert (settings.tls_certificate is None) == (settings.tls_key is None)
     assert _PASSWORD not in str(loaded)
-    advise(settings.host, tls=False, client_certificates=False, tokens=False, insecure=False, resolve=lambda _: [])
+    assess_binding(settings, resolve=lambda _: [])
     return True
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from mapless_server.security.binding import Advice, Verdict, advise, is_loopback, resolve_host
+from mapless_server.security.binding import assess_binding, is_loopback, resolve_host
 from mapless_server.serve.assembly import StartupError
 from mapless_server.serve.running import running_server
 from mapless_server.settings import Settings
@@ -40,41 +42,43 @@ def test_names_that_do_not_resolve_have_no_address(name: str) -> None:
     assert resolve_host(name) == []
 
 
-def advice_for(host: str, flags: str) -> Advice:
-    tls, client_certificates, tokens, insecure = (
-        flag in flags.split() for flag in ("tls", "client_certificates", "tokens", "insecure")
-    )
-    return advise(host, tls=tls, client_certificates=client_certificates, tokens=tokens, insecure=insecure)
-
-
 @pytest.mark.parametrize("tls", ["", "tls", "tls client_certificates"])
 @pytest.mark.parametrize("tokens", ["", "tokens"])
 @pytest.mark.parametrize("insecure", ["", "insecure"])
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
-def test_what_strangers_could_reach_is_refused_unless_wanted(host: str, tls: str, tokens: str, insecure: str) -> None:
-    refused = host == "0.0.0.0" and not (tls or tokens or insecure)
-    assert (advice_for(host, f"{tls} {tokens} {insecure}").verdict is Verdict.REFUSED) == refused
+def test_no_protection_beyond_loopback_is_rejected(host: str, tls: str, tokens: str, insecure: str) -> None:
+    level, _ = assess(host, f"{tls} {tokens} {insecure}")
+    assert (level == logging.CRITICAL) == (host == "0.0.0.0" and not (tls or tokens or insecure))
 
 
 @pytest.mark.parametrize(
-    ("host", "flags", "verdict", "words"),
+    ("host", "flags", "level", "words"),
     [
-        ("127.0.0.1", "", Verdict.FINE, "everybody on this machine"),
-        ("127.0.0.1", "tokens", Verdict.FINE, ""),
-        ("127.0.0.1", "tls", Verdict.FINE, ""),
-        ("0.0.0.0", "", Verdict.REFUSED, "tls_certificate and tls_key or tokens_file.*127.0.0.1.*insecure"),
-        ("0.0.0.0", "insecure", Verdict.WARNING, "everybody who can reach"),
-        ("0.0.0.0", "tokens", Verdict.WARNING, "in clear, unless a proxy"),
-        ("0.0.0.0", "tls", Verdict.WARNING, "neither tokens nor clients' certificates"),
-        ("0.0.0.0", "tls tokens", Verdict.FINE, "^$"),
-        ("0.0.0.0", "tls client_certificates", Verdict.FINE, "^$"),
+        ("127.0.0.1", "", logging.INFO, "every user of this machine"),
+        ("127.0.0.1", "tokens", logging.INFO, "^$"),
+        ("127.0.0.1", "tls", logging.INFO, "^$"),
+        ("0.0.0.0", "", logging.CRITICAL, "tls_certificate and tls_key or tokens_file.*127.0.0.1.*insecure"),
+        ("0.0.0.0", "insecure", logging.WARNING, "everybody who can reach"),
+        ("0.0.0.0", "tokens", logging.WARNING, "in clear, unless a proxy"),
+        ("0.0.0.0", "tls", logging.WARNING, "neither tokens nor clients' certificates"),
+        ("0.0.0.0", "tls tokens", logging.INFO, "^$"),
+        ("0.0.0.0", "tls client_certificates", logging.INFO, "^$"),
     ],
 )
-def test_what_is_said(host: str, flags: str, verdict: Verdict, words: str) -> None:
-    advice = advice_for(host, flags)
-    assert advice.verdict is verdict
+def test_the_log_names_what_is_unprotected(host: str, flags: str, level: int, words: str) -> None:
+    assessed, sentence = assess(host, flags)
+    assert assessed == level
+    assert re.search(words, sentence)
 
-    assert re.search(words, advice.sentence)
+
+def assess(host: str, flags: str) -> tuple[int, str]:
+    file = Path("file")
+    given: dict[str, Any] = {"insecure": "insecure" in flags, "tokens_file": file if "tokens" in flags else None}
+    if "tls" in flags:
+        given |= {"tls_certificate": file, "tls_key": file}
+    if "client_certificates" in flags:
+        given["tls_client_ca"] = file
+    return assess_binding(Settings(host=host, **given))
 
 
 def test_a_refused_start_leaves_no_store_behind(tmp_path: Path) -> None:

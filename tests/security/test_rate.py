@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -116,7 +117,10 @@ def test_a_clock_that_goes_back_gives_nothing_and_takes_nothing() -> None:
     assert limiter.charge("t", 1.0, 50.0) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(("rate", "burst_s"), [(-1.0, 1.0), (1.0, 0.0), (float("nan"), 1.0), (1.0, float("nan"))])
-def test_senseless_limits_are_refused(rate: float, burst_s: float) -> None:
-    with pytest.raises(ValueError, match="senseless"):
+@pytest.mark.parametrize(
+    ("rate", "burst_s", "named"),
+    [(-1.0, 1.0, "rate"), (1.0, 0.0, "burst_s"), (np.nan, 1.0, "rate"), (1.0, np.nan, "burst_s")],
+)
+def test_a_wrong_limit_is_rejected_by_name(rate: float, burst_s: float, named: str) -> None:
+    with pytest.raises(ValueError, match=f"^{named} must be"):
         RateLimiter(rate, burst_s)

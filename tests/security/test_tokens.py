@@ -80,7 +80,7 @@ class TestFile:
     def test_a_taken_name_is_refused_and_nothing_changes(self, path: Path) -> None:
         create_token(path, "a", "acme", "read", None)
         before = path.read_bytes()
-        with pytest.raises(SecurityError, match="'a' already"):
+        with pytest.raises(SecurityError, match="'a' exists already"):
             create_token(path, "a", "other", "write", None)
         assert path.read_bytes() == before
 
@@ -104,7 +104,7 @@ class TestFile:
         with pytest.raises(SecurityError, match="No such file"):
             revoke_token(path, "a")
         create_token(path, "a", "t", "read", None)
-        with pytest.raises(SecurityError, match="no token of the name 'b'"):
+        with pytest.raises(SecurityError, match="no token has the name 'b'"):
             revoke_token(path, "b")
 
     def test_commands_at_the_same_time_lose_no_token(self, path: Path) -> None:
@@ -135,8 +135,8 @@ class TestFile:
             (json.dumps({"tokens": [entry(role="root")]}), "tokens.0.role"),
             (json.dumps({"tokens": [entry(expires="tomorrow")]}), "tokens.0.expires"),
             (json.dumps({"tokens": [entry(expires="2030-01-01T00:00:00")]}), "tokens.0.expires: .*timezone"),
-            (json.dumps({"tokens": [entry(), entry(sha256=sha256_of("b"))]}), "name 'robot' stands twice"),
-            (json.dumps({"tokens": [entry(), entry(name="b")]}), "stands twice"),
+            (json.dumps({"tokens": [entry(), entry(sha256=sha256_of("b"))]}), "two tokens have the name 'robot'"),
+            (json.dumps({"tokens": [entry(), entry(name="b")]}), "two tokens have the sha256"),
             ('{"tenants": {"a": {"rate_ms": -1}}}', "tenants.a.rate_ms"),
             ('{"tenants": {"a/b": {}}}', "tenants.a/b"),
         ],

@@ -1,4 +1,4 @@
-"""Who calls, and whether they may: every method has its role in one table, and what is not in it is refused."""
+"""Authentication and authorization: one table has the role that each method takes; other methods are rejected."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ METHOD_ROLES: Mapping[str, Role] = {
     "/mapless.v1.LocalizationService/LocalizeProgressively": Role.LOCALIZE,
     "/mapless.v1.LocalizationService/LocalizeRig": Role.LOCALIZE,
     "/mapless.v1.LocalizationService/LocalizeSequence": Role.LOCALIZE,
-    # Other callers' photographs are shown.
+    # It shows other callers' photographs.
     "/mapless.v1.LocalizationService/WatchQueries": Role.WRITE,
     "/mapless.v1.ReferenceService/CreateScene": Role.WRITE,
     "/mapless.v1.ReferenceService/GetScene": Role.READ,
@@ -31,11 +31,11 @@ METHOD_ROLES: Mapping[str, Role] = {
     "/mapless.v1.ReferenceService/AuditScene": Role.WRITE,
     "/mapless.v1.ReferenceService/CheckCoverage": Role.LOCALIZE,
 }
-"""What a caller must be allowed at least."""
+"""The least role that a caller of the method must have."""
 
 OPEN_METHODS = frozenset(
     {
-        # Probes and load balancers hold no token.
+        # Probes and load balancers have no token.
         "/grpc.health.v1.Health/Check",
         "/grpc.health.v1.Health/List",
         "/grpc.health.v1.Health/Watch",
@@ -44,11 +44,11 @@ OPEN_METHODS = frozenset(
         "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo",
     }
 )
-"""What anybody may call; nothing of it tells of scenes."""
+"""Methods without authentication; none of them shows anything of scenes."""
 
 ENDLESS_METHODS = frozenset({"/mapless.v1.LocalizationService/WatchQueries"})
-"""Streams that last until their caller has seen enough: they have no deadline but the caller's own, nobody waits for
-their end, and whether the caller may is asked again before each message. All other calls end in time, streams too."""
+"""Streams that last until their caller ends them: they have no deadline but the caller's own, a drain does not wait for
+them, and the caller is authenticated again before each message. All other calls have a deadline, streams too."""
 
 _KEY = "authorization"
 _SCHEME = "bearer"
@@ -58,45 +58,45 @@ Metadata = Iterable[tuple[str, str | bytes]]
 
 
 class Authenticator:
-    """Finds out who calls by the bearer token; without tokens, everybody who can connect may do everything."""
+    """Authenticates callers by their bearer token; without tokens, every caller has all rights."""
 
     def __init__(
         self,
         tokens: Callable[[], Tokens] | None,
         now: Callable[[], datetime] = lambda: datetime.now(timezone.utc),
     ) -> None:
-        """`tokens` gives those that are good at the moment; None if none are asked for."""
+        """`tokens` gives the current tokens; None if callers need none."""
         self._tokens = tokens
         self._now = now
 
     def authenticate(
         self, metadata: Metadata, method: str, auth_context: Mapping[str, Iterable[bytes]] | None = None
     ) -> Principal:
-        """Who calls a method, which they may.
+        """The caller of a method, who may call it.
 
         Args:
             metadata: of the call.
             method: "/package.Service/Method", one of METHOD_ROLES.
-            auth_context: what the connection knows of the caller, `context.auth_context()`.
+            auth_context: the connection's facts about the caller, `context.auth_context()`.
 
         Raises:
-            Unauthenticated: no token (TOKEN_MISSING), none of ours (TOKEN_INVALID, also if it was revoked), or one
-                whose time is over (TOKEN_EXPIRED).
-            PermissionDenied: the token's role is not enough, or the method is not in the table.
+            Unauthenticated: no token (TOKEN_MISSING), an unknown or revoked one (TOKEN_INVALID), or an expired one
+                (TOKEN_EXPIRED).
+            PermissionDenied: the token's role is too low, or the method is not in the table.
         """
         needed = METHOD_ROLES.get(method)
         if needed is None:
-            raise PermissionDenied("nobody may call this method", reason="METHOD_NOT_ALLOWED")
+            raise PermissionDenied("this method cannot be called", reason="METHOD_NOT_ALLOWED")
         if self._tokens is None:
             return Principal(name=certificate_name(auth_context or {}))
         token = self._tokens().find(_bearer_token(metadata))
         if token is None:
-            raise Unauthenticated("the token is not known", reason="TOKEN_INVALID")
+            raise Unauthenticated("the token is unknown", reason="TOKEN_INVALID")
         if token.expires is not None and token.expires <= self._now():
             raise Unauthenticated("the token has expired", reason="TOKEN_EXPIRED")
         if token.allows < needed:
             raise PermissionDenied(
-                f"this takes a token of the role {needed.name.lower()}; the one given, {token.name!r}, has the role "
+                f"this method takes a token of the role {needed.name.lower()}; the token {token.name!r} has the role "
                 f"{token.role}",
                 reason="ROLE_TOO_LOW",
             )
@@ -104,7 +104,7 @@ class Authenticator:
 
 
 def certificate_name(auth_context: Mapping[str, Iterable[bytes]]) -> str:
-    """Whom the client's certificate names, fit for the log; empty if it showed none."""
+    """The name in the client's certificate, fit for the log; empty without a certificate."""
     for key in ("x509_common_name", "x509_subject_alternative_name", "x509_subject"):
         for value in auth_context.get(key, ()):
             text = value.decode(errors="replace")
@@ -115,7 +115,7 @@ def certificate_name(auth_context: Mapping[str, Iterable[bytes]]) -> str:
 def _bearer_token(metadata: Metadata) -> str:
     values = [value for key, value in metadata if key == _KEY]
     if not values:
-        raise Unauthenticated("a token is needed: metadata 'authorization: Bearer <token>'", reason="TOKEN_MISSING")
+        raise Unauthenticated("a token is required: metadata 'authorization: Bearer <token>'", reason="TOKEN_MISSING")
     scheme, _, token = str(values[0]).partition(" ")
     if len(values) > 1 or scheme.lower() != _SCHEME or not token:
         raise Unauthenticated("the metadata 'authorization' must be one 'Bearer <token>'", reason="TOKEN_INVALID")

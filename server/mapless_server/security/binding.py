@@ -1,33 +1,15 @@
-"""Whether a server may listen where it is told to, given what protects it: nobody opens it to the world by accident."""
+"""Checks that a server does not listen beyond this machine without protection by accident."""
 
 from __future__ import annotations
 
 import ipaddress
+import logging
 import socket
 from collections.abc import Callable
-from dataclasses import dataclass
-from enum import Enum
+
+from mapless_server.settings import Settings
 
 Resolve = Callable[[str], list[str]]
-
-
-class Verdict(Enum):
-    """What to make of an advice."""
-
-    FINE = "fine"
-    """Worth a line in the log, if it says anything."""
-    WARNING = "warning"
-    """Worth a warning."""
-    REFUSED = "refused"
-    """The server must not start."""
-
-
-@dataclass(frozen=True)
-class Advice:
-    """A verdict and a sentence for the operator, empty if there is nothing to say."""
-
-    verdict: Verdict
-    sentence: str = ""
 
 
 def resolve_host(host: str) -> list[str]:
@@ -40,59 +22,45 @@ def resolve_host(host: str) -> list[str]:
 
 
 def is_loopback(host: str, resolve: Resolve = resolve_host) -> bool:
-    """Whether nobody but this machine can reach what listens there; False if the name cannot be resolved."""
+    """Whether only this machine can connect to the host; False if its name cannot be resolved."""
     addresses = resolve(host)
     return bool(addresses) and all(map(_is_loopback, addresses))
 
 
-def advise(
-    host: str,
-    *,
-    tls: bool,
-    client_certificates: bool,
-    tokens: bool,
-    insecure: bool,
-    resolve: Resolve = resolve_host,
-) -> Advice:
-    """What is to be said of listening on a host.
+def assess_binding(settings: Settings, resolve: Resolve = resolve_host) -> tuple[int, str]:
+    """The danger of listening on the settings' host with the settings' protection.
 
-    Args:
-        host: the setting.
-        tls: whether connections are encrypted.
-        client_certificates: whether clients must show one.
-        tokens: whether callers must show one.
-        insecure: whether the operator wants it anyway.
-        resolve: finds a host's addresses.
+    Returns:
+        A level of `logging`, of which CRITICAL means that the server must not start, and a sentence for the operator,
+        which may be empty.
     """
+    host, tls, tokens = settings.host, settings.tls_certificate is not None, settings.tokens_file is not None
     loopback = is_loopback(host, resolve)
     if not tls and not tokens:
         if loopback:
-            return Advice(
-                Verdict.FINE,
-                "neither TLS nor tokens are set: everybody on this machine may do everything, and nobody else can "
-                "connect",
+            return logging.INFO, (
+                "neither TLS nor tokens are set: every user of this machine has all rights, and nobody else can connect"
             )
-        open_to_all = f"on {host} everybody who can reach this machine could read and delete all scenes"
-        if insecure:
-            return Advice(Verdict.WARNING, f"neither TLS nor tokens are set: {open_to_all}")
-        return Advice(
-            Verdict.REFUSED,
-            f"neither TLS nor tokens are set, and {open_to_all}: set tls_certificate and tls_key or tokens_file, or "
-            "listen on 127.0.0.1, or set insecure if something else keeps strangers out",
+        problem = (
+            f"neither TLS nor tokens are set, and on {host} everybody who can reach this machine could read and delete "
+            "all scenes"
+        )
+        if settings.insecure:
+            return logging.WARNING, problem
+        return logging.CRITICAL, (
+            f"{problem}: set tls_certificate and tls_key or tokens_file, or listen on 127.0.0.1, or set insecure if "
+            "another program keeps strangers out"
         )
     if loopback:
-        return Advice(Verdict.FINE)
+        return logging.INFO, ""
     if not tls:
-        return Advice(
-            Verdict.WARNING, "tokens are set without TLS: they travel in clear, unless a proxy in front ends TLS"
+        return logging.WARNING, "tokens are set without TLS: they are sent in clear, unless a proxy terminates TLS"
+    if not tokens and settings.tls_client_ca is None:
+        return logging.WARNING, (
+            "connections are encrypted, but neither tokens nor clients' certificates are required: on "
+            f"{host} everybody who can reach this machine has all rights"
         )
-    if not tokens and not client_certificates:
-        return Advice(
-            Verdict.WARNING,
-            f"connections are encrypted, but neither tokens nor clients' certificates are asked for: on {host} "
-            "everybody who can reach this machine may do everything",
-        )
-    return Advice(Verdict.FINE)
+    return logging.INFO, ""
 
 
 def _is_loopback(text: str) -> bool:

@@ -1,4 +1,4 @@
-"""Who calls, and what they may do."""
+"""An authenticated caller and its role."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 DEFAULT_TENANT = "default"
-"""Whose the scenes are on a server that asks nobody for a token."""
+"""The tenant of all scenes on a server without tokens."""
 
 
 class Role(IntEnum):
-    """What a caller may do; each may also do what those before it may."""
+    """The rights of a caller; each role includes those before it."""
 
     READ = 1
-    """Look at scenes and references."""
+    """Read scenes and references."""
     LOCALIZE = 2
     """Localize photographs."""
     WRITE = 3
@@ -25,9 +25,9 @@ class Principal:
     """A caller.
 
     Attributes:
-        tenant: whose scenes it sees.
-        role: what it may do with them.
-        name: of its token, for the log; empty without tokens.
+        tenant: whose scenes it can access.
+        role: its rights on them.
+        name: of its token or certificate, for the log; empty without either.
     """
 
     tenant: str = DEFAULT_TENANT

@@ -1,4 +1,4 @@
-"""What protects a server, put together from its settings."""
+"""The protection of a server, made from its settings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from mapless_server.settings import Settings
 
 from .access import Authenticator
-from .binding import Verdict, advise
+from .binding import assess_binding
 from .errors import SecurityError
 from .rate import RateLimiter
 from .reloading import Refreshable, Reloading
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Protection:
-    """What protects the server; made from the settings' files, and kept up to date with them."""
+    """TLS, tokens and quota of a server; `refreshable` follows changes of their files."""
 
     tls: Tls | None
     tokens: Reloading[Tokens] | None
@@ -28,18 +28,12 @@ class Protection:
 
     @staticmethod
     def of(settings: Settings) -> Protection:
-        """SecurityError if a file cannot be used, or the server would be open to the world by accident."""
-        advice = advise(
-            settings.host,
-            tls=settings.tls_certificate is not None,
-            client_certificates=settings.tls_client_ca is not None,
-            tokens=settings.tokens_file is not None,
-            insecure=settings.insecure,
-        )
-        if advice.verdict is Verdict.REFUSED:
-            raise SecurityError(advice.sentence)
-        if advice.sentence:
-            log.log(logging.WARNING if advice.verdict is Verdict.WARNING else logging.INFO, "%s", advice.sentence)
+        """Raises SecurityError if a file cannot be used, or the server would listen without protection by accident."""
+        level, sentence = assess_binding(settings)
+        if level == logging.CRITICAL:
+            raise SecurityError(sentence)
+        if sentence:
+            log.log(level, "%s", sentence)
         tls = tokens = None
         if settings.tls_certificate is not None and settings.tls_key is not None:
             tls = Tls(TlsFiles(settings.tls_certificate, settings.tls_key, settings.tls_client_ca))
@@ -49,13 +43,13 @@ class Protection:
 
     @property
     def authenticator(self) -> Authenticator:
-        """Finds out who calls."""
+        """Authenticates callers by the current tokens."""
         tokens = self.tokens
         return Authenticator(None if tokens is None else lambda: tokens.value)
 
     @property
     def refreshable(self) -> list[Refreshable]:
-        """What follows files."""
+        """The parts that are read from files."""
         return [it for it in (self.tls, self.tokens) if it is not None]
 
 

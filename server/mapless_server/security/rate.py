@@ -1,6 +1,6 @@
-"""How much computing each tenant may use: a bucket of seconds that fills at a steady rate and is drawn from by jobs.
+"""Limits each tenant's computing time by a token bucket of seconds.
 
-Time is passed in. Nothing is locked here: calls come from many threads, one at a time, with the work queue locked.
+Time is passed in. There is no lock here: the work queue calls from many threads while it holds its own.
 """
 
 from __future__ import annotations
@@ -9,22 +9,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 _ROUNDING_S = 1e-9
-"""Far below any job's cost: who waited as long as told is not refused again by a last digit."""
+"""Far below any job's cost: after the wait that was returned, rounding must not reject the job again."""
 
 _SWEEP_AT_LEAST = 64
-"""Buckets that are held before full ones are looked for."""
+"""Number of buckets from which full ones are removed."""
 
 
 @dataclass
 class _Bucket:
-    """What is left, seconds of computing (below 0: debt), at a moment."""
+    """Seconds of computing that were left (below 0: debt) at a time."""
 
     level_s: float
     at_s: float
 
 
 class RateLimiter:
-    """Admits jobs of tenants, each at its own rate."""
+    """Admits jobs of tenants, each tenant at its own rate."""
 
     def __init__(
         self, rate: float, burst_s: float, rate_of: Callable[[str], float | None] = lambda tenant: None
@@ -33,31 +33,32 @@ class RateLimiter:
 
         Args:
             rate: 0 for no limit.
-            burst_s: what a tenant has that did nothing for long; above 0.
+            burst_s: the most that a tenant can save; above 0.
             rate_of: a tenant's own rate, or None; it may change at any time.
 
         Raises:
             ValueError: a number out of its range.
         """
-        if not (rate >= 0 and burst_s > 0):
-            raise ValueError(f"senseless limits: {rate} seconds a second, at most {burst_s}")
+        if not rate >= 0:
+            raise ValueError(f"rate must be at least 0, is {rate}")
+        if not burst_s > 0:
+            raise ValueError(f"burst_s must be above 0, is {burst_s}")
         self._rate = rate
         self._burst_s = burst_s
         self._rate_of = rate_of
-        # A full bucket says nothing that an absent one does not.
+        # A full bucket is the same as an absent one.
         self._buckets: dict[str, _Bucket] = {}
         self._sweep_at = _SWEEP_AT_LEAST
 
     def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
-        """Admits a job and charges for it, or says how long to wait before it would be, seconds; 0: admitted.
+        """Admits a job and charges for it, or gives the time until it would be admitted, seconds; 0: admitted.
 
-        A job that costs more than the burst is admitted when the bucket is full, and leaves a debt: else it never
-        would be.
+        A job that costs more than the burst is admitted when the bucket is full, and leaves a debt.
 
         Args:
             tenant: whose job.
-            cost_s: what it is predicted to take, seconds of computing.
-            now_s: the time, by any clock that does not go back.
+            cost_s: predicted computing time, seconds.
+            now_s: the time, by any monotonic clock.
         """
         rate = self._rate_for(tenant)
         if rate == 0:
@@ -70,14 +71,14 @@ class RateLimiter:
         return 0.0
 
     def settle(self, tenant: str, predicted_s: float, actual_s: float, now_s: float) -> None:
-        """Corrects the charge for an admitted job by what it took; 0 for one that took nothing."""
+        """Replaces the predicted cost of an admitted job by the actual one."""
         rate = self._rate_for(tenant)
         if rate > 0:
             self._keep(tenant, self._level_s(tenant, rate, now_s) + predicted_s - actual_s, now_s)
 
     @property
     def bucket_count(self) -> int:
-        """Tenants that are remembered."""
+        """Number of tenants in memory."""
         return len(self._buckets)
 
     def _rate_for(self, tenant: str) -> float:
@@ -99,7 +100,7 @@ class RateLimiter:
             self._forget_full(now_s)
 
     def _forget_full(self, now_s: float) -> None:
-        """Next time at twice as many as remain, so that sweeping costs a constant a job."""
+        """Runs again at twice the number that remains, so that its cost per job is constant."""
         self._buckets = {
             tenant: bucket
             for tenant, bucket in self._buckets.items()

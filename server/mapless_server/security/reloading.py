@@ -1,4 +1,4 @@
-"""Files that are read anew when they change, while the server runs; what cannot be read leaves the old in use."""
+"""Reads files again when they change, while the server runs; the old values stay in use if that fails."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from .errors import SecurityError
 
 log = logging.getLogger(__name__)
 
-LOOK_INTERVAL_S = 1.0
-"""How old what is in use may be: a revoked token is of use this long, and a look costs but a stat a file."""
+CHECK_INTERVAL_S = 1.0
+"""A revoked token is accepted for this long; a check costs one stat of each file."""
 
 T = TypeVar("T")
 Stamp = tuple[tuple[int, int, int, int], ...]
 
 
 class Refreshable(Protocol):
-    """Something to be refreshed now and then."""
+    """A value that is read from files."""
 
     def refresh(self) -> bool:
-        """Looks for news; whether there were any. It blocks."""
+        """Reads the files if they changed; whether they did. It blocks."""
 
 
 class Reloading(Generic[T]):
-    """What some files hold together; `value` may be read from any thread and never waits."""
+    """A value made from files; `value` may be read from any thread and never waits."""
 
     def __init__(self, paths: Sequence[Path], read: Callable[[], T], what: str) -> None:
         """Reads the files.
 
         Args:
             paths: all files that `read` reads.
-            read: makes the value of them; raises SecurityError if it cannot.
-            what: they are, "tokens", for the log.
+            read: makes the value; raises SecurityError if it cannot.
+            what: its name in the log, "tokens".
 
         Raises:
             SecurityError: a file is missing, or wrong.
@@ -44,7 +44,7 @@ class Reloading(Generic[T]):
         self._paths = tuple(paths)
         self._read = read
         self._what = what
-        self._complaint = ""
+        self._last_error = ""
         self._stamp, self._value = self._load()
 
     @property
@@ -55,24 +55,24 @@ class Reloading(Generic[T]):
     def refresh(self) -> bool:
         """Reads the files if they changed; whether the value is a new one.
 
-        Files that cannot be read are logged once, and tried again by every call: when several files are replaced one
-        after the other, they do not fit together until the last one is. One thread at a time.
+        An error is logged once, and the files are read again by every call: files that are replaced one after the other
+        do not fit together until the last one is. One thread at a time.
         """
         try:
             if self._stamp_files() == self._stamp:
                 return False
             self._stamp, self._value = self._load()
         except SecurityError as error:
-            if str(error) != self._complaint:
+            if str(error) != self._last_error:
                 log.error("%s; the %s read before stay in use", error, self._what)
-            self._complaint = str(error)
+            self._last_error = str(error)
             return False
-        self._complaint = ""
+        self._last_error = ""
         log.info("the %s have changed and are in use", self._what)
         return True
 
     def _load(self) -> tuple[Stamp, T]:
-        # Stamped first: a file that changes while it is read is read again.
+        # The stamp is taken first, so that a file that changes while it is read is read again.
         return self._stamp_files(), self._read()
 
     def _stamp_files(self) -> Stamp:
@@ -83,8 +83,8 @@ class Reloading(Generic[T]):
         return tuple((it.st_ino, it.st_size, it.st_mtime_ns, it.st_ctime_ns) for it in found)
 
 
-async def keep_fresh(sources: Sequence[Refreshable], interval_s: float = LOOK_INTERVAL_S) -> None:
-    """Refreshes until it is cancelled, in a thread, so that the event loop never waits for a disk."""
+async def keep_fresh(sources: Sequence[Refreshable], interval_s: float = CHECK_INTERVAL_S) -> None:
+    """Refreshes until it is cancelled, in a thread, so that the event loop never waits for the disk."""
     while True:
         await asyncio.sleep(interval_s)
         for source in sources:

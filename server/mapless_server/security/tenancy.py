@@ -1,7 +1,7 @@
-"""Whose a scene is: below the service, a scene is known by a key that says so, and here alone keys are made and read.
+"""Keys of scenes: below the services, a scene's key holds its tenant. Only this module makes and reads keys.
 
-The store and its caches know scenes by their keys only, so that a scene of another tenant is one that does not exist.
-Callers see ids, and never learn that there are keys.
+The store and its caches use keys only, so that a scene of another tenant does not exist for a caller. Callers use ids,
+and never see keys.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from mapless.names import check_id
 from .principal import DEFAULT_TENANT
 
 SceneKey = NewType("SceneKey", str)
-"""The id of a scene of the default tenant, as in stores that never knew another; "tenant/scene" for all others.
+"""The id of a scene of the default tenant, as in stores without tenants; "tenant/scene" for all others.
 
-Neither tenants nor ids hold a slash, so that no two scenes share a key.
+Neither tenants nor ids contain a slash, so that no two scenes share a key.
 """
 
 KEY_SEPARATOR = "/"
@@ -23,23 +23,23 @@ _NEXT_CHARACTER = "0"
 
 
 def check_tenant(tenant: str) -> str:
-    """The tenant's name, unchanged; ValueError if it is not one: the rules are those of ids."""
+    """The tenant's name, unchanged; ValueError if it breaks the rules, which are those of ids."""
     return check_id(tenant)
 
 
 def key_of(tenant: str, scene_id: str) -> SceneKey:
-    """The key of a tenant's scene; both names must have been checked."""
+    """The key of a tenant's scene; both names are checked already."""
     return SceneKey(scene_id if tenant == DEFAULT_TENANT else f"{tenant}{KEY_SEPARATOR}{scene_id}")
 
 
 def tenant_of(key: SceneKey) -> str:
-    """Whose scene it is."""
+    """The tenant of a scene."""
     tenant, separator, _ = key.partition(KEY_SEPARATOR)
     return tenant if separator else DEFAULT_TENANT
 
 
 def scene_id_of(key: SceneKey) -> str:
-    """The scene's id, by which its tenant knows it."""
+    """The scene's id among those of its tenant."""
     tenant, separator, scene_id = key.partition(KEY_SEPARATOR)
     return scene_id if separator else tenant
 

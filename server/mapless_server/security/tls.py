@@ -1,6 +1,6 @@
-"""The server's certificate and key, and whose certificates clients must show: read from files, anew when they change.
+"""The server's certificate and key, and the authority of clients' certificates, read from files that may change.
 
-Connections that are there stay as they are; those that come after a change see the new certificate.
+Open connections are not affected by a change; new ones get the new certificate.
 """
 
 from __future__ import annotations
@@ -22,9 +22,12 @@ from .reloading import Reloading, read_file
 
 @dataclass(frozen=True)
 class TlsFiles:
-    """Paths of PEM files: the server's certificate chain, its own first; its key; whom clients' must be signed by.
+    """Paths of PEM files. Without `client_ca` clients need no certificate.
 
-    Without `client_ca` clients need no certificate.
+    Attributes:
+        certificate: the server's chain, its own certificate first.
+        key: of that certificate.
+        client_ca: the authorities of clients' certificates.
     """
 
     certificate: Path
@@ -33,13 +36,13 @@ class TlsFiles:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Those there are."""
+        """The paths that are set."""
         return (self.certificate, self.key) + ((self.client_ca,) if self.client_ca else ())
 
 
 @dataclass(frozen=True)
 class TlsMaterial:
-    """What the files hold, PEM, and when the server's certificate expires."""
+    """The contents of the files, PEM, and when the server's certificate expires."""
 
     certificate: bytes
     key: bytes
@@ -52,10 +55,11 @@ class TlsMaterial:
 
 
 def read_material(files: TlsFiles) -> TlsMaterial:
-    """What the files hold.
+    """The contents of the files.
 
     Raises:
-        SecurityError: a file is missing or not PEM, the key is not the certificate's, or its time is not now.
+        SecurityError: a file is missing or not PEM, the key is not the certificate's, or the certificate is not valid
+            now.
     """
     certificate, key = read_file(files.certificate), read_file(files.key)
     client_ca = read_file(files.client_ca) if files.client_ca else None
@@ -69,11 +73,11 @@ def read_material(files: TlsFiles) -> TlsMaterial:
 
 
 class Tls:
-    """The server's side of encryption, kept up to date by `refresh`."""
+    """The server's TLS; `refresh` follows changes of the files."""
 
     def __init__(self, files: TlsFiles) -> None:
         """Raises SecurityError if the files cannot be used."""
-        self._asks_clients = files.client_ca is not None
+        self._require_client_certificates = files.client_ca is not None
         self._material = Reloading(files.paths, lambda: read_material(files), "certificates")
 
     @property
@@ -82,34 +86,26 @@ class Tls:
         return self._material.value.expires.timestamp()
 
     def refresh(self) -> bool:
-        """Reads the files if they changed; files that cannot be used are logged, and the old ones stay in use."""
+        """See `Reloading.refresh`."""
         return self._material.refresh()
 
     def server_credentials(self) -> grpc.ServerCredentials:
         """For `add_secure_port`; they follow the files."""
-        feed = _Feed(self._material)
-        credentials: grpc.ServerCredentials
-        credentials = grpc.dynamic_ssl_server_credentials(feed.initial, feed.fetch, self._asks_clients)
+        lock, in_use = threading.Lock(), self._material.value
+
+        def fetch() -> grpc.ServerCertificateConfiguration | None:
+            """Called by grpc for every connection, in its own threads; None: no change."""
+            nonlocal in_use
+            with lock:
+                if self._material.value is in_use:
+                    return None
+                in_use = self._material.value
+                return _configuration(in_use)
+
+        credentials: grpc.ServerCredentials = grpc.dynamic_ssl_server_credentials(
+            _configuration(in_use), fetch, self._require_client_certificates
+        )
         return credentials
-
-
-class _Feed:
-    """Tells grpc of new certificates: it asks with every connection, in threads of its own."""
-
-    def __init__(self, source: Reloading[TlsMaterial]) -> None:
-        self._source = source
-        self._given = source.value
-        self._lock = threading.Lock()
-        self.initial = _configuration(self._given)
-
-    def fetch(self) -> grpc.ServerCertificateConfiguration | None:
-        """What is to be used from now on; None for what is in use."""
-        with self._lock:
-            material = self._source.value
-            if material is self._given:
-                return None
-            self._given = material
-        return _configuration(material)
 
 
 def _configuration(material: TlsMaterial) -> grpc.ServerCertificateConfiguration:
@@ -126,7 +122,7 @@ def _certificates(data: bytes, path: Path) -> Sequence[x509.Certificate]:
 
 
 def _check_time(certificate: x509.Certificate, path: Path) -> None:
-    """Raises SecurityError if no client would accept it today."""
+    """Raises SecurityError if the certificate is not valid now."""
     begins, ends, now = certificate.not_valid_before_utc, certificate.not_valid_after_utc, datetime.now(timezone.utc)
     if ends <= now:
         raise SecurityError(f"the certificate {path} expired at {ends.isoformat()}")
@@ -135,7 +131,7 @@ def _check_time(certificate: x509.Certificate, path: Path) -> None:
 
 
 def _certified_key(certificate: x509.Certificate, path: Path) -> bytes:
-    """The public key that a certificate is for, DER."""
+    """The public key of a certificate, DER."""
     try:
         return certificate.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
     except (ValueError, UnsupportedAlgorithm) as error:
@@ -143,11 +139,11 @@ def _certified_key(certificate: x509.Certificate, path: Path) -> bytes:
 
 
 def _public_key_of(data: bytes, path: Path) -> bytes:
-    """The public half of a private key, DER."""
+    """The public key of a private one, DER."""
     try:
         key = load_pem_private_key(data, password=None)
     except TypeError as error:
-        raise SecurityError(f"the key {path} is encrypted, and nobody is there to ask for its password") from error
+        raise SecurityError(f"the key {path} is encrypted; the server cannot ask for its password") from error
     except (ValueError, UnsupportedAlgorithm) as error:
         raise SecurityError(f"{path} holds no private key in PEM form") from error
     return key.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)

@@ -1,7 +1,7 @@
-"""The file of tokens: who holds one, whose scenes it opens, what it allows. It holds hashes, never the tokens.
+"""The file of tokens: names, tenants, roles and hashes, never the tokens themselves.
 
-A token is 32 random bytes, so that a plain SHA-256 is enough: slow hashes are for passwords, which can be guessed. The
-file is JSON, which a program can both read and write:
+A token is 32 random bytes, so a plain SHA-256 is enough: slow hashes are for passwords, which can be guessed. The file
+is JSON, which programs can read and write:
 
     {"tokens": [{"name": "robot-7", "tenant": "acme", "role": "localize", "sha256": "...",
                  "expires": "2027-01-01T00:00:00Z"}],
@@ -31,7 +31,7 @@ from .principal import DEFAULT_TENANT, Role
 from .reloading import read_file
 
 PREFIX = "mapless_"
-"""Begins every token, so that programs that look for leaked secrets find them."""
+"""First characters of every token, by which scanners for leaked secrets find it."""
 
 _TOKEN_BYTES = 32
 _FILE_MODE = 0o600
@@ -40,14 +40,14 @@ Name = Annotated[str, AfterValidator(check_id)]
 
 
 class Token(BaseModel):
-    """What is known of a token.
+    """An entry of the file.
 
     Attributes:
-        name: of whoever holds it; unique, and what the log calls the caller.
-        tenant: whose scenes it opens.
-        role: what it allows.
+        name: of the holder; unique, and the caller's name in the log.
+        tenant: whose scenes the holder can access.
+        role: the holder's rights.
         sha256: of the token, hexadecimal.
-        expires: when it ceases to be good; None: never.
+        expires: when it expires; None: never.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -60,12 +60,12 @@ class Token(BaseModel):
 
     @property
     def allows(self) -> Role:
-        """The role."""
+        """The role as an enum."""
         return Role[self.role.upper()]
 
 
 class TenantLimits(BaseModel):
-    """What is set for one tenant; `rate_ms` stands for the setting tenant_rate_ms, 0 for no limit."""
+    """Limits of one tenant; `rate_ms` replaces the setting tenant_rate_ms, 0 for no limit."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -73,7 +73,7 @@ class TenantLimits(BaseModel):
 
 
 class Tokens(BaseModel):
-    """What the file holds."""
+    """The contents of the file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -85,18 +85,18 @@ class Tokens(BaseModel):
         for what, values in (("name", [it.name for it in self.tokens]), ("sha256", [it.sha256 for it in self.tokens])):
             value, count = next(iter(Counter(values).most_common(1)), ("", 0))
             if count > 1:
-                raise ValueError(f"the {what} {value!r} stands twice")
+                raise ValueError(f"two tokens have the {what} {value!r}")
         return self
 
     def find(self, token: str) -> Token | None:
-        """What is known of a token; None if it is none of these.
+        """The entry of a token; None if it is unknown.
 
-        The look-up is by the hash: how long it takes tells of the hash of what the caller sent, and nothing of ours.
+        The look-up is by hash, so its duration depends on the caller's own token and reveals nothing of the others.
         """
         return self._by_hash.get(sha256_of(token))
 
     def rate_ms(self, tenant: str) -> float | None:
-        """Computing time that a tenant may use, milliseconds a second; None if the file says nothing of it."""
+        """Computing time that a tenant may use, milliseconds a second; None if the file does not set it."""
         limits = self.tenants.get(tenant)
         return limits.rate_ms if limits else None
 
@@ -106,16 +106,12 @@ class Tokens(BaseModel):
 
 
 def sha256_of(token: str) -> str:
-    """By which a token is known, hexadecimal."""
+    """The hash of a token, hexadecimal."""
     return hashlib.sha256(token.encode()).hexdigest()
 
 
 def read_tokens(path: Path) -> Tokens:
-    """The file of tokens.
-
-    Raises:
-        SecurityError: it cannot be read, or does not hold what it should.
-    """
+    """The file of tokens; SecurityError if it cannot be read or is malformed."""
     try:
         return Tokens.model_validate_json(read_file(path))
     except ValidationError as error:
@@ -123,10 +119,10 @@ def read_tokens(path: Path) -> Tokens:
 
 
 def create_token(path: Path, name: str, tenant: str, role: str, expires: datetime | None) -> str:
-    """A new token, whose hash is added to the file; the file is made if there is none.
+    """A new token, whose hash is added to the file, or to a new file.
 
     Raises:
-        SecurityError: the name is taken, something is not as it should be, or the file cannot be read or written.
+        SecurityError: the name is taken, a value is wrong, or the file cannot be read or written.
     """
     token = PREFIX + secrets.token_urlsafe(_TOKEN_BYTES)
     fields = {"name": name, "tenant": tenant, "role": role, "sha256": sha256_of(token), "expires": expires}
@@ -137,27 +133,27 @@ def create_token(path: Path, name: str, tenant: str, role: str, expires: datetim
     with _changing(path) as file:
         old = read_tokens(file) if file.exists() else Tokens()
         if any(it.name == name for it in old.tokens):
-            raise SecurityError(f"there is a token of the name {name!r} already; revoke it first, or take another name")
+            raise SecurityError(f"a token of the name {name!r} exists already; revoke it first, or use another name")
         _write(file, Tokens(tokens=(*old.tokens, new), tenants=old.tenants))
     return token
 
 
 def revoke_token(path: Path, name: str) -> None:
-    """Removes a token from the file; a running server refuses it about a second later.
+    """Removes a token from the file; a running server rejects it about a second later.
 
     Raises:
-        SecurityError: there is none of this name, or the file cannot be read or written.
+        SecurityError: no token has this name, or the file cannot be read or written.
     """
     with _changing(path) as file:
         old = read_tokens(file)
         kept = tuple(it for it in old.tokens if it.name != name)
         if len(kept) == len(old.tokens):
-            raise SecurityError(f"there is no token of the name {name!r}")
+            raise SecurityError(f"no token has the name {name!r}")
         _write(file, Tokens(tokens=kept, tenants=old.tenants))
 
 
 def _describe(error: ValidationError) -> str:
-    """The first fault, without what stands there: somebody may have put a token where its hash should be."""
+    """The first fault, without the value, which may be a token in the place of its hash."""
     fault = error.errors()[0]
     where = ascii(".".join(map(str, fault["loc"])))[1:-1]  # names in the file may be anything
     what = fault["msg"].removeprefix("Value error, ")
@@ -166,7 +162,7 @@ def _describe(error: ValidationError) -> str:
 
 @contextmanager
 def _changing(path: Path) -> Iterator[Path]:
-    """The file itself, should `path` be a link, while no other command changes it; SecurityError if it cannot be."""
+    """The file, with links resolved, locked against other commands; SecurityError if that fails."""
     file = path.resolve()
     try:
         folder = os.open(file.parent, os.O_RDONLY)
@@ -182,12 +178,12 @@ def _changing(path: Path) -> Iterator[Path]:
 
 
 def _write(file: Path, tokens: Tokens) -> None:
-    """Puts a new file in the place of the old one, so that nobody ever reads half of it."""
+    """Replaces the file atomically."""
     new = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
     descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _FILE_MODE)
     try:
         with open(descriptor, "w") as stream:
-            if file.exists() and os.geteuid() == 0:  # the server, which is not root, must still be able to read it
+            if file.exists() and os.geteuid() == 0:  # the server, which is not root, must be able to read it
                 os.fchown(descriptor, file.stat().st_uid, file.stat().st_gid)
             stream.write(tokens.model_dump_json(indent=2, exclude_none=True) + "\n")
             stream.flush()
