@@ -1,50 +1,78 @@
-"""The server that a command talks to: one that runs, or one of its own on the settings' store."""
+"""The server that a command talks to: one that runs, or one of its own on the store of the settings.
+
+Imports the client only when it connects, so that --help answers at once.
+"""
 
 from __future__ import annotations
 
+import functools
+import inspect
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-from mapless import Client, ConnectOptions
+import typer
+
 from mapless_server.settings import CLIENT_TOKEN_VARIABLE, Settings
-from mapless_tools.child import child_server
+
+if TYPE_CHECKING:
+    from mapless import Client, ConnectOptions
+
+Scene = Annotated[str, typer.Argument(help="Id of the scene.")]
 
 
 @dataclass(frozen=True)
 class Connection:
-    """Where a server is and how to connect.
+    """Where a server is and how to connect; each field is a flag of the commands that connect."""
 
-    Attributes:
-        address: "host:port"; empty for a server of one's own.
-        tls: whether to encrypt.
-        ca, certificate, key, token_file: files, or none.
-        client_id: which of the token's users this is.
-    """
-
-    address: str = ""
-    tls: bool = False
-    ca: Path | None = None
-    certificate: Path | None = None
-    key: Path | None = None
-    token_file: Path | None = None
-    client_id: str = ""
+    address: Annotated[
+        str, typer.Option(help="host:port of the server; default: one is started on the store of the settings.")
+    ] = ""
+    tls: Annotated[bool, typer.Option("--tls", help="Encrypt; --ca and --cert imply it.")] = False
+    ca: Annotated[Path | None, typer.Option(help="Certificate that signed the server's, PEM.")] = None
+    cert: Annotated[Path | None, typer.Option(help="Our own certificate, PEM, if the server asks.")] = None
+    key: Annotated[Path | None, typer.Option(help="Its key, PEM.")] = None
+    token_file: Annotated[
+        Path | None, typer.Option(help="Holds the token to show; default: that in MAPLESS_TOKEN.")
+    ] = None
+    client_id: Annotated[str, typer.Option(help="Which of the token's users this is.")] = ""
 
     def options(self) -> ConnectOptions:
         """As the client takes them; ValueError if they do not fit together or a file cannot be read."""
+        from mapless import ConnectOptions
+
         token = _read(self.token_file).decode("utf-8") if self.token_file else os.environ.get(CLIENT_TOKEN_VARIABLE)
         return ConnectOptions(
             timeout_s=60.0,
             upload_timeout_s=600.0,
-            tls=self.tls or self.ca is not None or self.certificate is not None,
+            tls=self.tls or self.ca is not None or self.cert is not None,
             root_certificates=_read(self.ca) if self.ca else None,
-            client_certificate=_read(self.certificate) if self.certificate else None,
+            client_certificate=_read(self.cert) if self.cert else None,
             client_key=_read(self.key) if self.key else None,
             token=token.strip() if token else None,
             client_id=self.client_id,
         )
+
+
+def with_connection_flags(command: Callable[..., None]) -> Callable[..., None]:
+    """Gives a command the flags of a Connection in the place of its keyword parameter `connection`."""
+    own = inspect.signature(command, eval_str=True).parameters.values()
+    hints = get_type_hints(Connection, include_extras=True)
+    flags = [
+        inspect.Parameter(it.name, inspect.Parameter.KEYWORD_ONLY, default=it.default, annotation=hints[it.name])
+        for it in fields(Connection)
+    ]
+
+    @functools.wraps(command)
+    def connecting(**arguments: Any) -> None:
+        connection = Connection(**{flag.name: arguments.pop(flag.name) for flag in flags})
+        command(**arguments, connection=connection)
+
+    vars(connecting)["__signature__"] = inspect.Signature([*(it for it in own if it.name != "connection"), *flags])
+    return connecting
 
 
 @contextmanager
@@ -55,6 +83,8 @@ def connected(connection: Connection, settings: Settings) -> Iterator[Client]:
         ValueError: the connection's options do not fit together, or the settings' server would not take us.
         ServerFailed: our own server did not start.
     """
+    from mapless import Client
+
     with reachable(connection, settings) as (address, options), Client(address, options) as client:
         yield client
 
@@ -67,6 +97,10 @@ def reachable(
 
     `environment` has settings for a server that is started, besides those of our own environment.
     """
+    from mapless import ConnectOptions
+
+    from .child import child_server
+
     options = connection.options()
     if connection.address:
         yield connection.address, options

@@ -22,9 +22,7 @@ from typer.testing import CliRunner, Result
 
 from mapless import Client
 from mapless.geometry import Camera
-from mapless_server.settings import Settings
 from mapless_tools.child import ServerFailed
-from mapless_tools.connection import Connection
 from mapless_tools.ingest.command import export_command, import_command
 from mapless_tools.ingest.formats.colmap.writing import PosedImage
 from mapless_tools.ingest.formats.writing import LAYOUTS
@@ -270,11 +268,11 @@ def test_the_store_may_be_named_by_its_folder(
 ) -> None:
     asked: list[Path] = []
 
-    def connected(connection: Connection, settings: Settings) -> NoReturn:
-        asked.append(settings.data_dir)
+    def child_server(store: Path, **_: Any) -> NoReturn:
+        asked.append(store)
         raise ServerFailed("as asked")
 
-    monkeypatch.setattr("mapless_tools.connection.connected", connected)
+    monkeypatch.setattr("mapless_tools.child.child_server", child_server)
     monkeypatch.delenv("MAPLESS_DATABASE_URL", raising=False)
     arguments = ["scene", str(tmp_path / "out")] if command == "export" else [str(folder), "scene", "--skip-check"]
     arguments = [command, *arguments, "--data-dir", str(tmp_path / "data")]

@@ -30,10 +30,8 @@ from mapless import (
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.ingest.existing import KnownReferences
-from mapless_tools.ingest.items import BATCH_BYTES, BATCH_COUNT
 from mapless_tools.ingest.report import ImportReport
-from mapless_tools.ingest.upload import Uploader
-from mapless_tools.ingest.waiting import UploadOptions
+from mapless_tools.ingest.upload import BATCH_BYTES, BATCH_COUNT, Uploader, UploadOptions
 
 Fault = Callable[[Sequence[NewReference], int], MaplessError | None]
 """What the server answers to a message and to which call, None to store it."""

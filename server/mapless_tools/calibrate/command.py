@@ -9,11 +9,13 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from mapless_tools.ingest.command import FORMAT_NAMES, Address, Ca, Cert, ClientId, Key, Tls, TokenFile
+from mapless_tools.connection import Connection, with_connection_flags
+from mapless_tools.ingest.command import FORMAT_NAMES
 
 OUTPUT = Path("calibration-output")
 
 
+@with_connection_flags
 def calibrate_command(
     folder: Annotated[
         Path | None, typer.Argument(help="Folder with photographs and their poses; not needed with --clear.")
@@ -45,13 +47,8 @@ def calibrate_command(
         False
     ),
     output: Annotated[Path, typer.Option(help="Folder for report.html and report.json.")] = OUTPUT,
-    address: Address = "",
-    tls: Tls = False,
-    ca: Ca = None,
-    cert: Cert = None,
-    key: Key = None,
-    token_file: TokenFile = None,
-    client_id: ClientId = "",
+    *,
+    connection: Connection,
 ) -> None:
     """Measure how often the truth lies within the radii that answers claim, and store what makes them right.
 
@@ -61,14 +58,12 @@ def calibrate_command(
     """
     from mapless import MaplessError
     from mapless_tools.child import ServerFailed
-    from mapless_tools.connection import Connection
     from mapless_tools.evaluate.command import usage_errors
     from mapless_tools.evaluate.plan import UsageError
 
     from .run import CalibrateOptions, calibrate, clear_calibration
 
     try:
-        connection = Connection(address, tls, ca, cert, key, token_file, client_id)
         if clear:
             clear_calibration(folder, scene, connection)
             print(f"answers in scene {scene} are uncalibrated now")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mapless_server.serve.command import fail
-from mapless_tools.ingest.command import Address, Ca, Cert, ClientId, Key, Scene, Tls, TokenFile
+from mapless_tools.connection import Connection, Scene, with_connection_flags
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -30,19 +30,15 @@ MAX_TIMEOUT_S = 600.0
 _ORDER = (*ALARMS, "DUPLICATE", "UNVERIFIABLE", "CONSISTENT")
 
 
+@with_connection_flags
 def audit_command(
     scene: Scene,
     report: Annotated[Path | None, typer.Option(help="JSON file for the whole report.")] = None,
     html: Annotated[Path | None, typer.Option(help="HTML file for the whole report.")] = None,
     page_size: Annotated[int, typer.Option(help="References a call, 1 to 100; each takes up to a second.")] = 10,
     everything: Annotated[bool, typer.Option("--all", help="Print consistent references, too.")] = False,
-    address: Address = "",
-    tls: Tls = False,
-    ca: Ca = None,
-    cert: Cert = None,
-    key: Key = None,
-    token_file: TokenFile = None,
-    client_id: ClientId = "",
+    *,
+    connection: Connection,
 ) -> None:
     """Examine the references of a scene against their neighbours; exit code 1 when any of them is wrong.
 
@@ -52,7 +48,7 @@ def audit_command(
     from mapless_server.serve.signals import terminable
     from mapless_server.settings import ConfigError, load_settings
     from mapless_tools.child import ServerFailed
-    from mapless_tools.connection import Connection, connected
+    from mapless_tools.connection import connected
     from mapless_tools.output_files import check_writable
     from mapless_tools.progress import progress_bars
 
@@ -61,7 +57,6 @@ def audit_command(
         for file in filter(None, (report, html)):
             check_writable(file)
         settings = load_settings({}).settings
-        connection = Connection(address, tls, ca, cert, key, token_file, client_id)
         with terminable(), connected(connection, settings) as client, progress_bars() as progress:
             examined.total = client.get_scene(scene).reference_count
             progress("audit", 0, examined.total)

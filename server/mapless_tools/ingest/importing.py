@@ -1,22 +1,32 @@
-"""An import from end to end: read, check, compare with what is there, store, report."""
+"""An import from end to end: read, choose, check, compare with what is there, store, report."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from mapless import AlreadyExists, Client, Reference
+from rich.console import Console
+
+from mapless import AlreadyExists, Client, MaplessError, Reference
 from mapless.names import check_id
 from mapless_server.errors import InvalidArgument
 from mapless_server.images.decode import ImageLimits, image_size
+from mapless_server.serve.signals import terminable
+from mapless_server.settings import Settings
+from mapless_tools.child import ServerFailed
+from mapless_tools.connection import Connection, connected
 from mapless_tools.dataset import MAX_NAME_LENGTH, Dataset, Frame, Refusal
-from mapless_tools.progress import Progress
+from mapless_tools.output_files import check_writable, write_json
+from mapless_tools.progress import progress_bars
 
+from .check import check_frames
 from .existing import KnownReferences
 from .formats import ReadOptions, read_dataset
-from .report import ImportReport
-from .upload import Uploader
-from .waiting import UploadOptions
+from .report import ImportReport, print_report, to_json, verdict_lines
+from .upload import Uploader, UploadOptions
 
 
 @dataclass(frozen=True)
@@ -25,9 +35,9 @@ class ImportOptions:
 
     Attributes:
         format: name of the folder's layout, or "auto".
-        read: what its reader is told.
+        read: options of its reader.
         split: take only frames of this split, "train" or "test"; empty for all.
-        stride: take every so-manieth frame.
+        stride: take only the first of every so many frames.
         max_count: take so many at most, spread evenly; None for all.
         id_prefix: before every reference's id, for several folders in one scene.
         check: whether to compare photographs with the poses first.
@@ -50,6 +60,47 @@ class ImportOptions:
             raise ValueError("stride and max must be at least 1")
         if self.id_prefix:
             check_id(f"{self.id_prefix}0")
+
+
+def run_import(
+    folder: Path,
+    scene: str,
+    options: ImportOptions,
+    settings: Settings,
+    connection: Connection | None,
+    report_file: Path | None,
+) -> bool:
+    """An import, without a connection a dry one; prints what it does and finds.
+
+    Returns:
+        whether all that was to be imported is in; of a dry run, whether all could be.
+
+    Raises:
+        ValueError: the folder, the scene's id or the connection cannot be used.
+    """
+    check_id(scene)
+    if report_file is not None:
+        check_writable(report_file)
+    dataset, frames = read_frames(folder, options)
+    _print(f"{folder}: {len(dataset.frames)} frames in layout {dataset.format}, {len(frames)} of them chosen")
+    for note in dataset.notes:
+        _print(f"note: {note}")
+    if not dataset.metric and not dataset.notes:
+        _print("note: its unit of length is not the metre; it is taken for metres, so all distances are in that unit")
+    report = ImportReport(scene, dataset, frames, is_dry=connection is None)
+    with terminable(), _reported(report, report_file):
+        if options.check:
+            with progress_bars() as progress:
+                report.verdict = check_frames(frames, progress)
+            for line in verdict_lines(report.verdict, frames):
+                _print(line)
+        if connection is None:
+            refuse_wrong_images(report)
+        elif report.verdict is not None and report.verdict.is_wrong:
+            report.stopped = "nothing is stored while the poses do not fit the photographs; --skip-check does it anyhow"
+        else:
+            _store(report, options.upload, settings, connection)
+    return report.went_well
 
 
 def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Frame, ...]]:
@@ -86,16 +137,14 @@ def refuse_wrong_images(report: ImportReport) -> None:
             report.refused.append(Refusal(frame.name, f"{frame.image_path.name} {reason}"))
 
 
-def store_frames(client: Client, report: ImportReport, options: UploadOptions, progress: Progress) -> None:
-    """Stores the report's chosen frames in its scene, which is made if there is none.
-
-    A scene that is made takes the dataset's datum and down; one that is there keeps its own.
-
-    Raises:
-        MaplessError: the scene could not be listed or made.
-    """
-    known = KnownReferences(_existing(client, report.scene, report.dataset))
-    Uploader(client, known, report, options, progress).run()
+def _store(report: ImportReport, options: UploadOptions, settings: Settings, connection: Connection) -> None:
+    """Stores the chosen frames in the scene, which is made with the dataset's datum and down if there is none."""
+    try:
+        with connected(connection, settings) as client, progress_bars() as progress:
+            known = KnownReferences(_existing(client, report.scene, report.dataset))
+            Uploader(client, known, report, options, progress).run()
+    except (MaplessError, ServerFailed) as error:
+        report.stopped = str(error)
 
 
 def _existing(client: Client, scene: str, dataset: Dataset) -> list[Reference]:
@@ -106,6 +155,20 @@ def _existing(client: Client, scene: str, dataset: Dataset) -> list[Reference]:
     return []
 
 
+@contextmanager
+def _reported(report: ImportReport, file: Path | None) -> Iterator[None]:
+    """The report is printed and written however the block is left."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit):
+        report.stopped = report.stopped or "interrupted"
+        raise
+    finally:
+        print_report(report, Console(soft_wrap=True))
+        if file is not None:
+            write_json(file, to_json(report))
+
+
 def _prefixed(frame: Frame, prefix: str) -> Frame:
     if not prefix:
         return frame
@@ -113,3 +176,7 @@ def _prefixed(frame: Frame, prefix: str) -> Frame:
     if len(name) > MAX_NAME_LENGTH:
         raise ValueError(f"{name} is longer than the {MAX_NAME_LENGTH} characters that an id may have")
     return replace(frame, name=name)
+
+
+def _print(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

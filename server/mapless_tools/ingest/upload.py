@@ -7,11 +7,13 @@ stored all the same, so an id that is taken is looked at before it is called a d
 
 from __future__ import annotations
 
+import hashlib
 import re
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 from mapless import (
     AlreadyExists,
@@ -20,21 +22,49 @@ from mapless import (
     Internal,
     InvalidArgument,
     MaplessError,
+    NewReference,
     NotFound,
     ResourceExhausted,
     Unavailable,
 )
+from mapless_server.errors import InvalidArgument as BadImage
+from mapless_server.images.decode import image_size
 from mapless_tools.dataset import Frame, Refusal
 from mapless_tools.progress import Progress
 
 from .existing import KnownReferences, Stored, difference, stored_of
-from .items import Item, batches_of, read_item
+from .formats.collecting import ANY_SIZE
 from .report import ALREADY_THERE, ImportReport
-from .waiting import UploadOptions, Waiting
+
+BATCH_COUNT = 8
+"""References a message: progress shows, and little is sent again when one is refused."""
+
+BATCH_BYTES = 6 * 2**20
+"""Of images a message; large ones take the server long to receive, which its other callers feel."""
 
 STORE_FULL = "STORE_FULL"
-
 _REQUEST = re.compile(r"requests\[(\d+)\]")
+
+
+@dataclass(frozen=True)
+class UploadOptions:
+    """Options of storing.
+
+    Attributes:
+        parallel: messages in flight. The server describes their photographs side by side; more only wait.
+        busy_patience_s: how long a server may say that it is too busy before the import gives up.
+        away_patience_s: how long it may be unreachable; a restart takes seconds.
+    """
+
+    parallel: int = 3
+    busy_patience_s: float = 600.0
+    away_patience_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.parallel <= 64:
+            raise ValueError(f"--parallel is the number of messages in flight, 1 to 64, not {self.parallel}")
+        if not (self.busy_patience_s > 0 and self.away_patience_s > 0):
+            raise ValueError("times must be above 0")
 
 
 class _Stopped(Exception):
@@ -212,3 +242,77 @@ class Uploader:
                 self._report.stopped = reason
             self._stop.set()
         raise _Stopped
+
+
+@dataclass(frozen=True, eq=False)
+class Item:
+    """A frame that is ready to be sent."""
+
+    frame: Frame
+    image: bytes
+    stored: Stored
+
+    def reference(self) -> NewReference:
+        """What the client sends."""
+        return NewReference(self.frame.name, self.image, self.frame.camera, self.frame.world_from_camera)
+
+
+def read_item(frame: Frame) -> Item:
+    """A frame with its image's bytes; ValueError if they cannot be what its camera took."""
+    file, camera = frame.image_path, frame.camera
+    try:
+        image = file.read_bytes()
+        width, height = image_size(image, ANY_SIZE)
+    except OSError as error:
+        raise ValueError(f"{file} cannot be read: {error.strerror}") from error
+    except BadImage as error:
+        raise ValueError(f"{file}: {error}") from error
+    if (width, height) != (camera.width_px, camera.height_px):
+        raise ValueError(f"{file} has {width}x{height} pixels, its camera {camera.width_px}x{camera.height_px}")
+    stored = Stored(frame.name, hashlib.sha256(image).hexdigest(), camera, frame.world_from_camera)
+    return Item(frame, image, stored)
+
+
+def batches_of(frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
+    """Frames in their order, as many together as one message shall have; their files are not read."""
+    batch: list[Frame] = []
+    batch_bytes = 0
+    for frame in frames:
+        try:
+            size_bytes = frame.image_path.stat().st_size
+        except OSError:  # whoever reads it says so
+            size_bytes = 0
+        if batch and (len(batch) == BATCH_COUNT or batch_bytes + size_bytes > BATCH_BYTES):
+            yield batch
+            batch, batch_bytes = [], 0
+        batch.append(frame)
+        batch_bytes += size_bytes
+    if batch:
+        yield batch
+
+
+class Waiting:
+    """Waiting for the server on behalf of one message."""
+
+    def __init__(self, options: UploadOptions, stop: threading.Event) -> None:
+        self.lost_an_answer = False
+        self._options = options
+        self._stop = stop
+        self._start_s = time.monotonic()
+        self._away_s = 0.0
+
+    def for_busy(self, retry_after_s: float) -> bool:
+        """Waits as the server asks; False when that has been going on for too long."""
+        if time.monotonic() - self._start_s > self._options.busy_patience_s:
+            return False
+        self._stop.wait(min(max(retry_after_s, 0.05), 30.0))
+        return True
+
+    def for_return(self) -> bool:
+        """Waits a little longer each time; False when it has been long enough."""
+        if self._away_s >= self._options.away_patience_s:
+            return False
+        pause_s = min(max(0.5, self._away_s / 2), 5.0)
+        self._stop.wait(pause_s)
+        self._away_s += pause_s
+        return True

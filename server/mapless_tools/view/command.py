@@ -8,11 +8,12 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from mapless_tools.ingest.command import Address, Ca, Cert, ClientId, Key, Scene, Tls, TokenFile
+from mapless_tools.connection import Connection, Scene, with_connection_flags
 
 _ALLOW_WATCHING = {"MAPLESS_ALLOW_WATCHING": "true"}
 
 
+@with_connection_flags
 def view_command(
     scene: Scene,
     host: Annotated[str, typer.Option(help="Loopback address that the page is served on.")] = "127.0.0.1",
@@ -22,13 +23,8 @@ def view_command(
     seeds: Annotated[
         int, typer.Option(help="References localized against their neighbours, to have points to show; 0.5 s each.")
     ] = 8,
-    address: Address = "",
-    tls: Tls = False,
-    ca: Ca = None,
-    cert: Cert = None,
-    key: Key = None,
-    token_file: TokenFile = None,
-    client_id: ClientId = "",
+    *,
+    connection: Connection,
 ) -> None:
     """Show a scene in the browser: references, matched points, and queries as they are answered.
 
@@ -40,7 +36,7 @@ def view_command(
     from mapless_server.serve.signals import terminable
     from mapless_server.settings import ConfigError, load_settings
     from mapless_tools.child import ServerFailed
-    from mapless_tools.connection import Connection, reachable
+    from mapless_tools.connection import reachable
 
     if not is_loopback(host):
         _fail(
@@ -54,13 +50,12 @@ def view_command(
     try:
         options = ViewOptions(host, port, max_pictured, seeds)
         settings = load_settings({}).settings
-        connection = Connection(address, tls, ca, cert, key, token_file, client_id)
         with (
             terminable(),
             reachable(connection, settings, _ALLOW_WATCHING) as (server, connect),
             viewer(server, connect, scene, options) as page,
         ):
-            _tell(page, "" if address else server, no_open)
+            _tell(page, "" if connection.address else server, no_open)
             threading.Event().wait()
     except (ValueError, ConfigError) as error:
         _fail(str(error))
