@@ -228,7 +228,7 @@ def test_true_matches_are_what_these_tests_assume() -> None:
     assert set(matches.keypoint.tolist()) <= shown
 
 
-def test_senseless_options_are_refused() -> None:
+def test_options_outside_their_bounds_are_refused() -> None:
     for options in ({"prior_share": 0.0}, {"iterations": 0}, {"loss_scale_sigma": -1.0}):
-        with pytest.raises(ValueError, match="senseless"):
+        with pytest.raises(ValueError, match="must be"):
             AdjustOptions(**options)

@@ -162,7 +162,7 @@ def test_each_group_of_matches_is_judged_by_its_own_chance() -> None:
     )
 
 
-def test_senseless_options_are_refused() -> None:
+def test_options_outside_their_bounds_are_refused() -> None:
     for options in ({"min_hull_share": 1.5}, {"min_found_share": -0.1}, {"max_log10_false_alarms": math.nan}):
-        with pytest.raises(ValueError, match="senseless"):
+        with pytest.raises(ValueError, match="must be"):
             GateOptions(**options)  # type: ignore[arg-type]

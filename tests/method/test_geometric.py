@@ -188,7 +188,7 @@ def test_matches_at_random_have_no_overlap() -> None:
         assert rejection_of(scene.query, scene.references, wrong).reason is RejectionReason.LOW_OVERLAP, seed
 
 
-def test_senseless_options_are_refused() -> None:
+def test_options_outside_their_bounds_are_refused() -> None:
     for options in ({"min_baseline_m": 0.0}, {"cell_px": 0}):
-        with pytest.raises(ValueError, match="senseless"):
+        with pytest.raises(ValueError, match="must be"):
             GeometricOptions(**options)

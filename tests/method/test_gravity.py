@@ -123,8 +123,8 @@ def test_without_gravity_there_is_nothing_to_do() -> None:
 
 
 @pytest.mark.parametrize("change", [{"batch": 0}, {"max_samples": 0}, {"confidence": 1.0}, {"refined": 0}])
-def test_senseless_options_are_refused(change: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="senseless"):
+def test_options_outside_their_bounds_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="must be"):
         GravityOptions(**change)  # type: ignore[arg-type]
 
 

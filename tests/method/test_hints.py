@@ -122,5 +122,5 @@ def test_poses_and_hints_that_are_there_stay() -> None:
 
 
 def test_options_check_themselves() -> None:
-    with pytest.raises(ValueError, match="senseless"):
+    with pytest.raises(ValueError, match="must be"):
         HintOptions(few_matches=50, many_matches=20)

@@ -251,7 +251,7 @@ def test_superpoint_keypoints_are_pixels(tmp_path: Path) -> None:
     np.testing.assert_array_equal(view.features.keypoints, np.rint(view.features.keypoints))
 
 
-def test_senseless_options_are_refused() -> None:
+def test_options_outside_their_bounds_are_refused() -> None:
     for options in ({"max_keypoints": 0}, {"max_side_px": 8}, {"min_score": 1.0}, {"min_score": float("nan")}):
-        with pytest.raises(ValueError, match="senseless"):
+        with pytest.raises(ValueError, match="must be"):
             LearnedOptions(**options)

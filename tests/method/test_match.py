@@ -230,7 +230,7 @@ def test_nothing_is_found_where_nothing_is(options: MatchOptions) -> None:
         assert len(match_points(query, scene.references, points, none, pose, options)) == 0
 
 
-def test_senseless_options_are_refused() -> None:
+def test_options_outside_their_bounds_are_refused() -> None:
     for options in ({"radius_px": -1.0}, {"min_similarity": 2.0}, {"radius_px": float("nan")}):
-        with pytest.raises(ValueError, match="senseless"):
+        with pytest.raises(ValueError, match="must be"):
             MatchOptions(**options)  # type: ignore[arg-type]

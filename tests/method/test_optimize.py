@@ -191,6 +191,7 @@ def test_losses_are_scipys_and_weights_their_derivatives(scale: float, squared: 
     assert_jacobian(cauchy_weight(s, scale), lambda x: cauchy_cost(x, scale), s, tolerance=1e-5)
     theirs = least_squares(lambda x: [math.sqrt(squared) + 0 * x[0]], [0.0], loss="soft_l1", f_scale=scale)
     assert soft_l1(s, scale)[0] == pytest.approx(2 * theirs.cost)
+    assert_jacobian(soft_l1_weight(s, scale), lambda x: float(soft_l1(x, scale)[0]), s, tolerance=1e-5)
 
 
 @pytest.mark.parametrize(

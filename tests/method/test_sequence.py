@@ -234,5 +234,5 @@ def test_a_session_is_put_where_its_frame_is() -> None:
 
 @pytest.mark.parametrize("change", [{"share": 0.0}, {"floor_m": -1.0}, {"loss_scale": 0.0}, {"deg_per_m": -0.1}])
 def test_senseless_drift_is_refused(change: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="senseless"):
+    with pytest.raises(ValueError, match="must be"):
         DriftOptions(**change)

@@ -26,7 +26,6 @@ from mapless_server.method.observations import (
     estimate_noise,
     triangulate,
 )
-from mapless_server.method.robust import soft_l1, soft_l1_weight
 from mapless_server.method.structure import (
     PAPER_STRUCTURE,
     Structure,
@@ -107,20 +106,6 @@ def test_jacobians() -> None:
             return np.asarray(observations.residuals(moved)[row])
 
         assert_jacobian(jacobians[o], residual, truth[point], tolerance=1e-6)
-
-
-@pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
-def test_soft_l1_is_square_then_linear_and_matches_its_weight(scale: float) -> None:
-    for squared in (0.0, 1e-3, 0.7, 10.0, 1e4):
-        assert_jacobian(
-            np.array([soft_l1_weight(np.array(squared), scale)]),
-            lambda s: soft_l1(s, scale),
-            [squared],
-            step=1e-6 * max(1, squared),
-            tolerance=1e-6,
-        )
-    assert soft_l1(np.array(1e-6), scale) == pytest.approx(1e-6, rel=1e-3)
-    assert soft_l1(np.array(1e10), scale) == pytest.approx(2 * scale * 1e5, rel=1e-3)
 
 
 # Small systems
@@ -454,12 +439,12 @@ def test_without_matches_there_is_no_structure(options: StructureOptions) -> Non
         assert structure.tracks.point_count == 0
 
 
-def test_senseless_options_are_refused() -> None:
+def test_options_outside_their_bounds_are_refused() -> None:
     for options in (
         {"iterations": 0},
         {"loss_scale_sigma": 0.0},
         {"max_residual_sigma": -1.0},
         {"min_parallax_deg": 90.0},
     ):
-        with pytest.raises(ValueError, match="senseless"):
+        with pytest.raises(ValueError, match="must be"):
             StructureOptions(**options)

@@ -184,6 +184,6 @@ def test_without_an_estimate_there_is_nothing_to_ask() -> None:
 @pytest.mark.parametrize(
     "options", [{"shrinkage": -0.1}, {"shrinkage": 1.1}, {"shared_matches": 0.0}, {"position_factor": 0.0}]
 )
-def test_senseless_options_are_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="senseless"):
+def test_options_outside_their_bounds_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="must be"):
         UncertaintyOptions(**options)

@@ -222,8 +222,8 @@ def test_what_is_remembered_of_neighbours_changes_no_verdict(references: list[Po
     assert len(forgetful._findings) == 1
 
 
-def test_senseless_options_are_refused() -> None:
-    with pytest.raises(ValueError, match="senseless"):
+def test_options_outside_their_bounds_are_refused() -> None:
+    with pytest.raises(ValueError, match="must be"):
         AuditOptions(position_tolerance_m=0.0)
 
 

@@ -249,6 +249,6 @@ def test_a_removed_reference_is_never_ranked() -> None:
         lambda: RankOptions(smallest_pool=0),
     ],
 )
-def test_senseless_options_are_refused(make: Callable[[], RankOptions]) -> None:
-    with pytest.raises(ValueError, match="senseless"):
+def test_options_outside_their_bounds_are_refused(make: Callable[[], RankOptions]) -> None:
+    with pytest.raises(ValueError, match="must be"):
         make()

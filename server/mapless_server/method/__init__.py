@@ -2,6 +2,7 @@
 
 Begin with `localize`, the stages in order. A module imports only modules above it in this list, which has no circle:
 
+options                      how options check themselves
 arrays, stopwatch, turns     either NumPy or torch; time of the stages; a call that may end early
 rigid, robust, optimize      small motions; robust losses; Levenberg-Marquardt, the only one
 views, reconstruction        photographs with features and poses; what the coarse stage gives

@@ -24,6 +24,7 @@ from mapless.geometry import RigidTransform
 from .bundle import Bundle, BundleProblem, bundle_of, reference_information
 from .match import PointMatches
 from .optimize import MinimizeOptions, minimize
+from .options import check_bounds
 from .pnp import PoseEstimate, PoseStage, reprojection_errors_px
 from .priors.known import NO_PRIORS, Priors
 from .structure import Structure
@@ -61,17 +62,8 @@ class AdjustOptions:
     uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
 
     def __post_init__(self) -> None:
-        positive = (
-            self.inlier_px,
-            self.min_kept_share,
-            self.loss_scale_sigma,
-            self.prior_share,
-            self.max_error_px,
-            self.iterations,
-            self.min_decrease,
-        )
-        if not min(positive) > 0:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "inlier_px min_kept_share loss_scale_sigma prior_share max_error_px", above=0)
+        check_bounds(self, "iterations min_decrease", above=0)
 
 
 def adjust_pose(

@@ -12,6 +12,7 @@ from mapless.geometry import Array, RigidTransform
 
 from .adjust import AdjustOptions
 from .match import PAPER_MATCH, MatchOptions
+from .options import check_bounds
 from .pnp import PnpOptions, PoseEstimate, PoseStage
 from .priors.known import PriorCheck
 from .rejection import Rejection
@@ -67,8 +68,7 @@ class LocalizeOptions:
     coverage: float = 0.99
 
     def __post_init__(self) -> None:
-        if not 0 < self.coverage <= 1:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "coverage", above=0, at_most=1)
 
     @property
     def structure(self) -> StructureOptions:

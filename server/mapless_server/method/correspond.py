@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, cross_matrix
 
+from .options import check_bounds
 from .views import Features, Matches, PosedView, View
 
 
@@ -53,12 +54,10 @@ class CorrespondOptions:
     remembered_pairs: int = 20_000
 
     def __post_init__(self) -> None:
-        ratios = (self.reference_ratio, self.query_ratio, self.wide_ratio)
-        similar = min(self.wide_similarity, self.guided_similarity) >= -1
-        if not (
-            0 < min(ratios) <= max(ratios) <= 1 and self.epipolar_px > 0 and self.remembered_pairs >= 0 and similar
-        ):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "reference_ratio query_ratio wide_ratio", above=0, at_most=1)
+        check_bounds(self, "wide_similarity guided_similarity", at_least=-1)
+        check_bounds(self, "epipolar_px", above=0)
+        check_bounds(self, "remembered_pairs", at_least=0)
 
 
 _ALIKED = CorrespondOptions(

@@ -18,6 +18,7 @@ import poselib
 from mapless.geometry import Array
 
 from .correspond import fundamental_matrix, mutual_matches
+from .options import check_bounds
 from .views import Matches, PosedView, View
 
 
@@ -36,8 +37,9 @@ class EpipolarOptions:
     min_matches: int = 24
 
     def __post_init__(self) -> None:
-        if not (0 < self.ratio <= 1 and self.fundamental_px > 0 and self.min_matches >= 8):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "ratio", above=0, at_most=1)
+        check_bounds(self, "fundamental_px", above=0)
+        check_bounds(self, "min_matches", at_least=8)
 
 
 def consistent_matches(first: View, second: View, options: EpipolarOptions | None = None) -> Matches:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .answer import Answer
+from .options import check_bounds
 from .rejection import Advice, Hint, Rejection, RejectionReason
 from .views import PosedView, View
 
@@ -44,8 +45,8 @@ class HintOptions:
     many_matches: int = 100
 
     def __post_init__(self) -> None:
-        if not self.few_features >= 0 or not 0 < self.few_matches <= self.many_matches:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "few_features", at_least=0)
+        check_bounds(self, "few_matches", above=0, at_most=self.many_matches)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera
 from mapless_server.networks.lightglue import LightGlue
 
+from .options import check_bounds
 from .views import Features, Matches, PosedView, View
 
 NOTHING: Matches = np.empty((0, 2), np.int32)
@@ -35,8 +36,8 @@ class LightGlueOptions:
     half: bool = False
 
     def __post_init__(self) -> None:
-        if not (0 <= self.min_score < 1 and self.max_keypoints >= 1 and self.pairs_at_once >= 1):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "min_score", at_least=0, below=1)
+        check_bounds(self, "max_keypoints pairs_at_once", at_least=1)
 
 
 CPU_OPTIONS = LightGlueOptions(max_keypoints=1024, pairs_at_once=1)

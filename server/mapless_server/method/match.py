@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 from mapless.geometry import RigidTransform
 
 from .correspond import Correspondences
+from .options import check_bounds
 from .structure import Structure
 from .views import PosedView, View
 
@@ -38,8 +39,8 @@ class MatchOptions:
     min_similarity: float = 0.89
 
     def __post_init__(self) -> None:
-        if not (self.radius_px >= 0 and -1 <= self.min_similarity <= 1):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "radius_px", at_least=0)
+        check_bounds(self, "min_similarity", at_least=-1, at_most=1)
 
 
 PAPER_MATCH = MatchOptions(through_tracks=False, radius_px=20.0, min_similarity=-1.0)

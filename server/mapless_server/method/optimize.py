@@ -20,6 +20,7 @@ import numpy as np
 from mapless.geometry import Array
 
 from .arrays import AnyArray, identity, namespace, solve_symmetric
+from .options import check_bounds
 
 X = TypeVar("X")
 E = TypeVar("E")
@@ -66,13 +67,9 @@ class MinimizeOptions:
     max_damping: float = 1e6
 
     def __post_init__(self) -> None:
-        if self.iterations < 0:
-            raise ValueError(f"iterations must be at least 0, is {self.iterations}")
-        if self.raised_by <= 1:
-            raise ValueError(f"raised_by must be above 1, is {self.raised_by}")
-        for name in ("min_decrease", "damping", "max_damping"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be above 0, is {getattr(self, name)}")
+        check_bounds(self, "iterations", at_least=0)
+        check_bounds(self, "min_decrease damping max_damping", above=0)
+        check_bounds(self, "raised_by", above=1)
 
 
 def minimize(problem: Problem[X, E], start: X, options: MinimizeOptions) -> X:

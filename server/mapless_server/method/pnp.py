@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, RigidTransform
 
 from .match import PointMatches
+from .options import check_bounds
 from .priors.informed import InformedOptions, informed_pose
 from .priors.known import NO_PRIORS, PriorCheck, Priors
 from .priors.pose_only import PoseOnlyOptions
@@ -61,10 +62,9 @@ class PnpOptions:
     error_inflation: float = 2.0
 
     def __post_init__(self) -> None:
-        if not (self.inlier_px > 0 and self.loss_scale_px > 0 and self.min_matches >= 4):
-            raise ValueError(f"senseless options: {self}")
-        if not (0 < self.min_iterations <= self.max_iterations and self.error_inflation > 0):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "inlier_px loss_scale_px error_inflation", above=0)
+        check_bounds(self, "min_iterations", above=0, at_most=self.max_iterations)
+        check_bounds(self, "min_matches", at_least=4)
 
     @property
     def informed(self) -> InformedOptions:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .correspond import CorrespondOptions, mutual_matches
+from .options import check_bounds
 from .views import PosedView, View
 
 
@@ -30,8 +31,8 @@ class RetrieveOptions:
     nearby_weight: float = 0.5
 
     def __post_init__(self) -> None:
-        if not (self.apart_m >= 0 and 0 <= self.nearby_weight <= 1):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "apart_m", at_least=0)
+        check_bounds(self, "nearby_weight", at_least=0, at_most=1)
 
 
 def choose_references(

@@ -30,6 +30,7 @@ from mapless.geometry import Array
 from .arrays import AnyArray, length, median, namespace
 from .correspond import Correspondences
 from .keypoints import keypoint_depths, keypoint_offsets, keypoint_rays
+from .options import check_bounds
 from .reconstruction import Reconstruction
 from .views import PosedView
 
@@ -80,18 +81,12 @@ class ScaleOptions:
     min_radius_per_depth: float = 0.002
 
     def __post_init__(self) -> None:
-        if not (
-            0 < self.min_baseline_m <= self.max_baseline_m
-            and 0 <= self.min_parallax_deg < 90
-            and self.min_ratios >= 1
-            and self.max_matches >= 1
-            and self.max_deviation >= 0
-            and self.inlier_distance_m > 0
-            and self.max_pair_cameras >= 2
-            and self.min_radius_m > 0
-            and self.min_radius_per_depth >= 0
-        ):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "min_baseline_m", above=0, at_most=self.max_baseline_m)
+        check_bounds(self, "min_parallax_deg", at_least=0, below=90)
+        check_bounds(self, "min_ratios max_matches", at_least=1)
+        check_bounds(self, "max_deviation min_radius_per_depth", at_least=0)
+        check_bounds(self, "inlier_distance_m min_radius_m", above=0)
+        check_bounds(self, "max_pair_cameras", at_least=2)
 
     @property
     def by_triangulation(self) -> bool:

@@ -33,6 +33,7 @@ from .observations import (
     estimate_noise,
     triangulate,
 )
+from .options import check_bounds
 from .reconstruction import Reconstruction
 from .scale import MetricScale
 from .tracks import Tracks, build_tracks
@@ -63,9 +64,10 @@ class StructureOptions:
     min_parallax_deg: float = 0.5
 
     def __post_init__(self) -> None:
-        positive = self.iterations > 0 and self.loss_scale_sigma > 0 and (self.max_residual_sigma or 1) > 0
-        if not (positive and 0 <= self.min_parallax_deg < 90):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "iterations loss_scale_sigma", above=0)
+        if self.max_residual_sigma is not None:
+            check_bounds(self, "max_residual_sigma", above=0)
+        check_bounds(self, "min_parallax_deg", at_least=0, below=90)
 
     @property
     def first_noise(self) -> KeypointNoise:

@@ -14,6 +14,7 @@ import numpy as np
 
 from mapless import Client, ConnectOptions, MaplessError, Reference, ResourceExhausted
 from mapless_server.errors import InvalidArgument
+from mapless_server.method.options import check_bounds
 
 from .feed import Feed
 from .guarded import GuardedViser
@@ -51,8 +52,9 @@ class ViewOptions:
     seeds: int = 8
 
     def __post_init__(self) -> None:
-        if not (self.max_pictured >= 1 and self.seeds >= 0 and 0 <= self.port <= 65535):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "max_pictured", at_least=1)
+        check_bounds(self, "seeds", at_least=0)
+        check_bounds(self, "port", at_least=0, at_most=65535)
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from ..correspond import Correspondences
 from ..match import PointMatches, vote
 from ..observations import FIRST_GUESS, adjust_points, triangulate
+from ..options import check_bounds
 from ..pnp import PnpOptions, ransac, reprojection_errors_px
 from ..priors.informed import informed_pose
 from ..priors.known import NO_PRIORS, Priors
@@ -49,8 +50,8 @@ class GeometricOptions:
     cell_px: int = 2
 
     def __post_init__(self) -> None:
-        if not (self.min_baseline_m > 0 and self.cell_px >= 1):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "min_baseline_m", above=0)
+        check_bounds(self, "cell_px", at_least=1)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from mapless.geometry import Array, Camera
 from mapless_server.networks.encoder import PATCH_PX
 
 from ..features import undistort_pixels
+from ..options import check_bounds
 
 PIXEL_LIMIT = 37 * 28 * PATCH_PX**2
 """Of 518x392."""
@@ -77,15 +78,12 @@ class GridOptions:
     max_half_field_deg: float = 50.0
 
     def __post_init__(self) -> None:
-        if not (
-            self.pixel_limit >= PATCH_PX**2
-            and self.aspects
-            and all(width > 0 and height > 0 for width, height in self.aspects)
-            and self.max_stretch >= 1
-            and self.max_distortion_px > 0
-            and 0 < self.max_half_field_deg < 80
-        ):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "pixel_limit", at_least=PATCH_PX**2)
+        check_bounds(self, "max_stretch", at_least=1)
+        check_bounds(self, "max_distortion_px", above=0)
+        check_bounds(self, "max_half_field_deg", above=0, below=80)
+        if not self.aspects or not all(width > 0 and height > 0 for width, height in self.aspects):
+            raise ValueError(f"GridOptions.aspects must be pairs of numbers above 0, at least one, is {self.aspects}")
 
     @cached_property
     def grids(self) -> tuple[Grid, ...]:

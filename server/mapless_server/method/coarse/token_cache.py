@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mapless.geometry import Camera
 
+from ..options import check_bounds
 from .grids import Grid
 
 
@@ -54,8 +55,7 @@ class TokenCacheOptions:
     host_bytes: int = 2 * 2**30
 
     def __post_init__(self) -> None:
-        if self.device_bytes < 0 or self.host_bytes < 0:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "device_bytes host_bytes", at_least=0)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..options import check_bounds
+
 
 @dataclass(frozen=True)
 class LearnedOptions:
@@ -24,8 +26,9 @@ class LearnedOptions:
     min_score: float = 0.01
 
     def __post_init__(self) -> None:
-        if self.max_keypoints < 1 or self.max_side_px < 32 or not 0 <= self.min_score < 1:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "max_keypoints", at_least=1)
+        check_bounds(self, "max_side_px", at_least=32)
+        check_bounds(self, "min_score", at_least=0, below=1)
 
     def label(self, extractor: str, weights_sha256: str) -> str:
         """The name under which features are stored, e.g. "aliked-n16-2048-1024px-0.01-c2ab3d81"."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera
 
+from ..options import check_bounds
 from ..views import View
 from .image import reduce_image, view_of
 
@@ -29,8 +30,9 @@ class SiftOptions:
     contrast_threshold: float = 0.02
 
     def __post_init__(self) -> None:
-        if self.max_keypoints < 1 or self.max_side_px < 32 or not self.contrast_threshold >= 0:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "max_keypoints", at_least=1)
+        check_bounds(self, "max_side_px", at_least=32)
+        check_bounds(self, "contrast_threshold", at_least=0)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, Similarity, cross_matrix
 
+from ..options import check_bounds
 from ..rigid import perturbed, rotation_vector
 from ..robust import cauchy_cost, cauchy_weight
 
@@ -48,9 +49,8 @@ class DriftOptions:
     loss_scale: float = 2.0
 
     def __post_init__(self) -> None:
-        positive = (self.share, self.floor_m, self.floor_deg, self.loss_scale)
-        if not (min(positive) > 0 and self.deg_per_m >= 0 and self.turn_share >= 0):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "share floor_m floor_deg loss_scale", above=0)
+        check_bounds(self, "deg_per_m turn_share", at_least=0)
 
     def sigma(self, step: RigidTransform) -> Array:
         """(6,) of a metric step: metres, then radians."""

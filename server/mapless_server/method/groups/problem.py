@@ -15,6 +15,7 @@ from ..adjust import AdjustOptions
 from ..bundle import Bundle, BundleProblem, NormalEquations, Poses, bundle_of, reference_information
 from ..match import PointMatches
 from ..optimize import solve_step
+from ..options import check_bounds
 from ..views import PosedView
 from .freedom import F, Freedom
 from .images import MatchedImage
@@ -36,8 +37,8 @@ class JointOptions:
     iterations: int = 15
 
     def __post_init__(self) -> None:
-        if self.max_matches < 3 or self.iterations < 1:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "max_matches", at_least=3)
+        check_bounds(self, "iterations", at_least=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
+from ..options import check_bounds
 from ..pnp import PnpOptions
 from ..rejection import Rejection, RejectionReason
 from ..rigid import perturbed
@@ -40,8 +41,7 @@ class RigOptions:
     rounds: int = 2
 
     def __post_init__(self) -> None:
-        if self.rounds < 1:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "rounds", at_least=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_angle_deg
 
+from ..options import check_bounds
 from ..pnp import PnpOptions
 from ..rejection import Rejection, RejectionReason
 from ..trust.gate import GateOptions
@@ -66,17 +67,9 @@ class SequenceOptions:
     scale_matches: int = 600
 
     def __post_init__(self) -> None:
-        counts = (self.rounds, self.scale_iterations, self.scale_matches)
-        lengths = (
-            self.loose_px,
-            self.enough_share,
-            self.same_position_m,
-            self.same_rotation_deg,
-            self.min_motion,
-            self.max_scale_sigma,
-        )
-        if not (min(counts) >= 1 and min(lengths) > 0):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "rounds scale_iterations scale_matches", at_least=1)
+        check_bounds(self, "loose_px enough_share same_position_m same_rotation_deg", above=0)
+        check_bounds(self, "min_motion max_scale_sigma", above=0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
 
+from ..options import check_bounds
 from .known import GravityPrior, Priors
 from .pose_only import PoseOnlyOptions, refine_pose
 
@@ -39,9 +40,8 @@ class GravityOptions:
     refined: int = 3
 
     def __post_init__(self) -> None:
-        counts = (self.max_matches, self.batch, self.max_samples, self.refined)
-        if not (min(counts) >= 1 and 0 < self.confidence < 1):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "max_matches batch max_samples refined", at_least=1)
+        check_bounds(self, "confidence", above=0, below=1)
 
 
 def ransac_with_gravity(

@@ -15,6 +15,7 @@ import numpy as np
 
 from mapless.geometry import Array, Camera, RigidTransform
 
+from ..options import check_bounds
 from .gravity import ransac_with_gravity
 from .known import NO_PRIORS, PriorCheck, Priors
 from .pose_only import PoseOnlyOptions, information, refine_pose, reprojection_errors_px
@@ -44,8 +45,9 @@ class InformedOptions:
     min_kept_share: float = 0.8
 
     def __post_init__(self) -> None:
-        if not (self.inlier_px > 0 and self.min_inliers >= 3 and 0 < self.min_kept_share <= 1):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "inlier_px", above=0)
+        check_bounds(self, "min_inliers", at_least=3)
+        check_bounds(self, "min_kept_share", above=0, at_most=1)
 
     @property
     def worst_cost(self) -> float:

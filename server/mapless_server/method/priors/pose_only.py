@@ -14,6 +14,7 @@ import numpy as np
 from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian, rotation_from_vector
 
 from ..optimize import MinimizeOptions, damped_step, minimize
+from ..options import check_bounds
 from ..robust import cauchy_cost, cauchy_weight
 from .known import NO_PRIORS, Priors
 
@@ -37,8 +38,7 @@ class PoseOnlyOptions:
     min_decrease: float = 1e-4
 
     def __post_init__(self) -> None:
-        if not min(self.sigma_px, self.loss_scale_sigma, self.prior_weight, self.iterations, self.min_decrease) > 0:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "sigma_px loss_scale_sigma prior_weight iterations min_decrease", above=0)
 
 
 def refine_pose(

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform, rotation_angle_deg
 
+from ..options import check_bounds
 from ..pnp import PnpOptions, ransac, reprojection_errors_px
 from ..rejection import Hypothesis
 from ..support import Support
@@ -59,10 +60,10 @@ class AmbiguityOptions:
     pnp: PnpOptions = field(default_factory=lambda: PnpOptions(min_iterations=50, max_iterations=200, max_matches=300))
 
     def __post_init__(self) -> None:
-        shares = (self.min_share, self.min_own_share)
-        lengths = (self.min_apart_m, self.min_apart_deg, self.agreeing_px - self.pnp.inlier_px)
-        if not (0 < min(shares) <= max(shares) <= 1 and self.min_keypoints >= 4 and min(lengths) >= 0):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "min_share min_own_share", above=0, at_most=1)
+        check_bounds(self, "min_keypoints", at_least=4)
+        check_bounds(self, "min_apart_m min_apart_deg", at_least=0)
+        check_bounds(self, "agreeing_px", at_least=self.pnp.inlier_px)
 
 
 @dataclass(frozen=True, eq=False)

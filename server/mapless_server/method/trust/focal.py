@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array
 
 from ..optimize import MinimizeOptions, minimize, solve_step
+from ..options import check_bounds
 from ..resection import Fit, Resection
 from ..support import Support
 
@@ -58,17 +59,11 @@ class FocalOptions:
     grid: int = 4
 
     def __post_init__(self) -> None:
-        counts = (self.iterations, self.max_matches, self.min_agreeing, self.grid)
-        shares = (
-            self.max_log_ratio,
-            self.max_sigmas,
-            self.first_loss_sigma,
-            self.first_share,
-            self.max_step,
-            self.min_decrease,
-        )
-        if not self.loss_scales_sigma or not min(*counts, *shares, *self.loss_scales_sigma) > 0:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "iterations max_matches min_agreeing grid", above=0)
+        check_bounds(self, "max_log_ratio max_sigmas first_loss_sigma first_share max_step min_decrease", above=0)
+        check_bounds(self, "loss_scales_sigma", above=0)
+        if not self.loss_scales_sigma:
+            raise ValueError("FocalOptions.loss_scales_sigma must be at least one number, is ()")
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ This is the coarse sieve, before anything dear is computed; how far to trust wha
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from scipy.special import gammaln
 from mapless.geometry import Camera, RigidTransform
 
 from ..match import PointMatches
+from ..options import check_bounds
 from ..structure import Structure
 from ..views import View
 
@@ -49,10 +51,9 @@ class GateOptions:
     agreeing_factor: float = 0.25
 
     def __post_init__(self) -> None:
-        shares = (self.min_found_share, self.min_hull_share)
-        sensible = 0 <= min(shares) <= max(shares) < 1 and 0 <= self.agreeing_factor <= 1
-        if np.isnan(self.max_log10_false_alarms) or not sensible:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "min_found_share min_hull_share", at_least=0, below=1)
+        check_bounds(self, "agreeing_factor", at_least=0, at_most=1)
+        check_bounds(self, "max_log10_false_alarms", at_least=-math.inf)
 
 
 def doubts(

@@ -16,12 +16,14 @@ references with wrong poses, hardly any overlap) from right ones by logistic reg
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..options import check_bounds
 from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
 from ..support import Support
 from ..views import Matches
@@ -58,10 +60,12 @@ class JudgeOptions:
     focal: FocalOptions = field(default_factory=FocalOptions)
 
     def __post_init__(self) -> None:
-        rising = all(a <= b for a, b in zip(self.scores, self.scores[1:], strict=False))
-        sizes = len(self.weights) == len(FEATURES) and len(self.scores) == len(LEVELS)
-        if not (sizes and rising and all(weight >= 0 for weight in (*self.weights, self.agreement_weight))):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "weights agreement_weight", at_least=0)
+        for name, values, size in (("weights", self.weights, len(FEATURES)), ("scores", self.scores, len(LEVELS))):
+            if len(values) != size:
+                raise ValueError(f"JudgeOptions.{name} must be {size} numbers, is {values}")
+        if not all(a <= b for a, b in itertools.pairwise(self.scores)):
+            raise ValueError(f"JudgeOptions.scores must be rising, is {self.scores}")
 
 
 @dataclass(frozen=True)

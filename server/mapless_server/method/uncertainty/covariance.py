@@ -39,6 +39,7 @@ import numpy as np
 
 from mapless.geometry import Array, Camera, RigidTransform
 
+from ..options import check_bounds
 from .dispersion import Dispersion, JackknifeInput, disperse
 from .perturbation import pose_hessian, world_covariance, world_jacobian
 
@@ -68,16 +69,9 @@ class UncertaintyOptions:
     max_error_px: float = 8.0
 
     def __post_init__(self) -> None:
-        positive = (
-            self.shared_matches,
-            self.max_matches,
-            self.position_factor,
-            self.rotation_factor,
-            self.loss_scale_sigma,
-            self.max_error_px,
-        )
-        if not (min(positive) > 0 and 0 <= self.shrinkage <= 1):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "shared_matches max_matches position_factor rotation_factor", above=0)
+        check_bounds(self, "loss_scale_sigma max_error_px", above=0)
+        check_bounds(self, "shrinkage", at_least=0, at_most=1)
 
 
 @dataclass(frozen=True, eq=False)

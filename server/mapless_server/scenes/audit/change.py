@@ -16,6 +16,7 @@ from scipy.special import bdtr
 
 from mapless.geometry import Array
 from mapless_server.method.match import MatchOptions, PointMatches, search
+from mapless_server.method.options import check_bounds
 from mapless_server.method.views import PosedView
 
 from .look import Look
@@ -52,9 +53,8 @@ class ChangeOptions:
     alarm_share: float = 0.35
 
     def __post_init__(self) -> None:
-        shares = (self.missing_share, self.max_chance, self.alarm_share)
-        if not (0 < min(shares) <= max(shares) < 1 and min(self.columns, self.rows, self.radius_px) > 0):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "missing_share max_chance alarm_share", above=0, below=1)
+        check_bounds(self, "columns rows radius_px", above=0)
 
 
 SAME_VIEWPOINT = ChangeOptions(max_turn_deg=8.0, max_scale=1.25)

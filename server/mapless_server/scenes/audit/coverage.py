@@ -16,6 +16,7 @@ from enum import Enum
 import numpy as np
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
+from mapless_server.method.options import check_bounds
 from mapless_server.method.structure import StructureOptions
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_server.method.uncertainty.perturbation import motion_jacobian, world_covariance
@@ -72,13 +73,10 @@ class CoverageOptions:
     visibility: VisibilityOptions = field(default_factory=lambda: VisibilityOptions(max_turn_deg=60.0, max_scale=4.0))
 
     def __post_init__(self) -> None:
-        positive = (self.turn_deg, self.log_scale, self.sigma_px, self.error_inflation, self.max_radius_m)
-        counts = (self.neighbour_count - 1, self.columns, self.rows, self.epipolar_px)
-        shares = (self.repeatability, self.enough_image_share)
-        if not (min(*positive, *counts) > 0 and 0 < min(shares) <= max(shares) <= 1):
-            raise ValueError(f"senseless options: {self}")
-        if not 0 < self.least_matches <= self.enough_matches:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "turn_deg log_scale sigma_px error_inflation max_radius_m columns rows epipolar_px", above=0)
+        check_bounds(self, "neighbour_count", above=1)
+        check_bounds(self, "repeatability enough_image_share", above=0, at_most=1)
+        check_bounds(self, "least_matches", above=0, at_most=self.enough_matches)
 
 
 @dataclass(frozen=True)

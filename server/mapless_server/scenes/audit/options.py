@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from mapless_server.method.options import check_bounds
 from mapless_server.method.structure import StructureOptions
 
 from .resection import ResectionOptions
@@ -61,15 +62,9 @@ class AuditOptions:
     resection: ResectionOptions = field(default_factory=ResectionOptions)
 
     def __post_init__(self) -> None:
-        tolerances = (self.position_tolerance_m, self.rotation_tolerance_deg, self.focal_tolerance, self.epipolar_px)
-        counts = (self.candidate_count, self.neighbour_count - 1, self.wide_count, self.min_inliers - 7)
-        factors = (
-            self.significance_sigma,
-            self.neighbour_noise,
-            self.swap_reach,
-            self.both_excess,
-            self.same_photograph_px,
-        )
-        shares = (self.same_photograph_share, self.same_view_share, self.same_view_matched_share)
-        if not (min(*tolerances, *counts, *factors) > 0 and 0 < min(shares) <= max(shares) <= 1):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "position_tolerance_m rotation_tolerance_deg focal_tolerance epipolar_px", above=0)
+        check_bounds(self, "candidate_count wide_count", above=0)
+        check_bounds(self, "neighbour_count", above=1)
+        check_bounds(self, "min_inliers", above=7)
+        check_bounds(self, "significance_sigma neighbour_noise swap_reach both_excess same_photograph_px", above=0)
+        check_bounds(self, "same_photograph_share same_view_share same_view_matched_share", above=0, at_most=1)

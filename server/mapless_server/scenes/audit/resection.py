@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
 from mapless_server.method.optimize import MinimizeOptions, minimize
+from mapless_server.method.options import check_bounds
 from mapless_server.method.resection import Resection
 
 _BEHIND_SIGMA = 1e3
@@ -50,8 +51,7 @@ class ResectionOptions:
     inlier_sigma: float = 4.0
 
     def __post_init__(self) -> None:
-        if not min(self.loss_scale_sigma, self.iterations, self.min_decrease, self.inlier_sigma) > 0:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "loss_scale_sigma iterations min_decrease inlier_sigma", above=0)
 
 
 @dataclass(frozen=True, eq=False)

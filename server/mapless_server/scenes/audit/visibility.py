@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
+from mapless_server.method.options import check_bounds
 
 from .neighbourhood import Neighbourhood
 
@@ -31,8 +32,8 @@ class VisibilityOptions:
     max_scale: float = 2.5
 
     def __post_init__(self) -> None:
-        if not (0 < self.max_turn_deg < 90 and self.max_scale > 1):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "max_turn_deg", above=0, below=90)
+        check_bounds(self, "max_scale", above=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ import torch.nn.functional as F  # noqa: N812  its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mapless_server.method.options import check_bounds
 from mapless_server.method.views import View
 from mapless_server.networks.blocks import Attention
 from mapless_server.networks.checkpoint import load_strictly
@@ -58,8 +59,7 @@ class MegaLocOptions:
     dtype: torch.dtype | None = None
 
     def __post_init__(self) -> None:
-        if self.dimension < 1 or self.batch < 1:
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "dimension batch", at_least=1)
 
 
 class MegaLocDescriptor:

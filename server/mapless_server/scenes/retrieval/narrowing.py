@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
+from mapless_server.method.options import check_bounds
 from mapless_server.method.priors.known import PosePrior, PositionPrior, Priors
 
 PRIOR_MARGIN_M = 10.0
@@ -70,8 +71,9 @@ class Cone:
     max_angle_deg: float
 
     def __post_init__(self) -> None:
-        if not (abs(float(np.linalg.norm(self.forward)) - 1) < 1e-3 and 0 <= self.max_angle_deg <= 180):
-            raise ValueError(f"senseless heading: {self.forward}, {self.max_angle_deg} degrees")
+        check_bounds(self, "max_angle_deg", at_least=0, at_most=180)
+        if not abs(float(np.linalg.norm(self.forward)) - 1) < 1e-3:
+            raise ValueError(f"{type(self).__name__}.forward must have unit length, is {self.forward}")
 
     def angle_deg(self, axis: Array) -> float:
         """How far beside the cone an optical axis (3,) of unit length points; negative inside."""

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapless.geometry import Array, RigidTransform
+from mapless_server.method.options import check_bounds
 
 from .descriptor import Vector
 from .index import Entries, Rows
@@ -50,10 +51,10 @@ class RankOptions:
     smallest_pool: int = 200
 
     def __post_init__(self) -> None:
-        is_sensible = min(self.apart_m, self.same_place_m) >= 0 and 0 <= self.apart_deg <= 180
-        counts = (self.per_place, self.pool, self.smallest_pool)
-        if not (is_sensible and 0 <= self.nearby_weight <= 1 and min(counts) >= 1):
-            raise ValueError(f"senseless options: {self}")
+        check_bounds(self, "apart_m same_place_m", at_least=0)
+        check_bounds(self, "apart_deg", at_least=0, at_most=180)
+        check_bounds(self, "nearby_weight", at_least=0, at_most=1)
+        check_bounds(self, "per_place pool smallest_pool", at_least=1)
 
 
 @dataclass(frozen=True, eq=False)
