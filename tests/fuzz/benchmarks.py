@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mapless.geometry import RigidTransform
 from mapless_tools.ingest.formats import ReadOptions
-from mapless_tools.ingest.formats.colmap.writing import PosedImage, model_texts
+from mapless_tools.ingest.formats.writing import PosedImage, model_texts
 
 from .importing import CAMERA, TRUTH, Layout, numbers, target
 

@@ -10,8 +10,7 @@ import numpy as np
 from support.layouts import opengl
 
 from mapless_tools.ingest.formats import Intrinsics, ReadOptions
-from mapless_tools.ingest.formats.colmap.writing import PosedImage
-from mapless_tools.ingest.formats.writing import cameras_files
+from mapless_tools.ingest.formats.writing import PosedImage, cameras_files
 
 from .importing import CAMERA, TRUTH, Layout, image_of, numbers, target
 

@@ -24,8 +24,7 @@ from mapless_tools.dataset import SPLITS, Dataset, read_frame
 from mapless_tools.ingest.formats import ReadOptions, read_dataset, recognize
 from mapless_tools.ingest.formats.collecting import check_camera
 from mapless_tools.ingest.formats.colmap.cameras import from_camera
-from mapless_tools.ingest.formats.colmap.writing import PosedImage
-from mapless_tools.ingest.formats.writing import cameras_files
+from mapless_tools.ingest.formats.writing import PosedImage, cameras_files
 
 from . import folders
 from .images import seeds as image_seeds

@@ -35,8 +35,7 @@ from mapless_server.services.messages.references import Page
 from mapless_server.store import SceneAttributes, codec
 from mapless_tools.dataset import Dataset, Refusal, printable
 from mapless_tools.ingest.formats import read_dataset
-from mapless_tools.ingest.formats.colmap.writing import PosedImage
-from mapless_tools.ingest.formats.writing import LAYOUTS
+from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage
 from mapless_tools.ingest.report import ImportReport, print_report
 
 LIMITS = ImageLimits()

@@ -24,8 +24,7 @@ from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import Store
 from mapless_tools.ingest.command import export_command, import_command
 from mapless_tools.ingest.formats import read_dataset
-from mapless_tools.ingest.formats.colmap.writing import PosedImage
-from mapless_tools.ingest.formats.writing import cameras_files
+from mapless_tools.ingest.formats.writing import PosedImage, cameras_files
 
 app = typer.Typer()
 app.command("import")(import_command)

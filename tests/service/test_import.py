@@ -24,8 +24,7 @@ from mapless import Client
 from mapless.geometry import Camera
 from mapless_tools.child import ServerFailed
 from mapless_tools.ingest.command import export_command, import_command
-from mapless_tools.ingest.formats.colmap.writing import PosedImage
-from mapless_tools.ingest.formats.writing import LAYOUTS
+from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage
 
 PROGRAM = (
     "import typer; from mapless_tools.ingest.command import import_command, export_command; app = typer.Typer();"

@@ -15,7 +15,7 @@ from support.layouts import CAMERA, Truth, assert_reads, assert_same_camera, rea
 from mapless.geometry import Camera, Fisheye, RadialTangential, RigidTransform
 from mapless_tools.ingest.formats import ReadOptions, read_dataset
 from mapless_tools.ingest.formats.colmap.cameras import MODEL_NAMES, ColmapCamera, from_camera
-from mapless_tools.ingest.formats.colmap.writing import PosedImage, model_texts
+from mapless_tools.ingest.formats.writing import PosedImage, model_texts
 
 TRUTH = truth()
 PINHOLE = (1, 1, 96, 64, (80.0, 81.0, 47.75, 31.25))

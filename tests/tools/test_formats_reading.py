@@ -15,8 +15,7 @@ from mapless.geometry import Fisheye, RadialTangential
 from mapless_tools.dataset import read_folder
 from mapless_tools.ingest.command import FORMAT_NAMES
 from mapless_tools.ingest.formats import FORMATS, read_dataset, recognize
-from mapless_tools.ingest.formats.colmap.writing import PosedImage
-from mapless_tools.ingest.formats.writing import LAYOUTS, image_name, write_file
+from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage, image_name, write_file
 
 TRUTH = truth()
 

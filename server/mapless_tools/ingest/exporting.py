@@ -16,8 +16,7 @@ from pathlib import Path
 from mapless import Client, DataLoss
 from mapless_tools.progress import Progress
 
-from .formats.colmap.writing import PosedImage
-from .formats.writing import IMAGES, LAYOUTS, image_name, write_file
+from .formats.writing import IMAGES, LAYOUTS, PosedImage, image_name, write_file
 
 PARALLEL = 4
 

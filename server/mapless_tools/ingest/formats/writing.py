@@ -5,16 +5,73 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 from mapless import Scene
-from mapless.geometry import Fisheye
+from mapless.geometry import Camera, Fisheye, RigidTransform
 from mapless_tools.dataset import FILE_NAME
 
-from .colmap.writing import PosedImage, model_texts
+from .colmap.cameras import from_camera
 
 IMAGES = "images"
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """An image that lies in the folder IMAGES under `name`, with its camera and pose."""
+
+    name: str
+    camera: Camera
+    world_from_camera: RigidTransform
+
+
+class Layout(Protocol):
+    """Contents of files by their paths."""
+
+    def __call__(self, images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
+        """Of images, where they come from in words, and what is known of their scene as a whole."""
+        ...
+
+
+def cameras_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
+    """`cameras.json`, with the scene's datum and down."""
+    content: dict[str, Any] = {"source": source, "metric": True, "units": "metre"}
+    if scene is not None and scene.datum is not None:
+        content["datum"] = scene.datum.to_json()
+    if scene is not None and scene.down_in_world is not None:
+        content["down_in_world"] = scene.down_in_world
+    content["frames"] = [_entry(image) for image in images]
+    return {FILE_NAME: json.dumps(content, indent=1, allow_nan=False) + "\n"}
+
+
+def colmap_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
+    """A COLMAP text model where COLMAP itself puts one."""
+    return {f"sparse/0/{name}": f"# {source}\n{text}" for name, text in model_texts(images).items()}
+
+
+def model_texts(images: Sequence[PosedImage]) -> dict[str, str]:
+    """A COLMAP text model's files by name; images of one camera share it, and there are no points."""
+    camera_ids: dict[Camera, int] = {}
+    for image in images:
+        camera_ids.setdefault(image.camera, len(camera_ids) + 1)
+    cameras = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
+    for camera, camera_id in camera_ids.items():
+        it = from_camera(camera_id, camera)
+        cameras.append(f"{camera_id} {it.model} {it.width_px} {it.height_px} {_words(it.parameters)}")
+    lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; then its observations, none here"]
+    for image_id, image in enumerate(images, 1):
+        camera_from_world = image.world_from_camera.inverse()
+        q = camera_from_world.quaternion()
+        pose = _words([q.w, q.x, q.y, q.z, *camera_from_world.translation.tolist()])
+        lines += [f"{image_id} {pose} {camera_ids[image.camera]} {image.name}", ""]
+    contents = {"cameras": cameras, "images": lines, "points3D": ["# POINT3D_ID X Y Z R G B ERROR TRACK[]: none"]}
+    return {f"{name}.txt": "\n".join(it) + "\n" for name, it in contents.items()}
+
+
+LAYOUTS: Mapping[str, Layout] = {"cameras": cameras_files, "colmap": colmap_files}
+"""Layouts that are written, by name."""
 
 
 def image_name(reference_id: str, image: bytes) -> str:
@@ -38,43 +95,6 @@ def write_file(file: Path, content: bytes) -> None:
         raise
 
 
-def cameras_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
-    """Contents of `cameras.json` by its path, with the scene's datum and down; images lie in the folder IMAGES."""
-    content: dict[str, Any] = {"source": source, "metric": True, "units": "metre"}
-    if scene is not None and scene.datum is not None:
-        content["datum"] = scene.datum.to_json()
-    if scene is not None and scene.down_in_world is not None:
-        content["down_in_world"] = scene.down_in_world
-    content["frames"] = [_entry(image) for image in images]
-    return {FILE_NAME: json.dumps(content, indent=1, allow_nan=False) + "\n"}
-
-
-def colmap_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
-    """Contents of a COLMAP text model's files by their paths; images lie in the folder IMAGES."""
-    return {f"sparse/0/{name}": f"# {source}\n{text}" for name, text in model_texts(images).items()}
-
-
-class Layout(Protocol):
-    """How a scene is written."""
-
-    def __call__(self, images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
-        """Contents of files by their paths.
-
-        Args:
-            images: what is described; they lie in the folder IMAGES.
-            source: where they come from, for a person.
-            scene: what is known of it as a whole, for layouts that have a place for it.
-        """
-        ...
-
-
-LAYOUTS: Mapping[str, Layout] = {
-    "cameras": cameras_files,
-    "colmap": colmap_files,
-}
-"""Layouts that are written, by name."""
-
-
 def _entry(image: PosedImage) -> dict[str, Any]:
     camera, lens = image.camera, image.camera.distortion
     entry: dict[str, Any] = {
@@ -86,3 +106,8 @@ def _entry(image: PosedImage) -> dict[str, Any]:
         "world_from_camera": image.world_from_camera.matrix().tolist(),
     }
     return entry | {"lens": "fisheye"} if isinstance(lens, Fisheye) else entry
+
+
+def _words(numbers: Sequence[float]) -> str:
+    """Numbers that are read back as they were."""
+    return " ".join(repr(float(number)) for number in numbers)

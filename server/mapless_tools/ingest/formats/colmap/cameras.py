@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential
 
@@ -70,17 +70,8 @@ class ColmapCamera:
                 + ") has no counterpart here; undistort the images first, or use OPENCV"
             )
         focal = value.get("f", 0.0)
-        return from_corner(
-            Camera(
-                self.width_px,
-                self.height_px,
-                value.get("fx", focal),
-                value.get("fy", focal),
-                value["cx"],
-                value["cy"],
-                _distortion(self.model, value),
-            )
-        )
+        k = (value.get("fx", focal), value.get("fy", focal), value["cx"], value["cy"])
+        return from_corner(Camera(self.width_px, self.height_px, *k, _distortion(self.model, value)))
 
 
 def _distortion(model: str, value: dict[str, float]) -> Distortion | None:
@@ -92,21 +83,15 @@ def _distortion(model: str, value: dict[str, float]) -> Distortion | None:
 
 def from_camera(camera_id: int, camera: Camera) -> ColmapCamera:
     """A camera of ours as COLMAP's."""
-    shared = (
-        camera.focal_x_px,
-        camera.focal_y_px,
-        camera.principal_x_px + 0.5,
-        camera.principal_y_px + 0.5,
-    )
-    model, coefficients = _coefficients(camera.distortion)
-    return ColmapCamera(camera_id, model, camera.width_px, camera.height_px, (*shared, *coefficients))
-
-
-def _coefficients(lens: Distortion | None) -> tuple[str, tuple[float, ...]]:
-    if lens is None:
-        return "PINHOLE", ()
+    lens = camera.distortion
+    model = "PINHOLE"
+    coefficients: tuple[float, ...] = ()
     if isinstance(lens, Fisheye):
-        return "OPENCV_FISHEYE", (lens.k1, lens.k2, lens.k3, lens.k4)
-    if lens.k3 == 0:
-        return "OPENCV", (lens.k1, lens.k2, lens.p1, lens.p2)
-    return "FULL_OPENCV", (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, 0.0, 0.0, 0.0)
+        model, coefficients = "OPENCV_FISHEYE", astuple(lens)
+    elif lens is not None and lens.k3 == 0:
+        model, coefficients = "OPENCV", (lens.k1, lens.k2, lens.p1, lens.p2)
+    elif lens is not None:
+        model, coefficients = "FULL_OPENCV", (*astuple(lens), 0.0, 0.0, 0.0)
+    centre = (camera.principal_x_px + 0.5, camera.principal_y_px + 0.5)
+    parameters = (camera.focal_x_px, camera.focal_y_px, *centre, *coefficients)
+    return ColmapCamera(camera_id, model, camera.width_px, camera.height_px, parameters)

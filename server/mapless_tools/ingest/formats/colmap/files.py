@@ -1,21 +1,76 @@
-"""COLMAP's binary files: little endian, without any checksum, so every step is checked against the file's size."""
+"""COLMAP's files of cameras and images, binary and text, record by record; observations are passed over.
+
+Read here and not by pycolmap, which takes truncated files for whole ones (docs/decisions.md). Binary files are little
+endian and have no checksum, so every step is compared with the file's size. Observations make files of gigabytes:
+binary ones are mapped, text is read by the line.
+"""
 
 from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from .cameras import MODEL_NAMES, PARAMETERS, ColmapCamera
-from .records import ImageRecord
 
 _POINT_BYTES = 24  # x, y, point3D_id of an observation
 _MAX_NAME_BYTES = 4096
 
 
+@dataclass(frozen=True)
+class ImageRecord:
+    """An image.
+
+    Attributes:
+        image_id: COLMAP's.
+        pose: qw qx qy qz tx ty tz of camera_from_world.
+        camera_id: of its camera.
+        name: its path from the images' folder.
+    """
+
+    image_id: int
+    pose: Sequence[float]
+    camera_id: int
+    name: str
+
+
+def read_cameras(file: Path) -> Iterator[ColmapCamera]:
+    """The cameras of a cameras.bin or cameras.txt; ValueError, naming file and record, where it is malformed."""
+    return _cameras_bin(file) if file.suffix == ".bin" else _cameras_txt(file)
+
+
+def read_images(file: Path) -> Iterator[ImageRecord]:
+    """The images of an images.bin or images.txt; ValueError, naming file and record, where it is malformed."""
+    return _images_bin(file) if file.suffix == ".bin" else _images_txt(file)
+
+
+def _cameras_bin(file: Path) -> Iterator[ColmapCamera]:
+    cursor = _Cursor(file)
+    for i in range(cursor.count(24, "cameras")):
+        cursor.record = f"camera record {i}"
+        camera_id, number, width_px, height_px = map(int, cursor.take("IiQQ"))
+        if not 0 <= number < len(MODEL_NAMES):
+            raise cursor.fault(f"camera {camera_id}: there is no camera model {number}")
+        model = MODEL_NAMES[number]
+        yield ColmapCamera(camera_id, model, width_px, height_px, cursor.take(f"{len(PARAMETERS[model])}d"))
+    cursor.end()
+
+
+def _images_bin(file: Path) -> Iterator[ImageRecord]:
+    cursor = _Cursor(file)
+    for i in range(cursor.count(73, "images")):
+        cursor.record = f"image record {i}"
+        image_id, *pose, camera_id = cursor.take("I7dI")
+        name = cursor.text()
+        cursor.take(f"{cursor.count(_POINT_BYTES, 'observations') * _POINT_BYTES}x")
+        yield ImageRecord(int(image_id), pose, int(camera_id), name)
+    cursor.end()
+
+
 class _Cursor:
-    """Reads a file from front to back; whatever ends too early is a ValueError with the place."""
+    """Reads a binary file from front to back; whatever ends too early is a ValueError with the place."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -24,8 +79,7 @@ class _Cursor:
         self._data: mmap.mmap | bytes
         try:
             with file.open("rb") as stream:
-                # Observations make files of gigabytes, of which little is looked at. An empty file cannot be mapped.
-                size = file.stat().st_size
+                size = file.stat().st_size  # an empty file cannot be mapped
                 self._data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
         except OSError as error:
             raise ValueError(f"{file} cannot be read: {error.strerror}") from error
@@ -33,7 +87,8 @@ class _Cursor:
     def take(self, layout: str) -> tuple[int | float, ...]:
         """The next values."""
         size = struct.calcsize("<" + layout)
-        self.need(size)
+        if self.position + size > len(self._data):
+            raise self.fault(f"the file ends after {len(self._data)} bytes")
         values = struct.unpack_from("<" + layout, self._data, self.position)
         self.position += size
         return values
@@ -58,16 +113,6 @@ class _Cursor:
         self.position = end + 1
         return name
 
-    def skip(self, size: int) -> None:
-        """Passes over bytes."""
-        self.need(size)
-        self.position += size
-
-    def need(self, size: int) -> None:
-        """There must be so many bytes."""
-        if self.position + size > len(self._data):
-            raise self.fault(f"the file ends after {len(self._data)} bytes")
-
     def end(self) -> None:
         """There must be nothing more."""
         if self.position != len(self._data):
@@ -79,27 +124,46 @@ class _Cursor:
         return ValueError(f"{self.file}: {self.record}, byte {self.position}: {what}; the file is cut off or damaged")
 
 
-def read_cameras(file: Path) -> Iterator[ColmapCamera]:
-    """The cameras of a cameras.bin."""
-    cursor = _Cursor(file)
-    for i in range(cursor.count(24, "cameras")):
-        cursor.record = f"camera record {i}"
-        camera_id, number, width_px, height_px = map(int, cursor.take("IiQQ"))
-        if not 0 <= number < len(MODEL_NAMES):
-            raise cursor.fault(f"camera {camera_id}: there is no camera model {number}")
-        model = MODEL_NAMES[number]
-        parameters = cursor.take(f"{len(PARAMETERS[model])}d")
-        yield ColmapCamera(camera_id, model, width_px, height_px, parameters)
-    cursor.end()
+def _cameras_txt(file: Path) -> Iterator[ColmapCamera]:
+    for place, line in _lines(file):
+        words = line.split()
+        if len(words) < 4 or words[1] not in PARAMETERS:
+            raise ValueError(f"{place}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line.strip()[:80]!r}")
+        wanted = PARAMETERS[words[1]]
+        if len(words) != 4 + len(wanted):
+            raise ValueError(f"{place}: {words[1]} has parameters {' '.join(wanted)}, found {len(words) - 4} numbers")
+        try:
+            camera_id, width_px, height_px = int(words[0]), int(words[2]), int(words[3])
+            yield ColmapCamera(camera_id, words[1], width_px, height_px, [float(word) for word in words[4:]])
+        except ValueError as error:
+            raise ValueError(f"{place}: {error}") from error
 
 
-def read_images(file: Path) -> Iterator[ImageRecord]:
-    """The images of an images.bin; their observations are passed over."""
-    cursor = _Cursor(file)
-    for i in range(cursor.count(73, "images")):
-        cursor.record = f"image record {i}"
-        image_id, *pose, camera_id = cursor.take("I7dI")
-        name = cursor.text()
-        cursor.skip(cursor.count(_POINT_BYTES, "observations") * _POINT_BYTES)
-        yield ImageRecord(int(image_id), pose, int(camera_id), name)
-    cursor.end()
+def _images_txt(file: Path) -> Iterator[ImageRecord]:
+    """A line for an image, then one for its observations, which may be empty."""
+    for place, line in _lines(file, skipped_after=1):
+        words = line.split(maxsplit=9)  # a name may have spaces
+        if len(words) != 10:
+            raise ValueError(
+                f"{place}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, found {line.strip()[:80]!r}"
+            )
+        try:
+            yield ImageRecord(int(words[0]), [float(w) for w in words[1:8]], int(words[8]), words[9].rstrip())
+        except ValueError as error:
+            raise ValueError(f"{place}: {error}") from error
+
+
+def _lines(file: Path, skipped_after: int = 0) -> Iterator[tuple[str, str]]:
+    """Lines that are neither empty nor comments, each with its place, and without the so many that follow it."""
+    try:
+        with file.open(encoding="utf-8") as stream:
+            numbered = enumerate(stream, 1)
+            for number, line in numbered:
+                if line.strip() and not line.startswith("#"):
+                    yield f"{file}:{number}", line
+                    for _ in range(skipped_after):
+                        next(numbered, None)
+    except OSError as error:
+        raise ValueError(f"{file} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{file} is not text: {error}") from error

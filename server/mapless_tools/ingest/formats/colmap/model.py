@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,10 +10,8 @@ import numpy as np
 
 from mapless.geometry import Array, Camera, Quaternion, RigidTransform
 
-from . import files as binary
-from . import text
 from .cameras import ColmapCamera
-from .records import ImageRecord
+from .files import ImageRecord, read_cameras, read_images
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,24 +63,19 @@ def read_model(folder: Path) -> Model:
     if ending is None:
         raise ValueError(f"{folder} holds no COLMAP model")
     cameras_file, images_file = folder / f"cameras{ending}", folder / f"images{ending}"
-    reader = binary if ending == ".bin" else text
     cameras: dict[int, ColmapCamera] = {}
-    for camera in reader.read_cameras(cameras_file):
+    for camera in read_cameras(cameras_file):
         if camera.camera_id in cameras:
             raise ValueError(f"{cameras_file}: camera {camera.camera_id} stands twice")
         cameras[camera.camera_id] = camera
-    return _model(images_file, cameras, reader.read_images(images_file))
-
-
-def _model(file: Path, cameras: Mapping[int, ColmapCamera], records: Iterable[ImageRecord]) -> Model:
     images: dict[str, ImageRecord] = {}
     refused: list[tuple[str, str]] = []
-    for record in records:
+    for record in read_images(images_file):
         if record.name in images:
-            refused.append((record.name, f"{file}: image {record.image_id}: its name stands twice"))
+            refused.append((record.name, f"{images_file}: image {record.image_id}: its name stands twice"))
         else:
             images[record.name] = record
-    return Model(file, cameras, images, refused)
+    return Model(images_file, cameras, images, refused)
 
 
 def _numbered(folder: Path) -> list[Path]:
