@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,6 +19,8 @@ pytestmark = pytest.mark.realdata
 Photographs = Callable[[str], Dataset]
 FOUNTAIN = "fountain-P11"
 KITCHEN = "7scenes-redkitchen-seq01-first600"
+OFFICE = "tum-fr3-office"
+nightly = partial(pytest.param, marks=pytest.mark.nightly)
 
 
 def check(frames: tuple[Frame, ...]) -> Verdict:
@@ -26,7 +29,13 @@ def check(frames: tuple[Frame, ...]) -> Verdict:
 
 @pytest.mark.parametrize(
     ("folder", "median_px"),
-    [(FOUNTAIN, 0.2), (KITCHEN, 0.5), ("tum-fr3-office", 1.2), ("kitti-drive-a", 0.5), ("reichstag-internet", 0.5)],
+    [
+        (FOUNTAIN, 0.2),
+        nightly(KITCHEN, 0.5),
+        nightly(OFFICE, 1.2),
+        nightly("kitti-drive-a", 0.5),
+        ("reichstag-internet", 0.5),
+    ],
 )
 def test_real_poses_pass_without_a_warning(photographs: Photographs, folder: str, median_px: float) -> None:
     verdict = check(photographs(folder).frames)
@@ -35,7 +44,7 @@ def test_real_poses_pass_without_a_warning(photographs: Photographs, folder: str
     assert len(verdict.pairs) > 10
 
 
-@pytest.mark.parametrize("folder", [FOUNTAIN, "tum-fr3-office"])
+@pytest.mark.parametrize("folder", [FOUNTAIN, nightly(OFFICE)])
 def test_opengl_axes_and_inverse_poses_are_named(photographs: Photographs, folder: str) -> None:
     frames = photographs(folder).frames
     flip = np.diag([1.0, -1.0, -1.0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ KITCHEN = "7scenes-redkitchen-seq01-first600"
 OFFICE = "tum-fr3-office"
 DRIVE = "kitti-drive-a"
 FOX = "fox-portrait"
+nightly = partial(pytest.param, marks=pytest.mark.nightly)
 
 
 def measure(dataset: Dataset, **options: object) -> Summary:
@@ -39,10 +41,10 @@ def ignore(step: str, done: int, total: int) -> None:
     [
         ("fountain-P11", None, None, 0.24, 0.020),
         ("herz-jesus-P8", None, None, 0.45, 0.020),
-        (KITCHEN, 30, None, 0.19, 0.065),
+        nightly(KITCHEN, 30, None, 0.19, 0.065),
         (KITCHEN, 10, 15, 0.45, 0.13),
-        ("kitti-drive-a", None, None, 1.15, 0.035),
-        (OFFICE, None, None, 0.50, 0.21),
+        nightly(DRIVE, None, None, 1.15, 0.035),
+        nightly(OFFICE, None, None, 0.50, 0.21),
     ],
 )
 def test_accuracy(
@@ -92,7 +94,7 @@ class TestForms:
     ("place", "elsewhere"),
     [
         ("fountain-P11", (KITCHEN, OFFICE, DRIVE, FOX, "herz-jesus-P8")),
-        (KITCHEN, ("fountain-P11", OFFICE, DRIVE, FOX, "herz-jesus-P8")),
+        nightly(KITCHEN, ("fountain-P11", OFFICE, DRIVE, FOX, "herz-jesus-P8")),
     ],
 )
 def test_no_photograph_of_another_place_is_localized(

@@ -49,6 +49,7 @@ def sees_the_same(frame: Frame, found: list[RankedReference]) -> bool:
     return bool((errors <= (0.5, 30.0)).all(axis=1).any())
 
 
+@pytest.mark.nightly
 def test_kitchen_queries_find_a_near_reference(photographs: Photographs) -> None:
     """100 references spread over the sequence, 100 other frames: 95 % of them, thinned or not."""
     frames = photographs("7scenes-redkitchen-seq01-first600").frames

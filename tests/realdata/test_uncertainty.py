@@ -44,7 +44,7 @@ def held(data: Path, scene: str) -> tuple[int, dict[str, int]]:
     return len(rows), dict(zip(names, np.sum(rows, axis=0).tolist(), strict=True))
 
 
-@pytest.mark.parametrize("scene", ["fountain-P11", "tum-fr3-office"])
+@pytest.mark.parametrize("scene", ["fountain-P11", pytest.param("tum-fr3-office", marks=pytest.mark.nightly)])
 def test_radii_hold_as_often_as_they_say(photographs: Callable[[str], Dataset], scene: str) -> None:
     """Within what chance allows one time in a thousand; photographs of one walk are not independent, besides."""
     data = photographs(scene).frames[0].image_path.parents
