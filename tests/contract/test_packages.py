@@ -12,7 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.programs import LIMIT_S, Program
+from support.programs import Program
+from support.waiting import LIMIT_S
 
 ROOT = Path(__file__).parents[2]
 SOURCES = ("client", "server", "deploy/ray/mapless_ray", "pyproject.toml", "README.md", "LICENSE")

@@ -17,6 +17,7 @@ import pytest
 from google.protobuf import json_format
 from support.images import textured
 from support.servers import CAMERA, PHOTO, pose, serving
+from support.waiting import wait_until
 
 from mapless import Client, NewReference, wire
 
@@ -48,13 +49,6 @@ def camera_json(tmp_path: Path) -> str:
 
 def lines(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
-def wait_until(condition: Any) -> None:
-    deadline_s = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
 
 
 def test_poses_go_on_after_the_server_was_away(loop: Any, tmp_path: Path, camera_json: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import sys
-import time
 from collections.abc import Callable
 from datetime import datetime, timezone
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from support.images import textured
 from support.servers import CAMERA, PHOTO, pose, serving
+from support.waiting import wait_until
 
 from mapless import Client, Fisheye, NewReference, RadialTangential, RigidTransform
 from mapless.geometry import rotation_from_vector
@@ -209,13 +209,6 @@ def node_module(monkeypatch: pytest.MonkeyPatch) -> Any:
             setattr(sys.modules[parent], child, module)
     monkeypatch.delitem(sys.modules, "ros2_node", raising=False)
     return importlib.import_module("ros2_node")
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
 
 
 def test_the_node_publishes_the_body_at_the_image_timestamp(

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from numpy.typing import NDArray
-from support.programs import gated, wait_until
+from support.programs import gated
 from support.servers import (
     COVARIANCE,
     StandInExtractor,
@@ -32,6 +32,7 @@ from support.servers import (
     localize_request,
     whole,
 )
+from support.waiting import wait_until
 
 from mapless.geometry import RigidTransform
 from mapless.v1 import reference_service_pb2 as reference_pb

@@ -26,8 +26,8 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from sqlalchemy import Connection
 from support.disks import fail, failing_disk, mount, small_disk
 from support.images import encode
-from support.programs import wait_until
 from support.servers import CAMERA, PHOTO, StandInMethod, pose, serving
+from support.waiting import wait_until
 
 from mapless import (
     Client,

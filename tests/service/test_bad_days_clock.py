@@ -19,8 +19,9 @@ from pathlib import Path
 
 import pytest
 from support import programs
-from support.programs import Program, program, wait_until
+from support.programs import Program, program
 from support.servers import CAMERA, PHOTO, pose
+from support.waiting import wait_until
 
 from mapless import Client, ConnectOptions, DeadlineExceeded, LocalizationResult, NewReference, Unauthenticated
 from mapless_server.security.tokens import create_token

@@ -17,8 +17,8 @@ import pytest
 from support.disks import mount, small_disk
 from support.images import encode
 from support.postgres import Cluster, require
-from support.programs import wait_until
 from support.servers import CAMERA, PHOTO, pose, serving
+from support.waiting import wait_until
 
 from mapless import (
     AlreadyExists,

@@ -20,10 +20,11 @@ import yaml  # type: ignore[import-untyped]
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from support import envoys
 from support.certificates import authority, signed
-from support.envoys import ENVOY, Gateway, configured, fetched, gateway, program, wait_until
+from support.envoys import ENVOY, Gateway, configured, fetched, gateway, program
 from support.postgres import shared_cluster
 from support.programs import gated
 from support.servers import CAMERA, PHOTO, RunningServer, localize_request, pose, serving
+from support.waiting import wait_until
 
 from mapless import (
     Client,

@@ -18,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import grpc
 import numpy as np
@@ -26,22 +26,21 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from support import raw_http2
 from support.images import encode
-from support.programs import gated, program, real, wait_until
+from support.programs import gated, program, real
 from support.servers import (
     CAMERA,
     PHOTO,
     RunningServer,
-    StandInExtractor,
     StandInMethod,
-    StandInReconstructor,
     Stubs,
     failure_of,
-    listening,
     localize_request,
+    make_scene,
     pose,
     serving,
     whole,
 )
+from support.waiting import wait_until
 
 from mapless import (
     AlreadyExists,
@@ -56,17 +55,9 @@ from mapless import (
 )
 from mapless.geometry import Camera
 from mapless.v1 import reference_service_pb2 as reference_pb
-from mapless_server.engine.query import Tier
-from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.pipeline import Pipeline
-from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc import receiving
-from mapless_server.security.rate import RateLimiter
 from mapless_server.serve import listening as grpc_server
-from mapless_server.serve.assembly import engine_options, engine_over
-from mapless_server.settings import Settings
-from mapless_server.store import Store
 from mapless_tools.load.scrape import Scrape, read_metrics
 
 ONCE = ConnectOptions(max_attempts=1)
@@ -84,11 +75,6 @@ def scraped(address: str) -> Scrape:
     scrape = read_metrics(address)
     assert scrape is not None
     return scrape
-
-
-def make_scene(client: Client) -> None:
-    client.create_scene("s")
-    client.add_reference("s", NewReference("r", PHOTO, CAMERA, pose(0)))
 
 
 def is_served(client: Client, scene: str) -> bool:
@@ -251,7 +237,10 @@ class TestMethods:
             }
             return replace(answer, outcome=replace(found, **spoilt[where]))
 
-        with answering(tmp_path, spoil) as address, Client(address) as client:
+        stand_in = StandInMethod()
+        stand_in.gate.set()
+        method = whole(lambda *asked: spoil(stand_in(*asked)))
+        with serving(tmp_path, method=method) as server, Client(server.address) as client:
             make_scene(client)
             with pytest.raises(Internal):
                 client.localize(PHOTO, CAMERA, "s")
@@ -317,22 +306,6 @@ class TestMethods:
             assert server.wait() == 70
             assert isinstance(hangs.exception(30), MaplessError)
             assert "the server hangs" in server.log
-
-
-@contextmanager
-def answering(data_dir: Path, change: Callable[[Answer], Answer]) -> Iterator[str]:
-    """A server whose every answer is changed."""
-    stand_in = StandInMethod()
-    stand_in.gate.set()
-
-    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
-        tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
-        method = whole(lambda *asked: change(stand_in(*asked)))
-        return engine_over(store, tiers, engine_options(settings), metrics, quota, method)
-
-    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, workers=1, metrics=False, warm_up=False)
-    with listening(settings, Store.open(data_dir), make) as (running, _):
-        yield running.address
 
 
 def code_of(call: Callable[[], object]) -> str:

@@ -15,23 +15,18 @@ pytest.importorskip("PIL", reason="the networks' extra is not installed")
 
 import torch
 from support.images import encode, textured
-from support.servers import listening
+from support.servers import serving
 from support.small_networks import GRIDS, small_network
 
 from mapless import Client, LocalizationResult, NewReference, Rejected
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.engine.query import Tier
-from mapless_server.engine.queue_engine import QueueEngine
+from mapless_server.engine.stages import Method
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.features import SiftExtractor
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.networks.network import Network
 from mapless_server.networks.runner import NetworkRunner
-from mapless_server.observability.metrics import Metrics
-from mapless_server.security.rate import RateLimiter
-from mapless_server.serve.assembly import engine_options, engine_over
-from mapless_server.settings import Settings
-from mapless_server.store import Store
 
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 DISTANCE_M = 3.0
@@ -49,21 +44,14 @@ def pose_at(x_m: float) -> RigidTransform:
 
 
 @contextmanager
-def serving(data_dir: Path, network: Network, name: str) -> Iterator[tuple[Client, NetworkReconstructor]]:
+def on_network(data_dir: Path, network: Network, name: str) -> Iterator[tuple[Client, NetworkReconstructor]]:
     """A client of a server on this network, with the real method and SIFT."""
     torch.set_num_threads(1)
     runner = NetworkRunner(network, name, f"sha-of-{name}", "cpu")
-    backend = NetworkReconstructor(runner, NetworkOptions(grids=GRIDS))
-    store = Store.open(data_dir)
-    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, workers=2, metrics=False, warm_up=False)
-
-    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
-        return engine_over(store, [Tier(SiftExtractor(), Pipeline(backend))], engine_options(settings), metrics, quota)
-
     with (
-        closing(backend),
-        listening(settings, store, make) as (running, _),
-        Client(running.address) as client,
+        closing(NetworkReconstructor(runner, NetworkOptions(grids=GRIDS))) as backend,
+        serving(data_dir, method=Method(), tier=Tier(SiftExtractor(), Pipeline(backend))) as server,
+        Client(server.address) as client,
     ):
         client.create_scene("wall")
         photos = [
@@ -77,7 +65,7 @@ def serving(data_dir: Path, network: Network, name: str) -> Iterator[tuple[Clien
 @pytest.mark.parametrize("name", ["pi3", "pi3x"])
 def test_a_random_network_is_answered_for(tmp_path: Path, name: str) -> None:
     """Nothing but the answer's form is known: the network is random, but matches and poses of references are true."""
-    with serving(tmp_path, small_network(name), name) as (client, backend):
+    with on_network(tmp_path, small_network(name), name) as (client, backend):
         names = ["r0", "r1", "r2", "r3"]
         answers = [client.localize(encode(".png", photograph_at(x_m)), CAMERA, "wall", names) for x_m in (0.7, 1.2)]
         for answer in answers:
@@ -94,7 +82,7 @@ def test_a_network_of_nans_is_a_rejection(tmp_path: Path, caplog: pytest.LogCapt
     network = small_network("pi3")
     for parameter in network.parameters():
         parameter.data[:] = float("nan")
-    with serving(tmp_path, network, "pi3") as (client, _):
+    with on_network(tmp_path, network, "pi3") as (client, _):
         answer = client.localize(encode(".png", photograph_at(0.7)), CAMERA, "wall", ["r0", "r1", "r2"])
     assert isinstance(answer, Rejected)
     assert answer.reason == "SCALE_UNRELIABLE"

@@ -7,31 +7,28 @@ from __future__ import annotations
 
 import threading
 import time
-import urllib.request
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass, replace
+from contextlib import AbstractContextManager, ExitStack, closing, suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import grpc
 import numpy as np
 import pytest
-from prometheus_client.parser import text_string_to_metric_families
 from support.images import encode, textured
-from support.programs import wait_until
 from support.servers import (
     CAMERA,
     PHOTO,
-    StandInExtractor,
+    RunningServer,
     StandInMethod,
-    StandInReconstructor,
-    listening,
     localize_request,
+    make_scene,
     pose,
+    serving,
     whole,
 )
+from support.waiting import wait_until
 
 from mapless import (
     Client,
@@ -46,61 +43,18 @@ from mapless.errors import from_rpc_error
 from mapless.geometry import Camera, RigidTransform
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.engine.query import Tier
-from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pnp import PoseStage
-from mapless_server.observability.metrics import Metrics
-from mapless_server.security.rate import RateLimiter
-from mapless_server.serve.assembly import engine_options, engine_over
-from mapless_server.settings import Settings
-from mapless_server.store import Store
 
 COST_S = 0.04
 WORKERS = 2
 
 
-@dataclass(frozen=True)
-class Overloaded:
-    """A server that takes its time.
-
-    Attributes:
-        address: "host:port".
-        engine: what computes.
-        scrape: its metrics now: sums over labels that are not given.
-    """
-
-    address: str
-    engine: QueueEngine
-    scrape: Callable[..., float]
-
-
-@contextmanager
-def overloaded(data_dir: Path, method: Method, tier: Tier | None = None, **options: Any) -> Iterator[Overloaded]:
-    """A server with this method, and stand-ins for the rest unless there is a tier."""
-    given = {"workers": WORKERS, "warm_up": False, "metrics_port": 0} | options
-    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, **given)
-
-    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
-        stand_in = Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))
-        return engine_over(store, [tier or stand_in], engine_options(settings), metrics, quota, method)
-
-    with listening(settings, Store.open(data_dir), make) as (running, _):
-        address = running.metrics_address
-        yield Overloaded(running.address, running.engine, lambda name, **labels: scrape(address, name, **labels))
-
-
-def scrape(address: str, name: str, **labels: str) -> float:
-    """A metric's value, summed over the labels that are not given."""
-    with urllib.request.urlopen(f"http://{address}/metrics", timeout=30) as response:
-        page = response.read().decode()
-    return sum(
-        sample.value
-        for family in text_string_to_metric_families(page)
-        for sample in family.samples
-        if sample.name == name and labels.items() <= sample.labels.items()
-    )
+def overloaded(data_dir: Path, method: Method, **options: Any) -> AbstractContextManager[RunningServer]:
+    """A server with this method."""
+    return serving(data_dir, method=method, **({"workers": WORKERS, "max_queued_s": 2.0} | options))
 
 
 def slow(seconds: float) -> Method:
@@ -115,10 +69,9 @@ def slow(seconds: float) -> Method:
     return whole(localize)
 
 
-def make_scene(client: Client, calls: int = 0) -> None:
-    """A scene "s", and so many calls by which the queue learns what to expect."""
-    client.create_scene("s")
-    client.add_reference("s", NewReference("r", PHOTO, CAMERA, pose(0)))
+def learn(client: Client, calls: int = 10) -> None:
+    """A scene "s", and calls by which the queue learns what to expect."""
+    make_scene(client)
     for _ in range(calls):
         client.localize(PHOTO, CAMERA, "s")
 
@@ -128,7 +81,7 @@ def test_triple_load_is_answered_or_refused_and_counted(tmp_path: Path) -> None:
     request = localize_request("s")
     with overloaded(tmp_path, slow(COST_S), max_queued_s=1.0) as server, ExitStack() as stack:
         with Client(server.address) as client:
-            make_scene(client, calls=10)
+            learn(client)
         # Four robots have four connections, each with its own limit of calls.
         own_connection = [("grpc.use_local_subchannel_pool", 1)]
         channels = [grpc.insecure_channel(server.address, own_connection) for _ in range(4)]
@@ -152,18 +105,18 @@ def test_triple_load_is_answered_or_refused_and_counted(tmp_path: Path) -> None:
         wait_until(lambda: calls_handled(server) == sent + 10)
         assert calls_handled(server, "OK") - before["OK"] == answered
         assert calls_handled(server, "RESOURCE_EXHAUSTED") - before["RESOURCE_EXHAUSTED"] == refused
-        assert server.scrape("mapless_admission_rejected_total") == refused
+        assert server.value("mapless_admission_rejected_total") == refused
         of_localize = [
-            server.scrape("mapless_jobs_terminated_total", stage=it) for it in ("prepare", "coarse", "refine")
+            server.value("mapless_jobs_terminated_total", stage=it) for it in ("prepare", "coarse", "refine")
         ]
         assert sum(of_localize) == answered + 10
-        assert server.scrape("mapless_jobs_terminated_total", outcome="expired") == 0
+        assert server.value("mapless_jobs_terminated_total", outcome="expired") == 0
         assert server.engine.queue.job_count == 0
 
 
-def calls_handled(server: Overloaded, code: str | None = None) -> float:
+def calls_handled(server: RunningServer, code: str | None = None) -> float:
     labels = {"grpc_method": "Localize"} | ({} if code is None else {"grpc_code": code})
-    return server.scrape("grpc_server_handled_total", **labels)
+    return server.value("grpc_server_handled_total", **labels)
 
 
 def test_one_who_asks_little_is_served_while_another_floods(tmp_path: Path) -> None:
@@ -183,7 +136,7 @@ def test_one_who_asks_little_is_served_while_another_floods(tmp_path: Path) -> N
         Client(server.address, ConnectOptions(client_id="light")) as light,
         ThreadPoolExecutor(40) as pool,
     ):
-        make_scene(light, calls=10)
+        learn(light)
         floods = [pool.submit(flood, heavy) for _ in range(40)]
         try:
             assert refused.wait(30)
@@ -242,7 +195,7 @@ def test_the_coarse_pose_is_answered_if_refining_has_no_time(tmp_path: Path) -> 
             client.localize(PHOTO, CAMERA, "s", timeout_s=2.0)
         assert refining.began == 2
         for outcome in ("degraded", "expired"):
-            wait_until(lambda: server.scrape("mapless_jobs_terminated_total", outcome=outcome) == 1)  # noqa: B023
+            wait_until(lambda: server.value("mapless_jobs_terminated_total", outcome=outcome) == 1)  # noqa: B023
 
 
 def test_what_is_foreseen_to_come_too_late_is_not_even_begun(tmp_path: Path) -> None:
@@ -308,12 +261,12 @@ def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path) -> None:
                     pool.submit(client.localize, photograph_at(x_m), camera, "s", names, timeout_s=60)
                     for x_m in (0.3, 0.6, 0.9, 1.2)
                 ]
-                wait_until(lambda: server.scrape("mapless_queue_depth", stage="coarse") == 4)
+                wait_until(lambda: server.value("mapless_queue_depth", stage="coarse") == 4)
             finally:
                 gate.set()
             assert all(isinstance(call.result(60), LocalizationResult | Rejected) for call in calls)
             assert sizes == [1, 4]
-            assert server.scrape("mapless_batch_size_sum", stage="coarse") == 5
-            assert server.scrape("mapless_batch_size_count", stage="coarse") == 2
+            assert server.value("mapless_batch_size_sum", stage="coarse") == 5
+            assert server.value("mapless_batch_size_count", stage="coarse") == 2
         # Each reference was encoded once: by the first query, for all of them.
         assert backend.cache.counters.misses == 4

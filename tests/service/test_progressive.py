@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import grpc
 import numpy as np
@@ -21,32 +20,27 @@ from support.corner import pose as corner_pose
 from support.servers import (
     CAMERA,
     PHOTO,
-    StandInDescriptor,
-    StandInExtractor,
+    RunningServer,
     StandInMethod,
-    StandInReconstructor,
     listening,
     localize_request,
+    make_scene,
     pose,
+    serving,
     whole,
 )
+from support.waiting import wait_until
 
-from mapless import Client, ConnectOptions, MaplessError, NewReference, RigidTransform, wire
+from mapless import Client, MaplessError, NewReference, RigidTransform, wire
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.engine.query import Tier
-from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Abandoned
-from mapless_server.security.rate import RateLimiter
-from mapless_server.security.tokens import create_token
-from mapless_server.serve.assembly import engine_options, engine_over, make_engine
+from mapless_server.serve.assembly import make_engine
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 
@@ -112,44 +106,37 @@ class Staged:
 
 @dataclass
 class Serving:
-    """A running server and what its method does."""
+    """A running server, what its method does, and a stub for it."""
 
-    address: str
+    server: RunningServer
     method: Staged
-    engine: QueueEngine
-    metrics: Metrics
-    stop: Callable[[], None]
     stub: LocalizationServiceStub
+
+    @property
+    def job_count(self) -> int:
+        """How many calls are in the queue or computed."""
+        return self.server.engine.queue.job_count
 
 
 @contextmanager
-def serving(
-    data_dir: Path, token: str | None = None, features: Sequence[str] = ("stand-in",), **options: Any
-) -> Iterator[Serving]:
+def staged(data_dir: Path, features: Sequence[str] = ("stand-in",), **options: Any) -> Iterator[Serving]:
     """A server with a scene "s" of three references, whose method refines when it is let."""
-    defaults = {"workers": 1, "metrics": False, "warm_up": False}
-    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, **(defaults | options))
-    staged, known = Staged(), list[Metrics]()
-
-    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
-        known.append(metrics)
-        tiers = [Tier(StandInExtractor(name), Pipeline(cast(Any, StandInReconstructor()))) for name in features]
-        return engine_over(store, tiers, engine_options(settings), metrics, quota, staged.method(), StandInDescriptor())
-
-    with listening(settings, Store.open(data_dir), make) as (running, stop):
-        with Client(running.address, ConnectOptions(token=token)) as client:
-            client.create_scene("s")
-            client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
-        with grpc.insecure_channel(running.address) as channel:
-            try:
-                yield Serving(running.address, staged, running.engine, known[0], stop, LocalizationServiceStub(channel))
-            finally:
-                staged.gate.set()
+    method = Staged()
+    with (
+        serving(data_dir, features, method=method.method(), **({"workers": 1} | options)) as server,
+        grpc.insecure_channel(server.address) as channel,
+    ):
+        with Client(server.address) as client:
+            make_scene(client, count=3)
+        try:
+            yield Serving(server, method, LocalizationServiceStub(channel))
+        finally:
+            method.gate.set()
 
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
-    with serving(tmp_path_factory.mktemp("data"), allow_watching=True) as running:
+    with staged(tmp_path_factory.mktemp("data"), allow_watching=True) as running:
         yield running
 
 
@@ -158,14 +145,7 @@ def server(shared: Serving) -> Iterator[Serving]:
     shared.method.reset()
     yield shared
     shared.method.gate.set()
-    wait_until(lambda: shared.engine.queue.job_count == 0)
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.005)
+    wait_until(lambda: shared.job_count == 0)
 
 
 def asking(server: Serving, timeout: float | None = LIMIT_S, metadata: Any = (), **fields: Any) -> Any:
@@ -181,17 +161,13 @@ def ending(call: Any) -> MaplessError:
     return from_rpc_error(caught.value)
 
 
-def sample(server: Serving, name: str, **labels: str) -> float:
-    return server.metrics.registry.get_sample_value(name, labels) or 0.0
-
-
 def test_the_coarse_pose_comes_first_with_only_what_is_known(server: Serving) -> None:
     session = wire.transform_to_message(pose(3.0))
     asked: dict[str, Any] = {"session_from_camera": session, "options": pb.LocalizeOptions(axes=pb.AXES_UNITY)}
     call = asking(server, **asked, metadata=(("x-request-id", "mine"),))
     first = next(call)
     assert server.method.refining.acquire(timeout=LIMIT_S)
-    assert server.engine.queue.job_count == 1
+    assert server.job_count == 1
     found = first.answer.localization
     assert not first.is_final
     assert found.pose_stage == pb.POSE_STAGE_COARSE
@@ -315,14 +291,14 @@ def test_a_coarse_pose_outside_a_hard_limit_is_not_told(server: Serving) -> None
 
 
 def test_a_cancelled_stream_frees_its_place_and_ends_refining(server: Serving) -> None:
-    before = sample(server, "mapless_jobs_terminated_total", outcome="cancelled", stage="refine")
+    before = server.server.value("mapless_jobs_terminated_total", outcome="cancelled", stage="refine")
     call = asking(server)
     next(call)
     assert server.method.refining.acquire(timeout=LIMIT_S)
     call.cancel()
     assert server.method.given_up.acquire(timeout=LIMIT_S)
-    wait_until(lambda: server.engine.queue.job_count == 0)
-    assert sample(server, "mapless_jobs_terminated_total", outcome="cancelled", stage="refine") == before + 1
+    wait_until(lambda: server.job_count == 0)
+    assert server.server.value("mapless_jobs_terminated_total", outcome="cancelled", stage="refine") == before + 1
     server.method.gate.set()
     assert len(list(asking(server))) == 2
 
@@ -343,15 +319,8 @@ def test_where_a_coarse_pose_suffices_the_deadline_ends_it(server: Serving) -> N
     assert last.answer.localization.pose_stage == pb.POSE_STAGE_COARSE
 
 
-def test_who_names_no_deadline_has_the_servers(tmp_path: Path) -> None:
-    with serving(tmp_path, default_deadline_s=0.7) as short:
-        call = asking(short, timeout=None)
-        assert not next(call).is_final
-        assert ending(call).code == "DEADLINE_EXCEEDED"
-
-
 def test_a_full_server_refuses_before_computing_anything(tmp_path: Path) -> None:
-    with serving(tmp_path, max_queued_s=0.001) as full:
+    with staged(tmp_path, max_queued_s=0.001) as full:
         first = asking(full)
         next(first)
         failure = ending(asking(full))
@@ -385,49 +354,12 @@ def test_who_does_not_read_holds_up_nobody(server: Serving) -> None:
     server.method.gate.set()
     for _ in range(3):
         assert server.stub.Localize(localize_request("s"), timeout=LIMIT_S).HasField("localization")
-    assert server.engine.queue.job_count == 0
+    assert server.job_count == 0
     assert [it.is_final for it in unread] == [False, True]
 
 
-def test_a_server_that_stops_waits_for_the_refined_answer(tmp_path: Path) -> None:
-    with serving(tmp_path, drain_grace_s=60) as leaving:
-        call = asking(leaving)
-        next(call)
-        assert leaving.method.refining.acquire(timeout=LIMIT_S)
-        leaving.stop()
-
-        def refuses() -> bool:
-            try:
-                asking(leaving, timeout=0.05, scene="scenes/absent").next()
-            except grpc.RpcError as error:
-                return from_rpc_error(error).reason == "DRAINING"
-            raise AssertionError("there is no such scene")
-
-        wait_until(refuses)
-        leaving.method.gate.set()
-        assert next(call).is_final
-        assert list(call) == []
-
-
-def test_it_takes_the_role_that_localizing_takes(tmp_path: Path) -> None:
-    tokens = tmp_path / "tokens.json"
-
-    def holding(tenant: str, role: str) -> Any:
-        return (("authorization", f"Bearer {create_token(tokens, f'{tenant}-{role}', tenant, role, None)}"),)
-
-    owner = create_token(tokens, "owner", "acme", "write", None)
-    reader, robot, stranger = holding("acme", "read"), holding("acme", "localize"), holding("other", "localize")
-    with serving(tmp_path / "data", owner, tokens_file=tokens) as guarded:
-        guarded.method.gate.set()
-        assert ending(asking(guarded)).reason == "TOKEN_MISSING"
-        assert ending(asking(guarded, metadata=reader)).reason == "ROLE_TOO_LOW"
-        assert len(list(asking(guarded, metadata=robot))) == 2
-        failure = ending(asking(guarded, metadata=stranger))
-        assert (failure.code, failure.field) == ("NOT_FOUND", "scene")
-
-
 def test_watchers_see_the_answer_once_and_it_counts_once(server: Serving) -> None:
-    answered = sample(server, "mapless_answers_total", outcome="localized")
+    answered = server.server.value("mapless_answers_total", outcome="localized")
     seen = server.stub.WatchQueries(pb.WatchQueriesRequest(scene="scenes/s"), timeout=LIMIT_S)
     seen.initial_metadata()
     server.method.gate.set()
@@ -436,12 +368,12 @@ def test_watchers_see_the_answer_once_and_it_counts_once(server: Serving) -> Non
     shown = [next(seen) for _ in range(2)]
     assert [it.answer.diagnostics.request_id for it in shown] == ["first", "second"]
     assert [it.answer.localization.pose_stage for it in shown] == [pb.POSE_STAGE_REFINED] * 2
-    assert sample(server, "mapless_answers_total", outcome="localized") == answered + 2
+    assert server.server.value("mapless_answers_total", outcome="localized") == answered + 2
     seen.cancel()
 
 
 def test_of_two_tiers_the_better_gives_the_final_answer(tmp_path: Path) -> None:
-    with serving(tmp_path, features=("cheap", "strong")) as both:
+    with staged(tmp_path, features=("cheap", "strong")) as both:
         both.method.trust = 0.01  # doubtful, so the stronger features try again
         both.method.gate.set()
         messages = list(asking(both))
@@ -451,7 +383,7 @@ def test_of_two_tiers_the_better_gives_the_final_answer(tmp_path: Path) -> None:
 
 
 def test_the_log_says_when_the_coarse_answer_was_there(server: Serving, caplog: pytest.LogCaptureFixture) -> None:
-    counted = sample(server, "mapless_coarse_answer_seconds_count")
+    counted = server.server.value("mapless_coarse_answer_seconds_count")
     with caplog.at_level("INFO", "mapless_server.rpc.guard"):
         call = asking(server, metadata=(("x-request-id", "logged"),))
         next(call)
@@ -462,7 +394,7 @@ def test_the_log_says_when_the_coarse_answer_was_there(server: Serving, caplog: 
     told: Any = vars(line)
     assert told["request_id"] == "logged"
     assert 0 < told["coarse_ms"] <= told["duration_ms"]
-    assert sample(server, "mapless_coarse_answer_seconds_count") == counted + 1
+    assert server.server.value("mapless_coarse_answer_seconds_count") == counted + 1
     assert {"prepare", "coarse", "refine"} == set(told["stages_ms"])
     assert (told["outcome"], told["pose_stage"], told["code"]) == ("localized", "refined", "OK")
     assert told["bytes_out"] > 0
@@ -472,7 +404,7 @@ def test_who_goes_through_the_log_finds_no_fault(server: Serving, caplog: pytest
     """However its callers leave."""
     with caplog.at_level("WARNING"):
         for leave in ("cancel", "deadline", "close"):
-            with grpc.insecure_channel(server.address) as channel:
+            with grpc.insecure_channel(server.server.address) as channel:
                 request = localize_request("s")
                 timeout = 0.3 if leave == "deadline" else LIMIT_S
                 call = LocalizationServiceStub(channel).LocalizeProgressively(request, timeout=timeout)
@@ -481,7 +413,7 @@ def test_who_goes_through_the_log_finds_no_fault(server: Serving, caplog: pytest
                     call.cancel()
                 elif leave == "deadline":
                     assert ending(call).code == "DEADLINE_EXCEEDED"
-        wait_until(lambda: server.engine.queue.job_count == 0)
+        wait_until(lambda: server.job_count == 0)
     assert not caplog.records
 
 

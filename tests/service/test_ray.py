@@ -27,6 +27,7 @@ from support.images import encode
 from support.postgres import Cluster as Database
 from support.postgres import require
 from support.servers import CAMERA, PHOTO, localize_request, pose, serving
+from support.waiting import wait_until
 
 from mapless import (
     Client,
@@ -65,14 +66,6 @@ LIMIT_S = 60.0
 SCENES = [f"scene-{i}" for i in range(16)]
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 AT_ONCE: dict[str, Any] = {"rolling_update_percentage": 1.0}
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    """Returns when it holds, and fails where it never does."""
-    give_up_s = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < give_up_s
-        time.sleep(0.05)
 
 
 @pytest.fixture(scope="module")

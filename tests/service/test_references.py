@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.images import encode, textured
-from support.programs import wait_until
 from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, pose, serving
+from support.waiting import wait_until
 
 from mapless import (
     AlreadyExists,

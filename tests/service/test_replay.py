@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from support import corner
 from support.images import encode, textured
-from support.programs import wait_until
+from support.waiting import wait_until
 
 from mapless import (
     Client,

@@ -28,7 +28,8 @@ import pytest
 from support import corner
 from support.images import encode, textured
 from support.postgres import shared_cluster
-from support.programs import LIMIT_S, Program, wait_until
+from support.programs import Program
+from support.waiting import LIMIT_S, wait_until
 
 from mapless import (
     AlreadyExists,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -17,6 +17,7 @@ from google.protobuf.message import Message
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from support.certificates import Pair, authority, signed
 from support.servers import CAMERA, PHOTO, RunningServer, failure_of, localize_request, pose, serving
+from support.waiting import wait_until
 
 from mapless import (
     Client,
@@ -35,11 +36,8 @@ from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1.geometry_pb2 import Vector3
 from mapless_server.security.access import METHOD_ROLES
-from mapless_server.security.errors import SecurityError
 from mapless_server.security.principal import Role
-from mapless_server.security.protection import Protection
 from mapless_server.security.tokens import create_token, revoke_token, sha256_of
-from mapless_server.settings import Settings
 
 LIMIT_S = 30.0
 EXPIRED = "mapless_expired"
@@ -353,30 +351,3 @@ class TestEncryption:
             with Client(server.address, self.options(root, signed(root, "robot-7"))) as client:
                 assert client.create_scene("s").scene_id == "s"
             assert any("robot-7" in str(record.__dict__) for record in caplog.records)
-
-
-class TestStart:
-    @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1"])
-    def test_an_unprotected_server_listens_on_this_machine_only(self, host: str) -> None:
-        with pytest.raises(SecurityError, match="neither TLS nor tokens"):
-            Protection.of(Settings(host=host))
-
-    def test_unless_the_operator_wants_it_or_something_protects_it(self, tmp_path: Path) -> None:
-        assert Protection.of(Settings(host="0.0.0.0", insecure=True)).tls is None
-        create_token(tmp_path / "tokens.json", "a", "t", "read", None)
-        assert len(Protection.of(Settings(host="0.0.0.0", tokens_file=tmp_path / "tokens.json")).refreshable) == 1
-
-    @pytest.mark.parametrize("missing", ["tokens_file", "tls_certificate"])
-    def test_a_missing_file_is_one_sentence(self, tmp_path: Path, missing: str) -> None:
-        signed(authority(), "server").write(tmp_path / "cert", tmp_path / "key")
-        files: dict[str, Any] = {"tls_certificate": tmp_path / "cert", "tls_key": tmp_path / "key"}
-        files[missing] = tmp_path / "absent"
-        with pytest.raises(SecurityError, match=r"absent: No such file or directory$"):
-            Protection.of(Settings(**files))
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < end_s, "it did not come about"
-        time.sleep(0.05)

@@ -21,8 +21,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 from support import postgres
-from support.programs import wait_until
 from support.stores import DATABASES, Folder, Place, Shared
+from support.waiting import wait_until
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server import errors

@@ -20,8 +20,8 @@ from typing import Any, cast
 import grpc
 import numpy as np
 import pytest
-from support.programs import LIMIT_S, wait_until
 from support.servers import CAMERA, PHOTO, localize_request, pose, serving
+from support.waiting import LIMIT_S, wait_until
 
 from mapless import Client, NewReference, wire
 from mapless.v1 import localization_service_pb2 as pb

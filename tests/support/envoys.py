@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import socket
 import subprocess
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,10 +22,10 @@ import yaml  # type: ignore[import-untyped]
 
 from mapless import ConnectOptions
 from support.certificates import Pair, authority, signed
+from support.waiting import LIMIT_S, wait_until
 
 ENVOY = Path(__file__).parents[2] / "deploy" / "envoy" / "gateway"
 HEALTH_INTERVAL_S = 0.2
-LIMIT_S = 60.0
 Json = dict[str, Any]
 
 
@@ -149,11 +148,3 @@ def gateway(folder: Path, servers: Sequence[str]) -> Iterator[Gateway]:
     finally:
         process.kill()
         process.wait(LIMIT_S)
-
-
-def wait_until(condition: Any) -> None:
-    """Returns when it holds, and fails where it never does."""
-    deadline_s = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,19 +32,11 @@ from mapless_server.serve.run import serve
 from mapless_server.settings import Settings, load_settings
 from mapless_server.store import Store
 from support.servers import StandInExtractor, StandInMethod, StandInReconstructor, whole
+from support.waiting import LIMIT_S
 
-LIMIT_S = 60.0
 TESTS = Path(__file__).parents[1]
 GATED = ("-m", "support.programs")
 _ANNOUNCEMENT = "mapless-server listening on "
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    """Returns when it holds, and fails where it never does."""
-    deadline_s = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
 
 
 @dataclass

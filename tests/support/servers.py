@@ -17,14 +17,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapless import MaplessError, wire
+from mapless import Client, MaplessError, NewReference, wire
 from mapless.errors import from_rpc_error
 from mapless.geometry import Camera, RigidTransform, Similarity, rotation_from_vector
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
-from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine
+from mapless_server.engine.query import Tier
 from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer, Localization, LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
@@ -181,7 +181,13 @@ class RunningServer:
     method: StandInMethod
     extractors: Sequence[StandInExtractor]
     engine: QueueEngine
+    metrics: Metrics
     stop: Callable[[], None]
+
+    def value(self, name: str, **labels: str) -> float:
+        """Of a metric, summed over the labels that are not given."""
+        samples = (sample for family in self.metrics.registry.collect() for sample in family.samples)
+        return sum(it.value for it in samples if it.name == name and labels.items() <= it.labels.items())
 
 
 @contextmanager
@@ -225,30 +231,44 @@ def serving(
     features: Sequence[str] = ("stand-in",),
     descriptor_name: str = "patches",
     store: Store | None = None,
+    method: Method | None = None,
+    tier: Tier | None = None,
     **options: Any,
 ) -> Iterator[RunningServer]:
     """A server with the given settings until the block is left, or `stop` is called, which begins to drain it.
 
-    It has a tier for each of the `features`, and closes its store, which lies in the folder unless one is given. Its
-    queue is so long that a slow machine makes nobody be turned away, which is the matter of other tests.
+    It has a tier of stand-ins for each of the `features`, or the given `tier`, and computes by a StandInMethod, or the
+    given `method`. It closes its store, which lies in the folder unless one is given. Its queue is so long that a slow
+    machine rejects no call, which other tests are about.
     """
     defaults = {"port": 0, "workers": 2, "metrics": False, "warm_up": False, "max_queued_s": 60.0}
     settings = Settings(host="127.0.0.1", data_dir=data_dir, **(defaults | options))
     store = store or Store.open(data_dir)
-    method, extractors = StandInMethod(), [StandInExtractor(name) for name in features]
-    method.gate.set()
+    stand_in, extractors, known = StandInMethod(), [StandInExtractor(name) for name in features], list[Metrics]()
+    stand_in.gate.set()
 
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
+        known.append(metrics)
+        arguments = engine_options(settings), metrics, quota, method or whole(stand_in)
+        if tier is not None:
+            return engine_over(store, [tier], *arguments)
         tiers = [Tier(extractor, Pipeline(cast(Any, StandInReconstructor()))) for extractor in extractors]
-        return engine_over(
-            store, tiers, engine_options(settings), metrics, quota, whole(method), StandInDescriptor(descriptor_name)
-        )
+        return engine_over(store, tiers, *arguments, StandInDescriptor(descriptor_name))
 
     with listening(settings, store, make) as (running, stop):
         try:
-            yield RunningServer(running.address, running.metrics_address, method, extractors, running.engine, stop)
+            yield RunningServer(
+                running.address, running.metrics_address, stand_in, extractors, running.engine, known[0], stop
+            )
         finally:
-            method.gate.set()
+            stand_in.gate.set()
+
+
+def make_scene(client: Client, scene_id: str = "s", count: int = 1) -> str:
+    """A scene of references r0, r1, and so on, a metre apart; its id."""
+    client.create_scene(scene_id)
+    client.add_references(scene_id, [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(count)])
+    return scene_id
 
 
 @dataclass
