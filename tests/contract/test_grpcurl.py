@@ -19,9 +19,9 @@ import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from support.documents import PAGES, shell
-from support.servers import CAMERA, PHOTO, pose, serving
+from support.servers import CAMERA, PHOTO, make_scene, serving
 
-from mapless import Client, NewReference, wire
+from mapless import Client, wire
 
 _FILES: Any = descriptor_pb2  # which is not annotated
 
@@ -103,8 +103,7 @@ class Described:
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with serving(tmp_path_factory.mktemp("data")) as running, Client(running.address) as client:
-        client.create_scene("kitchen")
-        client.add_references("kitchen", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)])
+        make_scene(client, "kitchen", 2)
         yield running.address
 
 

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from google.protobuf import json_format
 from support.images import textured
-from support.servers import CAMERA, PHOTO, pose, serving
+from support.servers import CAMERA, make_scene, pose, serving
 from support.waiting import wait_until
 
-from mapless import Client, NewReference, wire
+from mapless import Client, wire
 
 RATE_HZ = 20.0
 
@@ -55,8 +55,7 @@ def test_poses_go_on_after_the_server_was_away(loop: Any, tmp_path: Path, camera
     video = write_video(tmp_path / "drive.avi", 120)
     poses, tum, data = tmp_path / "poses.jsonl", tmp_path / "poses.tum", tmp_path / "data"
     with serving(data) as server, Client(server.address) as client:
-        client.create_scene("hall")
-        client.add_references("hall", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)])
+        make_scene(client, "hall", 2)
         port = int(server.address.rpartition(":")[2])
         flags = ["--camera", camera_json, "--scene", "hall", "--address", server.address]
         given = [str(video), *flags, "--poses", str(poses), "--tum", str(tum), "--speed", "2"]

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 import pytest
 from support.images import textured
-from support.servers import CAMERA, PHOTO, pose, serving
+from support.servers import CAMERA, PHOTO, make_scene, pose, serving
 from support.waiting import wait_until
 
-from mapless import Client, Fisheye, NewReference, RadialTangential, RigidTransform
+from mapless import Client, Fisheye, RadialTangential, RigidTransform
 from mapless.geometry import rotation_from_vector
 
 IDENTITY = RigidTransform(np.eye(3), np.zeros(3))
@@ -215,8 +215,7 @@ def test_the_node_publishes_the_body_at_the_image_timestamp(
     node_module: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with serving(tmp_path / "data") as server, Client(server.address) as client:
-        client.create_scene("hall")
-        client.add_references("hall", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)])
+        make_scene(client, "hall", 2)
         parameters = {"address": server.address, "scene": "hall", "compressed": True}
         monkeypatch.setattr(HandingOnNode, "parameters", parameters)
         node = node_module.MaplessNode()

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import grpc
 import pytest
-from support.servers import CAMERA, PHOTO, RunningServer, Stubs, pose, serving
+from support.servers import RunningServer, Stubs, make_scene, serving
 
-from mapless import Client, NewReference
+from mapless import Client
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 
@@ -36,7 +36,6 @@ def client(server: RunningServer) -> Iterator[Client]:
 def scene(client: Client) -> Iterator[str]:
     """A scene of three references, at x = 0, 1 and 2 m."""
     scene_id = f"scene-{time.monotonic_ns()}"
-    client.create_scene(scene_id)
-    client.add_references(scene_id, [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
+    make_scene(client, scene_id, 3)
     yield scene_id
     client.delete_scene(scene_id)

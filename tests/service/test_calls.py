@@ -13,7 +13,7 @@ from typing import Any
 
 import grpc
 import pytest
-from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose, serving
+from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, localize_request, make_scene, pose, serving
 from support.waiting import wait_until
 
 from mapless import (
@@ -97,8 +97,7 @@ def test_what_nobody_waits_for_is_not_computed(
 
 def test_a_call_without_deadline_gets_the_default(tmp_path: Path) -> None:
     with serving(tmp_path, default_deadline_s=0.3) as server, Client(server.address) as client:
-        client.create_scene("s")
-        client.add_reference("s", NewReference("r", PHOTO, CAMERA, pose(0)))
+        make_scene(client)
         with grpc.insecure_channel(server.address) as channel, server.method.held():
             method = channel.unary_unary("/mapless.v1.LocalizationService/Localize")
             with pytest.raises(grpc.RpcError) as caught:

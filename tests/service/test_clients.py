@@ -14,7 +14,7 @@ from typing import Any
 import grpc
 import pytest
 from support.clients import Connect, awaiting, failing, losing, status
-from support.servers import CAMERA, PHOTO, RunningServer, pose, serving
+from support.servers import CAMERA, PHOTO, RunningServer, make_scene, pose, serving
 
 from mapless import (
     AlreadyExists,
@@ -195,8 +195,7 @@ def test_no_time_is_refused(server: RunningServer, connect: Connect) -> None:
 @both
 def test_calls_go_on_when_a_server_restarts(tmp_path: Path, connect: Connect) -> None:
     with serving(tmp_path) as first, Client(first.address) as setup:
-        setup.create_scene("s")
-        setup.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)])
+        make_scene(setup, "s", 2)
         port = int(first.address.rpartition(":")[2])
         client = connect(first.address, ConnectOptions(max_attempts=20, max_backoff_s=0.5))
         client.localize(PHOTO, CAMERA, "s")

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.images import encode, textured
-from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, pose, serving
+from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, make_scene, pose, serving
 from support.waiting import wait_until
 
 from mapless import (
@@ -59,8 +59,7 @@ def test_the_life_of_a_scene(client: Client) -> None:
 
 def test_a_deleted_scene_takes_no_memory(client: Client, server: RunningServer) -> None:
     before = server.engine.references.index_bytes
-    client.create_scene("chosen")
-    client.add_references("chosen", [NewReference("r0", PHOTO, CAMERA, pose(0.0))])
+    make_scene(client, "chosen")
     client.localize(PHOTO, CAMERA, "chosen")
     assert server.engine.references.index_bytes > before
     client.delete_scene("chosen")
@@ -77,8 +76,7 @@ def test_a_scene_whose_deletion_is_slow_takes_no_memory(tmp_path: Path, ends: st
         raise Overloaded("the store's disk is full", reason="STORE_FULL")
 
     with serving(tmp_path, store=store) as server, Client(server.address, ConnectOptions(max_attempts=1)) as client:
-        client.create_scene("s")
-        client.add_references("s", [NewReference("r0", PHOTO, CAMERA, pose(0.0))])
+        make_scene(client)
         client.localize(PHOTO, CAMERA, "s")
         assert server.engine.references.index_bytes > 0
         store._pending_deletions.run = delete_what_is_left  # type: ignore[method-assign]

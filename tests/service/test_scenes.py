@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.servers import CAMERA, PHOTO, Stubs, failure_of, pose, serving
+from support.servers import CAMERA, PHOTO, Stubs, failure_of, make_scene, serving
 
-from mapless import UNCHANGED, Calibration, Client, Datum, InvalidArgument, NewReference, NotFound, Quaternion
+from mapless import UNCHANGED, Calibration, Client, Datum, InvalidArgument, NotFound, Quaternion
 from mapless.geodesy import enu_from_y_up
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
@@ -167,8 +167,7 @@ def test_what_is_deleted_leaves_the_memory(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(QueueEngine, "forget_scene", lambda _, scene_key: heard.append(scene_key))
     store = Store.open(tmp_path)
     with serving(tmp_path, store=store) as server, Client(server.address) as client:
-        client.create_scene("s")
-        client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
+        make_scene(client, "s", 3)
         client.localize(PHOTO, CAMERA, "s")
         scene_key = key_of("default", "s")
         keys = store.find_keys(scene_key, ["r0", "r1", "r2"])

@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.servers import CAMERA, PHOTO, RunningServer, pose, serving
+from support.servers import CAMERA, PHOTO, RunningServer, make_scene, serving
 
 import mapless
-from mapless import Client, ConnectOptions, LocalizationResult, NewReference, shortcut
+from mapless import Client, ConnectOptions, LocalizationResult, shortcut
 
 CALL = """
 import mapless, sys
@@ -34,8 +34,7 @@ def test_one_line_is_enough_where_there_is_one_scene(
         monkeypatch.setenv("MAPLESS_ADDRESS", server.address)
         with pytest.raises(ValueError, match="the server has none"):
             mapless.localize(photo, CAMERA)
-        client.create_scene("hall")
-        client.add_references("hall", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)])
+        make_scene(client, "hall", 2)
         assert isinstance(mapless.localize(photo, CAMERA), LocalizationResult)
         client.create_scene("other")
         with pytest.raises(ValueError, match="there are hall, other"):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from support.servers import CAMERA, PHOTO, pose, serving
+from support.servers import CAMERA, PHOTO, make_scene, serving
 
-from mapless import Client, NewReference
+from mapless import Client
 
 STAGES = ["decode", "features", "coarse", "pnp"]
 
@@ -24,8 +24,7 @@ def test_an_answer_names_its_features_and_the_time_of_all(
     tmp_path: Path, trust: float, answered: str, stages: list[str]
 ) -> None:
     with serving(tmp_path, ("cheap", "strong")) as server, Client(server.address) as client:
-        client.create_scene("s")
-        client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)])
+        make_scene(client, "s", 2)
         assert [len(it.seen) for it in server.extractors] == [2, 2], "each tier sees each reference when it is added"
         server.method.trust = trust
         used = client.localize(PHOTO, CAMERA, "s", ["r0", "r1"]).diagnostics
@@ -35,8 +34,7 @@ def test_an_answer_names_its_features_and_the_time_of_all(
 def test_a_server_of_other_features_takes_over_the_store(tmp_path: Path) -> None:
     """Each reference is described when it is first needed, once, and the scene does not change by it."""
     with serving(tmp_path, ("old",)) as server, Client(server.address) as client:
-        client.create_scene("s")
-        client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
+        make_scene(client, "s", 3)
         generation = client.get_scene("s").generation
     for described in (3, 0):  # one server, and then the same again
         with serving(tmp_path, ("new",)) as server, Client(server.address) as client:

@@ -20,10 +20,10 @@ from typing import Any, cast
 import grpc
 import numpy as np
 import pytest
-from support.servers import CAMERA, PHOTO, localize_request, pose, serving
+from support.servers import CAMERA, PHOTO, localize_request, make_scene, pose, serving
 from support.waiting import LIMIT_S, wait_until
 
-from mapless import Client, NewReference, wire
+from mapless import Client, wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.errors import DataLoss, NotFound, Unavailable
@@ -75,8 +75,7 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cl
         Client(server.address) as client,
         grpc.insecure_channel(server.address) as channel,
     ):
-        client.create_scene("s")
-        client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
+        make_scene(client, "s", 3)
         yield client, LocalizationServiceStub(channel), folder
 
 
@@ -125,8 +124,7 @@ def test_what_was_made_of_a_deleted_scene_or_reference_goes(
     served: tuple[Client, LocalizationServiceStub, Path], deleted: str
 ) -> None:
     client, _, folder = served
-    client.create_scene("other")
-    client.add_references("other", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)])
+    make_scene(client, "other", 2)
     client.localize(PHOTO, CAMERA, "other")
     client.localize(PHOTO, CAMERA, "s", ["r0", "r1"])
     wait_until(lambda: len(captured_in(folder)) == 2)
@@ -502,8 +500,7 @@ def test_stored_data_is_not_read_again_and_queries_keep_memory(tmp_path: Path, m
         serving(tmp_path / "data", store=store, features=("cheap", "strong"), workers=1, capture_dir=folder) as server,
         Client(server.address) as client,
     ):
-        client.create_scene("s")
-        client.add_references("s", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(5)])
+        make_scene(client, "s", 5)
         client.localize(PHOTO, CAMERA, "s", [f"r{i}" for i in range(5)])
         wait_until(lambda: len(captured_in(folder)) == 1)
         before = read["capture"]
