@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from support.compare import assert_pose_close
 from support.corner import photograph
 from support.corner import pose as corner_pose
 from support.images import encode
+from support.messages import set_field
 from support.servers import CAMERA, PHOTO, Stubs, failure_of, pose, serving
 
 from mapless import (
@@ -33,6 +34,7 @@ from mapless import (
 )
 from mapless.axes import Axes, pose_to
 from mapless.geometry import rotation_from_vector
+from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_tools.child import child_server
@@ -165,86 +167,69 @@ def sequence_request(scene: str) -> pb.LocalizeSequenceRequest:
     return pb.LocalizeSequenceRequest(scene=f"scenes/{scene}", frames=[frame] * 3)
 
 
-Change = Callable[[Any], object]
+Case = tuple[str, Any] | tuple[str, Any, str]
 
-BAD_RIGS: dict[str, tuple[Change, str]] = {
-    "no image": (lambda request: request.ClearField("images"), "images"),
-    "9 images": (lambda request: request.images.extend([request.images[0]] * 6), "images"),
-    "no pose": (lambda request: request.images[1].ClearField("rig_from_camera"), "images[1].rig_from_camera"),
-    "pose at NaN": (
-        lambda request: setattr(request.images[2].rig_from_camera.translation_m, "y", math.nan),
-        "images[2].rig_from_camera.translation_m.y",
-    ),
-    "pose far away": (
-        lambda request: setattr(request.images[2].rig_from_camera.translation_m, "y", 1e8),
-        "images[2].rig_from_camera.translation_m.y",
-    ),
-    "zero rotation": (
-        lambda request: request.images[0].rig_from_camera.rotation.Clear(),
-        "images[0].rig_from_camera.rotation",
-    ),
-    "infinite focal length": (
-        lambda request: setattr(request.images[2].intrinsics, "focal_x_px", math.inf),
-        "images[2].intrinsics.focal_x_px",
-    ),
-    "no intrinsics": (lambda request: request.images[2].ClearField("intrinsics"), "images[2].intrinsics"),
-    "not an image": (lambda request: setattr(request.images[1], "image", b"<svg/>"), "images[1].image"),
-    "truncated": (lambda request: setattr(request.images[1], "image", PHOTO[:-100]), "images[1].image"),
-    "reference of another scene": (
-        lambda request: request.images[1].references.append("scenes/other/references/r1"),
-        "images[1].references[0]",
-    ),
-    "another variant": (lambda request: setattr(request.options, "variant", pb.VARIANT_FULL), "options.variant"),
-    "65 chosen": (lambda request: setattr(request.options, "reference_count", 65), "options.reference_count"),
-    "no scene": (lambda request: request.ClearField("scene"), "scene"),
-    "session at NaN": (
-        lambda request: request.session_from_rig.CopyFrom(
-            wire.transform_to_message(RigidTransform(np.eye(3), np.array([0, math.nan, 0])))
-        ),
-        "session_from_rig.translation_m.y",
-    ),
-    "session far away": (
-        lambda request: request.session_from_rig.CopyFrom(
-            wire.transform_to_message(RigidTransform(np.eye(3), np.array([0, 1.7e308, 0])))
-        ),
-        "session_from_rig.translation_m.y",
-    ),
-    "other axes": (lambda request: setattr(request.options, "axes", pb.AXES_UNITY), "options.axes"),
-    "unknown axes": (lambda request: setattr(request.options, "axes", 77), "options.axes"),
+
+def shifted(y_m: float) -> geometry_pb.RigidTransform:
+    return wire.transform_to_message(RigidTransform(np.eye(3), np.array([0, y_m, 0])))
+
+
+BAD_RIGS: dict[str, Case] = {
+    "no image": ("images", None),
+    "9 images": ("images", list(rig_request("").images) * 2),
+    "no pose": ("images[1].rig_from_camera", None),
+    "pose at NaN": ("images[2].rig_from_camera.translation_m.y", math.nan),
+    "pose far away": ("images[2].rig_from_camera.translation_m.y", 1e8),
+    "zero rotation": ("images[0].rig_from_camera.rotation", geometry_pb.Quaternion()),
+    "infinite focal length": ("images[2].intrinsics.focal_x_px", math.inf),
+    "no intrinsics": ("images[2].intrinsics", None),
+    "not an image": ("images[1].image", b"<svg/>"),
+    "truncated": ("images[1].image", PHOTO[:-100]),
+    "reference of another scene": ("images[1].references", ["scenes/other/references/r1"], "images[1].references[0]"),
+    "another variant": ("options.variant", pb.VARIANT_FULL),
+    "65 chosen": ("options.reference_count", 65),
+    "no scene": ("scene", None),
+    "session at NaN": ("session_from_rig", shifted(math.nan), "session_from_rig.translation_m.y"),
+    "session far away": ("session_from_rig", shifted(1.7e308), "session_from_rig.translation_m.y"),
+    "other axes": ("options.axes", pb.AXES_UNITY),
+    "unknown axes": ("options.axes", 77),
 }
-
-BAD_SEQUENCES: dict[str, tuple[Change, str]] = {
-    "one frame": (lambda request: request.frames.__delitem__(slice(1, None)), "frames"),
-    "17 frames": (lambda request: request.frames.extend([request.frames[0]] * 14), "frames"),
-    "no pose": (lambda request: request.frames[1].ClearField("session_from_camera"), "frames[1].session_from_camera"),
+BAD_SEQUENCES: dict[str, Case] = {
+    "no frame": ("frames", None),
+    "17 frames": ("frames", [sequence_request("").frames[0]] * 14),
+    "no pose": ("frames[1].session_from_camera", None),
     "NaN rotation": (
-        lambda request: setattr(request.frames[1].session_from_camera.rotation, "w", math.nan),
+        "frames[1].session_from_camera.rotation.w",
+        math.nan,
         "frames[1].session_from_camera.rotation",
     ),
-    "unknown axes": (lambda request: setattr(request.options, "axes", 77), "options.axes"),
-    "other size": (
-        lambda request: setattr(request.frames[2].intrinsics, "width_px", 97),
-        "frames[2].intrinsics.width_px",
-    ),
+    "unknown axes": ("options.axes", 77),
+    "other size": ("frames[2].intrinsics.width_px", 97),
 }
 
 
 @pytest.mark.parametrize("name", BAD_RIGS)
 def test_bad_rigs_are_refused_by_field(stubs: Stubs, scene: str, name: str) -> None:
-    change, field = BAD_RIGS[name]
-    request = rig_request(scene)
-    change(request)
-    error = failure_of(stubs.localization.LocalizeRig, request)
-    assert (error.code, error.field) == ("INVALID_ARGUMENT", field), error
+    check_refused(stubs.localization.LocalizeRig, rig_request(scene), BAD_RIGS[name])
 
 
 @pytest.mark.parametrize("name", BAD_SEQUENCES)
 def test_bad_sequences_are_refused_by_field(stubs: Stubs, scene: str, name: str) -> None:
-    change, field = BAD_SEQUENCES[name]
+    check_refused(stubs.localization.LocalizeSequence, sequence_request(scene), BAD_SEQUENCES[name])
+
+
+def test_a_single_frame_is_no_sequence(stubs: Stubs, scene: str) -> None:
     request = sequence_request(scene)
-    change(request)
+    del request.frames[1:]
     error = failure_of(stubs.localization.LocalizeSequence, request)
-    assert (error.code, error.field) == ("INVALID_ARGUMENT", field), error
+    assert (error.code, error.field) == ("INVALID_ARGUMENT", "frames")
+
+
+def check_refused(method: Any, request: Any, case: Case) -> None:
+    path, value, *other = case
+    set_field(request, path, value)
+    error = failure_of(method, request)
+    assert (error.code, error.field) == ("INVALID_ARGUMENT", (*other, path)[0]), error
 
 
 def test_a_group_with_too_many_bytes_is_refused(tmp_path: Path) -> None:

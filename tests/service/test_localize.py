@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
 import pytest
 from support.images import cmyk_jpeg, encode, png_claiming, textured, with_exif_orientation
+from support.messages import set_field
 from support.servers import CAMERA, COVARIANCE, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose
 
 from mapless import (
@@ -32,7 +32,6 @@ from mapless_server.images.decode import ImageLimits, decode_image
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import Store
 
-Request = pb.LocalizeRequest
 DEEP = np.random.default_rng(3).integers(0, 65536, (64, 96, 3)).astype(np.uint16)
 JPEG = encode(".jpg", textured())
 
@@ -169,71 +168,52 @@ def test_exif_orientation_does_not_turn_the_intrinsics(client: Client, scene: st
     assert caught.value.field == "intrinsics.width_px"
 
 
-def set_image(data: bytes) -> Callable[[Request], None]:
-    return lambda request: setattr(request, "image", data)
+Case = tuple[str, Any] | tuple[str, Any, str]
+"""The field that is set, to what, and the field that is refused if it is another one."""
 
 
-def set_intrinsics(name: str, value: float) -> Callable[[Request], None]:
-    return lambda request: setattr(request.intrinsics, name, value)
+def session_at(**quaternion: float) -> geometry_pb.RigidTransform:
+    return geometry_pb.RigidTransform(
+        rotation=geometry_pb.Quaternion(**quaternion), translation_m=geometry_pb.Vector3(x=0, y=0, z=0)
+    )
 
 
-def set_session_rotation(**quaternion: float) -> Callable[[Request], None]:
-    def change(request: Request) -> None:
-        request.session_from_camera.rotation.CopyFrom(geometry_pb.Quaternion(**quaternion))
-        request.session_from_camera.translation_m.CopyFrom(geometry_pb.Vector3())
-
-    return change
+def prior_at(radius_m: float, x_m: float = 0.0) -> pb.PositionPrior:
+    return pb.PositionPrior(position_m=geometry_pb.Vector3(x=x_m), radius_m=radius_m)
 
 
-def set_prior(radius_m: float, x: float = 0.0) -> Callable[[Request], None]:
-    def change(request: Request) -> None:
-        request.position_prior.position_m.CopyFrom(geometry_pb.Vector3(x=x))
-        request.position_prior.radius_m = radius_m
-
-    return change
-
-
-def add_references(*references: str) -> Callable[[Request], None]:
-    """Names with {scene} for the request's own."""
-    return lambda request: request.references.extend(name.format(scene=request.scene) for name in references)
-
-
-def set_option(name: str, value: int) -> Callable[[Request], None]:
-    return lambda request: setattr(request.options, name, value)
-
-
-BAD_REQUESTS: dict[str, tuple[Callable[[Request], object], str]] = {
-    "no image": (set_image(b""), "image"),
-    "not an image": (set_image(b"<svg/>" * 30), "image"),
-    "truncated": (set_image(PHOTO[:-100]), "image"),
-    "900 megapixels": (set_image(png_claiming(30_000, 30_000)), "image"),
-    "too many bytes": (set_image(PHOTO + bytes(17 * 2**20)), "image"),
-    "no intrinsics": (lambda request: request.ClearField("intrinsics"), "intrinsics"),
-    "other size": (set_intrinsics("width_px", 97), "intrinsics.width_px"),
-    "focal length 0": (set_intrinsics("focal_x_px", 0.0), "intrinsics.focal_x_px"),
-    "focal length below 0": (set_intrinsics("focal_y_px", -5.0), "intrinsics.focal_y_px"),
-    "focal length NaN": (set_intrinsics("focal_x_px", math.nan), "intrinsics.focal_x_px"),
-    "principal point infinite": (set_intrinsics("principal_y_px", math.inf), "intrinsics.principal_y_px"),
-    "zero quaternion": (set_session_rotation(), "session_from_camera.rotation"),
-    "long quaternion": (set_session_rotation(x=1, w=1), "session_from_camera.rotation"),
-    "NaN quaternion": (set_session_rotation(w=math.nan), "session_from_camera.rotation"),
-    "radius 0": (set_prior(0.0), "position_prior.radius_m"),
-    "radius NaN": (set_prior(math.nan), "position_prior.radius_m"),
-    "radius infinite": (set_prior(math.inf), "position_prior.radius_m"),
-    "prior at NaN": (set_prior(1.0, math.nan), "position_prior.position_m.x"),
-    "prior nowhere": (lambda request: setattr(request.position_prior, "radius_m", 1), "position_prior.position_m"),
-    "no scene": (lambda request: request.ClearField("scene"), "scene"),
-    "scene id alone": (lambda request: setattr(request, "scene", "kitchen"), "scene"),
-    "duplicate reference": (add_references("{scene}/references/r1", "{scene}/references/r1"), "references[1]"),
-    "reference of another scene": (add_references("scenes/other/references/r1"), "references[0]"),
-    "reference id with ..": (add_references("{scene}/references/a..b"), "references[0]"),
-    "reference id with /": (add_references("{scene}/references/../../etc/passwd"), "references[0]"),
-    "reference id of 10,000": (add_references("{scene}/references/" + "x" * 10_000), "references[0]"),
-    "65 references": (add_references(*(f"{{scene}}/references/r{i}" for i in range(65))), "references"),
-    "unknown variant": (set_option("variant", 77), "options.variant"),
-    "unknown scale strategy": (set_option("scale_strategy", -1), "options.scale_strategy"),
-    "65 chosen": (set_option("reference_count", 65), "options.reference_count"),
-    "-1 chosen": (set_option("reference_count", -1), "options.reference_count"),
+BAD_REQUESTS: dict[str, Case] = {
+    "no image": ("image", b""),
+    "not an image": ("image", b"<svg/>" * 30),
+    "truncated": ("image", PHOTO[:-100]),
+    "900 megapixels": ("image", png_claiming(30_000, 30_000)),
+    "too many bytes": ("image", PHOTO + bytes(17 * 2**20)),
+    "no intrinsics": ("intrinsics", None),
+    "other size": ("intrinsics.width_px", 97),
+    "focal length 0": ("intrinsics.focal_x_px", 0.0),
+    "focal length below 0": ("intrinsics.focal_y_px", -5.0),
+    "focal length NaN": ("intrinsics.focal_x_px", math.nan),
+    "principal point infinite": ("intrinsics.principal_y_px", math.inf),
+    "zero quaternion": ("session_from_camera", session_at(), "session_from_camera.rotation"),
+    "long quaternion": ("session_from_camera", session_at(x=1, w=1), "session_from_camera.rotation"),
+    "NaN quaternion": ("session_from_camera", session_at(w=math.nan), "session_from_camera.rotation"),
+    "radius 0": ("position_prior", prior_at(0.0), "position_prior.radius_m"),
+    "radius NaN": ("position_prior", prior_at(math.nan), "position_prior.radius_m"),
+    "radius infinite": ("position_prior", prior_at(math.inf), "position_prior.radius_m"),
+    "prior at NaN": ("position_prior", prior_at(1.0, math.nan), "position_prior.position_m.x"),
+    "prior nowhere": ("position_prior.radius_m", 1, "position_prior.position_m"),
+    "no scene": ("scene", None),
+    "scene id alone": ("scene", "kitchen"),
+    "duplicate reference": ("references", ["{scene}/references/r1"] * 2, "references[1]"),
+    "reference of another scene": ("references", ["scenes/other/references/r1"], "references[0]"),
+    "reference id with ..": ("references", ["{scene}/references/a..b"], "references[0]"),
+    "reference id with /": ("references", ["{scene}/references/../../etc/passwd"], "references[0]"),
+    "reference id of 10,000": ("references", ["{scene}/references/" + "x" * 10_000], "references[0]"),
+    "65 references": ("references", [f"{{scene}}/references/r{i}" for i in range(65)]),
+    "unknown variant": ("options.variant", 77),
+    "unknown scale strategy": ("options.scale_strategy", -1),
+    "65 chosen": ("options.reference_count", 65),
+    "-1 chosen": ("options.reference_count", -1),
 }
 
 
@@ -241,12 +221,14 @@ BAD_REQUESTS: dict[str, tuple[Callable[[Request], object], str]] = {
 def test_bad_requests_are_refused_by_field(
     server: RunningServer, stubs: Stubs, client: Client, scene: str, name: str
 ) -> None:
-    change, field = BAD_REQUESTS[name]
+    path, value, *other = BAD_REQUESTS[name]
+    if path == "references":
+        value = [it.format(scene=f"scenes/{scene}") for it in value]
     request = localize_request(scene)
-    change(request)
+    set_field(request, path, value)
     computed_before = server.method.call_count
     error = failure_of(stubs.localization.Localize, request)
-    assert (error.code, error.field) == ("INVALID_ARGUMENT", field)
+    assert (error.code, error.field) == ("INVALID_ARGUMENT", (*other, path)[0])
     assert len(error.message) <= 1000
     assert server.method.call_count == computed_before
     localized(client.localize(PHOTO, CAMERA, scene))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import threading
-import urllib.request
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from support.images import encode, textured
+from support.messages import set_field
 from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, make_scene, pose, serving
 from support.waiting import wait_until
 
@@ -26,6 +26,7 @@ from mapless import (
     wire,
 )
 from mapless.v1 import reference_service_pb2 as pb
+from mapless.v1.geometry_pb2 import Quaternion
 from mapless_server.errors import Overloaded
 from mapless_server.services import references as reference_service
 from mapless_server.services.messages import references
@@ -155,63 +156,37 @@ def test_a_batch_larger_than_the_queue_is_described_bit_by_bit(tmp_path: Path) -
         assert len(client.add_references("s", references)) == 40
 
 
-Change = Callable[[pb.BatchCreateReferencesRequest], object]
-
-
-def set_pose(**quaternion: float) -> Change:
-    def change(batch: pb.BatchCreateReferencesRequest) -> None:
-        rotation = batch.requests[1].reference.world_from_camera.rotation
-        rotation.Clear()
-        for name, value in quaternion.items():
-            setattr(rotation, name, value)
-
-    return change
-
-
-BAD_BATCHES: dict[str, tuple[Change, str]] = {
-    "none": (lambda batch: batch.ClearField("requests"), "requests"),
-    "1001": (lambda batch: batch.requests.extend(create_request(f"x{i}") for i in range(999)), "requests"),
-    "no id": (lambda batch: batch.requests[1].ClearField("reference_id"), "requests[1].reference_id"),
-    "id with ..": (lambda batch: setattr(batch.requests[1], "reference_id", "a..b"), "requests[1].reference_id"),
-    "id with /": (lambda batch: setattr(batch.requests[1], "reference_id", "a/b"), "requests[1].reference_id"),
-    "id of 10,000": (
-        lambda batch: setattr(batch.requests[1], "reference_id", "x" * 10_000),
-        "requests[1].reference_id",
-    ),
-    "twice": (lambda batch: setattr(batch.requests[1], "reference_id", "n0"), "requests[1].reference_id"),
-    "other scene": (lambda batch: setattr(batch.requests[1], "scene", "scenes/other"), "requests[1].scene"),
-    "no reference": (lambda batch: batch.requests[1].ClearField("reference"), "requests[1].reference"),
-    "no image": (lambda batch: batch.requests[1].reference.ClearField("image"), "requests[1].reference.image"),
-    "truncated": (
-        lambda batch: setattr(batch.requests[1].reference, "image", PHOTO[:-50]),
-        "requests[1].reference.image",
-    ),
-    "other size": (
-        lambda batch: setattr(batch.requests[1].reference.intrinsics, "height_px", 65),
-        "requests[1].reference.intrinsics.width_px",
-    ),
-    "no pose": (
-        lambda batch: batch.requests[1].reference.ClearField("world_from_camera"),
-        "requests[1].reference.world_from_camera",
-    ),
-    "zero quaternion": (set_pose(), "requests[1].reference.world_from_camera.rotation"),
-    "long quaternion": (set_pose(w=1.1), "requests[1].reference.world_from_camera.rotation"),
-    "too far": (
-        lambda batch: setattr(batch.requests[1].reference.world_from_camera.translation_m, "y", 1.1e7),
-        "requests[1].reference.world_from_camera.translation_m.y",
-    ),
+ITEM = "requests[1]"
+REFERENCE = f"{ITEM}.reference"
+BAD_BATCHES: dict[str, tuple[str, Any] | tuple[str, Any, str]] = {
+    "none": ("requests", None),
+    "1001": ("requests", [create_request(f"x{i}") for i in range(999)]),
+    "no id": (f"{ITEM}.reference_id", None),
+    "id with ..": (f"{ITEM}.reference_id", "a..b"),
+    "id with /": (f"{ITEM}.reference_id", "a/b"),
+    "id of 10,000": (f"{ITEM}.reference_id", "x" * 10_000),
+    "twice": (f"{ITEM}.reference_id", "n0"),
+    "other scene": (f"{ITEM}.scene", "scenes/other"),
+    "no reference": (REFERENCE, None),
+    "no image": (f"{REFERENCE}.image", None),
+    "truncated": (f"{REFERENCE}.image", PHOTO[:-50]),
+    "other size": (f"{REFERENCE}.intrinsics.height_px", 65, f"{REFERENCE}.intrinsics.width_px"),
+    "no pose": (f"{REFERENCE}.world_from_camera", None),
+    "zero quaternion": (f"{REFERENCE}.world_from_camera.rotation", Quaternion()),
+    "long quaternion": (f"{REFERENCE}.world_from_camera.rotation", Quaternion(w=1.1)),
+    "too far": (f"{REFERENCE}.world_from_camera.translation_m.y", 1.1e7),
 }
 
 
 @pytest.mark.parametrize("name", BAD_BATCHES)
 def test_a_batch_with_one_bad_item_stores_nothing(client: Client, stubs: Stubs, scene: str, name: str) -> None:
+    path, value, *other = BAD_BATCHES[name]
     batch = pb.BatchCreateReferencesRequest(
         scene=f"scenes/{scene}", requests=[create_request("n0"), create_request("n1")]
     )
-    change, field = BAD_BATCHES[name]
-    change(batch)
+    set_field(batch, path, value)
     error = failure_of(stubs.references.BatchCreateReferences, batch)
-    assert (error.code, error.field) == ("INVALID_ARGUMENT", field)
+    assert (error.code, error.field) == ("INVALID_ARGUMENT", (*other, path)[0])
     assert client.get_scene(scene).reference_count == 3
 
 
@@ -267,13 +242,10 @@ def test_a_page_is_made_off_the_event_loop(client: Client, scene: str, monkeypat
 
 
 def test_the_metrics_count_store_reads_of_a_localization(tmp_path: Path) -> None:
-    with serving(tmp_path, metrics=True, metrics_port=0) as server, Client(server.address) as client:
-        client.create_scene("s")
-        client.add_reference("s", NewReference("r", PHOTO, CAMERA, pose(0)))
+    with serving(tmp_path) as server, Client(server.address) as client:
+        make_scene(client)
         for _ in range(3):
-            client.localize(PHOTO, CAMERA, "s", ["r"])
-        with urllib.request.urlopen(f"http://{server.metrics_address}/metrics", timeout=30) as response:
-            text = response.read().decode()
-    assert '\nmapless_store_op_seconds_count{op="load_references"} 3.0\n' in text
-    assert '\nmapless_store_op_seconds_count{op="add_references"} 1.0\n' in text
-    assert "\nmapless_store_errors_total 0.0\n" in text
+            client.localize(PHOTO, CAMERA, "s", ["r0"])
+        assert server.value("mapless_store_op_seconds_count", op="load_references") == 3
+        assert server.value("mapless_store_op_seconds_count", op="add_references") == 1
+        assert server.value("mapless_store_errors_total") == 0
