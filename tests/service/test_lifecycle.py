@@ -8,10 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -20,7 +17,9 @@ import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from support.images import encode
+from support.programs import real
 from support.servers import CAMERA, PHOTO, RunningServer, pose, serving
+from support.waiting import wait_until
 
 from mapless import Client, ConnectOptions, LocalizationResult, NewReference, Unavailable
 from mapless.geometry import Camera
@@ -87,44 +86,6 @@ def test_calls_that_outlast_the_grace_are_cut_off(tmp_path: Path) -> None:
         assert getattr(caught.value, "code", None) in {"UNAVAILABLE", "CANCELLED"}
 
 
-@dataclass
-class Command:
-    """`mapless-server serve` as a process of its own."""
-
-    process: subprocess.Popen[str]
-    address: str
-    log: Path
-
-    def stop(self, number: signal.Signals) -> int:
-        """The exit code after a signal."""
-        self.process.send_signal(number)
-        return self.process.wait(60)
-
-
-@contextmanager
-def command(data_dir: Path, *arguments: str, **environment: str) -> Iterator[Command]:
-    log = data_dir.with_suffix(".log")
-    flags = ["--port", "0", "--metrics-port", "0", "--data-dir", str(data_dir), *arguments]
-    with log.open("w") as stderr:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "mapless_tools", "serve", *flags],
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-            text=True,
-            env={**os.environ, **environment},
-        )
-    try:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        prefix = "mapless-server listening on "
-        assert line.startswith(prefix), log.read_text()
-        yield Command(process, line.removeprefix(prefix).strip(), log)
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.communicate(timeout=30)
-
-
 def noise_photo(seed: int) -> bytes:
     """A photograph that keeps a feature extractor busy."""
     noise = np.random.default_rng(seed).integers(0, 256, (768, 1024, 3)).astype(np.uint8)
@@ -134,74 +95,61 @@ def noise_photo(seed: int) -> bytes:
 def test_sigterm_finishes_a_running_call_and_exits_with_0(tmp_path: Path) -> None:
     camera = Camera(1024, 768, 900.0, 900.0, 511.5, 383.5)
     references = [NewReference(f"r{i}", noise_photo(i), camera, pose(i)) for i in range(6)]
-    data_dir = tmp_path / "data"
     with (
-        command(data_dir, "--workers", "1", "--drain-grace-s", "60", "--log-level", "debug") as server,
+        real(tmp_path / "server", workers=1, drain_grace_s=60, log_level="debug") as server,
         Client(server.address) as client,
         ThreadPoolExecutor(1) as thread,
     ):
         client.create_scene("s")
         upload = thread.submit(client.add_references, "s", references)
-        while "BatchCreateReferences begins" not in server.log.read_text():
-            time.sleep(0.01)
+        wait_until(lambda: "BatchCreateReferences begins" in server.log)
         server.process.send_signal(signal.SIGTERM)
         assert not upload.done()
         assert len(upload.result(60)) == 6
-        assert server.process.wait(60) == 0
-    with command(data_dir) as server, Client(server.address) as client:
+        assert server.wait() == 0
+    with real(tmp_path / "server") as server, Client(server.address) as client:
         assert client.get_scene("s").reference_count == 6
-        assert server.stop(signal.SIGINT) == 0
+        server.process.send_signal(signal.SIGINT)
+        assert server.wait() == 0
 
 
 def test_settings_are_shown_at_the_start(tmp_path: Path) -> None:
-    with command(tmp_path / "data", "--max-batch", "7", "--log-format", "text", MAPLESS_WORKERS="1") as server:
-        assert server.stop(signal.SIGTERM) == 0
-        log = server.log.read_text()
-    for shown in (r"max_batch +7  \(flag\)", r"workers +1  \(environment\)", r"reflection +True  \(default\)"):
-        assert re.search(f"^ +{shown}$", log, re.MULTILINE), shown
+    with real(tmp_path / "server", max_batch=7, log_format="text") as server:
+        assert server.address
+        for shown in (r"max_batch +7  \(flag\)", r"warm_up +False  \(environment\)", r"reflection +True  \(default\)"):
+            assert re.search(f"^ +{shown}$", server.log, re.MULTILINE), shown
+
+
+def refusal(tmp_path: Path, **settings: object) -> str:
+    """The one line with which a server says why it does not start."""
+    with real(tmp_path / "server", log_level="error", **settings) as server:
+        assert (server.wait(), server.output) == (2, ""), server.log
+        (line,) = server.log.strip().splitlines()
+    assert line.startswith("mapless-server: ")
+    return line
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("setting", "value"),
     [
-        (["--data-dir", "/dev/null/x"], "/dev/null/x"),
-        (["--config", "absent.toml"], "absent.toml"),
-        (["--workers", "0"], "workers"),
-        (["--backend", "nonesuch"], "nonesuch"),
-        (["--features", "nonesuch"], "nonesuch"),
-        (["--host", "192.0.2.1"], "192.0.2.1"),
+        ("data_dir", "/dev/null/x"),
+        ("config", "absent.toml"),
+        ("backend", "nonesuch"),
+        ("features", "nonesuch"),
+        ("host", "192.0.2.1"),
     ],
 )
-def test_a_server_that_cannot_start_says_why_in_one_line(tmp_path: Path, arguments: list[str], told: str) -> None:
-    given = {"--port": "0", "--data-dir": str(tmp_path), "--log-level": "error"}
-    given |= dict(zip(arguments[::2], arguments[1::2], strict=True))
-    flat = [part for pair in given.items() for part in pair]
-    done = subprocess.run(
-        [sys.executable, "-m", "mapless_server", "--no-metrics", *flat],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 2, done.stderr
-    (line,) = done.stderr.strip().splitlines()
-    assert line.startswith("mapless-server: ")
-    assert told in line
-    assert not done.stdout
+def test_a_server_that_cannot_start_says_why_in_one_line(tmp_path: Path, setting: str, value: str) -> None:
+    assert value in refusal(tmp_path, **{setting: value})
+
+
+def test_a_setting_out_of_bounds_is_named(tmp_path: Path) -> None:
+    assert "workers" in refusal(tmp_path, workers=0)
 
 
 def test_a_taken_port_is_not_shared(server: RunningServer, tmp_path: Path) -> None:
     port = server.address.rpartition(":")[2]
-    done = subprocess.run(
-        [sys.executable, "-m", "mapless_server", "--no-metrics", "--port", port, "--data-dir", str(tmp_path)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 2
-    assert f"cannot listen on 127.0.0.1:{port}" in done.stderr.splitlines()[-1]
-    assert "Traceback" not in done.stderr
+    assert f"cannot listen on 127.0.0.1:{port}" in refusal(tmp_path, port=port)
 
 
 @pytest.mark.parametrize(("environment", "threads"), [({}, 1), ({"OPENBLAS_NUM_THREADS": "2"}, 2)])

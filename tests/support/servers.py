@@ -23,8 +23,8 @@ from mapless.geometry import Camera, RigidTransform, Similarity, rotation_from_v
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
-from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.query import Tier
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer, Localization, LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
