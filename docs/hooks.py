@@ -29,6 +29,7 @@ OUTSIDE = {
     "deploy/envoy/README.md": "operation/envoy.md",
     "deploy/ray/README.md": "operation/ray.md",
     "deploy/ray/kubernetes/README.md": "operation/ray-kubernetes.md",
+    "server/research/README.md": "benchmarks/research.md",
 }
 """Pages of the site that lie outside docs/, by their path in the repository."""
 

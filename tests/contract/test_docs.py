@@ -7,6 +7,7 @@ import asyncio
 import importlib
 import re
 from fnmatch import fnmatch
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,8 @@ from mapless_tools.cli.app import app
 
 SERVER = Path(errors.__file__).parent
 DOCS, DEPLOY = ROOT / "docs", ROOT / "deploy"
-EVERYTHING = "\n".join(page.read_text() for page in PAGES)
+PAST = ("CHANGELOG.md", "history.md", "city.md")
+CURRENT = "\n".join(page.read_text() for page in PAGES if page.name not in PAST)
 
 
 def page_id(page: Path) -> str:
@@ -82,17 +84,29 @@ def test_server_commands_parse() -> None:
 
 def test_make_targets_exist() -> None:
     there = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    named = {target for _, (target, *_) in commands("make")} | set(re.findall(r"`make ([a-z-]+)", EVERYTHING))
+    named = {target for _, (target, *_) in commands("make")} | set(re.findall(r"`make ([a-z-]+)", CURRENT))
     assert "demo" in named
     assert named <= there
+
+
+def test_modules_that_are_run_exist(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "server")
+    named = set(re.findall(r"python -m\s+((?:mapless|research)[\w.]+)", CURRENT))
+    assert len(named) >= 8
+    assert sorted(name for name in named if find_spec(name) is None) == []
+
+
+def test_the_table_of_extras_is_complete() -> None:
+    listed = re.findall(r"^(\w+) = \[", (ROOT / "pyproject.toml").read_text().split("optional-dependencies]")[1], re.M)
+    named = [name for row in rows(DOCS / "operation/server.md", "extra") for name in row]
+    assert {*listed[: listed.index("dev") + 1]} <= {*named}
 
 
 def test_files_that_commands_and_text_name_exist() -> None:
     shown = "\n".join(map(shell, PAGES))
     named = set(re.findall(r"(?<![\w/.])((?:deploy|docker|proto|client)/[\w./-]+)", shown))
     assert {"deploy/compose.postgres.yaml", "deploy/kubernetes/overlays/shared"} <= named
-    current = "\n".join(page.read_text() for page in PAGES if page.parent.name != "benchmarks")
-    named |= set(re.findall(r"`((?:client|deploy|docker|docs|proto|server|tests)/[\w./-]+)`", current))
+    named |= set(re.findall(r"`((?:client|deploy|docker|docs|proto|server|tests)/[\w./-]+)`", CURRENT))
     assert sorted(name for name in named if not (ROOT / name).exists()) == ["deploy/.env"]
 
 
@@ -202,7 +216,7 @@ def test_metrics_exist() -> None:
 
 def test_the_table_of_manifests_is_complete() -> None:
     folders = {path.parent for path in (DEPLOY / "kubernetes").rglob("kustomization.yaml")}
-    table = re.findall(r"^\| (`(?:overlays|components|base|weights).*?) \|", EVERYTHING, re.MULTILINE)
+    table = re.findall(r"^\| (`(?:overlays|components|base|weights).*?) \|", CURRENT, re.MULTILINE)
     named = {name for row in table for name in re.findall(r"`([\w/]+)`", row)}
     assert named == {str(folder.relative_to(DEPLOY / "kubernetes")) for folder in folders}
 
@@ -212,7 +226,7 @@ def test_the_table_of_manifests_is_complete() -> None:
 
 def test_settings_that_are_named_exist() -> None:
     clients = {CLIENT_ADDRESS_VARIABLE, CLIENT_TOKEN_VARIABLE, "MAPLESS_SCENE", "MAPLESS_CONFIG"}
-    variables = set(re.findall(r"\bMAPLESS_[A-Z_]+[A-Z]", EVERYTHING)) - clients
+    variables = set(re.findall(r"\bMAPLESS_[A-Z_]+[A-Z]", CURRENT)) - clients
     assert "MAPLESS_DATABASE_URL" in variables
     assert {name.removeprefix("MAPLESS_").lower() for name in variables} <= set(Settings.model_fields)
 
