@@ -1,168 +1,147 @@
-"""What an operator can set: by flag, environment (MAPLESS_...), file (TOML) or default; the first that says it wins."""
+"""The settings of the server: from flags, environment (MAPLESS_...), a TOML file or defaults, in this precedence."""
 
 from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
-from pydantic_settings import (
-    BaseSettings,
-    EnvSettingsSource,
-    PydanticBaseSettingsSource,
-    SettingsConfigDict,
-    TomlConfigSettingsSource,
-)
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 PREFIX = "MAPLESS_"
 CONFIG_VARIABLE = "MAPLESS_CONFIG"
 CLIENT_TOKEN_VARIABLE, CLIENT_ADDRESS_VARIABLE = "MAPLESS_TOKEN", "MAPLESS_ADDRESS"
-"""The client's, which may run in the same environment."""
+"""Variables of the client, which may run in the same environment."""
 
-# Kubernetes sets these in every pod that has a service called "mapless" beside it; MAPLESS_PORT is then "tcp://...".
+# Kubernetes sets these in every pod of a namespace with a service called "mapless"; MAPLESS_PORT is then "tcp://...".
 _SERVICE_LINKS = re.compile(r"MAPLESS_SERVICE_(HOST|PORT.*)|MAPLESS_PORT_\d+_.*")
 _SERVICE_LINK_VALUE = "tcp://"
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?")
 
 
 class ConfigError(Exception):
-    """A setting is wrong; the message is for the operator."""
+    """A setting is wrong; the message, one line a fault, is for the operator."""
 
 
 def available_cores() -> int:
-    """Cores that this process may use, which in a container are fewer than the machine has."""
+    """Number of cores that this process may use, in a container fewer than the machine has."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def default_weights_dir() -> Path:
-    """The user's cache folder, since weights can be fetched again; without one, a folder beside the store."""
+    """A folder in the user's cache, because weights can be fetched again; without a cache, one beside the store."""
     cache = os.environ.get("XDG_CACHE_HOME", "")
-    if not os.path.isabs(cache):  # the XDG specification: a relative one is to be ignored
+    if not os.path.isabs(cache):  # the XDG specification: relative ones are ignored
         cache = os.path.expanduser("~/.cache")
     return Path(cache) / "mapless" / "weights" if os.path.isabs(cache) else Path("mapless-weights")
 
 
-class Settings(BaseSettings):
-    """All settings of the server; frozen, and a name that is not here is an error wherever it stands."""
+class Settings(BaseModel):
+    """All settings of the server; unknown names are errors."""
 
-    model_config = SettingsConfigDict(
-        frozen=True, extra="forbid", env_prefix=PREFIX, validate_default=True, allow_inf_nan=False
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
-    host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on; 0.0.0.0 for all.")
-    port: int = Field(default=50051, ge=0, le=65535, description="Port to listen on; 0 for any free one.")
-    data_dir: Path = Field(
-        default=Path("mapless-data"), description="Folder of the store, on a local disk; as a flag, above database_url."
-    )
-    database_url: SecretStr | None = Field(
-        default=None,
-        description="Of a PostgreSQL that several servers share, postgresql://user:password@host/name; else data_dir.",
-    )
-    backend: str = Field(
-        default="geometric",
-        description="What does the coarse stage: geometric, pi3, pi3x (both non-commercial), or auto.",
-    )
-    features: str = Field(
-        default="sift",
-        description="Local features: sift, aliked, xfeat, superpoint (research only), or auto.",
-    )
-    device: str = Field(default="auto", description="What networks run on: auto, cpu, cuda or cuda:N.")
-    weights_dir: Path = Field(default_factory=default_weights_dir, description="Folder of the networks' weights.")
-    compiled_views: int = Field(
-        default=0,
-        ge=0,
-        le=65,
-        description="Photographs of a query, itself among them, that a network is compiled for at the start; 0: none.",
-    )
-    workers: int = Field(default_factory=available_cores, ge=1, description="Threads that compute; default: all cores.")
-    max_batch: int = Field(default=4, ge=1, le=64, description="Queries a network reconstructs at a time.")
-    max_queued_s: float = Field(
-        default=2.0, gt=0, description="Predicted computing time that may be admitted and not done, seconds a worker."
-    )
-    max_queued_mib: int = Field(default=256, ge=1, description="Memory for photographs of calls in progress, MiB.")
-    stall_limit_s: float = Field(
-        default=120.0, gt=0, description="A step that computes longer has hung; the server then ends, seconds."
-    )
-    tenant_rate_ms: float = Field(
-        default=0.0, ge=0, description="Computing time a tenant may use, milliseconds a second; 0: no limit."
-    )
-    tenant_burst_ms: float = Field(
-        default=20_000.0, gt=0, description="Computing time that a tenant may save up, milliseconds."
-    )
-    default_deadline_s: float = Field(
-        default=30.0, gt=0, description="Time for calls that come without a deadline, seconds."
-    )
-    max_deadline_s: float = Field(default=600.0, gt=0, description="Calls with a later deadline get this one, seconds.")
-    max_message_mib: int = Field(default=32, ge=1, le=1024, description="Largest message, either way, MiB.")
-    max_image_mib: int = Field(default=16, ge=1, description="Largest image file, MiB.")
-    max_image_megapixels: float = Field(default=50.0, gt=0, le=268, description="Largest image, width times height.")
-    retrieval: str = Field(
-        default="auto",
-        description="What references are chosen by: vlad (of the local features), megaloc, or auto.",
-    )
-    retrieval_cache_mib: int = Field(
-        default=1024, ge=1, description="Memory for the scenes whose references are chosen from, MiB."
-    )
-    reference_cache_mib: int = Field(default=512, ge=0, description="Memory for references' features, MiB.")
-    coverage: float = Field(
-        default=0.99,
-        gt=0,
-        lt=1,
-        description="Share of right answers to accept where a call does not say; more, and more wrong ones pass too.",
-    )
-    allow_watching: bool = Field(
-        default=False,
-        description="Whether WatchQueries may show callers' photographs to those with the role write. What waits for "
-        "watchers, of whom there are 8 at most, takes the memory of 24 images.",
-    )
-    capture_dir: Path | None = Field(
-        default=None,
-        description="Folder in which calls are kept for a time, photographs and all, to be replayed; without it, none.",
-    )
-    capture_hours: float = Field(default=24.0, gt=0, le=8784, description="How long a captured call is kept, hours.")
-    capture_mib: int = Field(
-        default=1024, ge=1, description="What captured calls may take on the disk; the oldest are deleted first, MiB."
-    )
-    capture_tenants: str = Field(
-        default="", description="Tenants whose calls are captured, separated by commas; empty: of all."
-    )
-    warm_up: bool = Field(default=True, description="Whether a localization is tried before the first call is taken.")
-    drain_delay_s: float = Field(
-        default=0.0,
-        ge=0,
-        description="Time to say that it stops before it takes no more calls, for load balancers, seconds.",
-    )
-    drain_grace_s: float = Field(
-        default=10.0, ge=0, description="Time that running calls get when the server stops, seconds."
-    )
-    tls_certificate: Path | None = Field(default=None, description="The server's certificate chain, PEM; read anew.")
-    tls_key: Path | None = Field(default=None, description="Its private key, PEM.")
-    tls_client_ca: Path | None = Field(
-        default=None, description="Certificates that clients' own must be signed by, PEM; without, clients need none."
-    )
-    tokens_file: Path | None = Field(
-        default=None, description="Hashes of the bearer tokens that callers must show; see mapless-server token."
-    )
-    insecure: bool = Field(
-        default=False, description="Whether to listen beyond this machine with neither TLS nor tokens."
-    )
-    metrics: bool = Field(default=True, description="Whether to serve metrics to Prometheus.")
-    metrics_host: str = Field(default="127.0.0.1", min_length=1, description="Address of the metrics; 0.0.0.0 for all.")
-    metrics_port: int = Field(default=9464, ge=0, le=65535, description="Port of the metrics; 0 for any free one.")
-    otlp_endpoint: str = Field(
-        default="", description="Where traces go by OTLP over gRPC, http://host:4317; empty: nowhere."
-    )
-    reflection: bool = Field(
-        default=True, description="Whether the server describes its interface to grpcurl and the like."
-    )
-    log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="Least severity that is logged."
-    )
-    log_format: Literal["json", "text"] = Field(default="json", description="One JSON object a line, or plain text.")
+    host: str = Field(default="127.0.0.1", min_length=1)
+    """Address to listen on; 0.0.0.0 for all."""
+    port: int = Field(default=50051, ge=0, le=65535)
+    """Port to listen on; 0 for any free one."""
+    data_dir: Path = Path("mapless-data")
+    """Folder of the store, on a local disk; as a flag, it replaces database_url."""
+    database_url: SecretStr | None = None
+    """URL of a PostgreSQL that several servers share, postgresql://user:password@host/name; else data_dir."""
+    backend: str = "geometric"
+    """Backend of the coarse stage: geometric, pi3, pi3x (both non-commercial), or auto."""
+    features: str = "sift"
+    """Local features: sift, aliked, xfeat, superpoint (research only), or auto."""
+    device: str = "auto"
+    """Device of networks: auto, cpu, cuda or cuda:N."""
+    weights_dir: Path = Field(default_factory=default_weights_dir)
+    """Folder of the networks' weights."""
+    compiled_views: int = Field(default=0, ge=0, le=65)
+    """Photographs of a query, itself included, that a network is compiled for at the start; 0: none."""
+    workers: int = Field(default_factory=available_cores, ge=1)
+    """Threads that compute; default: all cores."""
+    max_batch: int = Field(default=4, ge=1, le=64)
+    """Queries that a network reconstructs at a time."""
+    max_queued_s: float = Field(default=2.0, gt=0)
+    """Predicted computing time that may be admitted and not done, seconds a worker."""
+    max_queued_mib: int = Field(default=256, ge=1)
+    """Memory for photographs of calls in progress, MiB."""
+    stall_limit_s: float = Field(default=120.0, gt=0)
+    """A step that computes longer hangs, and the server ends, seconds."""
+    tenant_rate_ms: float = Field(default=0.0, ge=0)
+    """Computing time that a tenant may use, milliseconds a second; 0: no limit."""
+    tenant_burst_ms: float = Field(default=20_000.0, gt=0)
+    """Computing time that a tenant may save up, milliseconds."""
+    default_deadline_s: float = Field(default=30.0, gt=0)
+    """Deadline of calls that have none, seconds."""
+    max_deadline_s: float = Field(default=600.0, gt=0)
+    """Deadline of calls that have a later one, seconds."""
+    max_message_mib: int = Field(default=32, ge=1, le=1024)
+    """Largest message, either way, MiB."""
+    max_image_mib: int = Field(default=16, ge=1)
+    """Largest image file, MiB."""
+    max_image_megapixels: float = Field(default=50.0, gt=0, le=268)
+    """Largest image, width times height."""
+    retrieval: str = "auto"
+    """Descriptors by which references are chosen: vlad (of the local features), megaloc, or auto."""
+    retrieval_cache_mib: int = Field(default=1024, ge=1)
+    """Memory for the scenes whose references are chosen, MiB."""
+    reference_cache_mib: int = Field(default=512, ge=0)
+    """Memory for references' features, MiB."""
+    coverage: float = Field(default=0.99, gt=0, lt=1)
+    """Share of right answers to accept where a request sets none; a larger one also accepts more wrong answers."""
+    allow_watching: bool = False
+    """Whether WatchQueries may show callers' photographs to callers with the role write; takes memory for 24 images."""
+    capture_dir: Path | None = None
+    """Folder in which calls are captured for a time, with photographs, to be replayed; without it, none are."""
+    capture_hours: float = Field(default=24.0, gt=0, le=8784)
+    """Time for which a captured call is kept, hours."""
+    capture_mib: int = Field(default=1024, ge=1)
+    """Space of captured calls on the disk, MiB; the oldest are deleted first."""
+    capture_tenants: str = ""
+    """Tenants whose calls are captured, separated by commas; empty: all."""
+    warm_up: bool = True
+    """Whether to localize a photograph before the first call is accepted."""
+    drain_delay_s: float = Field(default=0.0, ge=0)
+    """Time between reporting NOT_SERVING and rejecting calls, for load balancers, seconds."""
+    drain_grace_s: float = Field(default=10.0, ge=0)
+    """Time for running calls when the server stops, seconds."""
+    tls_certificate: Path | None = None
+    """The server's certificate chain, PEM; read again when it changes."""
+    tls_key: Path | None = None
+    """Its private key, PEM."""
+    tls_client_ca: Path | None = None
+    """Authorities of the certificates that clients must have, PEM; without it, clients need none."""
+    tokens_file: Path | None = None
+    """Hashes of the bearer tokens that callers must have; see mapless-server token."""
+    insecure: bool = False
+    """Whether to listen beyond this machine with neither TLS nor tokens."""
+    metrics: bool = True
+    """Whether to serve metrics to Prometheus."""
+    metrics_host: str = Field(default="127.0.0.1", min_length=1)
+    """Address of the metrics; 0.0.0.0 for all."""
+    metrics_port: int = Field(default=9464, ge=0, le=65535)
+    """Port of the metrics; 0 for any free one."""
+    otlp_endpoint: str = ""
+    """Address of the collector of traces, OTLP over gRPC, http://host:4317; empty: no traces."""
+    reflection: bool = True
+    """Whether the server describes its interface to grpcurl and similar programs."""
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """Least severity that is logged."""
+    log_format: Literal["json", "text"] = "json"
+    """One JSON object a line, or plain text."""
 
     @field_validator("compiled_views")
     @classmethod
@@ -201,20 +180,8 @@ class Settings(BaseSettings):
         if self.tls_client_ca is not None and self.tls_certificate is None:
             raise ValueError("tls_client_ca needs tls_certificate")
         if self.capture_dir is not None and _overlap(self.capture_dir, self.data_dir):
-            raise ValueError("capture_dir and data_dir must be folders apart: what is captured is deleted by itself")
+            raise ValueError("capture_dir and data_dir must be folders apart: captured calls are deleted automatically")
         return self
-
-    @classmethod
-    def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Only what is passed: `load_settings` reads the sources itself, to know where each value comes from."""
-        return (init_settings,)
 
 
 @dataclass(frozen=True)
@@ -225,7 +192,7 @@ class LoadedSettings:
     origins: Mapping[str, str]
 
     def __str__(self) -> str:
-        """A block for the log; a SecretStr shows as asterisks."""
+        """A line for each setting; secrets show as asterisks."""
         width = max(map(len, self.origins))
         return "\n".join(
             f"  {name:<{width}}  {getattr(self.settings, name)}  ({origin})" for name, origin in self.origins.items()
@@ -235,15 +202,15 @@ class LoadedSettings:
 def load_settings(flags: Mapping[str, Any], config: Path | None = None) -> LoadedSettings:
     """Settings from all sources.
 
-    A ``data_dir`` among the flags is where the store is meant to be, so that a ``database_url`` of elsewhere is void: a
-    program that starts a server on a folder of its own must not write to the database that its environment names.
+    A ``data_dir`` among the flags voids a ``database_url`` of file and environment: a program that starts a server on a
+    folder of its own must not write to the database that its environment names.
 
     Args:
-        flags: values given on the command line, by name; None means not given.
+        flags: values of the command line by name; None means not given.
         config: a TOML file; None means that of MAPLESS_CONFIG, if any.
 
     Raises:
-        ConfigError: the file cannot be read, a name is unknown or a value is wrong; one line a fault.
+        ConfigError: the file cannot be read, a name is unknown or a value is wrong.
     """
     config = config or (Path(os.environ[CONFIG_VARIABLE]) if os.environ.get(CONFIG_VARIABLE) else None)
     sources = {
@@ -271,26 +238,26 @@ def _overlap(first: Path, second: Path) -> bool:
 
 
 def _read_file(path: Path) -> dict[str, Any]:
-    if not path.is_file():  # pydantic-settings passes over a missing file in silence
+    if not path.is_file():
         raise ConfigError(f"{path}: no such file")
     try:
-        return TomlConfigSettingsSource(Settings, path)()
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: {error}") from None
 
 
-def _read_environment() -> dict[str, Any]:
-    clients = {CLIENT_TOKEN_VARIABLE, CLIENT_ADDRESS_VARIABLE}
-    known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields} | {CONFIG_VARIABLE} | clients
-    unknown = {name for name in os.environ if name.startswith(PREFIX) and not _SERVICE_LINKS.fullmatch(name)} - known
+def _read_environment() -> dict[str, str]:
+    variables = {f"{PREFIX}{name.upper()}": name for name in Settings.model_fields}
+    ours = {name for name in os.environ if name.startswith(PREFIX) and not _SERVICE_LINKS.fullmatch(name)}
+    unknown = ours - {*variables, CONFIG_VARIABLE, CLIENT_TOKEN_VARIABLE, CLIENT_ADDRESS_VARIABLE}
     if unknown:
         raise ConfigError("\n".join(f"environment: {ascii(name)[1:-1]} is not a setting" for name in sorted(unknown)))
-    values = EnvSettingsSource(Settings)()
-    if str(values.get("port", "")).startswith(_SERVICE_LINK_VALUE):
+    values = {name: os.environ[variable] for variable, name in variables.items() if variable in os.environ}
+    if values.get("port", "").startswith(_SERVICE_LINK_VALUE):
         del values["port"]
     return values
 
 
 def _describe(fault: Mapping[str, Any], origins: Mapping[str, str]) -> str:
-    name = ascii(".".join(map(str, fault["loc"])))[1:-1]  # in a file it may be anything
+    name = ascii(".".join(map(str, fault["loc"])))[1:-1]  # a key of a file may be any text
     return f"{name} ({origins.get(name, 'default')}): {fault['msg']}" if name else str(fault["msg"])
