@@ -83,5 +83,7 @@ def test_the_site_builds_strictly(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
     built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert built.returncode == 0, built.stderr
-    settings = (tmp_path / "site/reference/settings/index.html").read_text()
-    assert "MAPLESS_MAX_QUEUED_S" in settings
+    assert "MAPLESS_MAX_QUEUED_S" in (tmp_path / "site/reference/settings/index.html").read_text()
+    for page in (tmp_path / "site").rglob("index.html"):
+        text = re.sub(r"<pre.*?</pre>", "", page.read_text(), flags=re.DOTALL)
+        assert not re.search(r"^(- |\* |```|\| )", text, re.MULTILINE), f"{page}: Markdown that is not understood"

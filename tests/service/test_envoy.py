@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import threading
 import time
@@ -20,6 +19,7 @@ import yaml  # type: ignore[import-untyped]
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from support import envoys
 from support.certificates import authority, signed
+from support.documents import blocks
 from support.envoys import ENVOY, Gateway, configured, fetched, gateway, program
 from support.postgres import shared_cluster
 from support.programs import gated
@@ -108,8 +108,7 @@ def test_servers_may_have_certificates_as_the_readme_says(tmp_path: Path, monkey
     by = authority("servers")
     signed(by, "server").write(tmp_path / "tls.crt", tmp_path / "tls.key")
     (tmp_path / "ca.crt").write_bytes(by.certificate_pem)
-    readme = (ENVOY.parent / "README.md").read_text()
-    (block,) = re.findall(r"^ {6}transport_socket:\n(?: {8}.*\n)+", readme, re.MULTILINE)
+    (block,) = blocks(ENVOY.parent / "README.md", "yaml")
     said = block.replace("/etc/mapless/servers", str(tmp_path)).replace("mapless-headless", "localhost")
     configure = envoys.configured
 
