@@ -1,10 +1,11 @@
-"""A server of one's own: the real one, as a child process on the loopback interface."""
+"""The real server as a child process on the loopback interface."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
@@ -13,6 +14,7 @@ from pathlib import Path
 
 from pydantic import SecretStr
 
+from mapless import Client, ConnectOptions
 from mapless_server.settings import PREFIX
 
 START_TIMEOUT_S = 120.0
@@ -20,8 +22,12 @@ GRACE_S = 1.0
 _ANNOUNCEMENT = "mapless-server listening on "
 
 
+CONNECT = ConnectOptions(timeout_s=600.0, upload_timeout_s=3600.0, batch_count=8)
+"""For measuring: a late answer is measured, too, and photographs may be large."""
+
+
 class ServerFailed(Exception):
-    """The server did not start; it has said why on standard error."""
+    """The server did not start; the reason is on standard error."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,7 @@ class ChildServer:
     process_id: int
 
     def memory(self) -> Memory | None:
-        """What the process holds; None where the system does not tell (it is read from /proc)."""
+        """What the process holds; None where there is no /proc to read."""
         try:
             status = Path(f"/proc/{self.process_id}/status").read_text()
         except OSError:
@@ -91,6 +97,17 @@ def child_server(
     arguments = [part for flag in flags.items() for part in flag]
     with child_module("mapless_tools", "serve", *arguments, environment=environment, log=log) as server:
         yield server
+
+
+@contextmanager
+def temporary_server() -> Iterator[Client]:
+    """A client of a server with an empty store; both are gone when the block is left. Errors as `child_server`."""
+    with (
+        tempfile.TemporaryDirectory(prefix="mapless-") as data_dir,
+        child_server(Path(data_dir)) as server,
+        Client(server.address, CONNECT) as client,
+    ):
+        yield client
 
 
 @contextmanager

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,19 @@ def check_writable(file: Path) -> None:
         raise ValueError(f"{file} cannot be written")
 
 
+def finite(value: float) -> float | None:
+    """The value; None for what JSON and CSV have no word for."""
+    return value if math.isfinite(value) else None
+
+
 def write_json(file: Path, content: Any) -> None:
     """Writes strict JSON; it has no infinities."""
     file.write_text(json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+
+
+@contextmanager
+def whole_file(file: Path) -> Iterator[Path]:
+    """A file to write in place of another, which it replaces when the block ends without an error."""
+    partial = file.with_name(file.name + ".partial")
+    yield partial
+    os.replace(partial, file)

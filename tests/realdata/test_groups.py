@@ -19,9 +19,8 @@ from mapless import (
     SequenceLocalization,
 )
 from mapless.geometry import Array
-from mapless_tools.child import child_server
+from mapless_tools.child import CONNECT, child_server
 from mapless_tools.dataset import Dataset, Frame
-from mapless_tools.evaluate.run import CONNECT
 
 pytestmark = [pytest.mark.realdata, pytest.mark.nightly]
 

@@ -11,11 +11,11 @@ import pytest
 
 from mapless import Client, LocalizationResult
 from mapless_server.settings import Settings
-from mapless_tools.child import child_server
+from mapless_tools.child import CONNECT, child_server
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.evaluate.metrics import Summary, summarize
-from mapless_tools.evaluate.plan import EvaluationOptions, Plan
-from mapless_tools.evaluate.run import CONNECT, SCENE, evaluate, localize_queries, plan_for, upload
+from mapless_tools.evaluate.plan import EvaluationOptions
+from mapless_tools.evaluate.run import SCENE, Plan, evaluate, localize_queries, plan_for, store_references
 
 pytestmark = pytest.mark.realdata
 
@@ -67,7 +67,7 @@ def fountain(photographs: Photographs, tmp_path_factory: pytest.TempPathFactory)
     plan = plan_for(dataset, EvaluationOptions(query_count=3), Settings(), ignore)
     data_dir = tmp_path_factory.mktemp("fountain")
     with child_server(data_dir) as server, Client(server.address, CONNECT) as client:
-        upload(client, plan, ignore)
+        store_references(client, SCENE, plan.references, ignore)
         yield client, plan
 
 
@@ -105,7 +105,7 @@ def test_no_photograph_of_another_place_is_localized(
     plan = Plan(dataset, spread(dataset, 10), ())
     strangers = [frame for folder in elsewhere for frame in spread(photographs(folder), 5)]
     with child_server(tmp_path) as server, Client(server.address, CONNECT) as client:
-        upload(client, plan, ignore)
+        store_references(client, SCENE, plan.references, ignore)
         names = [reference.name for reference in plan.references]
         answers = {
             frame.image_path: client.localize(frame.image_path, frame.camera, SCENE, names) for frame in strangers

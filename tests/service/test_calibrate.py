@@ -23,8 +23,7 @@ from mapless import Camera, Client, LocalizationResult, NewReference, RigidTrans
 from mapless.geometry import rotation_from_vector
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_server.store import Store
-from mapless_tools.calibrate.claims import Claim
-from mapless_tools.calibrate.fit import Sample, fit_factors
+from mapless_tools.calibrate.claims import Claim, Sample, fit_factors
 from mapless_tools.cli.app import app
 
 COUNT = 12
@@ -242,7 +241,7 @@ def test_a_scene_that_can_answer_nothing_is_told(
         (("--scene", "a/b"), "a/b"),
         (("--query-count", 0), "at least 1 query"),
         (("--k", 0), "k, the references of a query"),
-        (("--right-cm", 0), "an answer is right within"),
+        (("--right-cm", 0), "right_cm must be above 0"),
         (("--layout", "polaroid"), "format must be auto or one of"),
     ],
 )

@@ -19,15 +19,20 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless.scenes import Calibration
 from mapless_server.method.uncertainty.accuracy import Accuracy, accuracy_from_covariance
 from mapless_server.services.messages.factors import Conditions, Factors, claimed, scaled_accuracy, scaled_covariance
-from mapless_tools.calibrate.claims import Claim
-from mapless_tools.calibrate.findings import RightRule, Share, find, reliability
-from mapless_tools.calibrate.fit import MIN_QUERIES, Sample, TooFewQueries, factor_for, fit_factors, left_one_out
+from mapless_tools.calibrate.claims import (
+    MIN_QUERIES,
+    Claim,
+    Sample,
+    TooFewQueries,
+    factor_for,
+    fit_factors,
+    left_one_out,
+)
+from mapless_tools.calibrate.findings import RightRule, Share, auroc, find, reliability, risk_coverage
 from mapless_tools.calibrate.page import page
-from mapless_tools.calibrate.queries import Outcome
+from mapless_tools.calibrate.queries import Outcome, other_world
 from mapless_tools.calibrate.report import CalibrationReport, to_json, worst
 from mapless_tools.calibrate.run import calibration_of
-from mapless_tools.calibrate.selective import auroc, risk_coverage
-from mapless_tools.calibrate.worlds import other_world
 from mapless_tools.dataset import Dataset
 
 SIFT = Conditions("sift", "geometric", "BEST", "1")

@@ -23,7 +23,8 @@ from mapless_tools.bench.scenes import BenchScene, Figures, met
 from mapless_tools.child import Memory
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.evaluate.metrics import QueryResult, pose_error, quantile, stage_share, summarize, trajectory_radius
-from mapless_tools.evaluate.plan import EvaluationOptions, Split, check_images, split_frames
+from mapless_tools.evaluate.plan import EvaluationOptions, Split, split_frames
+from mapless_tools.evaluate.references import check_images
 from mapless_tools.evaluate.report import print_report, to_json
 from mapless_tools.evaluate.run import Evaluation
 

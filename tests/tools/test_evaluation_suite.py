@@ -10,7 +10,6 @@ from contextlib import nullcontext
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,17 +28,16 @@ from mapless_tools.evaluate.averages import groups_of
 from mapless_tools.evaluate.benchmarks import BENCHMARKS, ScenePlace, find_scenes
 from mapless_tools.evaluate.charts import ablation, along_sequence, cumulative, sparsity
 from mapless_tools.evaluate.figures import write_figures
-from mapless_tools.evaluate.journal import Journal
 from mapless_tools.evaluate.metrics import QueryResult
 from mapless_tools.evaluate.page import page
-from mapless_tools.evaluate.pairs import chosen, pairs_file, read_pairs
 from mapless_tools.evaluate.paper import DENSE
 from mapless_tools.evaluate.pictures import WorstQuery, data_uri, fit_true_poses
-from mapless_tools.evaluate.plan import EvaluationOptions, PlannedQuery, UsageError
-from mapless_tools.evaluate.protocol import Method, SuiteOptions, split_scene
+from mapless_tools.evaluate.plan import EvaluationOptions, Method, SuiteOptions, split_scene
 from mapless_tools.evaluate.provenance import Provenance
-from mapless_tools.evaluate.suite import Apparatus, Failure, Run, SceneWork, Suite, measure
+from mapless_tools.evaluate.references import Matcher, PlannedQuery, paired, pairs_file, read_pairs
+from mapless_tools.evaluate.suite import Failure, Journal, Run, RunSetup, SceneWork, Suite, measure
 from mapless_tools.evaluate.tables import FAILED, NOTHING, OURS, Table, format_median, tables_of, text_lines
+from mapless_tools.usage import UsageError
 
 CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
 
@@ -245,10 +243,10 @@ class TestPairs:
         file = self.write(tmp_path, "q0.png r7.png", "q0 r3", "q0.png r3.png", "q0.png r5.png", "", "q1.png r0.png")
         pairs = read_pairs(file, dataset(), Path("/data"))
         query, references = frame("q0", "test"), {"r3", "r5", "r7"}
-        assert [f.name for f in chosen(pairs, query, references, 2)] == ["r7", "r3"]
-        assert [f.name for f in chosen(pairs, query, {"r3"}, 2)] == ["r3"]
+        assert [f.name for f in paired(pairs, query, references, 2).references] == ["r7", "r3"]
+        assert [f.name for f in paired(pairs, query, {"r3"}, 2).references] == ["r3"]
         with pytest.raises(UsageError, match="no reference of the query q1"):
-            chosen(pairs, frame("q1", "test"), references, 2)
+            paired(pairs, frame("q1", "test"), references, 2)
 
     @pytest.mark.parametrize(
         ("line", "words"),
@@ -325,13 +323,12 @@ class TestMeasure:
             calls.append(f"{scene}/{given.variant}/{query.frame.name}")
             return result(query.frame.name, 0.01)
 
-        monkeypatch.setattr(suite_module, "child_server", lambda _: nullcontext(SimpleNamespace(address="nowhere")))
-        monkeypatch.setattr(suite_module, "Client", lambda *_: nullcontext())
+        monkeypatch.setattr(suite_module, "temporary_server", nullcontext)
         monkeypatch.setattr(suite_module, "store_references", lambda *_: None)
         monkeypatch.setattr(suite_module, "localize_query", localize)
         planned = suite({"chess": 0.01}, options)
-        apparatus = Apparatus(options, Settings(), planned.provenance, folder, lambda *_: None)
-        return calls, measure(planned.scenes, apparatus, None, lambda _: None)
+        setup = RunSetup(options, Matcher.of(Settings()), planned.provenance, folder, lambda *_: None)
+        return calls, measure(planned.scenes, setup, None, lambda _: None)
 
     def test_goes_on_where_it_ended(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         options = SuiteOptions(sparse=(5,), variants=("best", "full"), max_queries=3)

@@ -8,11 +8,11 @@ from mapless_server.observability.provenance import cpu_model
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import available_cores, load_settings
 from mapless_tools.dataset import read_folder
-from mapless_tools.evaluate.command import usage_errors
-from mapless_tools.evaluate.plan import EvaluationOptions, UsageError
+from mapless_tools.evaluate.plan import EvaluationOptions
 from mapless_tools.evaluate.run import Evaluation, evaluate
 from mapless_tools.output_files import write_json
 from mapless_tools.progress import Progress, progress_bars
+from mapless_tools.usage import UsageError, usage_errors
 
 from .latency import measure_latency
 from .report import BenchResult, as_json, markdown

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from mapless import Client
 from mapless_server.settings import Settings
-from mapless_tools.child import Memory, child_server
+from mapless_tools.child import CONNECT, Memory, child_server
 from mapless_tools.dataset import Dataset
 from mapless_tools.evaluate.metrics import QueryResult
-from mapless_tools.evaluate.plan import EvaluationOptions, Plan
-from mapless_tools.evaluate.run import CONNECT, localize_queries, plan_for, upload
+from mapless_tools.evaluate.plan import EvaluationOptions
+from mapless_tools.evaluate.run import SCENE, Plan, localize_queries, plan_for, store_references
 from mapless_tools.progress import Progress
 
 REFERENCE_COUNT = 30
@@ -26,7 +26,7 @@ class Latency:
         cold_ms: the first call of each of several fresh servers on a filled store, on another photograph each.
         first_pass: calls of one server that meets every query for the first time, the cold one left out.
         warm: the same calls again.
-        memory: of that server after them; None where the system does not tell.
+        memory: of that server after them; None where there is no /proc to read.
     """
 
     cold_ms: tuple[float, ...]
@@ -47,7 +47,7 @@ def measure_latency(
     with tempfile.TemporaryDirectory(prefix="mapless-bench-") as folder:
         data_dir = Path(folder)
         with child_server(data_dir) as server, Client(server.address, CONNECT) as client:
-            upload(client, plan, progress)
+            store_references(client, SCENE, plan.references, progress)
         cold = [_first_call_ms(data_dir, plan, options, i + 1) for i in range(cold_count - 1)]
         with child_server(data_dir) as server, Client(server.address, CONNECT) as client:
             client.is_serving()

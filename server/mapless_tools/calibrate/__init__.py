@@ -1,5 +1,6 @@
-"""Whether answers keep what they claim: measured on photographs with known poses, and put right by factors.
+"""How often answers keep the radii that they claim, measured on photographs with known poses, and factors that help.
 
 A folder's photographs are localized (`queries`); each error beside the radii that were claimed is a `Claim`; from these
-come the reliability diagram and the factors (`fit`), which a scene keeps and every answer is multiplied by (`factors`).
+come the factors (`claims`), which a scene keeps and the server multiplies every answer by, and what the report says
+(`findings`, `report`, `page`). Begin reading with `run`.
 """

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import signal
-import sys
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
@@ -43,27 +41,24 @@ def calibrate_command(
     right_cm: Annotated[float, typer.Option(help="A right answer is at most this far off.")] = 10.0,
     right_deg: Annotated[float, typer.Option(help="And turned by this at most, degrees.")] = 5.0,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="With --scene: measure, store nothing.")] = False,
-    clear: Annotated[bool, typer.Option("--clear", help="Take the calibration of --scene away; measures nothing.")] = (
+    clear: Annotated[bool, typer.Option("--clear", help="Remove the calibration of --scene; measures nothing.")] = (
         False
     ),
     output: Annotated[Path, typer.Option(help="Folder for report.html and report.json.")] = OUTPUT,
     *,
     connection: Connection,
 ) -> None:
-    """Measure how often the truth lies within the radii that answers claim, and store what makes them right.
+    """Measure how often the truth lies within the radii that answers claim, and store factors that correct them.
 
     With --scene, photographs with known poses are localized in a scene that is there, none of them compared with
     itself; the factors by which its answers' radii are wrong are stored with it, and from then on its answers are
     calibrated. Exit code 1 when there is nothing to calibrate from.
     """
-    from mapless import MaplessError
-    from mapless_tools.child import ServerFailed
-    from mapless_tools.evaluate.command import usage_errors
-    from mapless_tools.evaluate.plan import UsageError
+    from mapless_tools.usage import UsageError, failures_end_command, usage_errors
 
     from .run import CalibrateOptions, calibrate, clear_calibration
 
-    try:
+    with failures_end_command("interrupted; nothing is stored"):
         if clear:
             clear_calibration(folder, scene, connection)
             print(f"answers in scene {scene} are uncalibrated now")
@@ -82,16 +77,5 @@ def calibrate_command(
                 right_deg=right_deg,
                 dry_run=dry_run,
             )
-        went_well = calibrate(folder, options, connection, output)
-    except UsageError as error:
-        _fail(str(error), 2)
-    except (ServerFailed, MaplessError, OSError) as error:
-        _fail(str(error), 1)
-    except KeyboardInterrupt:
-        _fail("interrupted; nothing is stored", 128 + signal.SIGINT)
-    raise typer.Exit(0 if went_well else 1)
-
-
-def _fail(message: str, code: int) -> NoReturn:
-    print(f"mapless-server: {message}", file=sys.stderr)
-    raise typer.Exit(code)
+        calibrated = calibrate(folder, options, connection, output)
+    raise typer.Exit(0 if calibrated else 1)

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import betaincinv
+from scipy.stats import rankdata
 
 from mapless_server.services.messages.factors import Conditions, Factors
 
-from .claims import Claim
-from .fit import Sample, TooFewQueries, fit_factors, left_one_out
+from .claims import Claim, Sample, TooFewQueries, fit_factors, left_one_out
 from .queries import Outcome
-from .selective import Operating, auroc, risk_coverage
 
 DIAGRAM = tuple(p / 100 for p in range(5, 100))
 """Claimed probabilities of the reliability diagram."""
@@ -29,8 +28,10 @@ class RightRule:
     rotation_deg: float = 5.0
 
     def __post_init__(self) -> None:
-        if not (0 < self.position_m < math.inf and 0 < self.rotation_deg <= 180):
-            raise ValueError(f"an answer is right within some metres and degrees, not {self}")
+        if not 0 < self.position_m < math.inf:
+            raise ValueError(f"right_cm must be above 0, is {100 * self.position_m:g}")
+        if not 0 < self.rotation_deg <= 180:
+            raise ValueError(f"right_deg must be above 0 and at most 180, is {self.rotation_deg:g}")
 
     def __call__(self, outcome: Outcome) -> bool:
         """Whether an answer is right; one that is none is not."""
@@ -62,7 +63,7 @@ class Share:
 
 @dataclass(frozen=True)
 class Held:
-    """How often a claimed radius held.
+    """How often the truth lies within a claimed radius.
 
     Attributes:
         claim: "position" or "rotation".
@@ -77,6 +78,25 @@ class Held:
     before: Share
     factor: float | None
     after: Share | None
+
+
+@dataclass(frozen=True)
+class Operating:
+    """What accepting every answer with at least a score comes to.
+
+    Attributes:
+        score: the smallest accepted.
+        coverage: share of the right answers that are accepted.
+        risk: share of wrong ones among the accepted.
+        accepted: how many are.
+        wrong: how many of these are wrong.
+    """
+
+    score: float
+    coverage: float
+    risk: float
+    accepted: int
+    wrong: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +132,7 @@ class Findings:
 
 
 def find(outcomes: Sequence[Outcome], right: RightRule) -> Findings:
-    """Everything, from what became of the photographs."""
+    """Everything, from the answers to all photographs."""
     answered = [it for it in outcomes if it.pose is not None]
     counts = Counter(it.conditions for it in answered if it.position is not None)
     conditions = counts.most_common(1)[0][0] if counts else None
@@ -148,6 +168,34 @@ def find(outcomes: Sequence[Outcome], right: RightRule) -> Findings:
 def reliability(claims: Sequence[Claim]) -> list[tuple[float, float]]:
     """The reliability diagram: claimed probability against the share of claims (at least one) that hold at it."""
     return [(p, float(np.mean([claim.held(p) for claim in claims]))) for p in DIAGRAM]
+
+
+def auroc(scores: Sequence[float], right: Sequence[bool]) -> float:
+    """Probability that a right answer has a higher score than a wrong one; equal scores count half.
+
+    The area under the receiver's curve, as the Mann-Whitney statistic. NaN where all are right or none is.
+    """
+    is_right = np.asarray(right, bool)
+    rights, wrongs = int(is_right.sum()), int((~is_right).sum())
+    if not rights or not wrongs:
+        return math.nan
+    ranks = rankdata(np.asarray(scores, float))
+    return float((ranks[is_right].sum() - rights * (rights + 1) / 2) / (rights * wrongs))
+
+
+def risk_coverage(scores: Sequence[float], right: Sequence[bool]) -> list[Operating]:
+    """An operating point for each different score, the highest first; answers of equal score are accepted together."""
+    order = np.argsort(-np.asarray(scores, float), kind="stable")
+    sorted_scores, is_right = np.asarray(scores, float)[order], np.asarray(right, bool)[order]
+    all_right = max(1, int(is_right.sum()))
+    points = []
+    for i in range(len(order)):
+        if i + 1 < len(order) and sorted_scores[i + 1] == sorted_scores[i]:
+            continue
+        rights = int(is_right[: i + 1].sum())
+        wrong = i + 1 - rights
+        points.append(Operating(float(sorted_scores[i]), rights / all_right, wrong / (i + 1), i + 1, wrong))
+    return points
 
 
 def _held(sample: Sample, factors: Factors | None, after: Sample | None) -> list[Held]:

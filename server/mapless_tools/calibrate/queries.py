@@ -1,4 +1,7 @@
-"""Localizing a folder's photographs through a server, and what each answer claimed beside the truth."""
+"""Localizing a folder's photographs through a server: each answer beside the truth, and whether the worlds agree.
+
+If a folder's poses are in another world than the scene, every answer is wrong, and all are wrong in the same way.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +15,30 @@ import numpy as np
 from mapless import Client, InvalidArgument, LocalizationResult, Reference, Rejected, RigidTransform
 from mapless_server.method.uncertainty.accuracy import Accuracy
 from mapless_server.services.messages.factors import Conditions, Factors, scaled_accuracy, scaled_covariance
+from mapless_tools.child import CONNECT
 from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error
-from mapless_tools.evaluate.plan import PlannedQuery, UsageError
-from mapless_tools.evaluate.run import CONNECT
+from mapless_tools.evaluate.references import PlannedQuery
 from mapless_tools.progress import Progress
+from mapless_tools.usage import UsageError
 
 from .claims import Claim
 
 MAX_RERANKED = 1000
 """References that one call may name to choose among."""
 SAME_M, SAME_DEG = 1e-3, 0.01
-"""A photograph that is a reference, too, must have the same pose in both; nobody writes poses less exactly."""
+"""A photograph that is a reference, too, must have the same pose in both; poses are written more exactly than that."""
+MIN_ANSWERS = 3
+"""Two could agree by chance."""
+FAR = 3.0
+"""Answers are suspected where half of them are off by more than so many of their claimed 95 % radii."""
+EXPLAINED = 0.2
+"""One rigid motion explains them if it leaves at most this share of half of the errors."""
 
 
 @dataclass(frozen=True, eq=False)
-class Question:
-    """A photograph and what it is compared with.
+class Query:
+    """A photograph and the references that it is compared with.
 
     Attributes:
         frame: with its true pose, in the scene's world.
@@ -43,7 +53,7 @@ class Question:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What became of a photograph.
+    """The answer to a photograph beside the truth.
 
     Attributes:
         name: of the frame.
@@ -72,13 +82,13 @@ class Outcome:
     pose: RigidTransform | None
 
 
-def planned_questions(queries: Sequence[PlannedQuery]) -> list[Question]:
-    """The questions of an evaluation's plan."""
-    return [Question(query.frame, tuple(reference.name for reference in query.references)) for query in queries]
+def planned_queries(queries: Sequence[PlannedQuery]) -> list[Query]:
+    """The queries of an evaluation's plan."""
+    return [Query(query.frame, tuple(reference.name for reference in query.references)) for query in queries]
 
 
-def scene_questions(client: Client, scene: str, frames: Sequence[Frame], progress: Progress) -> list[Question]:
-    """Questions to a scene that is there: no photograph is offered itself, nor a copy of itself.
+def scene_queries(client: Client, scene: str, frames: Sequence[Frame], progress: Progress) -> list[Query]:
+    """Queries in a stored scene: no photograph is compared with itself, nor with a copy of itself.
 
     Raises:
         UsageError: the scene has too few references, or a photograph's poses in the folder and in the scene differ.
@@ -92,41 +102,41 @@ def scene_questions(client: Client, scene: str, frames: Sequence[Frame], progres
     by_digest: dict[str, list[Reference]] = {}
     for reference in known:
         by_digest.setdefault(reference.image_sha256, []).append(reference)
-    questions = []
+    queries = []
     for frame in frames:
         own = by_digest.get(hashlib.sha256(frame.image_path.read_bytes()).hexdigest(), [])
         _refuse_another_pose(frame, own, scene)
-        questions.append(_without(client, scene, frame, known, own))
-        progress("choosing references", len(questions), len(frames))
-    return questions
+        queries.append(_without(client, scene, frame, known, own))
+        progress("choosing references", len(queries), len(frames))
+    return queries
 
 
-def ask(
-    client: Client, scene: str, question: Question, *, count: int, variant: str, scaled: Factors | None = None
+def localize(
+    client: Client, scene: str, query: Query, *, count: int, variant: str, scaled: Factors | None = None
 ) -> Outcome:
     """Localizes one photograph.
 
     Args:
         client: of the server.
         scene: id of the scene.
-        question: the photograph.
-        count: references to choose, where the server does.
+        query: the photograph.
+        count: references that the server chooses, where it does.
         variant: form of the method.
         scaled: factors that the server multiplies claims by if they are calibrated; they are divided out again.
 
     Raises:
         MaplessError: the call failed, for another reason than the photograph.
     """
-    frame = question.frame
+    frame = query.frame
     try:
         answer = client.localize(
             frame.image_path.read_bytes(),
             frame.camera,
             scene,
-            question.references,
+            query.references,
             variant=variant,
-            reference_count=count if question.reranked or not question.references else 0,
-            rerank_references=question.reranked,
+            reference_count=count if query.reranked or not query.references else 0,
+            rerank_references=query.reranked,
             timeout_s=CONNECT.timeout_s,
         )
     except InvalidArgument as error:
@@ -138,13 +148,56 @@ def ask(
     return _outcome(frame, answer, conditions, scaled)
 
 
+@dataclass(frozen=True)
+class OtherWorld:
+    """How a folder's world lies in the scene's, as the answers show.
+
+    Attributes:
+        moved_m, turned_deg: of the folder's frame.
+        left_m: median error once that is undone.
+    """
+
+    moved_m: float
+    turned_deg: float
+    left_m: float
+
+    def __str__(self) -> str:
+        return (
+            f"the folder's poses are in another world than the scene: answers agree with them to {self.left_m:.3g} m, "
+            f"once these are turned by {self.turned_deg:.3g} degrees and moved by {self.moved_m:.3g} m"
+        )
+
+
+def other_world(outcomes: Sequence[Outcome]) -> OtherWorld | None:
+    """The motion between the folder's world and the scene's; None where answers do not show one.
+
+    Each answer's scene_from_folder = answered pose times inverse true pose is a candidate; the one that leaves the
+    smallest median error is taken.
+    """
+    found = [it for it in outcomes if it.pose is not None and it.position is not None]
+    if len(found) < MIN_ANSWERS:
+        return None
+    in_radii = [it.error_m / max(it.position.radius_95, np.finfo(float).tiny) for it in found if it.position]
+    if np.median(in_radii) <= FAR:
+        return None
+    candidates = [it.pose.compose(it.true_pose.inverse()) for it in found if it.pose]
+    left = [_median_error_m(found, candidate) for candidate in candidates]
+    best = int(np.argmin(left))
+    if left[best] > EXPLAINED * float(np.median([it.error_m for it in found])):
+        return None
+    moved_m, turned_deg = pose_error(RigidTransform(np.eye(3), np.zeros(3)), candidates[best])
+    return OtherWorld(moved_m, turned_deg, left[best])
+
+
 def _outcome(frame: Frame, answer: LocalizationResult, conditions: Conditions, scaled: Factors | None) -> Outcome:
     error_m, error_deg = pose_error(frame.world_from_camera, answer.world_from_camera)
     position = rotation = None
     if answer.accuracy is not None and answer.covariance is not None:
-        said, covariance = answer.accuracy, answer.covariance
-        accuracy = Accuracy(said.position_68_m, said.position_95_m, said.rotation_68_deg, said.rotation_95_deg)
-        if said.calibrated and scaled is not None:
+        claimed, covariance = answer.accuracy, answer.covariance
+        accuracy = Accuracy(
+            claimed.position_68_m, claimed.position_95_m, claimed.rotation_68_deg, claimed.rotation_95_deg
+        )
+        if claimed.calibrated and scaled is not None:
             accuracy = scaled_accuracy(accuracy, scaled.inverse)
             covariance = scaled_covariance(covariance, scaled.inverse)
         position = Claim.of(error_m, accuracy.position_68_m, accuracy.position_95_m, covariance[:3, :3])
@@ -183,12 +236,10 @@ def _refuse_another_pose(frame: Frame, own: Sequence[Reference], scene: str) -> 
             )
 
 
-def _without(
-    client: Client, scene: str, frame: Frame, known: Sequence[Reference], own: Sequence[Reference]
-) -> Question:
-    """The question whose references are all but the photograph itself."""
+def _without(client: Client, scene: str, frame: Frame, known: Sequence[Reference], own: Sequence[Reference]) -> Query:
+    """The query whose references are all but the photograph itself."""
     if not own:
-        return Question(frame)
+        return Query(frame)
     left_out = {reference.reference_id for reference in own}
     others = [reference.reference_id for reference in known if reference.reference_id not in left_out]
     if not others:
@@ -197,4 +248,9 @@ def _without(
         similar = client.retrieve_references(frame.image_path, frame.camera, scene, MAX_RERANKED)
         names = (it.name.rpartition("/")[2] for it in similar)
         others = [name for name in names if name not in left_out]
-    return Question(frame, tuple(others), reranked=True)
+    return Query(frame, tuple(others), reranked=True)
+
+
+def _median_error_m(found: Sequence[Outcome], scene_from_folder: RigidTransform) -> float:
+    off = [it.pose.translation - scene_from_folder.apply(it.true_pose.translation) for it in found if it.pose]
+    return float(np.median(np.linalg.norm(off, axis=1)))

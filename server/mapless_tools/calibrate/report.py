@@ -12,9 +12,10 @@ from rich.table import Table
 
 from mapless_server import __version__
 from mapless_tools.dataset import Dataset
+from mapless_tools.output_files import finite
 
+from .claims import MIN_QUERIES, PRIOR_QUERIES
 from .findings import Findings, Held, RightRule, Share, reliability
-from .fit import MIN_QUERIES, PRIOR_QUERIES
 from .queries import Outcome
 
 RULES = (
@@ -160,7 +161,7 @@ def to_json(report: CalibrationReport) -> dict[str, Any]:
         "reliability": {kind: _reliability(report, kind) for kind in ("position", "rotation")},
         "right": {"position_m": report.right.position_m, "rotation_deg": report.right.rotation_deg}
         | _share(found.right),
-        "auroc": _finite(found.auroc),
+        "auroc": finite(found.auroc),
         "risk_coverage": [asdict(point) for point in found.trusted],
         "rules": [*RULES],
         "per_query": [_query(it, report.unit) for it in found.outcomes],
@@ -187,7 +188,7 @@ def _share(share: Share) -> dict[str, Any]:
     return {
         "part": share.part,
         "whole": share.whole,
-        "share": _finite(share.value),
+        "share": finite(share.value),
         "low": share.low,
         "high": share.high,
     }
@@ -206,8 +207,8 @@ def _query(it: Outcome, unit: str) -> dict[str, Any]:
     position, rotation = it.position, it.rotation
     return {
         "name": it.name,
-        f"error_{unit}": _finite(it.error_m),
-        "error_deg": _finite(it.error_deg),
+        f"error_{unit}": finite(it.error_m),
+        "error_deg": finite(it.error_deg),
         f"claimed_68_{unit}": position.radius_68 if position else None,
         f"claimed_95_{unit}": position.radius_95 if position else None,
         "claimed_68_deg": rotation.radius_68 if rotation else None,
@@ -218,7 +219,3 @@ def _query(it: Outcome, unit: str) -> dict[str, Any]:
         "rejection": {"reason": it.rejection, "message": it.message} if it.rejection else None,
         "features": it.conditions.features if it.conditions else None,
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from mapless import Client
@@ -18,21 +16,21 @@ from mapless_server.serve.assembly import image_limits
 from mapless_server.serve.signals import terminable
 from mapless_server.services.messages.factors import Factors
 from mapless_server.settings import Settings, load_settings
-from mapless_tools.child import child_server
+from mapless_tools.child import temporary_server
 from mapless_tools.connection import Connection, connected
-from mapless_tools.dataset import Dataset, Frame
-from mapless_tools.evaluate.command import usage_errors
-from mapless_tools.evaluate.plan import EvaluationOptions, UsageError, check_images
-from mapless_tools.evaluate.run import CONNECT, plan_for, store_references
+from mapless_tools.dataset import Dataset
+from mapless_tools.evaluate.plan import EvaluationOptions, evenly_spread
+from mapless_tools.evaluate.references import check_images
+from mapless_tools.evaluate.run import plan_for, store_references
 from mapless_tools.ingest.formats import read_dataset
 from mapless_tools.output_files import write_json
 from mapless_tools.progress import Progress, progress_bars
+from mapless_tools.usage import UsageError, usage_errors
 
 from .findings import Findings, RightRule, find
 from .page import page
-from .queries import Outcome, Question, ask, planned_questions, scene_questions
+from .queries import Outcome, Query, localize, other_world, planned_queries, scene_queries
 from .report import CalibrationReport, print_report, to_json
-from .worlds import other_world
 
 OWN_SCENE = "calibration"
 
@@ -42,7 +40,7 @@ class CalibrateOptions:
     """Options of a calibration.
 
     Attributes:
-        scene: the scene to ask; empty for the folder by itself.
+        scene: the scene to calibrate; empty for the folder by itself.
         layout: of the folder.
         reference_count, query_count, k, variant: as EvaluationOptions has them.
         right_m, right_deg: what counts as a right answer.
@@ -70,16 +68,16 @@ class CalibrateOptions:
         self.right()
 
     def evaluation(self) -> EvaluationOptions:
-        """How the folder is split; ValueError where that is senseless."""
+        """How the folder is split."""
         return EvaluationOptions(self.reference_count, self.query_count, self.k, self.variant)
 
     def right(self) -> RightRule:
-        """What is right; ValueError likewise."""
+        """What counts as right."""
         return RightRule(self.right_m, self.right_deg)
 
 
 def clear_calibration(folder: Path | None, scene: str, connection: Connection) -> None:
-    """Takes a scene's calibration away.
+    """Removes a scene's calibration.
 
     Raises:
         UsageError: no scene is named, or a folder is.
@@ -105,7 +103,7 @@ def calibrate(folder: Path, options: CalibrateOptions, connection: Connection, o
         output: folder for the report; made if it is not there.
 
     Returns:
-        Whether there were factors to be found.
+        Whether factors were found.
 
     Raises:
         UsageError: a wrong folder, file or setting; or the folder's poses are not in the scene's world.
@@ -132,13 +130,9 @@ def _measure_folder(
 ) -> CalibrationReport:
     """The folder by itself, as `evaluate` splits it, on a server of its own."""
     plan = plan_for(dataset, options.evaluation(), settings, progress)
-    with (
-        tempfile.TemporaryDirectory(prefix="mapless-calibrate-") as data_dir,
-        child_server(Path(data_dir)) as server,
-        Client(server.address, CONNECT) as client,
-    ):
+    with temporary_server() as client:
         store_references(client, OWN_SCENE, plan.references, progress)
-        outcomes = _ask_all(client, OWN_SCENE, planned_questions(plan.queries), options, None, progress)
+        outcomes = _localize_all(client, OWN_SCENE, planned_queries(plan.queries), options, None, progress)
     stored = "not stored: no --scene was given"
     return CalibrationReport(
         dataset, "", len(plan.references), options.k, options.right(), stored, find(outcomes, options.right())
@@ -148,14 +142,14 @@ def _measure_folder(
 def _measure_scene(
     dataset: Dataset, options: CalibrateOptions, connection: Connection, settings: Settings, progress: Progress
 ) -> CalibrationReport:
-    """A scene that is there; its calibration is replaced by what was found, unless that is nothing or a dry run."""
-    frames = _spread(dataset.frames, options.query_count)
+    """A stored scene; its calibration is replaced by the factors that were found, except in a dry run."""
+    frames = evenly_spread(dataset.frames, options.query_count)
     check_images(frames, image_limits(settings))
     with _connected(connection, settings) as client:
         scene = client.get_scene(options.scene)
         before = Factors.of(scene.calibration) if scene.calibration else None
-        questions = scene_questions(client, options.scene, frames, progress)
-        outcomes = _ask_all(client, options.scene, questions, options, before, progress)
+        queries = scene_queries(client, options.scene, frames, progress)
+        outcomes = _localize_all(client, options.scene, queries, options, before, progress)
         other = other_world(outcomes)
         if other is not None:
             raise UsageError(str(other))
@@ -171,7 +165,7 @@ def _store(client: Client, options: CalibrateOptions, found: Findings, before: C
     if options.dry_run:
         return "not stored: a dry run"
     if client.get_scene(options.scene).calibration != before:
-        return "not stored: somebody else calibrated the scene meanwhile"
+        return "not stored: the scene was calibrated by another command meanwhile"
     client.update_scene(options.scene, calibration=calibration_of(found))
     return f"stored with scene {options.scene}, from {len(found.sample)} answers"
 
@@ -193,19 +187,19 @@ def calibration_of(found: Findings) -> Calibration:
     )
 
 
-def _ask_all(
+def _localize_all(
     client: Client,
     scene: str,
-    questions: Sequence[Question],
+    queries: Sequence[Query],
     options: CalibrateOptions,
     scaled: Factors | None,
     progress: Progress,
 ) -> list[Outcome]:
     outcomes: list[Outcome] = []
-    progress("localizing", 0, len(questions))
-    for question in questions:
-        outcomes.append(ask(client, scene, question, count=options.k, variant=options.variant, scaled=scaled))
-        progress("localizing", len(outcomes), len(questions))
+    progress("localizing", 0, len(queries))
+    for query in queries:
+        outcomes.append(localize(client, scene, query, count=options.k, variant=options.variant, scaled=scaled))
+        progress("localizing", len(outcomes), len(queries))
     return outcomes
 
 
@@ -216,8 +210,3 @@ def _connected(connection: Connection, settings: Settings) -> Iterator[Client]:
         with usage_errors():
             client = stack.enter_context(connected(connection, settings))
         yield client
-
-
-def _spread(frames: Sequence[Frame], count: int | None) -> list[Frame]:
-    wanted = len(frames) if count is None else min(count, len(frames))
-    return [frames[i] for i in np.linspace(0, len(frames) - 1, wanted).round().astype(int)]

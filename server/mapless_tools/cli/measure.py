@@ -37,17 +37,11 @@ def bench_command(
     quick: Annotated[bool, typer.Option(help="A few queries a scene: to see that it runs.")] = False,
 ) -> None:
     """Measure all scenes against their targets, and latency and memory; writes bench-output/bench.json."""
-    from mapless import MaplessError
     from mapless_tools.bench import bench
-    from mapless_tools.child import ServerFailed
-    from mapless_tools.evaluate.plan import UsageError
+    from mapless_tools.usage import failures_end_command
 
-    try:
+    with failures_end_command():
         bench(data, quick)
-    except UsageError as error:
-        fail(str(error))
-    except (ServerFailed, MaplessError) as error:
-        fail(str(error), code=1)
 
 
 def bench_network_command(

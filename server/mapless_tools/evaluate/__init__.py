@@ -1,8 +1,10 @@
-"""Measuring the server on photographs with known poses.
+"""Accuracy and latency on photographs with known poses, measured through a server of its own.
 
-One folder of one's own (`command`): plan (who is a reference, who a query, which references a query gets) > run (a
-server of its own, one call a query) > metrics > report.
+One's own folder (`command.evaluate_folder`): plan (who is a reference, who a query) > references (which of them a query
+gets) > run (one call a query) > metrics > report.
 
-Benchmarks as in the paper (`benchmark_command`): benchmarks (scenes on the disk) > protocol (settings and methods) >
+Benchmarks as in the paper (`command.evaluate_benchmarks`): benchmarks (scenes on the disk) > plan (settings, methods) >
 suite (each run, kept in a journal) > averages > tables, charts, pictures > figures (JSON, CSV), page (HTML).
+
+Other tools may import `plan`, `references`, `run` and `metrics`. Begin reading with `run`.
 """

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from .benchmarks import BENCHMARKS, Benchmark
 from .metrics import RECALL_BARS, QueryResult, Summary, summarize
-from .protocol import Method
+from .plan import Method
 from .suite import Run, Suite
 
 Key = tuple[str, int, Method]

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapless_tools.ingest.formats import cambridge, cameras, seven_scenes, twelve_scenes
+from mapless_tools.usage import UsageError
 
 from .paper import CAMBRIDGE, SEVEN_SCENES, TWELVE_SCENES, PaperTables
-from .plan import UsageError
 
 MAX_DEPTH = 2
 """12-Scenes keeps its rooms in folders of buildings."""

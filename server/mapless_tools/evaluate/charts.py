@@ -15,7 +15,7 @@ from mapless_tools.charts import figure_of, new_axes, plot, use_logarithms
 from .averages import Average, Group
 from .metrics import QueryResult
 from .paper import DENSE
-from .protocol import Method, setting_name
+from .plan import Method, setting_name
 
 RIVALS = ("ACE", "ACE + GS-CPR", "L3")
 """Of the paper's figure of sparsity."""

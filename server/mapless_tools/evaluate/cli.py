@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -86,12 +85,9 @@ def evaluate_command(
     interrupted goes on where it ended. A folder with cameras.json is measured by leaving one out, or with --references,
     unless --protocol or --output asks for the same report.
     """
-    from mapless import MaplessError
-    from mapless_tools.child import ServerFailed
+    from mapless_tools.usage import failures_end_command
 
-    from .plan import UsageError
-
-    try:
+    with failures_end_command():
         if _is_own_folder(folder, layout) and protocol is None and output is None:
             benchmarks = {"sparse": sparse, "max_queries": max_queries, "pairs": pairs, "ground_truth": ground_truth}
             _refuse("with --protocol or --output", **benchmarks, partial=partial)
@@ -102,8 +98,8 @@ def evaluate_command(
             return
         own = {"references": references, "queries": queries, "json": json}
         _refuse("for a folder with cameras.json, and without --protocol or --output", **own)
-        from .benchmark_command import evaluate_benchmarks
-        from .protocol import PROTOCOLS, SCALES, VARIANTS
+        from .command import evaluate_benchmarks
+        from .plan import PROTOCOLS, SCALES, VARIANTS
 
         default = "sparse" if _is_own_folder(folder, layout) else ",".join(PROTOCOLS)
         complete = evaluate_benchmarks(
@@ -123,12 +119,6 @@ def evaluate_command(
             max_queries=max_queries,
             choice=choose,
         )
-    except UsageError as error:
-        print(f"mapless-server: {error}", file=sys.stderr)
-        raise typer.Exit(2) from None
-    except (ServerFailed, MaplessError, OSError) as error:
-        print(f"mapless-server: {error}", file=sys.stderr)
-        raise typer.Exit(1) from None
     raise typer.Exit(0 if complete else 1)
 
 
@@ -138,7 +128,7 @@ def _is_own_folder(folder: Path, layout: str) -> bool:
 
 def _refuse(only: str, **flags: object) -> None:
     """Raises UsageError if a flag is given that has no effect here."""
-    from .plan import UsageError
+    from mapless_tools.usage import UsageError
 
     given = [f"--{name.replace('_', '-')}" for name, value in flags.items() if value not in (None, False)]
     if given:
@@ -150,7 +140,7 @@ def _words(text: str, known: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _numbers(text: str | None) -> tuple[int, ...]:
-    from .plan import UsageError
+    from mapless_tools.usage import UsageError
 
     try:
         return tuple(int(word) for word in (text or "").split(",") if word.strip())

@@ -1,41 +1,39 @@
-"""`mapless-server evaluate`: arguments in, table and JSON out."""
+"""`mapless-server evaluate`: everything is checked first, then measured, then reported."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import tempfile
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from mapless_server.serve.signals import terminable
-from mapless_server.settings import ConfigError, load_settings
+from mapless_server.settings import load_settings
 from mapless_tools.dataset import read_folder
+from mapless_tools.ingest.formats import ReadOptions, read_dataset
 from mapless_tools.output_files import check_writable, write_json
 from mapless_tools.progress import progress_bars
+from mapless_tools.usage import UsageError, usage_errors
 
-from .plan import EvaluationOptions, UsageError
+from .benchmarks import ScenePlace, find_scenes
+from .plan import EvaluationOptions, SuiteOptions, split_scene
+from .provenance import provenance_of
+from .references import Matcher, check_images, paired, pairs_file, read_pairs
 from .report import print_report, to_json
 from .run import evaluate
+from .suite import RunSetup, SceneWork, measure
 
-
-@contextmanager
-def usage_errors() -> Iterator[None]:
-    """Faults of what a person gave, as UsageError; to be held around what checks it, not around what computes."""
-    try:
-        yield
-    except (ValueError, ConfigError) as error:
-        raise UsageError(str(error)) from error
+PAGE_FILE = "report.html"
+RUNS_FOLDER = "runs"
+NO_POSE = ("pose:", "ground truth:")
+"""How the reason begins for which readers refuse a frame that the benchmark has no pose of."""
 
 
 def evaluate_folder(folder: Path, json_file: Path | None, **options: Any) -> None:
-    """Measures the server on a folder, prints the table and writes the JSON file.
+    """Measures the server on a folder with cameras.json, prints the table and writes the JSON file, if one is named.
 
-    Args:
-        folder: with images/ and cameras.json.
-        json_file: where to write; None for nowhere.
-        options: those of EvaluationOptions.
+    `options` are those of EvaluationOptions.
 
     Raises:
         UsageError: a wrong folder, option, file or setting.
@@ -53,3 +51,102 @@ def evaluate_folder(folder: Path, json_file: Path | None, **options: Any) -> Non
     print_report(evaluation, Console())
     if json_file is not None:
         write_json(json_file, to_json(evaluation))
+
+
+def evaluate_benchmarks(
+    folder: Path,
+    output: Path,
+    *,
+    pairs: Path | None = None,
+    ground_truth: Path | None = None,
+    partial: bool = False,
+    worst: int = 4,
+    **options: Any,
+) -> bool:
+    """Measures the server on a scene, or on all scenes of a folder, and writes the report.
+
+    Args:
+        folder: a scene, or what holds scenes.
+        output: folder of the report; made if need be. What it holds of the same evaluation is not measured again.
+        pairs: references of each query, a file or a folder with one for each scene; None: see the options' `choice`.
+        ground_truth: poses instead of the layout's own, see `ReadOptions`.
+        partial: whether images that are missing or damaged may be left out; the report names them.
+        worst: how many queries of each scene are shown as pictures.
+        options: those of SuiteOptions.
+
+    Returns:
+        Whether everything was measured.
+
+    Raises:
+        UsageError: a wrong folder, option, file or setting; nothing was measured.
+    """
+    from .figures import write_figures
+    from .page import page, print_suite
+    from .pictures import worst_queries
+
+    with usage_errors():
+        checked = SuiteOptions(**options)
+        if worst < 0:
+            raise UsageError(f"worst must be 0 or more, not {worst}")
+        settings = load_settings({}).settings
+        matcher = Matcher.of(settings)
+        provenance = provenance_of(settings)
+        places = find_scenes(folder, checked.layout)
+        journals = _journal_folder(output)
+    with terminable(), progress_bars() as progress:
+        scenes = []
+        for done, place in enumerate(places):
+            progress("reading scenes", done, len(places))
+            files = None if pairs is None else pairs_file(pairs, place.name, len(places))
+            scenes.append(_read_scene(place, checked, matcher, files, ground_truth, partial))
+        setup = RunSetup(checked, matcher, provenance, journals, progress)
+        suite = measure(scenes, setup, pairs, lambda so_far: write_figures(so_far, output))
+        shown = worst_queries(suite, worst, matcher, progress)
+    (output / PAGE_FILE).write_text(page(suite, shown), encoding="utf-8")
+    print_suite(suite)
+    print(f"{output / PAGE_FILE}, with evaluation.json, evaluation.csv and queries.csv beside it")
+    return not suite.failures
+
+
+def _journal_folder(output: Path) -> Path:
+    """The folder of the journals in it; raises UsageError if it cannot be written."""
+    journals = output / RUNS_FOLDER
+    try:
+        journals.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=journals):
+            pass
+    except OSError as error:
+        raise UsageError(f"{output} cannot be written: {error.strerror}") from error
+    return journals
+
+
+def _read_scene(
+    place: ScenePlace,
+    options: SuiteOptions,
+    matcher: Matcher,
+    pairs: Path | None,
+    ground_truth: Path | None,
+    partial: bool,
+) -> SceneWork:
+    """A scene read, split and checked; UsageError if that is not possible, or images cannot be used."""
+    with usage_errors():
+        dataset = read_dataset(place.path, place.layout, ReadOptions(ground_truth=ground_truth))
+    if not dataset.metric:
+        raise UsageError(f"{place.name}: its unit of length is arbitrary, the paper's figures are centimetres")
+    faults = [refusal for refusal in dataset.refused if not refusal.reason.startswith(NO_POSE)]
+    if faults and not partial:
+        raise UsageError(
+            f"{place.name}: {len(faults)} of {len(dataset.frames) + len(dataset.refused)} frames cannot be used, the "
+            f"first, {faults[0].frame}: {faults[0].reason}; --partial leaves them out"
+        )
+    first = {frame.split: frame for frame in reversed(dataset.frames)}
+    check_images(first.values(), matcher.limits)
+    splits = tuple(split_scene(dataset, setting, options) for setting in options.settings(place))
+    if pairs is None:
+        return SceneWork(place, dataset, splits, None)
+    known = read_pairs(pairs, dataset, place.path)
+    for split in splits:
+        names = {frame.name for frame in split.references}
+        for query in split.queries:
+            paired(known, query, names, options.k)
+    return SceneWork(place, dataset, splits, known)

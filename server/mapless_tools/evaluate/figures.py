@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import csv
-import json
-import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from mapless_tools.output_files import finite, whole_file, write_json
+
 from .averages import Group, groups_of
 from .metrics import RECALL_BARS, summarize
 from .paper import PaperTables
-from .protocol import setting_name
+from .plan import setting_name
 from .suite import Run, Suite
 
 JSON_FILE, RUNS_FILE, QUERIES_FILE = "evaluation.json", "evaluation.csv", "queries.csv"
@@ -30,8 +29,8 @@ RULES = (
 def write_figures(suite: Suite, folder: Path) -> None:
     """Writes the three files, each whole or not at all."""
     groups = groups_of(suite)
-    text = json.dumps(as_json(suite, groups), indent=1, ensure_ascii=False, allow_nan=False)
-    _write(folder / JSON_FILE, text + "\n")
+    with whole_file(folder / JSON_FILE) as partial:
+        write_json(partial, as_json(suite, groups))
     _write_csv(folder / RUNS_FILE, [run_figures(run) for run in suite.runs])
     _write_csv(folder / QUERIES_FILE, [_query(run, i) for run in suite.runs for i in range(len(run.results))])
 
@@ -87,11 +86,6 @@ def run_figures(run: Run) -> dict[str, Any]:
         "backend": run.results[0].backend,
         "features": " ".join(summary.features),
     }
-
-
-def finite(value: float) -> float | None:
-    """The value; None for what JSON and CSV have no word for."""
-    return value if math.isfinite(value) else None
 
 
 def _averages(group: Group) -> Iterable[dict[str, Any]]:
@@ -151,15 +145,7 @@ def _query(run: Run, index: int) -> dict[str, Any]:
 
 
 def _write_csv(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    partial = file.with_name(file.name + ".partial")
-    with partial.open("w", encoding="utf-8", newline="") as stream:
+    with whole_file(file) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]) if rows else ["scene"])
         writer.writeheader()
         writer.writerows(rows)
-    os.replace(partial, file)
-
-
-def _write(file: Path, text: str) -> None:
-    partial = file.with_name(file.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, file)

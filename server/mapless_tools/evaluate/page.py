@@ -12,7 +12,7 @@ from .charts import ablation, along_sequence, cumulative, sparsity
 from .figures import RULES
 from .pictures import EPIPOLAR_PX, WorstQuery
 from .suite import SceneWork, Suite
-from .tables import tables_of
+from .tables import tables_of, text_lines
 
 
 def page(suite: Suite, worst: Sequence[WorstQuery]) -> str:
@@ -37,6 +37,18 @@ def _group(group: Group, worst: Sequence[WorstQuery]) -> dict[str, object]:
         "sequences": [inline_svg(it) for scene in group.scenes for it in along_sequence(group, scene)],
         "worst": worst,
     }
+
+
+def print_suite(suite: Suite) -> None:
+    """The tables, and what the figures come from, for the terminal."""
+    for group in groups_of(suite):
+        for table in (table for table in tables_of(group) if not table.wide):
+            print(f"\n{group.title}. {table.title}")
+            print("\n".join((*text_lines(table), *table.notes)))
+    print()
+    for name, value in facts(suite).items():
+        print(f"{name}: {value}")
+    print("\n".join(problems(suite)))
 
 
 def facts(suite: Suite) -> dict[str, str]:

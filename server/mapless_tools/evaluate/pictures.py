@@ -15,15 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, cross_matrix
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images.decode import decode_image
 from mapless_server.method.correspond import mutual_matches
-from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import View
 from mapless_tools.dataset import Frame
+from mapless_tools.progress import Progress
 
 from .metrics import QueryResult
-from .protocol import setting_name
-from .suite import Run
+from .plan import setting_name
+from .references import Matcher
+from .suite import Run, Suite
 
 HEIGHT_PX, GAP_PX = 260, 6
 EPIPOLAR_PX = 4.0
@@ -72,19 +73,33 @@ class WorstQuery:
         )
 
 
-def worst_of(run: Run, count: int, extractor: FeatureExtractor, ratio: float, limits: ImageLimits) -> list[WorstQuery]:
+def worst_queries(suite: Suite, count: int, matcher: Matcher, progress: Progress) -> list[WorstQuery]:
+    """So many of each scene, by its first method in the densest and in the sparsest setting."""
+    method = suite.options.methods()[0]
+    runs: list[Run] = []
+    for scene in suite.scenes:
+        own = [run for run in suite.runs if run.scene is scene and run.method == method]
+        runs += [*own[:1], *own[1:][-1:]]
+    worst = []
+    for done, run in enumerate(runs if count else ()):
+        progress("pictures", done, len(runs))
+        worst += worst_of(run, count, matcher)
+    return worst
+
+
+def worst_of(run: Run, count: int, matcher: Matcher) -> list[WorstQuery]:
     """The queries with the largest translation errors, the rejected first, each with its picture."""
     order = sorted(run.results, key=lambda it: (-it.translation_error, -it.rotation_error_deg, it.name))
     frames = {frame.name: frame for frame in (*run.split.references, *run.split.queries)}
     worst = []
     for result in order[:count]:
         beside = result.best_reference or next(iter(result.references), "")
-        query = _Shown.of(frames[result.name], extractor, limits)
+        query = _Shown.of(frames[result.name], matcher)
         if not beside:
             worst.append(WorstQuery(run, result, data_uri(query.image), "", 0, 0))
             continue
-        reference = _Shown.of(frames[beside], extractor, limits)
-        matches = mutual_matches(query.view.features, reference.view.features, ratio)
+        reference = _Shown.of(frames[beside], matcher)
+        matches = mutual_matches(query.view.features, reference.view.features, matcher.ratio)
         fits = fit_true_poses(query.frame, reference.frame, query.view, reference.view, matches)
         picture = _side_by_side(query, reference, matches, fits)
         worst.append(WorstQuery(run, result, data_uri(picture), beside, len(matches), int(fits.sum())))
@@ -125,9 +140,9 @@ class _Shown:
     keypoints: Array
 
     @staticmethod
-    def of(frame: Frame, extractor: FeatureExtractor, limits: ImageLimits) -> _Shown:
-        image = decode_image(frame.image_path.read_bytes(), limits)
-        view = extractor.extract(image, frame.camera)
+    def of(frame: Frame, matcher: Matcher) -> _Shown:
+        image = decode_image(frame.image_path.read_bytes(), matcher.limits)
+        view = matcher.extractor.extract(image, frame.camera)
         scale = HEIGHT_PX / image.shape[0]
         size = (round(image.shape[1] * scale), HEIGHT_PX)
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)

@@ -1,39 +1,39 @@
-"""What is to be measured: which frames are references, which are queries, and which references each query is given."""
+"""What is measured: which frames are references and which are queries, in which settings, and by which methods.
+
+A benchmark's references are the frames of its training split and its queries those of its test split. Dense, all of the
+former are references; sparse, N of them, evenly spread. A folder without a split leaves one out, or has N references
+evenly spread and queries between them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 
-from mapless_server.errors import InvalidArgument
-from mapless_server.images.decode import ImageLimits, decode_image, image_size
 from mapless_server.method.answer import Variant
-from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.retrieve import choose_references
 from mapless_server.method.scale_equations import ScaleStrategy
-from mapless_server.method.views import PosedView, View
-from mapless_server.settings import available_cores
 from mapless_tools.dataset import Dataset, Frame
-from mapless_tools.progress import Progress
+from mapless_tools.usage import UsageError
+
+from .benchmarks import LAYOUTS, ScenePlace
+from .paper import DENSE
 
 T = TypeVar("T")
 
 MAX_K = 64
 """What one call of Localize takes."""
-
-
-class UsageError(ValueError):
-    """Arguments, settings or a folder are wrong, or do not fit together; the message is for a person."""
-
-
 QUERY_MARGIN = 3
 """Queries beside references keep this far from the first and the last frame, so that they lie within the walk."""
-
 DEFAULT_QUERY_COUNT = 40
+PROTOCOLS = ("dense", "sparse")
+CHOICES = ("retrieval", "matches", "given")
+VARIANTS = tuple(variant.value for variant in Variant)
+SCALES = tuple(strategy.value for strategy in ScaleStrategy)
+MAX_MATCHED = 1000
+"""Comparing a query with each reference's features takes 20 ms each: beyond this it is retrieval's job."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,87 @@ class EvaluationOptions:
             raise ValueError(f"at least 2 references are needed for a baseline, not {self.reference_count}")
         if self.query_count is not None and self.query_count < 1:
             raise ValueError(f"at least 1 query is needed, not {self.query_count}")
-        if not 1 <= self.k <= MAX_K:
-            raise ValueError(f"k, the references of a query, must be 1 to {MAX_K}, not {self.k}")
-        for name, value, known in (
-            ("variant", self.variant, [v.value for v in Variant]),
-            ("scale", self.scale_strategy, [s.value for s in ScaleStrategy]),
-        ):
-            if value not in known:
-                raise ValueError(f"{name} must be one of {', '.join(known)}, not {value!r}")
+        _check_k(self.k)
+        _check_known("variant", [self.variant], VARIANTS)
+        _check_known("scale", [self.scale_strategy], SCALES)
+
+
+@dataclass(frozen=True)
+class SuiteOptions:
+    """Options of an evaluation as in the paper.
+
+    Attributes:
+        layout: how the scenes lie on the disk; "auto" looks.
+        protocols: dense, sparse or both.
+        sparse: numbers of references; empty for the paper's of each benchmark.
+        variants: forms of the method, each with the first of `scales`.
+        scales: ways to find the metric scale; those after the first are run with `ablated` only.
+        k: references that a query is given; the paper's.
+        stride: dense, every so many-th training frame is a reference; 1, as in the paper, takes all.
+        max_queries: queries of a scene, evenly spread; None, as in the paper, takes all.
+        choice: who chooses a query's references: the server's own "retrieval" as for a caller who names none; feature
+            "matches" counted here; or all are "given", first those taken first, without any ranking.
+    """
+
+    layout: str = "auto"
+    protocols: tuple[str, ...] = PROTOCOLS
+    sparse: tuple[int, ...] = ()
+    variants: tuple[str, ...] = ("best",)
+    scales: tuple[str, ...] = ("two_stage",)
+    k: int = 10
+    stride: int = 1
+    max_queries: int | None = None
+    choice: str = "retrieval"
+
+    def __post_init__(self) -> None:
+        _check_known("layout", [self.layout], LAYOUTS)
+        _check_known("protocol", self.protocols, PROTOCOLS)
+        _check_known("variant", self.variants, VARIANTS)
+        _check_known("scale", self.scales, SCALES)
+        _check_known("references", [self.choice], CHOICES)
+        if any(count < 2 for count in self.sparse):
+            raise ValueError(f"sparse: at least 2 references are needed for a baseline, not {min(self.sparse)}")
+        _check_k(self.k)
+        if self.stride < 1:
+            raise ValueError(f"stride must be at least 1, not {self.stride}")
+        if self.max_queries is not None and self.max_queries < 1:
+            raise ValueError(f"max-queries must be at least 1, not {self.max_queries}")
+
+    @property
+    def ablated(self) -> str:
+        """The variant whose scale is varied: the paper's own where it is among the variants."""
+        return "full" if "full" in self.variants else self.variants[0]
+
+    def methods(self) -> tuple[Method, ...]:
+        """What is run in every setting: each variant, then the ablation of the scale."""
+        first, *others = self.scales
+        return (*(Method(v, first) for v in self.variants), *(Method(self.ablated, scale) for scale in others))
+
+    def settings(self, place: ScenePlace) -> tuple[int, ...]:
+        """Numbers of references of a scene, DENSE first, then the densest.
+
+        Raises:
+            UsageError: sparse is wanted of a scene of no benchmark, without numbers.
+        """
+        sparse: tuple[int, ...] = ()
+        if "sparse" in self.protocols:
+            if not self.sparse and place.benchmark is None:
+                raise UsageError(f"{place.name} is no benchmark's scene: say how sparse, --sparse 5,10,20,30")
+            sparse = self.sparse or (place.benchmark.sparse if place.benchmark else ())
+        return (*((DENSE,) if "dense" in self.protocols else ()), *sorted(set(sparse), reverse=True))
+
+
+@dataclass(frozen=True)
+class Method:
+    """A form of the method."""
+
+    variant: str
+    scale: str
+
+    @property
+    def label(self) -> str:
+        """For people; the paper's scale strategy is left out."""
+        return self.variant if self.scale == "two_stage" else f"{self.variant}, {self.scale}"
 
 
 @dataclass(frozen=True)
@@ -80,20 +153,24 @@ class Split:
 
 
 @dataclass(frozen=True, eq=False)
-class PlannedQuery:
-    """A frame to localize and the references it is given, most similar first."""
+class SceneSplit:
+    """References and queries of a scene in one setting.
 
-    frame: Frame
+    Attributes:
+        setting: number of references that was asked for; DENSE for all.
+        references, queries: frames.
+        test_count: queries that the benchmark has, of which `queries` may be a part.
+    """
+
+    setting: int
     references: tuple[Frame, ...]
+    queries: tuple[Frame, ...]
+    test_count: int
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """All that is to be done: upload the references, localize the queries."""
-
-    dataset: Dataset
-    references: tuple[Frame, ...]
-    queries: tuple[PlannedQuery, ...]
+def setting_name(setting: int) -> str:
+    """For people: "dense" or "N=10"."""
+    return "dense" if setting == DENSE else f"N={setting}"
 
 
 def split_frames(frame_count: int, options: EvaluationOptions) -> Split:
@@ -110,112 +187,81 @@ def split_frames(frame_count: int, options: EvaluationOptions) -> Split:
         if frame_count < 3:
             raise UsageError(f"leaving one out needs at least 3 frames, the folder has {frame_count}")
         wanted = frame_count if options.query_count is None else options.query_count
-        return Split(tuple(range(frame_count)), _spread(0, frame_count - 1, wanted))
+        return Split(tuple(range(frame_count)), tuple(_spread(0, frame_count - 1, wanted)))
     if options.reference_count > frame_count:
         raise UsageError(f"{options.reference_count} references are wanted, the folder has {frame_count} frames")
     references = _spread(0, frame_count - 1, options.reference_count)
     margin = QUERY_MARGIN if frame_count >= 8 else 0
     wanted = DEFAULT_QUERY_COUNT if options.query_count is None else options.query_count
-    candidates = _spread(margin, frame_count - 1 - margin, wanted)
-    queries = tuple(sorted(set(candidates) - set(references)))
+    queries = tuple(sorted(set(_spread(margin, frame_count - 1 - margin, wanted)) - set(references)))
     if not queries:
         raise UsageError(
             f"with {options.reference_count} references among {frame_count} frames no frame is left as a query; take "
             "fewer references, more queries, or leave one out"
         )
-    return Split(references, queries)
+    return Split(tuple(references), queries)
 
 
-def check_images(frames: Iterable[Frame], limits: ImageLimits) -> None:
-    """Reads the images' headers.
+def split_scene(dataset: Dataset, setting: int, options: SuiteOptions) -> SceneSplit:
+    """References and queries of a scene in a setting.
 
-    Raises:
-        UsageError: an image is missing, too large, no JPEG, PNG or WebP, or of another size than its camera.
-    """
-    for frame in frames:
-        try:
-            size = image_size(frame.image_path.read_bytes(), limits)
-        except (InvalidArgument, OSError) as error:
-            raise UsageError(f"{frame.image_path}: {error}") from error
-        camera = frame.camera
-        if size != (camera.width_px, camera.height_px):
-            raise UsageError(
-                f"{frame.image_path} has {size[0]}x{size[1]} pixels, cameras.json says "
-                f"{camera.width_px}x{camera.height_px}"
-            )
-
-
-def make_plan(
-    dataset: Dataset,
-    options: EvaluationOptions,
-    extractor: FeatureExtractor,
-    ratio: float,
-    limits: ImageLimits,
-    progress: Progress,
-) -> Plan:
-    """Chooses references and queries, and ranks the references of each query by their feature matches with it.
-
-    The ranking does not look at the query's true pose. It is the server's own (`retrieve`) with the extractor and ratio
-    of its first features, done here because a query that is left out must not be offered itself.
+    A folder with cameras.json may have no split; sparse, it is then split as `split_frames` does.
 
     Raises:
-        UsageError: too few frames, or an image is missing, damaged or of another size than its camera.
+        UsageError: the dataset has no split, or fewer training frames than are asked for.
     """
-    split = split_frames(len(dataset.frames), options)
-    references, queries = (tuple(dataset.frames[i] for i in part) for part in (split.references, split.queries))
-    check_images(dict.fromkeys((*references, *queries)), limits)
-    return Plan(
-        dataset, references, rank_by_matches(queries, references, options.k, extractor, ratio, limits, progress)
-    )
+    train = [frame for frame in dataset.frames if frame.split == "train"]
+    test = [frame for frame in dataset.frames if frame.split == "test"]
+    if setting != DENSE and not train and not test and dataset.format == "cameras":
+        split = split_frames(len(dataset.frames), EvaluationOptions(setting, options.max_queries))
+        references, queries = ([dataset.frames[i] for i in part] for part in (split.references, split.queries))
+        return SceneSplit(setting, tuple(references), tuple(queries), len(dataset.frames) - len(references))
+    for name, frames in (("train", train), ("test", test)):
+        if not frames:
+            raise UsageError(f"{dataset.name} has no frame of the {name} split: is its file of the split there?")
+    if setting == DENSE:
+        references = train[:: options.stride]
+        if len(references) < 2:
+            raise UsageError(f"{dataset.name}: a stride of {options.stride} leaves 1 of {len(train)} references")
+    else:
+        if setting > len(train):
+            raise UsageError(f"{dataset.name} has {len(train)} training frames, {setting} references are wanted")
+        references = evenly_spread(train, setting)
+    queries = evenly_spread(test, options.max_queries)
+    if options.choice == "matches" and len(references) > MAX_MATCHED:
+        raise UsageError(
+            f"{dataset.name}: {len(references)} references are too many to compare with each query; use "
+            "--choose retrieval, or a --stride"
+        )
+    if options.choice == "given" and len(references) > MAX_K:
+        raise UsageError(
+            f"{dataset.name}: a query can be given {MAX_K} references at most, not {len(references)}; use --choose "
+            "retrieval, or --protocol sparse"
+        )
+    return SceneSplit(setting, tuple(references), tuple(queries), len(test))
 
 
-def rank_by_matches(
-    queries: Sequence[Frame],
-    references: Sequence[Frame],
-    k: int,
-    extractor: FeatureExtractor,
-    ratio: float,
-    limits: ImageLimits,
-    progress: Progress,
-) -> tuple[PlannedQuery, ...]:
-    """The queries, each with those k references, itself excepted, that share the most feature matches with it.
-
-    Raises:
-        UsageError: an image is damaged.
-    """
-    used = tuple(dict.fromkeys((*references, *queries)))
-
-    def view_of(frame: Frame) -> View:
-        try:
-            return extractor.extract(decode_image(frame.image_path.read_bytes(), limits), frame.camera)
-        except InvalidArgument as error:
-            raise UsageError(f"{frame.image_path}: {error}") from error
-
-    views = dict(zip(used, _map(view_of, used, "features", progress), strict=True))
-
-    def planned(query: Frame) -> PlannedQuery:
-        candidates = [frame for frame in references if frame is not query]
-        posed = [PosedView(frame.name, frame.name, views[frame], frame.world_from_camera) for frame in candidates]
-        chosen = choose_references(views[query], posed, k, ratio=ratio)
-        return PlannedQuery(query, tuple(candidates[i] for i in chosen))
-
-    return tuple(_map(planned, queries, "choosing references", progress))
+def evenly_spread(items: Sequence[T], count: int | None) -> list[T]:
+    """`count` of the items, evenly spread from the first to the last; all if there are no more, or for None."""
+    if count is None or count >= len(items):
+        return list(items)
+    return [items[i] for i in _spread(0, len(items) - 1, count)]
 
 
-def _spread(first: int, last: int, count: int) -> tuple[int, ...]:
+def _spread(first: int, last: int, count: int) -> list[int]:
     """`count` whole numbers evenly from `first` to `last`, rounded half to even; fewer where they coincide."""
-    return tuple(dict.fromkeys(np.round(np.linspace(first, last, count)).astype(int).tolist()))
+    return list(dict.fromkeys(np.round(np.linspace(first, last, count)).astype(int).tolist()))
 
 
-def _map(function: Callable[[Frame], T], items: Sequence[Frame], step: str, progress: Progress) -> list[T]:
-    results: list[T] = []
-    with ThreadPoolExecutor(available_cores()) as pool:
-        progress(step, 0, len(items))
-        try:
-            for result in pool.map(function, items):
-                results.append(result)
-                progress(step, len(results), len(items))
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
-    return results
+def _check_k(k: int) -> None:
+    if not 1 <= k <= MAX_K:
+        raise ValueError(f"k, the references of a query, must be 1 to {MAX_K}, not {k}")
+
+
+def _check_known(field: str, values: Iterable[str], known: Sequence[str]) -> None:
+    values = list(values)
+    unknown = [value for value in values if value not in known]
+    if unknown or not values:
+        raise ValueError(f"{field} must be one of {', '.join(known)}, not {', '.join(map(repr, unknown)) or '-'}")
+    if len(set(values)) < len(values):
+        raise ValueError(f"{field}: {', '.join(values)} names one twice")

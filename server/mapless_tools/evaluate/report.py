@@ -11,6 +11,7 @@ from rich.table import Table
 
 from mapless_server import __version__
 from mapless_server.method.retrieve import RetrieveOptions
+from mapless_tools.output_files import finite
 
 from .metrics import QueryResult, Summary, summarize
 from .run import Evaluation
@@ -47,9 +48,9 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
         "version": __version__,
         "queries": summary.query_count,
         "localized": summary.localized_count,
-        "median_translation_m": _finite(summary.median_translation) if metric else None,
-        "median_rotation_deg": _finite(summary.median_rotation_deg),
-        "p90_translation_m": _finite(summary.p90_translation) if metric else None,
+        "median_translation_m": finite(summary.median_translation) if metric else None,
+        "median_rotation_deg": finite(summary.median_rotation_deg),
+        "p90_translation_m": finite(summary.p90_translation) if metric else None,
         "recall": dict(summary.recall) if metric else dict.fromkeys(summary.recall),
         "relative": _relative(evaluation, summary),
         "claimed_68_held": summary.claim_held,
@@ -147,13 +148,13 @@ def _relative(evaluation: Evaluation, summary: Summary) -> dict[str, Any]:
     """Lengths for which the unit does not matter, and the unit's own where it is not the metre."""
     radius = evaluation.trajectory_radius
     relative: dict[str, Any] = {
-        "median_translation_of_reference_radius": _finite(summary.median_translation / radius) if radius else None,
-        "p90_translation_of_reference_radius": _finite(summary.p90_translation / radius) if radius else None,
-        "median_translation_of_reference_distance": _finite(summary.median_relative),
+        "median_translation_of_reference_radius": finite(summary.median_translation / radius) if radius else None,
+        "p90_translation_of_reference_radius": finite(summary.p90_translation / radius) if radius else None,
+        "median_translation_of_reference_distance": finite(summary.median_relative),
     }
     if not evaluation.dataset.metric:
-        relative["median_translation_units"] = _finite(summary.median_translation)
-        relative["p90_translation_units"] = _finite(summary.p90_translation)
+        relative["median_translation_units"] = finite(summary.median_translation)
+        relative["p90_translation_units"] = finite(summary.p90_translation)
     return relative
 
 
@@ -162,8 +163,8 @@ def _query(result: QueryResult, metric: bool) -> dict[str, Any]:
     return {
         "name": result.name,
         "localized": result.localized,
-        f"translation_{unit}": _finite(result.translation_error),
-        "rotation_deg": _finite(result.rotation_error_deg),
+        f"translation_{unit}": finite(result.translation_error),
+        "rotation_deg": finite(result.rotation_error_deg),
         f"claimed_68_{unit}": result.position_68,
         f"reference_distance_{unit}": result.reference_distance,
         "inliers": result.inlier_count,
@@ -178,7 +179,3 @@ def _query(result: QueryResult, metric: bool) -> dict[str, Any]:
 
 def _rejection(result: QueryResult) -> Mapping[str, str] | None:
     return None if result.localized else {"reason": result.rejection, "message": result.message}
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

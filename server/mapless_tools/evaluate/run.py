@@ -1,34 +1,35 @@
-"""An evaluation from end to end: client, gRPC, decoding, engine, pipeline; nothing is bypassed."""
+"""An evaluation of a folder from end to end: client, gRPC, decoding, engine, pipeline; nothing is bypassed."""
 
 from __future__ import annotations
 
 import math
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from mapless import Client, ConnectOptions, LocalizationResult, NewReference, Rejected, RigidTransform
+from mapless import Client, LocalizationResult, NewReference, Rejected, RigidTransform
 from mapless.names import parse_reference_name
-from mapless_server.method.correspond import OPTIONS
-from mapless_server.method.features import FeatureExtractor
-from mapless_server.networks.weights import WeightsError
-from mapless_server.serve.assembly import image_limits, make_first_features
 from mapless_server.settings import Settings
-from mapless_tools.child import child_server
+from mapless_tools.child import temporary_server
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.progress import Progress
 
 from .metrics import QueryResult, pose_error, trajectory_radius
-from .plan import EvaluationOptions, Plan, PlannedQuery, UsageError, make_plan
+from .plan import EvaluationOptions, split_frames
+from .references import Matcher, PlannedQuery, check_images, rank_by_matches
 
 SCENE = "evaluation"
 
-# An answer is measured however late it comes, and however large the photographs are.
-CONNECT = ConnectOptions(timeout_s=600.0, upload_timeout_s=3600.0, batch_count=8)
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """All that is to be done: upload the references, localize the queries."""
+
+    dataset: Dataset
+    references: tuple[Frame, ...]
+    queries: tuple[PlannedQuery, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +37,10 @@ class Evaluation:
     """Results and what they are results of.
 
     Attributes:
+        dataset, options: that were given.
         reference_count: references of the scene; when one is left out, the query among them.
         trajectory_radius: of the references, the dataset's unit.
+        results: one for each query.
     """
 
     dataset: Dataset
@@ -56,41 +59,25 @@ def evaluate(dataset: Dataset, options: EvaluationOptions, settings: Settings, p
         MaplessError: a call failed.
     """
     plan = plan_for(dataset, options, settings, progress)
-    with (
-        tempfile.TemporaryDirectory(prefix="mapless-evaluate-") as data_dir,
-        child_server(Path(data_dir)) as server,
-        Client(server.address, CONNECT) as client,
-    ):
-        upload(client, plan, progress)
-        return evaluation_of(plan, options, localize_queries(client, plan, options, progress))
+    with temporary_server() as client:
+        store_references(client, SCENE, plan.references, progress)
+        results = localize_queries(client, plan, options, progress)
+    radius = trajectory_radius(np.array([f.world_from_camera.translation for f in plan.references]))
+    return Evaluation(dataset, options, len(plan.references), radius, results)
 
 
 def plan_for(dataset: Dataset, options: EvaluationOptions, settings: Settings, progress: Progress) -> Plan:
-    """The plan, chosen with the first features that a server of these settings has.
+    """Chooses references and queries, and ranks the references of each query by their feature matches with it.
 
     Raises:
-        UsageError: as `make_plan`, or the settings ask for features that are not there.
+        UsageError: too few frames; an image is missing, damaged or of another size than its camera; or the settings
+            ask for features that are not there.
     """
-    extractor, ratio = first_features(settings)
-    return make_plan(dataset, options, extractor, ratio, image_limits(settings), progress)
-
-
-def first_features(settings: Settings) -> tuple[FeatureExtractor, float]:
-    """The first features that a server of these settings has, and their ratio of a match with the query.
-
-    Raises:
-        UsageError: the settings ask for features that are not there.
-    """
-    try:
-        features, extractor = make_first_features(settings)
-    except (ValueError, ImportError, WeightsError) as error:
-        raise UsageError(str(error)) from error
-    return extractor, OPTIONS[features].query_ratio
-
-
-def upload(client: Client, plan: Plan, progress: Progress) -> None:
-    """Creates the scene and stores the plan's references in it."""
-    store_references(client, SCENE, plan.references, progress)
+    matcher = Matcher.of(settings)
+    split = split_frames(len(dataset.frames), options)
+    references, queries = (tuple(dataset.frames[i] for i in part) for part in (split.references, split.queries))
+    check_images(dict.fromkeys((*references, *queries)), matcher.limits)
+    return Plan(dataset, references, rank_by_matches(queries, references, options.k, matcher, progress))
 
 
 def store_references(client: Client, scene: str, references: Sequence[Frame], progress: Progress) -> None:
@@ -111,18 +98,12 @@ def localize_queries(
 ) -> tuple[QueryResult, ...]:
     """Localizes the plan's queries, one after the other."""
     results: list[QueryResult] = []
-    poses = {frame.name: frame for frame in plan.references}
+    references = {frame.name: frame for frame in plan.references}
     progress("localizing", 0, len(plan.queries))
     for query in plan.queries:
-        results.append(localize_query(client, SCENE, query, options, poses))
+        results.append(localize_query(client, SCENE, query, options, references))
         progress("localizing", len(results), len(plan.queries))
     return tuple(results)
-
-
-def evaluation_of(plan: Plan, options: EvaluationOptions, results: tuple[QueryResult, ...]) -> Evaluation:
-    """Results and their plan."""
-    radius = trajectory_radius(np.array([f.world_from_camera.translation for f in plan.references]))
-    return Evaluation(plan.dataset, options, len(plan.references), radius, results)
 
 
 def localize_query(
@@ -166,12 +147,10 @@ def _result(
     diagnostics = answer.diagnostics
     uses = {parse_reference_name(use.name)[1]: use for use in diagnostics.references}
     used = list(given) or [references[name] for name in uses]
-    distances = [
-        float(np.linalg.norm(it.world_from_camera.translation - frame.world_from_camera.translation)) for it in used
-    ]
+    centre = frame.world_from_camera.translation
+    distances = [float(np.linalg.norm(it.world_from_camera.translation - centre)) for it in used]
     found = answer if isinstance(answer, LocalizationResult) else None
     errors = pose_error(frame.world_from_camera, found.world_from_camera) if found else (math.inf, math.inf)
-    best = max(uses, key=lambda name: uses[name].inlier_count, default="") if found else ""
     return QueryResult(
         name=frame.name,
         references=tuple(it.name for it in used),
@@ -187,7 +166,7 @@ def _result(
         stage_ms={stage: 1000 * seconds for stage, seconds in diagnostics.stage_s.items()},
         backend=diagnostics.backend,
         features=diagnostics.features,
-        best_reference=best,
+        best_reference=max(uses, key=lambda name: uses[name].inlier_count, default="") if found else "",
         pose=_numbers(found.world_from_camera) if found else None,
     )
 

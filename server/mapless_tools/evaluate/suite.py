@@ -1,32 +1,32 @@
 """An evaluation as in the paper, from end to end: every scene, setting and method, each query through a real server.
 
-A scene has a server of its own, which holds a set of references for each setting. What is measured is written at once
-(`journal`), so that an evaluation of days can be interrupted, and a scene that fails does not take the others with it.
+A scene has a server of its own, which holds a set of references for each setting. Each result is written to a journal
+at once, so that an evaluation of days can be interrupted, and a scene that fails does not stop the others.
 """
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
-from hashlib import sha256
+import hashlib
+import json
+import math
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from mapless import Client, MaplessError
-from mapless_server.serve.assembly import image_limits
-from mapless_server.settings import Settings
-from mapless_tools.child import ServerFailed, child_server
+from mapless_tools.child import ServerFailed, temporary_server
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.progress import Progress
+from mapless_tools.usage import UsageError
 
 from .benchmarks import ScenePlace
-from .journal import Identity, Journal
 from .metrics import QueryResult
-from .pairs import Pairs, chosen
-from .plan import EvaluationOptions, PlannedQuery, UsageError, rank_by_matches
-from .protocol import Method, SceneSplit, SuiteOptions, setting_name
+from .plan import EvaluationOptions, Method, SceneSplit, SuiteOptions, setting_name
 from .provenance import Provenance
-from .run import CONNECT, first_features, localize_query, store_references
+from .references import Matcher, Pairs, PlannedQuery, paired, rank_by_matches
+from .run import localize_query, store_references
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +34,7 @@ class SceneWork:
     """A scene that is ready to be measured.
 
     Attributes:
+        place, dataset: the scene.
         splits: one for each setting.
         pairs: the references of its queries; None unless they were given.
     """
@@ -49,6 +50,8 @@ class Run:
     """The results of one method in one setting of one scene, in the order of its queries.
 
     Attributes:
+        scene, split, method: of the run.
+        results: one for each query.
         journal: the file that they are in.
     """
 
@@ -69,9 +72,10 @@ class Failure:
 
 @dataclass(frozen=True, eq=False)
 class Suite:
-    """Everything that was measured, and what it is of.
+    """Everything that was measured, and its circumstances.
 
     Attributes:
+        options, provenance, scenes: that it is of.
         runs: complete ones, in the order of scenes, settings and methods.
         failures: what is missing, and why.
         pairs: file or folder of given pairs; None without.
@@ -86,53 +90,119 @@ class Suite:
 
 
 @dataclass(frozen=True)
-class Apparatus:
-    """What scenes are measured with.
+class RunSetup:
+    """What all runs have in common.
 
     Attributes:
+        options, provenance: of the suite.
+        matcher: ranks references, where matches do.
         journals: folder of the journals; exists.
+        progress: of the command.
     """
 
     options: SuiteOptions
-    settings: Settings
+    matcher: Matcher
     provenance: Provenance
     journals: Path
     progress: Progress
 
 
 def measure(
-    scenes: Sequence[SceneWork], apparatus: Apparatus, pairs: Path | None, on_scene: Callable[[Suite], None]
+    scenes: Sequence[SceneWork], setup: RunSetup, pairs: Path | None, on_scene: Callable[[Suite], None]
 ) -> Suite:
     """Measures all scenes; what a journal has already is not measured again.
 
     Args:
         scenes: what to measure.
-        apparatus: with what.
+        setup: what all runs have in common.
         pairs: for the report.
-        on_scene: told of everything so far after each scene.
+        on_scene: called with everything so far after each scene.
     """
     runs: list[Run] = []
     failures: list[Failure] = []
-    suite = Suite(apparatus.options, apparatus.provenance, tuple(scenes), (), (), pairs)
+    suite = Suite(setup.options, setup.provenance, tuple(scenes), (), (), pairs)
     for scene in scenes:
-        waiting = _waiting_runs(scene, apparatus)
+        pending = _pending_runs(scene, setup)
         try:
-            _measure_scene(scene, waiting, apparatus)
+            _measure_scene(scene, pending, setup)
         except (MaplessError, ServerFailed, UsageError, OSError) as error:
             failures.append(Failure(scene.place.name, str(error)))
-        for run in waiting:
+        for run in pending:
             if run.complete:
                 runs.append(run.finished())
             elif not failures or failures[-1].scene != scene.place.name:
                 failures.append(Failure(scene.place.name, f"{run.label} is incomplete"))
-        suite = Suite(apparatus.options, apparatus.provenance, tuple(scenes), tuple(runs), tuple(failures), pairs)
+        suite = Suite(setup.options, setup.provenance, tuple(scenes), tuple(runs), tuple(failures), pairs)
         on_scene(suite)
     return suite
 
 
+class Journal:
+    """The results of one run as they come: a file with a line for each query.
+
+    The first line says what the run is of; the file's name ends in a digest of it. A run that is started again with the
+    same data, options, code and weights goes on where its file ends; with anything else it gets another file.
+    """
+
+    def __init__(self, folder: Path, name: str, identity: Mapping[str, Any]) -> None:
+        """Reads what is there already.
+
+        Args:
+            folder: exists.
+            name: of the run.
+            identity: what the run's results depend on, as JSON values.
+        """
+        self._head = json.dumps(identity, sort_keys=True)
+        self.path = folder / f"{name}.{hashlib.sha256(self._head.encode()).hexdigest()[:12]}.jsonl"
+        self.results: dict[str, QueryResult] = {}
+        if self.path.is_file():
+            self._read()
+
+    def _read(self) -> None:
+        """Takes whole lines; one that a crash tore, and what follows it, is cut off."""
+        content = self.path.read_bytes()
+        head, *lines = content.split(b"\n")
+        if head.decode() != self._head:
+            os.truncate(self.path, 0)
+            return
+        whole = len(head) + 1
+        for line in lines[:-1]:
+            try:
+                result = _result(json.loads(line))
+            except (ValueError, TypeError, KeyError):
+                break
+            self.results[result.name] = result
+            whole += len(line) + 1
+        if whole < len(content):
+            os.truncate(self.path, whole)
+
+    def add(self, result: QueryResult) -> None:
+        """Writes a result; it survives the program once this returns."""
+        begins = not self.path.is_file() or not self.path.stat().st_size
+        # Only rejections have infinities: they are written as null.
+        line = {
+            name: None if isinstance(value, float) and math.isinf(value) else value
+            for name, value in asdict(result).items()
+        }
+        with self.path.open("a", encoding="utf-8") as stream:
+            if begins:
+                stream.write(self._head + "\n")
+            stream.write(json.dumps(line, allow_nan=False) + "\n")
+        self.results[result.name] = result
+
+
+def _result(line: dict[str, Any]) -> QueryResult:
+    if set(line) != {field.name for field in fields(QueryResult)}:
+        raise KeyError("another version's line")
+    infinite = ("translation_error", "rotation_error_deg", "reference_distance")
+    line |= {name: math.inf for name in infinite if line[name] is None}
+    pose = None if line["pose"] is None else tuple(line["pose"])
+    return QueryResult(**line | {"references": tuple(line["references"]), "pose": pose})
+
+
 @dataclass(frozen=True, eq=False)
-class _WaitingRun:
-    """A run and how far it is."""
+class _PendingRun:
+    """A run and its results so far."""
 
     scene: SceneWork
     split: SceneSplit
@@ -152,25 +222,25 @@ class _WaitingRun:
         return Run(self.scene, self.split, self.method, results, self.journal.path)
 
 
-def _waiting_runs(scene: SceneWork, apparatus: Apparatus) -> list[_WaitingRun]:
+def _pending_runs(scene: SceneWork, setup: RunSetup) -> list[_PendingRun]:
     runs = []
-    queries = _digest(_told(frame) for frame in scene.dataset.frames if frame.split != "train")
+    queries = _digest(map(_description, (frame for frame in scene.dataset.frames if frame.split != "train")))
     for split in scene.splits:
-        references = _digest(map(_told, split.references))
-        for method in apparatus.options.methods():
+        references = _digest(map(_description, split.references))
+        for method in setup.options.methods():
             name = ".".join((scene.place.name.replace("/", "_"), setting_name(split.setting), *asdict(method).values()))
             data = {"scene": scene.place.name, "references": references, "queries": queries, **asdict(method)}
-            journal = Journal(apparatus.journals, name, {**data, **_identity(scene, apparatus)})
-            runs.append(_WaitingRun(scene, split, method, journal))
+            journal = Journal(setup.journals, name, {**data, **_identity(scene, setup)})
+            runs.append(_PendingRun(scene, split, method, journal))
     return runs
 
 
-def _identity(scene: SceneWork, apparatus: Apparatus) -> Identity:
-    """What a scene's results depend on beside the data; how many queries is no part: more go on where fewer ended."""
-    made, options = apparatus.provenance, apparatus.options
+def _identity(scene: SceneWork, setup: RunSetup) -> dict[str, Any]:
+    """What results depend on beside the data; not how many queries there are: more go on where fewer ended."""
+    made, options = setup.provenance, setup.options
     pairs = None
     if scene.pairs is not None:
-        pairs = _digest(f"{query} {frame.name}" for query, its in sorted(scene.pairs.items()) for frame in its)
+        pairs = _digest(f"{query} {frame.name}" for query, given in sorted(scene.pairs.items()) for frame in given)
     return {
         "ground_truth": scene.dataset.ground_truth,
         "k": options.k,
@@ -183,40 +253,35 @@ def _identity(scene: SceneWork, apparatus: Apparatus) -> Identity:
     }
 
 
-def _told(frame: Frame) -> str:
+def _description(frame: Frame) -> str:
     return f"{frame.name} {frame.camera} {frame.world_from_camera.matrix().round(9).tolist()}"
 
 
 def _digest(lines: Iterable[str]) -> str:
-    return sha256("\n".join(lines).encode()).hexdigest()[:16]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
-def _measure_scene(scene: SceneWork, runs: Sequence[_WaitingRun], apparatus: Apparatus) -> None:
-    waiting = [run for run in runs if not run.complete]
-    if not waiting:
-        return
-    with (
-        tempfile.TemporaryDirectory(prefix="mapless-evaluate-") as data_dir,
-        child_server(Path(data_dir)) as server,
-        Client(server.address, CONNECT) as client,
-    ):
-        for split in scene.splits:
-            its = [run for run in waiting if run.split is split]
-            if its:
-                _measure_setting(client, split, its, apparatus)
+def _measure_scene(scene: SceneWork, runs: Sequence[_PendingRun], setup: RunSetup) -> None:
+    incomplete = [run for run in runs if not run.complete]
+    if incomplete:
+        with temporary_server() as client:
+            for split in scene.splits:
+                of_split = [run for run in incomplete if run.split is split]
+                if of_split:
+                    _measure_setting(client, split, of_split, setup)
 
 
-def _measure_setting(client: Client, split: SceneSplit, runs: Sequence[_WaitingRun], apparatus: Apparatus) -> None:
+def _measure_setting(client: Client, split: SceneSplit, runs: Sequence[_PendingRun], setup: RunSetup) -> None:
     scene, scene_id = runs[0].scene, setting_name(split.setting).replace("=", "-")
 
     def labelled(label: str) -> Progress:
-        return lambda step, done, total: apparatus.progress(f"{scene.place.name}, {label}: {step}", done, total)
+        return lambda step, done, total: setup.progress(f"{scene.place.name}, {label}: {step}", done, total)
 
-    planned = _with_references(scene, split, apparatus, labelled(setting_name(split.setting)))
+    planned = _with_references(scene, split, setup, labelled(setting_name(split.setting)))
     store_references(client, scene_id, split.references, labelled(setting_name(split.setting)))
     references = {frame.name: frame for frame in split.references}
     for run in runs:
-        options = EvaluationOptions(k=apparatus.options.k, variant=run.method.variant, scale_strategy=run.method.scale)
+        options = EvaluationOptions(k=setup.options.k, variant=run.method.variant, scale_strategy=run.method.scale)
         progress = labelled(run.label)
         progress("localizing", len(run.journal.results), len(planned))
         for done, query in enumerate(planned, start=1):
@@ -226,17 +291,14 @@ def _measure_setting(client: Client, split: SceneSplit, runs: Sequence[_WaitingR
 
 
 def _with_references(
-    scene: SceneWork, split: SceneSplit, apparatus: Apparatus, progress: Progress
+    scene: SceneWork, split: SceneSplit, setup: RunSetup, progress: Progress
 ) -> tuple[PlannedQuery, ...]:
     """The queries with their references; without where the server is to choose."""
-    options = apparatus.options
+    options = setup.options
     if scene.pairs is not None:
-        pairs = scene.pairs
         known = {frame.name for frame in split.references}
-        return tuple(PlannedQuery(query, chosen(pairs, query, known, options.k)) for query in split.queries)
+        return tuple(paired(scene.pairs, query, known, options.k) for query in split.queries)
     if options.choice == "matches":
-        extractor, ratio = first_features(apparatus.settings)
-        limits = image_limits(apparatus.settings)
-        return rank_by_matches(split.queries, split.references, options.k, extractor, ratio, limits, progress)
+        return rank_by_matches(split.queries, split.references, options.k, setup.matcher, progress)
     given = split.references if options.choice == "given" else ()
     return tuple(PlannedQuery(query, given) for query in split.queries)

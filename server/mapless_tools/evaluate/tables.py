@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from .averages import Average, Group
 from .metrics import Summary
 from .paper import DENSE, Median, PaperMethod
-from .protocol import Method, setting_name
+from .plan import Method, setting_name
 from .report import format_stages
 
 OURS, PAPERS, RIVAL = "ours", "paper", "rival"

@@ -94,7 +94,7 @@ def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> lis
     from mapless_server.settings import available_cores
     from mapless_tools.charts import write_figure
     from mapless_tools.demo import place_of
-    from mapless_tools.evaluate.command import usage_errors
+    from mapless_tools.usage import usage_errors
 
     from .charts import draw_load
     from .pipeline import PipelineOptions, measure_pipeline, pipeline_checks, pipeline_json
@@ -118,7 +118,7 @@ def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Ch
     from mapless_server.settings import available_cores
     from mapless_tools.charts import write_figure
     from mapless_tools.demo import place_of
-    from mapless_tools.evaluate.command import usage_errors
+    from mapless_tools.usage import usage_errors
 
     from .charts import draw_soak
     from .report import machine_lines, step_lines
@@ -165,19 +165,13 @@ def _report(
 
 @contextmanager
 def _measuring() -> Iterator[Progress]:
-    """Progress bars; what goes wrong ends the command with one line."""
-    from mapless import MaplessError
+    """Progress bars; a failure ends the command with one line."""
     from mapless_server.serve.signals import terminable
-    from mapless_tools.child import ServerFailed
-    from mapless_tools.evaluate.plan import UsageError
     from mapless_tools.progress import progress_bars
+    from mapless_tools.usage import failures_end_command
 
-    try:
-        with terminable(), progress_bars() as progress:
-            yield progress
-    except (UsageError, ServerFailed, MaplessError) as error:
-        print(f"mapless-server: {error}", file=sys.stderr)
-        raise typer.Exit(2 if isinstance(error, UsageError) else 1) from None
+    with failures_end_command(), terminable(), progress_bars() as progress:
+        yield progress
 
 
 def _finish(checks: list[Check]) -> None:

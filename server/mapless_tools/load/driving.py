@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapless import Client
-from mapless_tools.child import child_server
+from mapless_tools.child import CONNECT, child_server
 from mapless_tools.demo import Place
-from mapless_tools.evaluate.run import CONNECT
 from mapless_tools.progress import Progress
 
 from .arrivals import Mix, Requests, plan_calls

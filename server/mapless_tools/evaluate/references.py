@@ -1,0 +1,197 @@
+"""Which references each query is given: by feature matches, or as a file says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from mapless_server.errors import InvalidArgument
+from mapless_server.images.decode import ImageLimits, decode_image, image_size
+from mapless_server.method.correspond import OPTIONS
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.retrieve import choose_references
+from mapless_server.method.views import PosedView, View
+from mapless_server.networks.weights import WeightsError
+from mapless_server.serve.assembly import image_limits, make_first_features
+from mapless_server.settings import Settings, available_cores
+from mapless_tools.dataset import Dataset, Frame
+from mapless_tools.progress import Progress
+from mapless_tools.usage import UsageError
+
+T = TypeVar("T")
+Pairs = Mapping[str, tuple[Frame, ...]]
+"""By a query frame's name, its references, most similar first."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedQuery:
+    """A frame to localize and the references it is given, most similar first; none: the server chooses."""
+
+    frame: Frame
+    references: tuple[Frame, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Matcher:
+    """The features that queries and references are compared by.
+
+    Attributes:
+        extractor: finds them.
+        ratio: of a match with the query.
+        limits: of photographs.
+    """
+
+    extractor: FeatureExtractor
+    ratio: float
+    limits: ImageLimits
+
+    @classmethod
+    def of(cls, settings: Settings) -> Matcher:
+        """With the first features that a server of these settings has.
+
+        Raises:
+            UsageError: the settings ask for features that are not there.
+        """
+        try:
+            features, extractor = make_first_features(settings)
+        except (ValueError, ImportError, WeightsError) as error:
+            raise UsageError(str(error)) from error
+        return cls(extractor, OPTIONS[features].query_ratio, image_limits(settings))
+
+
+def check_images(frames: Iterable[Frame], limits: ImageLimits) -> None:
+    """Reads the images' headers.
+
+    Raises:
+        UsageError: an image is missing, too large, no JPEG, PNG or WebP, or of another size than its camera.
+    """
+    for frame in frames:
+        try:
+            size = image_size(frame.image_path.read_bytes(), limits)
+        except (InvalidArgument, OSError) as error:
+            raise UsageError(f"{frame.image_path}: {error}") from error
+        camera = frame.camera
+        if size != (camera.width_px, camera.height_px):
+            raise UsageError(
+                f"{frame.image_path} has {size[0]}x{size[1]} pixels, cameras.json says "
+                f"{camera.width_px}x{camera.height_px}"
+            )
+
+
+def rank_by_matches(
+    queries: Sequence[Frame], references: Sequence[Frame], k: int, matcher: Matcher, progress: Progress
+) -> tuple[PlannedQuery, ...]:
+    """The queries, each with those k references, itself excepted, that share the most feature matches with it.
+
+    The true poses are not looked at. The ranking is the server's own (`retrieve`), done here because a query that is
+    left out must not be offered itself.
+
+    Raises:
+        UsageError: an image is damaged.
+    """
+    used = tuple(dict.fromkeys((*references, *queries)))
+
+    def view_of(frame: Frame) -> View:
+        try:
+            return matcher.extractor.extract(decode_image(frame.image_path.read_bytes(), matcher.limits), frame.camera)
+        except InvalidArgument as error:
+            raise UsageError(f"{frame.image_path}: {error}") from error
+
+    views = dict(zip(used, _map(view_of, used, "features", progress), strict=True))
+
+    def planned(query: Frame) -> PlannedQuery:
+        candidates = [frame for frame in references if frame is not query]
+        posed = [PosedView(frame.name, frame.name, views[frame], frame.world_from_camera) for frame in candidates]
+        chosen = choose_references(views[query], posed, k, ratio=matcher.ratio)
+        return PlannedQuery(query, tuple(candidates[i] for i in chosen))
+
+    return tuple(_map(planned, queries, "choosing references", progress))
+
+
+def pairs_file(path: Path, scene: str, scene_count: int) -> Path:
+    """The file of a scene's pairs: the one given, or in a folder the one of the scene's name.
+
+    Raises:
+        UsageError: there is no such file, or one file is given for several scenes.
+    """
+    if path.is_dir():
+        path = path / f"{scene.replace('/', '_')}.txt"
+    elif scene_count > 1:
+        raise UsageError(f"{path} is one file for {scene_count} scenes: give a folder with SCENE.txt for each")
+    if not path.is_file():
+        raise UsageError(f"there is no file {path} with the pairs of {scene}")
+    return path
+
+
+def read_pairs(file: Path, dataset: Dataset, folder: Path) -> Pairs:
+    """References of each query as hloc writes them: lines "query reference", most similar first.
+
+    An image is named by its path from the scene's folder, or by its frame's name.
+
+    Raises:
+        UsageError: the file cannot be read, a line is no pair, an image is unknown, a query is no test frame, or a
+            reference is no training frame.
+    """
+    frames = _by_name(dataset, folder)
+    pairs: dict[str, list[Frame]] = {}
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{file} cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    for number, line in enumerate(lines, start=1):
+        names = line.split()
+        if not names:
+            continue
+        if len(names) != 2:
+            raise UsageError(f"{file}, line {number}: a query and a reference are wanted, not {line.strip()!r}")
+        unknown = [name for name in names if name not in frames]
+        if unknown:
+            raise UsageError(f"{file}, line {number}: {dataset.name} has no image {unknown[0]!r}")
+        query, reference = (frames[name] for name in names)
+        for frame, split in ((query, "test"), (reference, "train")):
+            if frame.split != split:
+                raise UsageError(f"{file}, line {number}: {frame.name} is not in the {split} split")
+        if reference not in pairs.setdefault(query.name, []):
+            pairs[query.name].append(reference)
+    if not pairs:
+        raise UsageError(f"{file} has no pairs")
+    return {query: tuple(references) for query, references in pairs.items()}
+
+
+def paired(pairs: Pairs, query: Frame, references: Set[str], k: int) -> PlannedQuery:
+    """A query with the first k of its pairs that are among the named references of the setting.
+
+    Raises:
+        UsageError: there are none.
+    """
+    chosen = tuple(frame for frame in pairs.get(query.name, ()) if frame.name in references)[:k]
+    if not chosen:
+        raise UsageError(f"the pairs file names no reference of the query {query.name} among those of the setting")
+    return PlannedQuery(query, chosen)
+
+
+def _by_name(dataset: Dataset, folder: Path) -> dict[str, Frame]:
+    root = folder.resolve()
+    frames = {frame.name: frame for frame in dataset.frames}
+    for frame in dataset.frames:
+        path = frame.image_path.resolve()
+        if path.is_relative_to(root):
+            frames[path.relative_to(root).as_posix()] = frame
+    return frames
+
+
+def _map(function: Callable[[Frame], T], items: Sequence[Frame], step: str, progress: Progress) -> list[T]:
+    results: list[T] = []
+    with ThreadPoolExecutor(available_cores()) as pool:
+        progress(step, 0, len(items))
+        try:
+            for result in pool.map(function, items):
+                results.append(result)
+                progress(step, len(results), len(items))
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return results

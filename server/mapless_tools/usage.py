@@ -1,0 +1,43 @@
+"""How a command ends that cannot do its work: one line on standard error, and an exit code that says whose fault it is.
+
+Imports nothing that takes time.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from mapless_server.serve.command import fail
+
+
+class UsageError(ValueError):
+    """Arguments, settings or a folder are wrong, or do not fit together; the message is for a person."""
+
+
+@contextmanager
+def usage_errors() -> Iterator[None]:
+    """Turns ValueError and ConfigError into UsageError; for a block that checks arguments and computes nothing."""
+    from mapless_server.settings import ConfigError
+
+    try:
+        yield
+    except (ValueError, ConfigError) as error:
+        raise UsageError(str(error)) from error
+
+
+@contextmanager
+def failures_end_command(interrupted: str = "interrupted") -> Iterator[None]:
+    """Ends the command after a failure: exit code 2 for wrong usage, 1 for a server or a file, 130 after Ctrl-C."""
+    from mapless import MaplessError
+    from mapless_tools.child import ServerFailed
+
+    try:
+        yield
+    except UsageError as error:
+        fail(str(error))
+    except (ServerFailed, MaplessError, OSError) as error:
+        fail(str(error), code=1)
+    except KeyboardInterrupt:
+        fail(interrupted, code=128 + signal.SIGINT)
