@@ -277,14 +277,19 @@ def _distortion(entry: Mapping[str, Any]) -> Distortion | None:
 def _numbers(entry: Mapping[str, Any], field: str, shape: tuple[int, ...] | None) -> Array:
     if field not in entry:
         raise ValueError(f"{field} is missing")
+    return finite_numbers(entry[field], field, shape)
+
+
+def finite_numbers(value: object, what: str, shape: tuple[int, ...] | None = None) -> Array:
+    """Numbers, or their texts, as an array; ValueError, naming `what` they are, for others or another shape."""
     try:
-        values = np.array(entry[field], dtype=float)
+        values = np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError) as error:  # JSON's integers have any number of digits
-        raise ValueError(f"{field} must be numbers") from error
+        raise ValueError(f"{what} must be numbers") from error
     if shape is not None and values.shape != shape:
         raise ValueError(
-            f"{field} must be {'x'.join(map(str, shape))}, is {'x'.join(map(str, values.shape)) or 'a scalar'}"
+            f"{what} must be {'x'.join(map(str, shape))} numbers, is {'x'.join(map(str, values.shape)) or 'a scalar'}"
         )
     if not np.isfinite(values).all():
-        raise ValueError(f"{field} is not finite")
+        raise ValueError(f"{what} is not finite")
     return values

@@ -19,10 +19,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless_tools.dataset import Dataset, read_json
+from mapless_tools.dataset import Dataset, finite_numbers, read_json
 
 from .collecting import Collector, from_corner, from_opengl, natural_order, size_of
 from .options import ReadOptions
@@ -107,15 +105,15 @@ def _scanner_frame(content: Mapping[str, Any], size: tuple[int, int]) -> tuple[C
 def _polycam_frame(content: Mapping[str, Any], size: tuple[int, int]) -> tuple[Camera, RigidTransform]:
     names = [f"t_{row}{column}" for row in range(3) for column in range(4)]
     fields = ("fx", "fy", "cx", "cy", "width", "height")
-    missing = [name for name in (*names, *fields) if name not in content]
-    if missing:
-        raise ValueError(f"{missing[0]} is missing")
-    values = {"pose": [content[name] for name in names], "intrinsics": [content[name] for name in fields]}
-    *k, width, height = _numbers(values, "intrinsics", 6).tolist()
+    for name in (*names, *fields):
+        if name not in content:
+            raise ValueError(f"{name} is missing")
+    *k, width, height = finite_numbers([content[name] for name in fields], "intrinsics", (6,)).tolist()
     if (width, height) != size:
         raise ValueError(f"width and height are {width:g}x{height:g}, the image is {size[0]}x{size[1]}")
+    matrix = finite_numbers([content[name] for name in names], "pose", (12,)).reshape(3, 4)
     try:
-        return Camera(*size, *k), RigidTransform.from_matrix(_numbers(values, "pose", 12).reshape(3, 4))
+        return Camera(*size, *k), RigidTransform.from_matrix(matrix)
     except ValueError as error:
         raise ValueError(f"t_00 to t_23: {error}") from error
 
@@ -123,10 +121,5 @@ def _polycam_frame(content: Mapping[str, Any], size: tuple[int, int]) -> tuple[C
 def _numbers(content: Mapping[str, Any], field: str, count: int) -> Array:
     if field not in content:
         raise ValueError(f"{field} is missing")
-    try:
-        values = np.array(content[field], dtype=float).reshape(-1)
-    except (TypeError, ValueError, OverflowError) as error:  # JSON's integers have any number of digits
-        raise ValueError(f"{field} must be numbers") from error
-    if len(values) != count or not np.isfinite(values).all():
-        raise ValueError(f"{field} must be {count} finite numbers")
-    return values
+    values = finite_numbers(content[field], field)
+    return finite_numbers(values.reshape(-1), field, (count,))

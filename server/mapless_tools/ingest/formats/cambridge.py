@@ -12,10 +12,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from mapless.geometry import Camera, Quaternion, RadialTangential, RigidTransform
-from mapless_tools.dataset import Dataset
+from mapless.geometry import Camera, RadialTangential, RigidTransform
+from mapless_tools.dataset import Dataset, finite_numbers
 
-from .collecting import Collector, from_corner, natural_order, numbers, read_text, size_of
+from .collecting import Collector, from_corner, natural_order, read_text, rotation_of, size_of
 from .options import ReadOptions
 
 SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
@@ -88,12 +88,8 @@ def _pose_lines(file: Path) -> Iterator[list[str]]:
 
 
 def _world_from_camera(words: list[str]) -> RigidTransform:
-    x, y, z, qw, qx, qy, qz = numbers(words, 7, "pose").tolist()
-    try:
-        rotation = Quaternion(qx, qy, qz, qw).matrix()
-    except ValueError as error:
-        raise ValueError(f"pose: {error}") from error
-    return RigidTransform(rotation.T, numbers([str(x), str(y), str(z)], 3, "pose"))
+    values = finite_numbers(words, "pose", (7,))
+    return RigidTransform(rotation_of(values[3:], "pose").T, values[:3])
 
 
 def _lenses(file: Path) -> Mapping[str, Lens]:
@@ -113,7 +109,7 @@ def _lenses(file: Path) -> Mapping[str, Lens]:
         number, line = next(filled, (number + 1, ""))
         words = line.rsplit(maxsplit=10)  # a name may have spaces
         try:
-            values = numbers(words[1:], 10, "focal length, quaternion, centre, distortion and a zero")
+            values = finite_numbers(words[1:], "focal length, quaternion, centre, distortion and a zero", (10,))
             if not values[0] > 0:
                 raise ValueError("the focal length must be above 0")
         except ValueError as error:

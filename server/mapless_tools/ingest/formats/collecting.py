@@ -7,14 +7,14 @@ in the folder, is there and is named once; the pose can be one.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from mapless.geometry import MAX_COORDINATE_M, Array, Camera, RigidTransform
+from mapless.geometry import MAX_COORDINATE_M, Array, Camera, Quaternion, RigidTransform
 from mapless_server.errors import InvalidArgument
 from mapless_server.images.decode import ImageLimits, image_size
 from mapless_tools.dataset import MAX_SIDE_PX, Dataset, Frame, Refusal, image_file, legal_id
@@ -144,17 +144,13 @@ def read_text(file: Path) -> str:
         raise ValueError(f"{file} is not text: {error}") from error
 
 
-def numbers(words: Sequence[str], count: int, what: str) -> Array:
-    """Finite numbers (count,) of their texts; ValueError, naming `what` they are."""
-    if len(words) != count:
-        raise ValueError(f"{what} must be {count} numbers, are {len(words)}")
+def rotation_of(quaternion: Array, what: str) -> Array:
+    """The rotation of a unit quaternion (w, x, y, z); ValueError, naming `what` it is of, if it is none."""
+    w, x, y, z = quaternion.tolist()
     try:
-        values = np.array([float(word) for word in words])
+        return Quaternion(x, y, z, w).matrix()
     except ValueError as error:
         raise ValueError(f"{what}: {error}") from error
-    if not np.isfinite(values).all():
-        raise ValueError(f"{what} is not finite")
-    return values
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:

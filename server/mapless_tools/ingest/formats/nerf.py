@@ -16,10 +16,8 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import numpy as np
-
-from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential, RigidTransform, nearest_rotation
-from mapless_tools.dataset import Dataset, read_json
+from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform, nearest_rotation
+from mapless_tools.dataset import Dataset, finite_numbers, read_json
 
 from .collecting import Collector, from_corner, from_opengl, natural_order, size_of
 from .options import ReadOptions
@@ -88,8 +86,9 @@ def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
 
 
 def _world_from_camera(frame: Mapping[str, Any], scale: float, world_from_original: RigidTransform) -> RigidTransform:
+    matrix = finite_numbers(frame.get("transform_matrix"), "transform_matrix")
     try:
-        pose = RigidTransform.from_matrix(_matrix(frame.get("transform_matrix")))
+        pose = RigidTransform.from_matrix(matrix)
     except ValueError as error:
         raise ValueError(f"transform_matrix: {error}") from error
     unscaled = RigidTransform(pose.rotation, pose.translation / scale)
@@ -143,10 +142,10 @@ def _applied(content: Mapping[str, Any]) -> tuple[float, RigidTransform]:
         raise ValueError(f"applied_scale must be above 0, is {scale:g}")
     if "applied_transform" not in content:
         return scale, RigidTransform.identity()
+    matrix = finite_numbers(content["applied_transform"], "applied_transform")
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise ValueError(f"applied_transform must be 3x4, is {'x'.join(map(str, matrix.shape))}")
     try:
-        matrix = _matrix(content["applied_transform"])
-        if matrix.shape not in ((3, 4), (4, 4)):
-            raise ValueError(f"must be 3x4, is {'x'.join(map(str, matrix.shape))}")
         return scale, RigidTransform(nearest_rotation(matrix[:3, :3]), matrix[:3, 3])
     except ValueError as error:
         raise ValueError(f"applied_transform: {error}") from error
@@ -162,16 +161,6 @@ def _splits(content: Mapping[str, Any]) -> dict[str, str]:
             if splits.setdefault(str(name), split) != split:
                 raise ValueError(f"{field}: {name} is in both splits")
     return splits
-
-
-def _matrix(value: Any) -> Array:
-    try:
-        matrix = np.array(value, dtype=float)
-    except (TypeError, ValueError, OverflowError) as error:  # JSON's integers have any number of digits
-        raise ValueError("must be numbers") from error
-    if not np.isfinite(matrix).all():
-        raise ValueError("is not finite")
-    return matrix
 
 
 def _number(value: Mapping[str, Any], field: str, default: float) -> float:

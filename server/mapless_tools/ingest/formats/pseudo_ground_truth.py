@@ -13,9 +13,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapless.geometry import Camera, Quaternion, RigidTransform
+from mapless.geometry import Camera, RigidTransform
+from mapless_tools.dataset import finite_numbers
 
-from .collecting import check_camera, from_corner, numbers, read_text
+from .collecting import check_camera, from_corner, read_text, rotation_of
 from .colmap.model import Model, find_model, read_model
 from .options import Intrinsics
 
@@ -52,13 +53,10 @@ class PosesBySplit:
     def _from_line(self, image: str, size: tuple[int, int]) -> tuple[Camera, RigidTransform]:
         if image not in self.lines:
             raise ValueError(f"ground truth: {self.source} has no pose of {image}")
-        w, x, y, z, *translation, focal_px = numbers(self.lines[image], 8, "ground truth")
-        try:
-            rotation = Quaternion(float(x), float(y), float(z), float(w)).matrix()
-        except ValueError as error:
-            raise ValueError(f"ground truth: {error}") from error
-        camera_from_world = RigidTransform(rotation, numbers([str(t) for t in translation], 3, "ground truth"))
-        camera = Camera(*size, float(focal_px), float(focal_px), size[0] / 2, size[1] / 2)
+        values = finite_numbers(self.lines[image], "ground truth", (8,))
+        camera_from_world = RigidTransform(rotation_of(values[:4], "ground truth"), values[4:7])
+        focal_px = float(values[7])
+        camera = Camera(*size, focal_px, focal_px, size[0] / 2, size[1] / 2)
         return from_corner(camera), camera_from_world.inverse()
 
 

@@ -14,12 +14,10 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
+from mapless.geometry import RigidTransform
+from mapless_tools.dataset import Dataset, finite_numbers
 
-from mapless.geometry import Array, RigidTransform
-from mapless_tools.dataset import Dataset
-
-from .collecting import Collector, numbers, read_text, size_of
+from .collecting import Collector, read_text, size_of
 from .options import Intrinsics, ReadOptions
 from .pseudo_ground_truth import GROUND_TRUTH, PosesBySplit, find_ground_truth
 
@@ -78,10 +76,8 @@ def read_pose(file: Path) -> RigidTransform:
     """The pose in a text file of 4x4 numbers; ValueError if there is none, as in frames where tracking was lost."""
     if not file.is_file():
         raise ValueError(f"pose: there is no file {file}")
-    matrix: Array = np.empty((0, 0))
     try:
-        matrix = numbers(read_text(file).split(), 16, "pose").reshape(4, 4)
-        return RigidTransform.from_matrix(matrix)
+        return RigidTransform.from_matrix(finite_numbers(read_text(file).split(), "pose", (16,)).reshape(4, 4))
     except ValueError as error:
         raise ValueError(f"pose: {file.name}: {error}") from error
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from mapless.geometry import Array, Camera, RadialTangential, RigidTransform
-from mapless_tools.dataset import Dataset
+from mapless_tools.dataset import Dataset, finite_numbers
 
-from .collecting import Collector, numbers, read_text, size_of
+from .collecting import Collector, read_text, size_of
 from .options import ReadOptions
 
 MAX_GAP_S = 0.02
@@ -47,7 +47,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
         with collector.attempt(f"rgb.txt:{number} ({words[-1]})"):
             if len(words) != 2:
                 raise ValueError(f"expected a time and a path, found {len(words)} words")
-            time_s = float(numbers(words[:1], 1, "time")[0])
+            time_s = float(finite_numbers(words[0], "time"))
             size = size_of(collector.image(words[1]))
             if options.intrinsics is not None:
                 camera = options.intrinsics.camera(*size)
@@ -77,7 +77,7 @@ def _lines(file: Path) -> list[tuple[int, list[str]]]:
 
 def _row(file: Path, number: int, words: list[str]) -> Array:
     try:
-        row = numbers(words, 8, "time, position and quaternion")
+        row = finite_numbers(words, "time, position and quaternion", (8,))
         if not abs(np.linalg.norm(row[4:]) - 1) < 1e-2:
             raise ValueError("the quaternion must have norm 1")
     except ValueError as error:
@@ -108,10 +108,5 @@ class _Trajectory:
         gap_s = max(time_s - self._time_s[before], self._time_s[after] - time_s)
         if gap_s > MAX_GAP_S:
             raise ValueError(f"pose: the ground truth has none within {1000 * MAX_GAP_S:g} ms, only {1000 * gap_s:.0f}")
-        position = [
-            float(np.interp(time_s, self._time_s[before : after + 1], axis)) for axis in self._between(before, after)
-        ]
-        return RigidTransform(self._slerp(time_s).as_matrix(), np.array(position))
-
-    def _between(self, before: int, after: int) -> Array:
-        return np.asarray(self._position[before : after + 1].T)
+        position = np.array([np.interp(time_s, self._time_s, axis) for axis in self._position.T])
+        return RigidTransform(self._slerp(time_s).as_matrix(), position)

@@ -10,9 +10,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from mapless_tools.dataset import Dataset
+from mapless_tools.dataset import Dataset, finite_numbers
 
-from .collecting import Collector, check_camera, numbers, read_text, size_of
+from .collecting import Collector, check_camera, read_text, size_of
 from .options import Intrinsics, ReadOptions
 from .pseudo_ground_truth import GROUND_TRUTH, find_ground_truth
 from .seven_scenes import read_pose
@@ -64,9 +64,9 @@ def _intrinsics(file: Path) -> tuple[tuple[int, int], Intrinsics]:
             raise ValueError(f"{file}: {field} is missing")
     width, height, matrix = (values[field].split() for field in fields)
     try:
-        k = numbers(matrix, 16, fields[2]).reshape(4, 4)
-        size = numbers(width, 1, fields[0]), numbers(height, 1, fields[1])
-        return (int(size[0][0]), int(size[1][0])), Intrinsics(*(float(k[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))))
+        k = finite_numbers(matrix, fields[2], (16,))
+        size = (int(finite_numbers(width, fields[0], (1,))[0]), int(finite_numbers(height, fields[1], (1,))[0]))
+        return size, Intrinsics(*k[[0, 5, 2, 6]].tolist())
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
 
