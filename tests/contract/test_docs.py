@@ -35,7 +35,7 @@ from mapless_server.store.faults import RETRY_AFTER_S
 from mapless_server.store.postgresql import CONNECTION_WAIT_S, CONNECTIONS_AT_MOST, CONNECTIONS_KEPT
 from mapless_tools.cli.app import app
 
-SERVER = Path(errors.__file__).parent
+SERVER, CLIENT = Path(errors.__file__).parent, Path(client_errors.__file__).parent
 DOCS, DEPLOY = ROOT / "docs", ROOT / "deploy"
 PAST = ("CHANGELOG.md", "history.md", "city.md")
 CURRENT = "\n".join(page.read_text() for page in PAGES if page.name not in PAST)
@@ -115,6 +115,16 @@ def test_architecture_names_files_that_exist(page: Path) -> None:
     bases = [ROOT, SERVER, SERVER / "method"]
     for name in re.findall(r"`([\w./]+(?:\.py|/))`", page.read_text()):
         assert any((base / name).exists() for base in bases), name
+
+
+def test_architecture_names_types_that_exist() -> None:
+    """Classes of the server, or messages and methods of the interface."""
+    text = "".join(page.read_text() for page in (DOCS / "architecture").iterdir())
+    paths = (*SERVER.rglob("*.py"), *CLIENT.glob("*.py"), *(ROOT / "proto").rglob("*.proto"))
+    sources = "".join(path.read_text() for path in paths)
+    named = set(re.findall(r"`([A-Z][a-z]\w+)`", text))
+    assert {"QueryRun", "LocalizeRequest"} <= named
+    assert sorted(name for name in named if not re.search(rf"(class|message|rpc) {name}\b", sources)) == []
 
 
 def test_the_table_of_rooms_is_the_ladder_of_imports() -> None:
