@@ -87,8 +87,7 @@ def verdict_lines(verdict: Verdict, frames: Sequence[Frame]) -> list[str]:
     ]
     if verdict.unmatched_count > len(verdict.pairs):
         lines.append(
-            f"warning: {verdict.unmatched_count} further pairs have too few matches: do positions and headings say who "
-            "is near?"
+            f"warning: {verdict.unmatched_count} further pairs have too few matches: are positions and headings right?"
         )
     return lines
 

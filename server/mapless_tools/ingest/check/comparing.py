@@ -1,7 +1,7 @@
 """The epipolar check of a dataset: photographs are read and described, pairs matched and judged.
 
-It comes before anything is uploaded. Poses that are wrong may not tell who stands near whom, so when they do not fit,
-photographs that are near in the folder's order are compared as well.
+It comes before anything is uploaded. Wrong poses may not show which photographs are near each other, so when they do
+not fit, photographs that are near in the folder's order are compared as well.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from .errors import MatchedPair
 from .pairs import Pair, more_pairs, pairs_by_order, pairs_by_pose
 from .verdict import Verdict, judge
 
-MAX_ACCUSED = 12
-"""Photographs of bad pairs that are compared with more neighbours, to tell which of the two it is."""
+MAX_SUSPECTED = 12
+"""Photographs of bad pairs that are compared with more neighbours, to find out which of the two it is."""
 
 MORE_PAIRS = 3
 
@@ -39,7 +39,7 @@ def check_frames(frames: Sequence[Frame], progress: Progress, extractor: Feature
 
     Args:
         frames: with the poses to check.
-        progress: told how far it is.
+        progress: called with how far it is.
         extractor: SIFT if none.
     """
     poses = [frame.world_from_camera for frame in frames]
@@ -51,10 +51,10 @@ def check_frames(frames: Sequence[Frame], progress: Progress, extractor: Feature
     if verdict.is_wrong or len(verdict.pairs) <= verdict.unmatched_count:
         work.compare(pairs_by_order(len(frames)))
         return work.verdict()
-    accused = list(dict.fromkeys(i for error in verdict.pairs if error.is_bad for i in error.pair))[:MAX_ACCUSED]
-    for reference in accused:
+    suspected = list(dict.fromkeys(i for error in verdict.pairs if error.is_bad for i in error.pair))[:MAX_SUSPECTED]
+    for reference in suspected:
         work.compare(more_pairs(poses, reference, work.pairs, MORE_PAIRS))
-    return work.verdict() if accused else verdict
+    return work.verdict() if suspected else verdict
 
 
 @dataclass

@@ -1,17 +1,27 @@
-"""Which usual mistake would make poses fit that do not."""
+"""Which usual mistake in poses or intrinsics, corrected, makes poses fit that do not.
+
+A correction turns a pose as it was given into what was meant. A pose with mirrored axes stays a rotation when both the
+world and the camera are mirrored, which is how left-handed engines come through unnoticed.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .conventions import CONVENTIONS, FOCAL_SCALES, Correction, corrected, focal_scaled
+from mapless.geometry import Array, Quaternion, RigidTransform
+from mapless_server.method.views import PosedView
+
 from .errors import MatchedPair, PairError, Views, errors_of, summary, summary_with
 
+Correction = Callable[[RigidTransform], RigidTransform]
+
+FOCAL_SCALES = np.geomspace(0.2, 5.0, 33)
+"""Wrong image sizes are usually wrong by a factor of up to four."""
 FOCAL_TOLERANCE = 0.03
 """A focal length that would have to change by less is not the reason."""
 
@@ -22,12 +32,58 @@ _REFINEMENTS = 3
 _ENOUGH_MATCHES = 64  # for a median that tells mistakes apart
 
 
+def _turned_camera(rotation: Array) -> Correction:
+    return lambda pose: RigidTransform(pose.rotation @ rotation, pose.translation)
+
+
+def _mirrored(pose: RigidTransform) -> RigidTransform:
+    mirror = np.diag([1.0, -1.0, 1.0])
+    return RigidTransform(mirror @ pose.rotation @ mirror, mirror @ pose.translation)
+
+
+def _reordered(order: tuple[int, int, int, int]) -> Correction:
+    """The quaternion (x, y, z, w) of what was read, its parts taken in another order."""
+
+    def correct(pose: RigidTransform) -> RigidTransform:
+        q = pose.quaternion()
+        parts = (q.x, q.y, q.z, q.w)
+        return RigidTransform(Quaternion(*(parts[i] for i in order)).matrix(), pose.translation)
+
+    return correct
+
+
+def _within_inverse(correction: Correction) -> Correction:
+    """The correction of camera_from_world."""
+    return lambda pose: correction(pose.inverse()).inverse()
+
+
+_OPENGL = _turned_camera(np.diag([1.0, -1.0, -1.0]))
+_QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_W_FIRST = _reordered((1, 2, 3, 0))
+_W_LAST = _reordered((3, 0, 1, 2))
+
+CONVENTIONS: Mapping[str, Correction] = {
+    "the camera axes are OpenGL's (x right, y up, z back)": _OPENGL,
+    "the poses are camera_from_world, not world_from_camera": RigidTransform.inverse,
+    "the poses are camera_from_world with OpenGL's camera axes": lambda pose: _OPENGL(pose.inverse()),
+    "the quaternions are w x y z and were read as x y z w": _W_FIRST,
+    "the quaternions are x y z w and were read as w x y z": _W_LAST,
+    "the quaternions of camera_from_world are w x y z and were read as x y z w": _within_inverse(_W_FIRST),
+    "the quaternions of camera_from_world are x y z w and were read as w x y z": _within_inverse(_W_LAST),
+    "the poses are of images turned by 90 degrees (EXIF orientation)": _turned_camera(_QUARTER),
+    "the poses are of images turned by 180 degrees (EXIF orientation)": _turned_camera(_QUARTER @ _QUARTER),
+    "the poses are of images turned by 270 degrees (EXIF orientation)": _turned_camera(_QUARTER.T),
+    "the axes are left-handed (y up, as in Unity)": _mirrored,
+}
+"""Corrections by what the report says of the mistake."""
+
+
 @dataclass(frozen=True)
 class Explanation:
     """A likely mistake.
 
     Attributes:
-        text: what a person is told; empty if there is none.
+        text: for the report; empty if there is none.
         error_px: median error of the pairs if it were corrected.
         photographs: those that it concerns, where it does not concern all.
     """
@@ -48,7 +104,7 @@ def explain(views: Views, matched: Sequence[MatchedPair], given_px: float) -> Ex
     matched = [MatchedPair(item.pair, item.matches[:: 1 + len(item.matches) // _ENOUGH_MATCHES]) for item in matched]
     candidates = []
     for text, correction in CONVENTIONS.items():
-        error_px, bad_share = summary_with(views, matched, lambda view, c=correction: corrected(view, c))  # type: ignore[misc]
+        error_px, bad_share = summary_with(views, matched, lambda view, c=correction: _corrected(view, c))  # type: ignore[misc]
         if bad_share < _BAD_SHARE:
             candidates.append(Explanation(text, error_px))
     scale, error_px, bad_share = best_focal_scale(views, matched)
@@ -59,36 +115,32 @@ def explain(views: Views, matched: Sequence[MatchedPair], given_px: float) -> Ex
         )
         candidates.append(Explanation(text, error_px))
     fitting = [candidate for candidate in candidates if candidate.error_px < _GAIN * given_px]
-    return min(fitting, key=lambda candidate: candidate.error_px) if fitting else _explain_mixed(views, matched)
+    if not fitting:  # perhaps it was made with some photographs only
+        mixed = [_mixed(views, matched, text, correction) for text, correction in CONVENTIONS.items()]
+        fitting = [explanation for explanation in mixed if explanation.text]
+    return min(fitting, key=lambda it: it.error_px, default=Explanation())
 
 
 def best_focal_scale(views: Views, matched: Sequence[MatchedPair]) -> tuple[float, float, float]:
     """The factor on all focal lengths with the least median error, that error, and the share of bad pairs then."""
+
+    def summary_at(scale: float) -> tuple[float, float]:
+        return summary_with(views, matched, lambda view: _focal_scaled(view, scale))
+
     scales = FOCAL_SCALES
     for _ in range(_REFINEMENTS):
-        medians = [
-            summary_with(views, matched, lambda view, s=scale: focal_scaled(view, s))[0]  # type: ignore[misc]
-            for scale in scales
-        ]
-        best = int(np.argmin(medians))
+        best = int(np.argmin([summary_at(scale)[0] for scale in scales]))
         low, high = scales[max(best - 1, 0)], scales[min(best + 1, len(scales) - 1)]
         scale = float(scales[best])
         scales = np.geomspace(low, high, 9)
-    return scale, *summary_with(views, matched, lambda view: focal_scaled(view, scale))
-
-
-def _explain_mixed(views: Views, matched: Sequence[MatchedPair]) -> Explanation:
-    """A mistake that was made with some photographs only; none if that does not explain it either."""
-    found = [_mixed(views, matched, text, correction) for text, correction in CONVENTIONS.items()]
-    fitting = [explanation for explanation in found if explanation.text]
-    return min(fitting, key=lambda explanation: explanation.error_px) if fitting else Explanation()
+    return scale, *summary_at(scale)
 
 
 def _mixed(views: Views, matched: Sequence[MatchedPair], text: str, correction: Correction) -> Explanation:
-    """With every pair free to have either, both or none of its photographs corrected."""
-    turned = {i: corrected(view, correction) for i, view in views.items()}
+    """With every pair free to have either, both or none of its photographs corrected; empty if that does not fit."""
+    turned = {i: _corrected(view, correction) for i, view in views.items()}
     best: list[PairError] = []
-    said: Counter[int] = Counter()
+    votes: Counter[int] = Counter()
     for item in matched:
         choices = [
             (error, chosen)
@@ -99,9 +151,19 @@ def _mixed(views: Views, matched: Sequence[MatchedPair], text: str, correction: 
             error, chosen = min(choices, key=lambda choice: choice[0].error_px)
             best.append(error)
             for i in item.pair:
-                said[i] += 1 if i in chosen else -1
+                votes[i] += 1 if i in chosen else -1
     error_px, bad_share = summary(best)
-    concerned = tuple(sorted(i for i, votes in said.items() if votes > 0))
+    concerned = tuple(sorted(i for i, count in votes.items() if count > 0))
     if bad_share >= _MIXED_BAD_SHARE or not concerned:
         return Explanation()
     return Explanation(f"with some photographs, not all, {text}", error_px, concerned)
+
+
+def _corrected(view: PosedView, correction: Correction) -> PosedView:
+    return replace(view, world_from_camera=correction(view.world_from_camera))
+
+
+def _focal_scaled(view: PosedView, scale: float) -> PosedView:
+    camera = view.view.camera
+    scaled = replace(camera, focal_x_px=scale * camera.focal_x_px, focal_y_px=scale * camera.focal_y_px)
+    return replace(view, view=replace(view.view, camera=scaled))

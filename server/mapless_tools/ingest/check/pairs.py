@@ -20,7 +20,7 @@ BASELINE_SHARE = 0.05
 """Of the scene's extent: neighbours in a video stand so close together that almost any pose would fit."""
 
 ORDER_STEPS = (1, 3, 10, 30)
-"""How far apart in the folder's order photographs are compared if their poses do not tell who is near."""
+"""How far apart in the folder's order photographs are compared if their poses do not show which are near."""
 
 Pair = tuple[int, int]
 
@@ -55,7 +55,7 @@ def pairs_by_order(frame_count: int, count: int = PAIR_COUNT) -> list[Pair]:
 
 
 class _Neighbours:
-    """Who stands near whom and looks the same way."""
+    """Which photographs are near each other and look the same way."""
 
     def __init__(self, poses: Sequence[RigidTransform]) -> None:
         self._centre: Array = np.array([pose.translation for pose in poses])

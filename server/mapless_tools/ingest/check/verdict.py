@@ -13,8 +13,8 @@ from .errors import THRESHOLD_PX, MatchedPair, PairError, Views, errors_of, summ
 from .explaining import explain
 
 _WRONG_SHARE = 0.4  # more bad pairs than one photograph in five could make
-_GUILTY_SHARE = 0.6
-_GUILTY_PAIRS = 2
+_SUSPECT_SHARE = 0.6
+_SUSPECT_PAIRS = 2
 
 
 @dataclass(frozen=True)
@@ -74,15 +74,15 @@ def judge(views: Views, matched: Sequence[MatchedPair], unmatched_count: int = 0
 
 
 def suspects_of(errors: Sequence[PairError]) -> tuple[int, ...]:
-    """Photographs almost all of whose pairs are bad; the worst first, whose pairs then accuse nobody else."""
+    """Photographs almost all of whose pairs are bad; the worst first, whose pairs then count against no other."""
     left = list(errors)
     suspects: list[int] = []
     while True:
         total = Counter(i for error in left for i in error.pair)
         bad = Counter(i for error in left if error.is_bad for i in error.pair)
-        guilty = [i for i in bad if bad[i] >= _GUILTY_PAIRS and bad[i] >= _GUILTY_SHARE * total[i]]
-        if not guilty:
+        doubtful = [i for i in bad if bad[i] >= _SUSPECT_PAIRS and bad[i] >= _SUSPECT_SHARE * total[i]]
+        if not doubtful:
             return tuple(suspects)
-        worst = max(guilty, key=lambda i: (bad[i] / total[i], bad[i], -i))
+        worst = max(doubtful, key=lambda i: (bad[i] / total[i], bad[i], -i))
         suspects.append(worst)
         left = [error for error in left if worst not in error.pair]
