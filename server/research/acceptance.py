@@ -12,7 +12,9 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from mapless_server.method.answer import Answer, Localization, LocalizeOptions
+from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pipeline import StageOptions
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.method.trust.evidence import evidence_of
 from mapless_server.method.trust.judge import trust_of
@@ -32,7 +34,7 @@ def score_of(answer: Answer) -> float:
     A pose that was rejected for too little trust has it computed again; one that was rejected before its trust was
     asked for, or because there is a second one, comes after all others.
     """
-    outcome, support, options = answer.outcome, answer.support, LocalizeOptions()
+    outcome, support, options = answer.outcome, answer.support, StageOptions()
     if isinstance(outcome, Localization):
         return REJECTED if outcome.trust is None else outcome.trust
     estimate = None if support is None else support.estimate

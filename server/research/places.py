@@ -15,12 +15,13 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.images.decode import ImageLimits, decode_image
-from mapless_server.method.answer import Answer, Localization, LocalizeOptions
+from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import OPTIONS, make_matcher
 from mapless_server.method.features import FeatureExtractor, make_extractor
 from mapless_server.method.localize import localize
-from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pipeline import Pipeline, StageOptions
 from mapless_server.method.priors.known import NO_PRIORS, Priors
 from mapless_server.method.retrieve import choose_references
 from mapless_server.method.views import PosedView, View
@@ -175,10 +176,13 @@ def cross_pairs(places: Sequence[Place], queries_each: int, k: int = 10) -> Iter
 
 
 def answered(
-    pairs: Iterable[Pair], options: LocalizeOptions | None = None, features: str = "sift"
+    pairs: Iterable[Pair],
+    options: LocalizeOptions | None = None,
+    features: str = "sift",
+    stages: StageOptions | None = None,
 ) -> Iterator[Measured]:
     """Localizes each; a line on standard error for each setting."""
-    pipeline = Pipeline(make_reconstructor("geometric", Path()), make_matcher(features, 2))
+    pipeline = Pipeline(make_reconstructor("geometric", Path()), make_matcher(features, 2), stages or StageOptions())
     title = ""
     try:
         for pair in pairs:

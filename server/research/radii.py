@@ -23,7 +23,9 @@ from scipy.special import bdtrik
 
 from mapless.geometry import Array
 from mapless_server.method.adjust import AdjustOptions
-from mapless_server.method.answer import Localization, LocalizeOptions
+from mapless_server.method.answer import Localization
+from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pipeline import StageOptions
 from mapless_server.method.uncertainty.accuracy import error_radius
 from mapless_server.method.uncertainty.covariance import UncertaintyOptions
 
@@ -33,11 +35,10 @@ KS = (10, 5, 3)
 SETTINGS = tuple((name, count) for name, count in METRIC if count is None or count >= max(KS))
 TAIL_SHARE = 0.97
 """With 95 %, half of the unseen scenes would have fewer within."""
-UNFITTED = LocalizeOptions(
-    coverage=1.0,
-    adjust=AdjustOptions(uncertainty=replace(UncertaintyOptions(), position_factor=1.0, rotation_factor=1.0)),
+UNFITTED = StageOptions(
+    adjust=AdjustOptions(uncertainty=replace(UncertaintyOptions(), position_factor=1.0, rotation_factor=1.0))
 )
-"""Claims as the model makes them, and every answer accepted."""
+"""Radii as the model gives them, without fitted factors."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def collect(data: Path) -> Iterator[Answered]:
     """Localizes the scenes' photographs; minutes."""
     places = read_places(data, dict.fromkeys(name for name, _ in SETTINGS))
     for name, count in SETTINGS:
-        for it in answered(right_pairs(places[name], count, KS), UNFITTED):
+        for it in answered(right_pairs(places[name], count, KS), LocalizeOptions(coverage=1.0), stages=UNFITTED):
             outcome = it.answer.outcome
             if isinstance(outcome, Localization) and outcome.covariance is not None and it.off is not None:
                 position, rotation = outcome.covariance[:3, :3], np.degrees(np.degrees(outcome.covariance[3:, 3:]))

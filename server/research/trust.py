@@ -26,8 +26,10 @@ from scipy.optimize import minimize
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.images.decode import ImageLimits, decode_image
-from mapless_server.method.answer import Localization, LocalizeOptions
+from mapless_server.method.answer import Localization
 from mapless_server.method.features import make_extractor
+from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pipeline import StageOptions
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.method.trust.evidence import FEATURES, Evidence, evidence_of
 from mapless_server.method.trust.judge import LEVELS, JudgeOptions, trust_of
@@ -107,7 +109,7 @@ def _samples(kind: str, pairs: Iterable[Pair]) -> Iterator[Sample]:
         passed = isinstance(outcome, Localization) or outcome.reason is RejectionReason.AMBIGUOUS
         if support is not None and support.estimate is not None and passed:
             scene = it.pair.references[0].name.split("/")[1]
-            yield Sample(kind, scene, it.right, evidence_of(support, options.pnp.inlier_px))
+            yield Sample(kind, scene, it.right, evidence_of(support, StageOptions().pnp.inlier_px))
 
 
 def _thinned(pair: Pair, left: int, random: np.random.Generator) -> Pair:

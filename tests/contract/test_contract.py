@@ -20,12 +20,10 @@ import mapless_server
 from mapless import Client, NewReference, wire
 from mapless.axes import Axes
 from mapless.v1 import localization_service_pb2, reference_service_pb2
-from mapless_server.method.answer import Variant
-from mapless_server.method.pnp import PoseStage
+from mapless_server.method.options import ScaleStrategy, Variant
 from mapless_server.method.priors.known import PriorKind
 from mapless_server.method.rejection import Advice, RejectionReason
-from mapless_server.method.scale import ScaleStage
-from mapless_server.method.scale_equations import ScaleStrategy
+from mapless_server.method.results import PoseStage, ScaleStage
 from mapless_server.services.localization import LocalizationService
 from mapless_server.services.references import ReferenceService
 

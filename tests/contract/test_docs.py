@@ -26,7 +26,7 @@ from mapless.cli.arguments import make_parser
 from mapless.exchange import MALFORMED_ANSWER
 from mapless_server import errors
 from mapless_server.errors import Unavailable
-from mapless_server.method.answer import Variant
+from mapless_server.method.options import Variant
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Refusal

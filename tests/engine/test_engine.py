@@ -23,10 +23,11 @@ from mapless_server.engine.stages import MAX_LISTINGS, QueryStages
 from mapless_server.engine.tiers import EscalationOptions
 from mapless_server.errors import DeadlineExceeded, InvalidArgument, Unavailable
 from mapless_server.images.decode import ImageLimits, decode_image
-from mapless_server.method.answer import Answer, Localization, LocalizeOptions
+from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.results import PoseStage
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.scenes.retrieval.narrowing import Narrowing, Sphere
 from mapless_server.scheduling import Abandoned, CostModel, Ending, Flow, Job

@@ -14,8 +14,8 @@ from mapless_server.engine.query import Result, Tier
 from mapless_server.engine.tiers import UNRECOVERABLE, EscalationOptions, better_of, is_doubtful
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.results import PoseStage
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance, error_radius
 
 OPTIONS = EscalationOptions()

@@ -14,8 +14,8 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method.adjust import AdjustOptions, adjust_pose, pose_problem
 from mapless_server.method.bundle import Bundle, BundleProblem
-from mapless_server.method.match import PointMatches
-from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
+from mapless_server.method.pnp import PnpOptions, solve_pose
+from mapless_server.method.results import PointMatches, PoseEstimate
 
 
 def problem_of(case: str, moved: float = 0.0) -> tuple[BundleProblem, Bundle]:

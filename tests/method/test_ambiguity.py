@@ -13,10 +13,11 @@ from support.scenes import make_scene, random_for
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.images.decode import ImageLimits, decode_image
-from mapless_server.method.answer import Answer, Localization, LocalizeOptions
+from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import make_extractor
 from mapless_server.method.localize import localize
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.trust import ambiguity

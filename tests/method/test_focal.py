@@ -10,9 +10,9 @@ import pytest
 from support.planted import true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
-from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
+from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.rejection import Advice, RejectionReason
-from mapless_server.method.support import Support
+from mapless_server.method.results import PoseEstimate, Support
 from mapless_server.method.trust.focal import Focal, FocalOptions, wrong_focal
 from mapless_server.method.trust.judge import JudgeOptions, judge
 

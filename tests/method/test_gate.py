@@ -11,9 +11,9 @@ from support.pnp_problems import POSE, Problem, planted, problem_of
 from support.scenes import CAMERA, random_for
 
 from mapless.geometry import RigidTransform
-from mapless_server.method.match import PointMatches
-from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
+from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.results import PointMatches, PoseEstimate
 from mapless_server.method.trust.gate import (
     GateOptions,
     doubts,

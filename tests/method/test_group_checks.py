@@ -13,8 +13,8 @@ from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.groups.checks import check_mounting, check_unit
 from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate
-from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
+from mapless_server.method.results import PoseStage
 
 HERE = RigidTransform.identity()
 

@@ -11,8 +11,8 @@ from support.scenes import make_scene, random_for
 from mapless.geometry import RigidTransform
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.hints import HintOptions, hinted
-from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
+from mapless_server.method.results import PoseStage
 from mapless_server.method.views import PosedView, View
 
 SCENE = make_scene(random_for("hints"))

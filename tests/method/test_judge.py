@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from support.planted import true_structure
 from support.scenes import SceneOptions, make_scene, random_for
 
-from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
+from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.support import Support
+from mapless_server.method.results import PoseEstimate, Support
 from mapless_server.method.trust.evidence import FEATURES, Evidence, evidence_of
 from mapless_server.method.trust.judge import LEVELS, JudgeOptions, judge, score_of, trust_of
 

@@ -16,19 +16,18 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 import mapless_server.method.localize as method
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method import pnp
-from mapless_server.method.answer import Answer, Localization, LocalizeOptions, Variant
+from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.coarse import Bucket, Outcome, Reconstructor, Request
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.context import StageContext
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.localize import MIN_FEATURES, localize, prepare, refine
-from mapless_server.method.pipeline import Coarse, Pipeline, Prepared, coarse_answer, reconstruct
-from mapless_server.method.pnp import PoseStage
+from mapless_server.method.options import LocalizeOptions, ScaleStrategy, Variant
+from mapless_server.method.pipeline import Coarse, Pipeline, Prepared, StageOptions, coarse_answer, reconstruct
 from mapless_server.method.reconstruction import Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.scale import ScaleStage
-from mapless_server.method.scale_equations import ScaleStrategy
+from mapless_server.method.results import PoseStage, ScaleStage
 from mapless_server.method.views import Features, Matches, PosedView, View
 
 SCENE = make_scene(random_for("localize"), SceneOptions(point_count=400, reference_count=5))
@@ -234,9 +233,9 @@ def test_a_weak_answer_is_recomputed_from_wide_correspondences(monkeypatch: pyte
         return correspond(self, query, references, wide, check, query_matches)
 
     monkeypatch.setattr(Matcher, "correspond", spy)
-    strong = pose_of(answer_of(pipeline_of("geometric"), LocalizeOptions(weak_inliers=10)))
+    strong = pose_of(answer_of(weak_below(10, pipeline_of("geometric"))))
     assert asked == [False]
-    again = answer_of(pipeline_of("geometric"), LocalizeOptions(weak_inliers=10**6))
+    again = answer_of(weak_below(10**6, pipeline_of("geometric")))
     assert asked == [False, False, True]
     assert pose_of(again).inlier_count >= strong.inlier_count
     assert list(again.stage_seconds) == ["correspond", "coarse", "scale", *LATER_STAGES, "adjust", *JUDGED]
@@ -244,8 +243,12 @@ def test_a_weak_answer_is_recomputed_from_wide_correspondences(monkeypatch: pyte
 
     for variant in (Variant.COARSE, Variant.NO_STRUCTURE, Variant.FULL):  # the paper's forms stay the paper's
         asked.clear()
-        answer_of(pipeline_of("geometric"), LocalizeOptions(variant, weak_inliers=10**6))
+        answer_of(weak_below(10**6, pipeline_of("geometric")), LocalizeOptions(variant))
         assert asked == [False]
+
+
+def weak_below(weak_inliers: int, pipeline: Pipeline) -> Pipeline:
+    return replace(pipeline, options=StageOptions(weak_inliers=weak_inliers))
 
 
 class NobodyWaits(Exception):
@@ -465,7 +468,7 @@ def test_a_network_is_asked_once_for_a_query(backend: str, times: int) -> None:
             asked.append(len(requests))
             return pipeline.reconstructor.reconstruct_many(requests)
 
-    answer_of(replace(pipeline, reconstructor=Counting()), LocalizeOptions(weak_inliers=10**6))
+    answer_of(weak_below(10**6, replace(pipeline, reconstructor=Counting())))
     assert len(asked) == times
 
 
@@ -522,9 +525,9 @@ def same_bits(first: Answer, second: Answer) -> bool:
 @pytest.mark.parametrize("backend", ["geometric", "network", "device"])
 def test_queries_of_one_batch_are_answered_as_alone(backend: str, weak_inliers: int) -> None:
     """To the bit, where the backend itself gives the same bits; with their own options."""
-    pipeline = pipeline_of(backend, options=None if backend == "geometric" else ROUGH)
+    pipeline = weak_below(weak_inliers, pipeline_of(backend, options=None if backend == "geometric" else ROUGH))
     queries = [fewer_features(seed) for seed in range(3)] if backend == "geometric" else [SCENE.query] * 3
-    choices = [LocalizeOptions(variant, weak_inliers=weak_inliers) for variant in (Variant.BEST, Variant.FULL)]
+    choices = [LocalizeOptions(variant) for variant in (Variant.BEST, Variant.FULL)]
     options = [choices[i % 2] for i in range(3)]
     batch = [prepared_of(pipeline, o, q) for o, q in zip(options, queries, strict=True)]
     assert len({prepared.bucket for prepared in batch}) == 1

@@ -14,8 +14,9 @@ from support.scenes import CAMERA, SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method import pnp
-from mapless_server.method.pnp import PnpOptions, PoseEstimate, PoseStage, ransac, reprojection_errors_px, solve_pose
+from mapless_server.method.pnp import PnpOptions, ransac, reprojection_errors_px, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.results import PoseEstimate, PoseStage
 
 
 def solve(problem: Problem, initial: RigidTransform = POSE, options: PnpOptions | None = None) -> PoseEstimate:

@@ -14,12 +14,13 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import RigidTransform, Similarity, rotation_angle_deg, rotation_from_vector
 from mapless_server.method.correspond import Correspondences
+from mapless_server.method.options import ScaleStrategy
 from mapless_server.method.reconstruction import ReconstructedView, Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.scale import MetricScale, ScaleStage, estimate_scale
+from mapless_server.method.results import MetricScale, ScaleStage
+from mapless_server.method.scale import estimate_scale
 from mapless_server.method.scale_equations import (
     ScaleOptions,
-    ScaleStrategy,
     pairs_of,
     trajectory_radius,
     trajectory_scale,

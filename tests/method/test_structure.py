@@ -19,16 +19,15 @@ from mapless_server.method.correspond import Correspondences
 from mapless_server.method.observations import (
     MIN_NOISE_LEVEL_PX,
     ONE_PIXEL,
-    KeypointNoise,
     Observations,
     adjust_points,
     better_start,
     estimate_noise,
     triangulate,
 )
+from mapless_server.method.results import KeypointNoise, Structure
 from mapless_server.method.structure import (
     PAPER_STRUCTURE,
-    Structure,
     StructureOptions,
     build_structure,
     observe,

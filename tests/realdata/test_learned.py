@@ -12,8 +12,9 @@ import pytest
 from mapless_server.engine.query import Tier
 from mapless_server.engine.tiers import EscalationOptions, is_doubtful
 from mapless_server.images.decode import ImageLimits, decode_image
-from mapless_server.method.answer import Answer, Localization, LocalizeOptions
+from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.localize import localize
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.views import PosedView, View
 from mapless_server.serve.assembly import make_tiers
 from mapless_server.settings import Settings, default_weights_dir

@@ -10,7 +10,8 @@ from itertools import chain
 import numpy as np
 import pytest
 
-from mapless_server.method.answer import Localization, LocalizeOptions
+from mapless_server.method.answer import Localization
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.method.trust.focal import FocalOptions, wrong_focal
 from mapless_tools.dataset import Dataset

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.special import bdtrik
 
-from mapless_server.method.answer import Localization, LocalizeOptions
+from mapless_server.method.answer import Localization
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_tools.dataset import Dataset
 from research.places import answered, read_places, right_pairs

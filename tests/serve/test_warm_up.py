@@ -43,8 +43,8 @@ from mapless_server.engine.query import Result, Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.results import PoseStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import CostModel, Job
 from mapless_server.security.rate import RateLimiter

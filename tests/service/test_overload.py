@@ -46,7 +46,7 @@ from mapless_server.engine.query import Tier
 from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.pnp import PoseStage
+from mapless_server.method.results import PoseStage
 
 COST_S = 0.04
 WORKERS = 2

@@ -37,8 +37,8 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.pnp import PoseStage
 from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.results import PoseStage
 from mapless_server.scheduling import Abandoned
 from mapless_server.serve.assembly import make_engine
 from mapless_server.settings import Settings

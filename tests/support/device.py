@@ -16,13 +16,14 @@ from torch.utils._pytree import tree_leaves
 from mapless.geometry import Array
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.correspond import Correspondences
-from mapless_server.method.match import PAPER_MATCH, MatchOptions, PointMatches, match_points
+from mapless_server.method.match import PAPER_MATCH, MatchOptions, match_points
 from mapless_server.method.on_device import Refined, refine_on_device
 from mapless_server.method.reconstruction import Reconstruction
 from mapless_server.method.rejection import Rejection
-from mapless_server.method.scale import MetricScale, estimate_scale
+from mapless_server.method.results import MetricScale, PointMatches, Structure
+from mapless_server.method.scale import estimate_scale
 from mapless_server.method.scale_equations import ScaleOptions
-from mapless_server.method.structure import PAPER_STRUCTURE, Structure, StructureOptions, build_structure
+from mapless_server.method.structure import PAPER_STRUCTURE, StructureOptions, build_structure
 from mapless_server.method.views import Matches
 from support.fake_network import FakeNetwork, FakeNetworkOptions
 from support.planted import true_correspondences

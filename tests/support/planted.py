@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from mapless.geometry import RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.correspond import Correspondences
-from mapless_server.method.match import PointMatches
-from mapless_server.method.observations import ONE_PIXEL, KeypointNoise, adjust_points, estimate_noise, triangulate
-from mapless_server.method.pnp import PnpOptions, PoseEstimate, solve_pose
-from mapless_server.method.scale import MetricScale, ScaleStage
-from mapless_server.method.structure import Structure, observe
+from mapless_server.method.observations import ONE_PIXEL, adjust_points, estimate_noise, triangulate
+from mapless_server.method.pnp import PnpOptions, solve_pose
+from mapless_server.method.results import KeypointNoise, MetricScale, PointMatches, PoseEstimate, ScaleStage, Structure
+from mapless_server.method.structure import observe
 from mapless_server.method.tracks import Tracks
 from mapless_server.method.views import Matches, PosedView
 from support.scenes import SyntheticScene

@@ -21,8 +21,7 @@ from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.pnp import PoseStage
-from mapless_server.method.scale import MetricScale, ScaleStage
+from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.rate import RateLimiter
 from mapless_server.serve.assembly import engine_options, engine_over

@@ -26,10 +26,10 @@ from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
-from mapless_server.method.answer import Answer, Localization, LocalizeOptions
+from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.pnp import PoseStage
-from mapless_server.method.scale import MetricScale, ScaleStage
+from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security.rate import RateLimiter

@@ -11,12 +11,12 @@ from typing import TypeVar
 
 from mapless.geometry import RigidTransform
 from mapless_server.errors import Overloaded, RequestError
-from mapless_server.method.answer import LocalizeOptions
 from mapless_server.method.groups.checks import check_mounting, check_unit
 from mapless_server.method.groups.hints import hinted_group
 from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOptions, solve_sequence
+from mapless_server.method.options import Variant
 from mapless_server.method.rejection import Rejection
 from mapless_server.scheduling import Job
 
@@ -170,5 +170,5 @@ class _Group:
 
 
 def _image(result: Result) -> GroupImage:
-    similarity = result.tier.pipeline.matcher.options.guided_similarity
-    return GroupImage(result.answer, LocalizeOptions().match(similarity))
+    pipeline = result.tier.pipeline
+    return GroupImage(result.answer, pipeline.options.match(Variant.BEST, pipeline.matcher.options.guided_similarity))

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from mapless.geometry import Camera
-from mapless_server.method.answer import Answer, LocalizeOptions
+from mapless_server.method.answer import Answer
 from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.priors.known import NO_PRIORS, Priors
 from mapless_server.method.views import PosedView, View

@@ -23,8 +23,8 @@ from mapless_server.method.groups.tracked import tracked_support
 from mapless_server.method.hints import hinted
 from mapless_server.method.pipeline import Coarse, Prepared
 from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.results import Support
 from mapless_server.method.retrieve import spread_choice
-from mapless_server.method.support import Support
 from mapless_server.method.views import Matches, PosedView, View
 from mapless_server.scenes.library import Loaded, NotDescribedYet, load_usable
 from mapless_server.scenes.retrieval.chosen import Choice

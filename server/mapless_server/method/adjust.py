@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from mapless.geometry import RigidTransform
 
 from .bundle import Bundle, BundleProblem, bundle_of, reference_information
-from .match import PointMatches
 from .optimize import MinimizeOptions, minimize
 from .options import check_bounds
-from .pnp import PoseEstimate, PoseStage, reprojection_errors_px
+from .pnp import reprojection_errors_px
 from .priors.known import NO_PRIORS, Priors
-from .structure import Structure
+from .results import PointMatches, PoseEstimate, PoseStage, Structure
 from .uncertainty.covariance import UncertaintyOptions, one_match_covariance, uncertainty_of
 from .uncertainty.linearization import jackknife_input, tracks_with_query
 from .views import PosedView, View

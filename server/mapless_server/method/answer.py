@@ -1,85 +1,18 @@
-"""What is asked of the method, and what it says."""
+"""The answer of the method to one query."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from enum import Enum
 
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 
-from .adjust import AdjustOptions
-from .match import PAPER_MATCH, MatchOptions
-from .options import check_bounds
-from .pnp import PnpOptions, PoseEstimate, PoseStage
 from .priors.known import PriorCheck
 from .rejection import Rejection
-from .scale import MetricScale
-from .scale_equations import ScaleStrategy
-from .structure import PAPER_STRUCTURE, StructureOptions
-from .support import Support
-from .trust.gate import GateOptions
-from .trust.judge import JudgeOptions
+from .results import MetricScale, PoseEstimate, PoseStage, Support
 from .uncertainty.accuracy import accuracy_from_covariance
-
-
-class Variant(str, Enum):
-    """Forms of the method; all but `BEST` are the paper's."""
-
-    COARSE = "coarse"
-    """The reconstruction's own pose at metric scale."""
-    NO_STRUCTURE = "no_structure"
-    """PnP on predicted points."""
-    FULL = "full"
-    """The paper's method."""
-    BEST = "best"
-    """Tracks over all references, keypoints weighted by their noise, a final adjustment of everything."""
-
-
-@dataclass(frozen=True)
-class LocalizeOptions:
-    """Options of the method; the defaults are the best we know.
-
-    Attributes:
-        variant: decides the options of structure and matching.
-        scale_strategy: how the metric scale is found.
-        weak_inliers: an answer of `Variant.BEST` with fewer inliers is computed again from wide correspondences (see
-            `correspond`), and replaced if that finds more. Above a hundred they do not help any more.
-        max_radius_ratio: but not if the wide answer claims a radius this many times as large. On photographs where it
-            was the better one it claimed at most 1.7 times as much; where repeated floor tiles had given it inliers,
-            and centimetres of error, 40 to 80 times.
-        pnp: of the pose solver.
-        gate: what is no pose at all.
-        adjust: of the final adjustment.
-        judge: of what is accepted.
-        coverage: share of right answers to accept; more, and more wrong ones are accepted too (see `judge`).
-    """
-
-    variant: Variant = Variant.BEST
-    scale_strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
-    weak_inliers: int = 100
-    max_radius_ratio: float = 3.0
-    pnp: PnpOptions = field(default_factory=PnpOptions)
-    gate: GateOptions = field(default_factory=GateOptions)
-    adjust: AdjustOptions = field(default_factory=AdjustOptions)
-    judge: JudgeOptions = field(default_factory=JudgeOptions)
-    coverage: float = 0.99
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "coverage", above=0, at_most=1)
-
-    @property
-    def structure(self) -> StructureOptions:
-        """Options of the structure stage."""
-        if self.variant is Variant.BEST:
-            return StructureOptions()
-        return replace(PAPER_STRUCTURE, optimize=self.variant is Variant.FULL)
-
-    def match(self, guided_similarity: float) -> MatchOptions:
-        """Options of the matching stage; what similarity is enough depends on the features."""
-        return MatchOptions(min_similarity=guided_similarity) if self.variant is Variant.BEST else PAPER_MATCH
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,13 +93,13 @@ def shifted(answer: Answer, offset: Array) -> Answer:
     return replace(answer, outcome=outcome, scale=scale)
 
 
-def is_better(wide: Answer, strict: Answer, options: LocalizeOptions) -> bool:
-    """Whether the answer from wide correspondences is to be given."""
+def is_better(wide: Answer, strict: Answer, max_radius_ratio: float) -> bool:
+    """Whether the answer from wide correspondences is the better one; its radius may be `max_radius_ratio` as large."""
     if isinstance(wide.outcome, Rejection) or isinstance(strict.outcome, Rejection):
         return isinstance(wide.outcome, Localization)
     if wide.outcome.inlier_count <= strict.outcome.inlier_count:
         return False
-    return _claimed_radius_m(wide) <= options.max_radius_ratio * _claimed_radius_m(strict)
+    return _claimed_radius_m(wide) <= max_radius_ratio * _claimed_radius_m(strict)
 
 
 def _claimed_radius_m(answer: Answer) -> float:

@@ -22,8 +22,9 @@ from .arrays import invert_symmetric
 from .observations import Observations
 from .optimize import solve_step
 from .priors.known import NO_PRIORS, Priors
+from .results import Structure
 from .robust import cauchy_cost
-from .structure import Structure, observe
+from .structure import observe
 from .tracks import Tracks
 from .uncertainty.linearization import Linearization, linearize
 from .views import PosedView

@@ -10,18 +10,18 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from .adjust import adjust_pose
-from .answer import Answer, Localization, LocalizeOptions, Variant, is_better
+from .answer import Answer, Localization, is_better
 from .context import StageContext
-from .match import PointMatches, match_points
+from .match import match_points
+from .options import LocalizeOptions, Variant
 from .pipeline import Coarse, Pipeline, Prepared, reconstruct, with_wide_correspondences
 from .pnp import solve_pose
 from .pose_covariance import pose_covariance
 from .priors.known import NO_PRIORS, Priors
 from .reconstruction import Reconstruction
 from .rejection import Rejection, RejectionReason
-from .scale import MetricScale
-from .structure import Structure, build_structure
-from .support import Support
+from .results import MetricScale, PointMatches, Structure, Support
+from .structure import build_structure
 from .trust.gate import doubts
 from .trust.judge import judge
 from .views import Matches, PosedView, View
@@ -96,7 +96,7 @@ def _strict_then_wide(coarse: Coarse, counts_agreement: bool) -> Answer:
     if not coarse.prepared.can_improve(answer):
         return answer
     wide = _solve(with_wide_correspondences(coarse), counts_agreement)
-    better = wide if is_better(wide, answer, coarse.prepared.options) else answer
+    better = wide if is_better(wide, answer, coarse.prepared.pipeline.options.max_radius_ratio) else answer
     return replace(better, stage_seconds=wide.stage_seconds)
 
 
@@ -105,7 +105,7 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
     prepared, scale, stage = coarse.prepared, coarse.scale, coarse.prepared.context.stage
     if isinstance(scale, Rejection):
         return coarse.answer(scale)
-    query, references, options, priors = prepared.query, prepared.references, prepared.options, prepared.priors
+    query, references, options, priors = prepared.query, prepared.references, prepared.pipeline.options, prepared.priors
     structure, matches = _structure_and_matches(coarse, scale)
     support = Support(query, references, structure, matches, None, prepared.origin)
     with stage("pnp"):
@@ -117,18 +117,18 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
     doubt = doubts(query, structure, matches, pose, inliers, options.pnp.inlier_px, options.gate, chance)
     if doubt:
         return coarse.answer(Rejection(RejectionReason.GATE, doubt), replace(support, estimate=estimate))
-    if options.variant is Variant.BEST:
+    if prepared.options.variant is Variant.BEST:
         with stage("adjust"):
             estimate = adjust_pose(query, references, structure, matches, estimate, options.adjust, priors)
     support = replace(support, estimate=estimate)
     with stage("uncertainty"):
-        predicted = not options.structure.optimize
+        predicted = not prepared.structure_options.optimize
         covariance = pose_covariance(support, scale, options.adjust.uncertainty, priors, predicted)
     estimate = replace(estimate, covariance=covariance)
     support = replace(support, estimate=estimate)
     with stage("judge"):
         query_matches = prepared.correspondences.query_matches
-        judged = judge(support, query_matches, options.pnp.inlier_px, options.coverage, options.judge, chance)
+        judged = judge(support, query_matches, options.pnp.inlier_px, prepared.options.coverage, options.judge, chance)
     if judged.rejection:
         return coarse.answer(judged.rejection, support)
     return coarse.answer(Localization.of(estimate, len(matches), judged.trust), support)
@@ -142,7 +142,7 @@ def _structure_and_matches(coarse: Coarse, scale: MetricScale) -> tuple[Structur
     assert isinstance(reconstruction, Reconstruction)
     references, correspondences = prepared.references, prepared.correspondences
     with prepared.context.stage("structure"):
-        structure = build_structure(reconstruction, scale, references, correspondences, prepared.options.structure)
+        structure = build_structure(reconstruction, scale, references, correspondences, prepared.structure_options)
     with prepared.context.stage("match"):
         initial, options = scale.world_from_query, prepared.match_options
         foreseen = prepared.priors.pose.world_from_camera if prepared.priors.pose else None

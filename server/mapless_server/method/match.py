@@ -18,7 +18,7 @@ from mapless.geometry import RigidTransform
 
 from .correspond import Correspondences
 from .options import check_bounds
-from .structure import Structure
+from .results import PointMatches, Structure
 from .views import PosedView, View
 
 
@@ -45,26 +45,6 @@ class MatchOptions:
 
 PAPER_MATCH = MatchOptions(through_tracks=False, radius_px=20.0, min_similarity=-1.0)
 """What the paper does."""
-
-
-@dataclass(frozen=True, eq=False)
-class PointMatches:
-    """2D-3D matches; no point and no keypoint stands twice.
-
-    Attributes:
-        point: (M,) index into the structure.
-        keypoint: (M,) index into the query's keypoints.
-        guided: (M,) whether the match was searched for near its projection, rather than found in the whole image.
-        radius_px: how near.
-    """
-
-    point: NDArray[np.intp]
-    keypoint: NDArray[np.intp]
-    guided: NDArray[np.bool_]
-    radius_px: float
-
-    def __len__(self) -> int:
-        return len(self.point)
 
 
 def match_points(

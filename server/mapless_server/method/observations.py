@@ -22,28 +22,9 @@ from .arrays import (
     solve_symmetric,
 )
 from .optimize import minimize_each
+from .results import KeypointNoise
 from .robust import soft_l1, soft_l1_weight
 from .tracks import Grouping
-
-
-@dataclass(frozen=True)
-class KeypointNoise:
-    """How far keypoints lie from where they should: sigma^2 = level^2 + (slope * size)^2.
-
-    Attributes:
-        level_px: what all keypoints share: detection, and what errors of poses and lenses look like in pixels. While it
-            is being estimated, an array of that one number.
-        slope: error per diameter of the patch; a blob of 20 px is found to a pixel, one of 3 px to a fifth. Measured on
-            photographs with surveyed poses.
-    """
-
-    level_px: float
-    slope: float
-
-    def sigma_px(self, sizes_px: AnyArray) -> AnyArray:
-        """Standard deviation (N,) of each coordinate of keypoints of these sizes (N,)."""
-        return (self.level_px**2 + (self.slope * sizes_px) ** 2) ** 0.5
-
 
 ONE_PIXEL = KeypointNoise(1.0, 0.0)
 FIRST_GUESS = KeypointNoise(0.3, 0.06)

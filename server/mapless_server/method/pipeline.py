@@ -14,23 +14,63 @@ from typing import Any, TypeVar
 
 from mapless.geometry import Array
 
-from .answer import Answer, Localization, LocalizeOptions, Variant, shifted
+from .adjust import AdjustOptions
+from .answer import Answer, Localization, shifted
 from .coarse import Bucket, Outcome, Reconstructor, Request, reconstruct_one
 from .coarse.geometric import GeometricReconstructor
 from .context import StageContext
 from .correspond import Correspondences, Matcher
-from .match import MatchOptions, PointMatches
-from .pnp import PoseStage
+from .match import PAPER_MATCH, MatchOptions
+from .options import LocalizeOptions, Variant
+from .pnp import PnpOptions
 from .priors.known import NO_PRIORS, Priors
 from .reconstruction import Reconstruction
 from .rejection import Rejection, RejectionReason
-from .scale import MetricScale, estimate_scale
+from .results import MetricScale, PointMatches, PoseStage, Structure, Support
+from .scale import estimate_scale
 from .scale_equations import ScaleOptions
-from .structure import Structure
-from .support import Support
+from .structure import PAPER_STRUCTURE, StructureOptions
+from .trust.gate import GateOptions
+from .trust.judge import JudgeOptions
 from .views import PosedView, View
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class StageOptions:
+    """Options of the stages after the coarse one, the same for all queries; the defaults are the best we know.
+
+    Attributes:
+        weak_inliers: an answer of `Variant.BEST` with fewer inliers is computed again from wide correspondences (see
+            `correspond`), and replaced if that finds more. Above a hundred they do not help any more.
+        max_radius_ratio: but not if the wide answer claims a radius this many times as large. On photographs where it
+            was the better one it claimed at most 1.7 times as much; where repeated floor tiles had given it inliers,
+            and centimetres of error, 40 to 80 times.
+        pnp: of the pose solver.
+        gate: what is no pose at all.
+        adjust: of the final adjustment.
+        judge: of what is accepted.
+    """
+
+    weak_inliers: int = 100
+    max_radius_ratio: float = 3.0
+    pnp: PnpOptions = field(default_factory=PnpOptions)
+    gate: GateOptions = field(default_factory=GateOptions)
+    adjust: AdjustOptions = field(default_factory=AdjustOptions)
+    judge: JudgeOptions = field(default_factory=JudgeOptions)
+
+    @staticmethod
+    def structure(variant: Variant) -> StructureOptions:
+        """Options of the structure stage."""
+        if variant is Variant.BEST:
+            return StructureOptions()
+        return replace(PAPER_STRUCTURE, optimize=variant is Variant.FULL)
+
+    @staticmethod
+    def match(variant: Variant, guided_similarity: float) -> MatchOptions:
+        """Options of the matching stage; what similarity is enough depends on the features."""
+        return MatchOptions(min_similarity=guided_similarity) if variant is Variant.BEST else PAPER_MATCH
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +80,12 @@ class Pipeline:
     Attributes:
         reconstructor: the coarse backend.
         matcher: keeps matches between references.
+        options: of the stages.
     """
 
     reconstructor: Reconstructor = field(default_factory=GeometricReconstructor)
     matcher: Matcher = field(default_factory=Matcher)
+    options: StageOptions = field(default_factory=StageOptions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +98,7 @@ class Prepared:
             may be millions of metres (UTM, ECEF), too long for the digits of differences of squares.
         origin: (3,) where that is in the caller's world, metres.
         pipeline: what to run on.
-        options: of the method.
+        options: of the request.
         correspondences: between all photographs.
         bucket: prepared queries of the same bucket may be reconstructed together.
         context: cancels the computation and times its stages.
@@ -74,9 +116,15 @@ class Prepared:
     priors: Priors = NO_PRIORS
 
     @property
+    def structure_options(self) -> StructureOptions:
+        """Options of the structure stage for this variant."""
+        return self.pipeline.options.structure(self.options.variant)
+
+    @property
     def match_options(self) -> MatchOptions:
-        """Options of the matching stage for these features."""
-        return self.options.match(self.pipeline.matcher.options.guided_similarity)
+        """Options of the matching stage for this variant and these features."""
+        similarity = self.pipeline.matcher.options.guided_similarity
+        return self.pipeline.options.match(self.options.variant, similarity)
 
     def can_improve(self, answer: Answer) -> bool:
         """Whether wide correspondences could give a better answer than this one."""
@@ -84,7 +132,7 @@ class Prepared:
             return False
         if isinstance(answer.outcome, Rejection):
             return answer.outcome.reason not in (RejectionReason.DEGENERATE_REFERENCES, RejectionReason.AMBIGUOUS)
-        return answer.outcome.inlier_count < self.options.weak_inliers
+        return answer.outcome.inlier_count < self.pipeline.options.weak_inliers
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +244,7 @@ def _launch_scale(prepared: Prepared, reconstruction: Outcome) -> Callable[[], C
     from .on_device.compute import Options
 
     is_coarse = prepared.options.variant is Variant.COARSE
-    further = (None, None) if is_coarse else (prepared.options.structure, prepared.match_options)
+    further = (None, None) if is_coarse else (prepared.structure_options, prepared.match_options)
     context.check()
     start_s = time.perf_counter()
     launched = launch_on_device(reconstruction, prepared.query, references, correspondences, Options(options, *further))

@@ -8,34 +8,21 @@ candidates, and terms of its own in the cost (see `informed`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import Enum
 
 import numpy as np
 import poselib
-from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
 
-from .match import PointMatches
 from .options import check_bounds
 from .priors.informed import InformedOptions, informed_pose
-from .priors.known import NO_PRIORS, PriorCheck, Priors
+from .priors.known import NO_PRIORS, Priors
 from .priors.pose_only import PoseOnlyOptions
 from .priors.pose_only import reprojection_errors_px as reprojection_errors_px
 from .rejection import Rejection, RejectionReason
-from .structure import Structure
-from .uncertainty.covariance import Uncertainty
+from .results import PointMatches, PoseEstimate, PoseStage, Structure
 from .uncertainty.perturbation import pose_hessian, world_covariance
 from .views import View
-
-
-class PoseStage(str, Enum):
-    """Which stage gave the pose."""
-
-    INITIAL = "initial"
-    REFINED = "refined"
-    COARSE = "coarse"
-    """The initial one, because there was no time to refine it."""
 
 
 @dataclass(frozen=True)
@@ -71,32 +58,6 @@ class PnpOptions:
         """Options of what is done with priors."""
         refine = PoseOnlyOptions(sigma_px=self.loss_scale_px, prior_weight=self.error_inflation**2)
         return InformedOptions(self.inlier_px, refine)
-
-
-@dataclass(frozen=True, eq=False)
-class PoseEstimate:
-    """A pose, believed or not.
-
-    Attributes:
-        world_from_camera: metric.
-        stage: whether it is the refined or the initial pose.
-        inliers: (M,) which of the matches agree with it.
-        errors_px: (M,) reprojection errors; NaN for points behind the camera.
-        covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians.
-        prior_checks: of each prior.
-        uncertainty: what the covariance was computed from, before priors sharpened it; None where it is from the
-            residuals alone, and errors that go together are not in it yet (see `pose_covariance`).
-        without_priors: the estimate before priors were used; None where none were.
-    """
-
-    world_from_camera: RigidTransform
-    stage: PoseStage
-    inliers: NDArray[np.bool_]
-    errors_px: Array
-    covariance: Array
-    prior_checks: tuple[PriorCheck, ...] = ()
-    uncertainty: Uncertainty | None = None
-    without_priors: PoseEstimate | None = None
 
 
 def solve_pose(

@@ -10,18 +10,10 @@ import numpy as np
 
 from mapless.geometry import Array
 
-from .pnp import PoseEstimate, PoseStage
 from .priors.known import NO_PRIORS, Priors
-from .scale import MetricScale
+from .results import MetricScale, PoseEstimate, PoseStage, Support, Uncertainty
 from .structure import observe
-from .support import Support
-from .uncertainty.covariance import (
-    Uncertainty,
-    UncertaintyOptions,
-    one_match_covariance,
-    scale_covariance,
-    uncertainty_of,
-)
+from .uncertainty.covariance import UncertaintyOptions, one_match_covariance, scale_covariance, uncertainty_of
 from .uncertainty.linearization import jackknife_input, linearize, tracks_with_query
 from .views import PosedView
 

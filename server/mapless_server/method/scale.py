@@ -11,8 +11,6 @@ tensors; `judge` looks at what came out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
@@ -21,36 +19,9 @@ from mapless.geometry import RigidTransform, Similarity
 from .correspond import Correspondences
 from .reconstruction import Reconstruction
 from .rejection import Rejection, RejectionReason
+from .results import MetricScale, ScaleStage
 from .scale_equations import ScaleCandidates, ScaleOptions, gather, predict, scale_candidates, trajectory_radius
 from .views import PosedView
-
-
-class ScaleStage(str, Enum):
-    """Which stage gave it."""
-
-    TRIANGULATION = "triangulation"
-    TRAJECTORY = "trajectory"
-
-
-@dataclass(frozen=True, eq=False)
-class MetricScale:
-    """A reconstruction made metric.
-
-    Attributes:
-        metres_per_unit: S, above 0; metres per unit of the reconstruction.
-        stage: which stage gave it.
-        deviation: d of this scale, 0 and above.
-        anchor: index of the reference whose pose ties the local frame to the world.
-        world_from_local: the reconstruction's frame in the world, metres.
-        world_from_query: the query camera's initial pose P_q^init, metres.
-    """
-
-    metres_per_unit: float
-    stage: ScaleStage
-    deviation: float
-    anchor: int
-    world_from_local: Similarity
-    world_from_query: RigidTransform
 
 
 def estimate_scale(

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,17 +29,9 @@ from mapless.geometry import Array
 from .arrays import AnyArray, length, median, namespace
 from .correspond import Correspondences
 from .keypoints import keypoint_depths, keypoint_offsets, keypoint_rays
-from .options import check_bounds
+from .options import ScaleStrategy, check_bounds
 from .reconstruction import Reconstruction
 from .views import PosedView
-
-
-class ScaleStrategy(str, Enum):
-    """Which stages may give the scale."""
-
-    TRIANGULATION = "triangulation"
-    TRAJECTORY = "trajectory"
-    TWO_STAGE = "two_stage"
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ from .keypoints import keypoint_depths, keypoint_offsets, keypoint_rays
 from .observations import (
     FIRST_GUESS,
     ONE_PIXEL,
-    KeypointNoise,
     Observations,
     adjust_points,
     back_project,
@@ -35,7 +34,7 @@ from .observations import (
 )
 from .options import check_bounds
 from .reconstruction import Reconstruction
-from .scale import MetricScale
+from .results import KeypointNoise, MetricScale, Structure
 from .tracks import Tracks, build_tracks
 from .views import PosedView
 
@@ -84,21 +83,6 @@ PAPER_STRUCTURE = StructureOptions(
     min_parallax_deg=0.0,
 )
 """What the paper does."""
-
-
-@dataclass(frozen=True, eq=False)
-class Structure:
-    """Points and the tracks they come from.
-
-    Attributes:
-        x_in_world: (P, 3) metres.
-        tracks: of these points over the references, in the order of the points.
-        noise: of the keypoints, as estimated from the residuals.
-    """
-
-    x_in_world: Array
-    tracks: Tracks
-    noise: KeypointNoise
 
 
 def build_structure(

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.engine.query import Caller, Photo, Query
 from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.method.answer import Localization, LocalizeOptions
+from mapless_server.method.answer import Localization
 from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.views import Photograph, PosedView
 from mapless_server.scenes.retrieval.chosen import Choice
 from mapless_server.scenes.retrieval.narrowing import Narrowing

@@ -19,10 +19,11 @@ import torch
 
 from mapless_server.engine.query import Tier
 from mapless_server.images.decode import ImageLimits, decode_image
-from mapless_server.method.answer import Answer, Localization, LocalizeOptions
+from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.localize import localize
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.views import Photograph, PosedView
 from mapless_server.networks.network import Network

@@ -13,8 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mapless_server.method.answer import Variant
-from mapless_server.method.scale_equations import ScaleStrategy
+from mapless_server.method.options import ScaleStrategy, Variant
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.usage import UsageError
 

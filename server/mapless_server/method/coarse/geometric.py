@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..correspond import Correspondences
-from ..match import PointMatches, vote
+from ..match import vote
 from ..observations import FIRST_GUESS, adjust_points, triangulate
 from ..options import check_bounds
 from ..pnp import PnpOptions, ransac, reprojection_errors_px
@@ -24,7 +24,8 @@ from ..priors.informed import informed_pose
 from ..priors.known import NO_PRIORS, Priors
 from ..reconstruction import ReconstructedView, Reconstruction
 from ..rejection import Rejection, RejectionReason
-from ..structure import Structure, StructureOptions, observe, trustworthy
+from ..results import PointMatches, Structure
+from ..structure import StructureOptions, observe, trustworthy
 from ..tracks import build_tracks
 from ..trust.gate import GateOptions, format_false_alarms, log10_false_alarms
 from ..views import PosedView, View

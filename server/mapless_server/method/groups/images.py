@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..answer import Answer, Localization
-from ..match import MatchOptions, PointMatches, search
+from ..match import MatchOptions, search
 from ..rejection import Rejection, RejectionReason
-from ..structure import Structure
-from ..support import Support
+from ..results import PointMatches, Structure, Support
 from ..trust.gate import GateOptions, false_alarms, findable_count, format_false_alarms, hull_share
 from ..views import PosedView, View
 from .generalized import CameraMatches

@@ -18,9 +18,9 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 
-from ..match import PointMatches
 from ..optimize import MinimizeOptions, minimize
 from ..pnp import reprojection_errors_px
+from ..results import PointMatches
 from .freedom import F, Freedom
 from .images import MatchedImage, PosedImage
 from .problem import GroupProblem, JointOptions

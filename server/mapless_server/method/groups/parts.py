@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..match import PointMatches
 from ..pnp import reprojection_errors_px
+from ..results import PointMatches
 from ..tracks import Tracks
 from .freedom import Freedom
 from .images import MatchedImage

@@ -13,9 +13,9 @@ from mapless.geometry import Array
 
 from ..adjust import AdjustOptions
 from ..bundle import Bundle, BundleProblem, NormalEquations, Poses, bundle_of, reference_information
-from ..match import PointMatches
 from ..optimize import solve_step
 from ..options import check_bounds
+from ..results import PointMatches
 from ..views import PosedView
 from .freedom import F, Freedom
 from .images import MatchedImage

@@ -12,8 +12,8 @@ from dataclasses import replace
 from ..match import vote
 from ..observations import triangulate
 from ..pipeline import Prepared
-from ..structure import Structure, StructureOptions, observe, refine_points, tracks_of
-from ..support import Support
+from ..results import Structure, Support
+from ..structure import StructureOptions, observe, refine_points, tracks_of
 from ..tracks import Tracks
 
 

@@ -18,13 +18,13 @@ from mapless.geometry import Camera
 
 from ..coarse.device import DeviceReconstruction
 from ..correspond import Correspondences
-from ..match import MatchOptions, PointMatches
-from ..observations import KeypointNoise
+from ..match import MatchOptions
 from ..reconstruction import map_cells
 from ..rejection import Rejection, RejectionReason
-from ..scale import MetricScale, check_references, judge, not_finite
+from ..results import KeypointNoise, MetricScale, PointMatches, Structure
+from ..scale import check_references, judge, not_finite
 from ..scale_equations import ScaleOptions, gather
-from ..structure import Structure, StructureOptions, tracks_of
+from ..structure import StructureOptions, tracks_of
 from ..tracks import Tracks
 from ..views import PosedView, View
 from .compute import Inputs, Options, Outputs, Points, compute

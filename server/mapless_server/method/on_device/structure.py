@@ -17,7 +17,8 @@ from torch import Tensor
 
 from ..arrays import AnyArray
 from ..keypoints import keypoint_offsets, keypoint_rays
-from ..observations import KeypointNoise, Observations
+from ..observations import Observations
+from ..results import KeypointNoise
 from ..tracks import Tracks
 from ..views import PosedView
 

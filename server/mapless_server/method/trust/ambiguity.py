@@ -26,7 +26,7 @@ from mapless.geometry import Array, Camera, RigidTransform, rotation_angle_deg
 from ..options import check_bounds
 from ..pnp import PnpOptions, ransac, reprojection_errors_px
 from ..rejection import Hypothesis
-from ..support import Support
+from ..results import Support
 from ..uncertainty.accuracy import Accuracy, accuracy_from_covariance
 from ..uncertainty.perturbation import pose_hessian, world_covariance
 from ..views import Matches

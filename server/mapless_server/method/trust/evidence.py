@@ -8,7 +8,7 @@ import numpy as np
 
 from mapless.geometry import Array
 
-from ..support import Support
+from ..results import Support
 from ..uncertainty.accuracy import accuracy_from_covariance
 from .gate import findable_count, hull_share, log10_false_alarms
 

@@ -23,7 +23,7 @@ from mapless.geometry import Array
 from ..optimize import MinimizeOptions, minimize, solve_step
 from ..options import check_bounds
 from ..resection import Fit, Resection
-from ..support import Support
+from ..results import Support
 
 
 @dataclass(frozen=True)

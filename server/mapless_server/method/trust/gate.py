@@ -19,9 +19,8 @@ from scipy.special import gammaln
 
 from mapless.geometry import Camera, RigidTransform
 
-from ..match import PointMatches
 from ..options import check_bounds
-from ..structure import Structure
+from ..results import PointMatches, Structure
 from ..views import View
 
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from ..options import check_bounds
 from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
-from ..support import Support
+from ..results import Support
 from ..views import Matches
 from .ambiguity import AmbiguityOptions, find_rival
 from .evidence import FEATURES, Evidence, evidence_of

@@ -40,6 +40,7 @@ import numpy as np
 from mapless.geometry import Array, Camera, RigidTransform
 
 from ..options import check_bounds
+from ..results import Uncertainty
 from .dispersion import Dispersion, JackknifeInput, disperse
 from .perturbation import pose_hessian, world_covariance, world_jacobian
 
@@ -72,21 +73,6 @@ class UncertaintyOptions:
         check_bounds(self, "shared_matches max_matches position_factor rotation_factor", above=0)
         check_bounds(self, "loss_scale_sigma max_error_px", above=0)
         check_bounds(self, "shrinkage", at_least=0, at_most=1)
-
-
-@dataclass(frozen=True, eq=False)
-class Uncertainty:
-    """What is known of a pose's error.
-
-    Attributes:
-        covariance: (6, 6) of world_from_camera, order x y z rx ry rz, fixed world axes, metres and radians.
-        motions: (K, 6) how the pose would move, in the same coordinates, without each of its references.
-        inflation: i, by how much the references' errors exceed those of independent matches.
-    """
-
-    covariance: Array
-    motions: Array
-    inflation: float
 
 
 def uncertainty_of(

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from mapless.geometry import Array
 
 from ..observations import Observations
+from ..results import Structure
 from ..robust import cauchy_weight
-from ..structure import Structure
 from ..tracks import Tracks
 from .dispersion import JackknifeInput, LinearizedObservations
 from .perturbation import motion_jacobian

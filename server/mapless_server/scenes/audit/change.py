@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.special import bdtr
 
 from mapless.geometry import Array
-from mapless_server.method.match import MatchOptions, PointMatches, search
+from mapless_server.method.match import MatchOptions, search
 from mapless_server.method.options import check_bounds
+from mapless_server.method.results import PointMatches
 from mapless_server.method.views import PosedView
 
 from .look import Look

@@ -20,7 +20,8 @@ from mapless_server.method.arrays import invert_symmetric
 from mapless_server.method.correspond import Correspondences, epipolar_distance_px, mutual_matches
 from mapless_server.method.match import vote
 from mapless_server.method.observations import Observations, triangulate
-from mapless_server.method.structure import Structure, StructureOptions, observe, refine_points
+from mapless_server.method.results import Structure
+from mapless_server.method.structure import StructureOptions, observe, refine_points
 from mapless_server.method.tracks import Tracks, build_tracks
 from mapless_server.method.views import Matches, PosedView
 

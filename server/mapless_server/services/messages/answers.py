@@ -11,10 +11,11 @@ from mapless.geometry import Array, RigidTransform
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import __version__
 from mapless_server.engine.query import Result
-from mapless_server.method.answer import Localization, LocalizeOptions
+from mapless_server.method.answer import Localization
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.priors.known import PriorCheck
 from mapless_server.method.rejection import Hint, Rejection
-from mapless_server.method.scale import MetricScale
+from mapless_server.method.results import MetricScale
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_server.store import SceneAttributes
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, normalize
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.method.support import Support
+from mapless_server.method.results import Support
 from mapless_server.method.views import View
 
 MAX_MATCHES = 2000

@@ -15,10 +15,10 @@ from mapless.wire import FieldError
 from mapless_server.engine.groups import GroupResult
 from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Query
-from mapless_server.method.answer import Variant
 from mapless_server.method.groups.images import PosedImage
 from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate
+from mapless_server.method.options import Variant
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_server.scenes.retrieval.narrowing import Narrowing
