@@ -35,8 +35,8 @@ from mapless_tools.load.report import Check, check_lines, machine_lines, step_li
 from mapless_tools.load.requests import photo_request, read_answer
 from mapless_tools.load.scrape import Scrape, parse_metrics, reconcile
 from mapless_tools.load.sender import Target, connected, send_closed_loop, send_open_loop
-from mapless_tools.load.step import ServerUnderLoad, Step, run_step
-from mapless_tools.load.watch import ProcessSample, going_first, read_process
+from mapless_tools.load.step import Step, run_step
+from mapless_tools.load.watch import ProcessSample, ServerUnderLoad, priority_over, read_process
 
 METHOD = "/toy.Toy/Call"
 GOOD, BAD = b"good", b"bad"
@@ -374,7 +374,7 @@ def test_the_generator_has_priority_while_it_measures_only() -> None:
 
     before = niceness(0)
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as server:
-        with going_first(server.pid):
+        with priority_over(server.pid):
             assert niceness(server.pid) - niceness(0) == 5
         assert niceness(0) == before
         server.communicate(b"\n")
@@ -457,11 +457,11 @@ def test_what_an_answer_says() -> None:
 # Reports
 
 
-def step(name: str, asked_per_s: float | None, records: Sequence[CallRecord], told: Scrape | None = None) -> Step:
+def step(name: str, asked_per_s: float | None, records: Sequence[CallRecord], scraped: Scrape | None = None) -> Step:
     samples = [ProcessSample(i / 2, 400.0 + (i % 2), 14, 25, 0.9 * i) for i in range(21)]
     account = account_of(records, 10.0)
     codes = [r.code for r in records]
-    return Step(name, asked_per_s, 10.0, account, codes, samples, 0.0, told, 0.1, 10.0)
+    return Step(name, asked_per_s, 10.0, account, codes, samples, 0.0, scraped, 0.1, 10.0)
 
 
 def planted_result(slowest_refusal_s: float = 0.004) -> PipelineResult:
@@ -474,15 +474,15 @@ def planted_result(slowest_refusal_s: float = 0.004) -> PipelineResult:
             refusals[-1] = replace(refusals[-1], ended_s=refusals[-1].at_s + slowest_refusal_s)
         return answers + refusals
 
-    told = Scrape(0, {}, {}, {0.01: 100, math.inf: 100})
+    scraped = Scrape(0, {}, {}, {0.01: 100, math.inf: 100})
     options = PipelineOptions(shares=(0.7, 1.0, 3.0))
     steps = [
-        step("70 %", 5.6, calls(56, 0), told),
-        step("100 %", 8.0, calls(78, 2), told),
-        step("300 %", 24.0, calls(79, 161), told),
+        step("70 %", 5.6, calls(56, 0), scraped),
+        step("100 %", 8.0, calls(78, 2), scraped),
+        step("300 %", 24.0, calls(79, 161), scraped),
     ]
-    ramp = [step("2 at a time", None, calls(80, 0), told)]
-    unloaded = step("unloaded", None, calls(80, 0), told)
+    ramp = [step("2 at a time", None, calls(80, 0), scraped)]
+    unloaded = step("unloaded", None, calls(80, 0), scraped)
     return PipelineResult("a planted place", options, unloaded, ramp, 8.0, steps)
 
 
@@ -536,7 +536,7 @@ def test_a_step_uses_the_servers_account_of_its_time_only(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pages = iter([Scrape(10, {"OK": 10}, {}, {}), Scrape(13, {"OK": 13}, {}, {})])
-    monkeypatch.setattr("mapless_tools.load.step.read_metrics", lambda _: next(pages))
+    monkeypatch.setattr("mapless_tools.load.watch.read_metrics", lambda _: next(pages))
 
     async def send() -> list[CallRecord]:
         await asyncio.sleep(0.05)
@@ -544,8 +544,8 @@ def test_a_step_uses_the_servers_account_of_its_time_only(
 
     under_load = ServerUnderLoad(os.getpid(), "nowhere")
     measured = asyncio.run(run_step("toy", under_load, send, 1.0, sample_every_s=0.01))
-    assert measured.told is not None
-    assert (measured.told.started, measured.told.handled) == (3, {"OK": 3})
+    assert measured.scraped is not None
+    assert (measured.scraped.started, measured.scraped.handled) == (3, {"OK": 3})
     assert measured.answers == 3
     assert len(measured.samples) >= 2
     assert [s.at_s for s in measured.samples] == sorted(s.at_s for s in measured.samples)

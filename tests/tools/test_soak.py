@@ -15,10 +15,10 @@ from mapless.geometry import Array
 from mapless_tools.load.arrivals import Kind, Mix, Requests, plan_calls
 from mapless_tools.load.charts import draw_soak
 from mapless_tools.load.records import CallRecord, Fate
-from mapless_tools.load.scrape import Series
+from mapless_tools.load.scrape import Scrape
 from mapless_tools.load.slopes import MIN_SAMPLES, Slope, slope
 from mapless_tools.load.soak import MIN_SETTLED_S, UNITS, SoakOptions, least_minutes, slopes_of
-from mapless_tools.load.state import ServerState, Watched, read_state
+from mapless_tools.load.watch import ServerState, ServerUnderLoad, read_state
 
 EVERY_S = 10.0
 TIMES_S = np.arange(0.0, 2400.0, EVERY_S)
@@ -120,13 +120,13 @@ def test_the_minimum_of_minutes_gives_slopes_and_less_none(options: SoakOptions)
 
 def test_a_process_is_read_with_its_files_sockets_and_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pages = [
-        Series({"mapless_event_loop_lag_seconds_sum": s, "mapless_event_loop_lag_seconds_count": n})
+        Scrape(0, {}, {}, {}, {"mapless_event_loop_lag_seconds_sum": s, "mapless_event_loop_lag_seconds_count": n})
         for s, n in ((1.0, 100.0), (1.5, 200.0))
     ]
-    monkeypatch.setattr("mapless_tools.load.state.read_series", lambda _: pages.pop(0))
+    monkeypatch.setattr("mapless_tools.load.watch.read_metrics", lambda _: pages.pop(0))
     (tmp_path / "below").mkdir()
     (tmp_path / "below" / "file").write_bytes(bytes(2**20))
-    watched = Watched(os.getpid(), "nowhere", tmp_path)
+    watched = ServerUnderLoad(os.getpid(), "nowhere", tmp_path)
     first, series = read_state(watched, 0.0, None)
     second, _ = read_state(watched, 1.0, series)
     assert first.data_mib == pytest.approx(1.0, abs=0.1)

@@ -117,12 +117,6 @@ class Sample:
     def __len__(self) -> int:
         return len(self.position)
 
-    def without(self, index: int) -> Sample:
-        """All but one."""
-        return Sample(
-            self.position[:index] + self.position[index + 1 :], self.rotation[:index] + self.rotation[index + 1 :]
-        )
-
     def times(self, factors: Factors) -> Sample:
         """With the radii multiplied."""
         return Sample(

@@ -1,4 +1,4 @@
-"""When calls are made, by whom, and what kind of call each is: decided before the first one is sent.
+"""When calls are made, by which client, and of what kind: decided before the first one is sent.
 
 Several clients call independently of one another and of the answers (open loop), as many robots do; so each one's calls
 are a Poisson process. A closed loop, where a client calls again once it has its answer, asks less of a slow server and
@@ -21,10 +21,10 @@ class Kind(str, Enum):
 
     QUERY = "query"
     CANCELLED = "cancelled"
-    """A good query whose caller hangs up at a random moment."""
+    """A good query that is cancelled at a random moment."""
     BAD_IMAGE = "bad_image"
     HURRIED = "hurried"
-    """A good query that is given less time than most answers take."""
+    """A good query with a deadline shorter than most answers take."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +57,11 @@ class Mix:
     def __post_init__(self) -> None:
         shares = (self.cancelled_share, self.bad_share, self.hurried_share)
         if min(shares) < 0 or sum(shares) > 1:
-            raise ValueError("shares must be at least 0 and together at most 1")
+            raise ValueError(f"shares must be at least 0 and together at most 1, are {shares}")
         if not min(self.cancel_within_s, self.hurry_s) > 0:
-            raise ValueError("cancel_within_s and hurry_s must be above 0")
+            raise ValueError(
+                f"cancel_within_s and hurry_s must be above 0, are {self.cancel_within_s:g}, {self.hurry_s:g}"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +70,11 @@ class PlannedCall:
 
     Attributes:
         at_s: when, seconds from the start. Latency counts from here, however late the call is sent.
-        client: who makes it, 0, 1, ...
+        client: its number: 0, 1, ...
         kind: what kind of call it is.
         request: what is sent.
-        cancel_after_s: when the caller hangs up, seconds after sending; None if it waits.
-        deadline_s: that it is given; None for what all others are given.
+        cancel_after_s: when it is cancelled, seconds after sending; None if it is not.
+        deadline_s: its own; None for that of all others.
     """
 
     at_s: float
@@ -103,7 +105,7 @@ def plan_calls(
     if clients < 1:
         raise ValueError(f"clients must be at least 1, are {clients}")
     if mix.bad_share > 0 and not requests.bad:
-        raise ValueError("no bad requests to choose from")
+        raise ValueError(f"bad_share is {mix.bad_share:g}, and there are no bad requests")
     random = np.random.default_rng(seed)
     calls = [
         _planned(float(at_s), client, requests, mix, random)

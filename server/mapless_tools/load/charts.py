@@ -15,8 +15,8 @@ from mapless_tools.charts import COLOURS, prepared, use_logarithms
 from .pipeline import PipelineResult
 from .report import machine
 from .slopes import Slope
-from .state import ServerState, column
 from .step import Step
+from .watch import ServerState, column
 
 Value = Callable[[Step], "float | None"]
 _BLUE, _AMBER, _GREEN, _RED = COLOURS[0], COLOURS[1], COLOURS[2], COLOURS[6]

@@ -1,7 +1,7 @@
-"""What goes on at a server beside queries: scenes and references that come and go, watchers, callers who do it wrong.
+"""What a server does beside queries: scenes and references that come and go, watchers, wrong requests.
 
-Each worker does one kind of thing again and again, at random moments, and notes how its calls end. What may go wrong by
-its own doing, a scene that another worker has just deleted, is expected; anything else is a failure.
+Each worker makes one kind of call again and again, at random moments, and counts how its calls end. An error that it
+caused itself, or another worker by deleting a scene, is expected; any other is a failure.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from .requests import SCENE
 from .sender import MAX_MESSAGE_BYTES
 
 ONCE = ConnectOptions(max_attempts=1, timeout_s=20.0)
-"""What becomes of a call is what is noted, not what becomes of trying again."""
+"""The outcome of each call is counted, not that of a retry."""
 EXTRA_REFERENCES = 4
 """Of the scene that is queried, at a time: added in turn, the oldest deleted."""
 SCENES = 5
-"""Names that scenes are made under, again and again: a scene's generation is remembered for ever."""
+"""Ids that scenes are created with, again and again: a scene's generation is kept for ever."""
 ENDING_S = 120.0
-"""For workers to be through with what they do: their calls have deadlines."""
+"""For workers to finish: their calls have deadlines."""
 BUSY = frozenset({"RESOURCE_EXHAUSTED", "DEADLINE_EXCEEDED"})
-"""What a server may say to anybody at its limit."""
+"""What a server may answer any call at its limit."""
 UNCERTAIN = ("ALREADY_EXISTS", "NOT_FOUND")
-"""What may come of a call before that nobody knows the end of, because its time was over."""
+"""What a call may find after one whose end is unknown, because its deadline passed."""
 
 
 @dataclass
@@ -49,16 +49,16 @@ class Outcomes:
 
     Attributes:
         counts: by worker and status.
-        failures: what none should have ended like; the first of each kind in full.
-        localize_codes: statuses of those that were Localize, for comparing with the server's account.
+        failures: unexpected ends; the first of each kind in full.
+        localize_codes: statuses of the calls of Localize, for comparing with the server's account.
     """
 
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
     failures: dict[str, str] = field(default_factory=dict)
     localize_codes: list[str] = field(default_factory=list)
 
-    async def note(self, worker: str, call: Awaitable[object], *expected: str) -> bool:
-        """Awaits a call; whether it went well. Statuses that are `expected` are no failures."""
+    async def count(self, worker: str, call: Awaitable[object], *expected: str) -> bool:
+        """Awaits a call and counts its status; whether it is OK. Statuses that are `expected` are no failures."""
         code, text = "OK", ""
         try:
             await call
@@ -73,14 +73,14 @@ class Outcomes:
 
 
 WORK: Mapping[str, str] = {
-    "references": "add references to the scene that is asked, and delete the oldest",
-    "scenes": "make scenes, ask in them, and delete them",
-    "watch queries": "watch the queries for a while",
-    "watch health": "watch the health for a while",
-    "comers": "come on a new connection each time, ask a little and go, one in three in the middle of a call",
-    "wrong": "ask for what is to be refused",
+    "references": "adds references to the queried scene, and deletes the oldest",
+    "scenes": "creates scenes, localizes in them, and deletes them",
+    "watch queries": "watches the queries for a while",
+    "watch health": "watches the health for a while",
+    "comers": "opens a connection each time, one in three closed in the middle of a call",
+    "wrong": "sends requests that are to be refused",
 }
-"""What the workers do, by the names that their calls are counted under."""
+"""What each worker does, by the name that its calls are counted under."""
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,10 @@ class Workers:
 
     Attributes:
         address: of the server.
-        place: whose photographs are stored and asked with.
-        outcomes: where it is noted how calls end.
-        pace: times between what a worker does are divided by this.
-        stopping: set when they are to end, each when it is through with what it does.
+        place: whose photographs are stored and sent.
+        outcomes: counts how calls end.
+        pace: times between a worker's calls are divided by this.
+        stopping: set when workers are to end, each after its current calls.
     """
 
     address: str
@@ -108,31 +108,31 @@ class Workers:
             for number in self._rounds():
                 photo = chance.choice(self.place.references)
                 new = NewReference(f"extra-{number}", photo.data, photo.camera, photo.world_from_camera)
-                if await self.outcomes.note("references", client.add_reference(SCENE, new)):
+                if await self.outcomes.count("references", client.add_reference(SCENE, new)):
                     stored.append(new.reference_id)
-                # One whose answer came too late was perhaps stored all the same, and stays: no more than a few.
+                # One whose answer came too late was perhaps stored all the same, and stays: a few at most.
                 while len(stored) > EXTRA_REFERENCES:
                     deleted = client.delete_reference(SCENE, stored.pop(0))
-                    await self.outcomes.note("references", deleted, "NOT_FOUND")
+                    await self.outcomes.count("references", deleted, "NOT_FOUND")
                 await self._pause(chance, 8.0)
 
     async def scenes(self, chance: random.Random) -> None:
-        """Makes scenes, asks in them, and deletes them, sometimes while they are asked in."""
+        """Creates scenes, localizes in them, and deletes them, sometimes during a query."""
         first, second = self.place.references[:2]
         async with aio.Client(self.address, ONCE) as client:
             for number in self._rounds():
                 scene = f"scene-{number % SCENES}"
-                await self.outcomes.note("scenes", client.create_scene(scene), *UNCERTAIN)
+                await self.outcomes.count("scenes", client.create_scene(scene), *UNCERTAIN)
                 for photo in (first, second):
                     new = NewReference(photo.name, photo.data, photo.camera, photo.world_from_camera)
-                    await self.outcomes.note("scenes", client.add_reference(scene, new), *UNCERTAIN)
-                asked = asyncio.create_task(self._ask(client, scene, self.place.queries[0]))
+                    await self.outcomes.count("scenes", client.add_reference(scene, new), *UNCERTAIN)
+                asked = asyncio.create_task(self._localize(client, scene, self.place.queries[0]))
                 await asyncio.sleep(chance.choice([0.0, 0.05, 0.2, 3.0]))
-                await self.outcomes.note("scenes", client.delete_scene(scene), *UNCERTAIN)
+                await self.outcomes.count("scenes", client.delete_scene(scene), *UNCERTAIN)
                 await asked
                 await self._pause(chance, 20.0)
 
-    async def _ask(self, client: aio.Client, scene: str, photo: Photograph) -> None:
+    async def _localize(self, client: aio.Client, scene: str, photo: Photograph) -> None:
         code = "OK"
         try:
             await client.localize(photo.data, photo.camera, scene)
@@ -144,7 +144,7 @@ class Workers:
         self.outcomes.localize_codes.append(code)
 
     async def watchers(self, chance: random.Random) -> None:
-        """Watches the scene's queries, and the server's health, for a while each, and leaves without a word."""
+        """Watches the scene's queries, and the server's health, for a while each, and cancels."""
         async with _channel(self.address) as channel:
             for _ in self._rounds():
                 watched = rpcs.LocalizationServiceStub(channel).WatchQueries(
@@ -156,16 +156,16 @@ class Workers:
                 for name, (messages, how) in zip(("watch queries", "watch health"), seen, strict=True):
                     self.outcomes.counts[name, "messages"] += messages
                     self.outcomes.counts[name, how] += 1
-                    # A connection has its age, after which the server ends it.
+                    # The server ends a connection after its maximum age.
                     if how not in ("left", "UNAVAILABLE", *BUSY):
                         self.outcomes.failures.setdefault(f"{name}: {how}", "the server ended it")
 
     async def comers(self, chance: random.Random) -> None:
-        """Comes on a new connection each time, asks a little, and goes; one in three in the middle of a call."""
+        """Opens a connection each time, makes a call or two, and closes it; one in three in the middle of a call."""
         for _ in self._rounds():
             async with aio.Client(self.address, ONCE) as client:
-                await self.outcomes.note("comers", client.is_serving())
-                listing = asyncio.create_task(self.outcomes.note("comers", _listed(client), "CANCELLED"))
+                await self.outcomes.count("comers", client.is_serving())
+                listing = asyncio.create_task(self.outcomes.count("comers", _listed(client), "CANCELLED"))
                 if chance.random() < 1 / 3:
                     await asyncio.sleep(chance.uniform(0.0, 0.01))
                     listing.cancel()
@@ -180,7 +180,7 @@ class Workers:
             await self._pause(chance, 3.0)
 
     async def wrong(self, chance: random.Random) -> None:
-        """Asks for what is not there, makes what is there, and sends what is no message."""
+        """Asks for scenes that do not exist, creates one that exists, and sends bytes that are no message."""
         photo = self.place.queries[0]
         async with aio.Client(self.address, ONCE) as client, _channel(self.address) as channel:
             raw: Any = channel.unary_unary("/mapless.v1.ReferenceService/GetScene")
@@ -198,7 +198,7 @@ class Workers:
             )
             for _ in self._rounds():
                 call, code = chance.choice(wrongs)
-                await self.outcomes.note("wrong", call(), code)
+                await self.outcomes.count("wrong", call(), code)
                 await self._pause(chance, 2.0)
 
     def _rounds(self) -> Iterator[int]:
@@ -211,7 +211,7 @@ class Workers:
 
 @asynccontextmanager
 async def churning(workers: Workers, seed: int) -> AsyncIterator[Outcomes]:
-    """All workers at work until the block is left, which ends with RuntimeError if one has failed by itself."""
+    """All workers run until the block is left; RuntimeError if one has failed by itself."""
     kinds = (workers.references, workers.scenes, workers.watchers, workers.comers, workers.wrong)
     tasks = [asyncio.create_task(work(random.Random(seed + number))) for number, work in enumerate(kinds)]
     try:
@@ -240,7 +240,7 @@ async def _listed(client: aio.Client) -> int:
 
 
 async def _seen_until(leaving: asyncio.Task[None], stream: Any) -> tuple[int, str]:
-    """Messages until the watcher leaves, and "left"; or the status if the server ended it before."""
+    """Messages until `leaving` is over, and "left"; or the status if the server ended the stream before."""
     seen = 0
 
     async def read() -> None:

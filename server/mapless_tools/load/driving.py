@@ -1,12 +1,12 @@
-"""The real server with a scene, and the ways it is called: side by side, as fast as it can, and at a rate."""
+"""The real server with a scene, and the ways to call it: side by side, as fast as it answers, and at a rate."""
 
 from __future__ import annotations
 
 import itertools
 import socket
 import tempfile
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractAsyncContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,32 +17,30 @@ from mapless_tools.progress import Progress
 
 from .arrivals import Mix, Requests, plan_calls
 from .records import CallRecord, Fate
-from .requests import METHOD, read_answer, requests_for, store_references
-from .sender import Target, connected, send_closed_loop, send_open_loop
-from .step import ServerUnderLoad, Step, run_step
-from .watch import going_first
+from .requests import requests_for, store_references
+from .sender import Target, send_closed_loop, send_open_loop
+from .step import Step, run_step
+from .watch import ServerUnderLoad, priority_over
 
 CLOSED_SETTLE_SHARE = 0.2
 """Of a step of calls side by side, what rates leave out: as many answers are missing at first as calls are begun."""
 _RAMP_GAIN = 1.03
-"""So much more has to come of twice as many calls side by side, or the server is saturated."""
+"""Twice as many calls side by side give so much more, or the server is saturated."""
 
 
 @dataclass(frozen=True)
 class LoadedServer:
-    """A server with a scene and what to ask of it.
+    """A server with a scene, and requests to it.
 
     Attributes:
         address: of its services.
-        under_load: its process and metrics.
+        under_load: its process, metrics and store.
         requests: that are ready to be sent.
-        data_dir: its store.
     """
 
     address: str
     under_load: ServerUnderLoad
     requests: Requests
-    data_dir: Path
 
 
 @contextmanager
@@ -66,23 +64,16 @@ def server_with_scene(
                 store_references(client, place.references)
                 progress("first answers", 0, len(place.queries))
                 requests = requests_for(client, place.queries)
-            with going_first(server.process_id):
-                under_load = ServerUnderLoad(server.process_id, f"127.0.0.1:{port}")
-                yield LoadedServer(server.address, under_load, requests, Path(data_dir))
+            with priority_over(server.process_id):
+                under_load = ServerUnderLoad(server.process_id, f"127.0.0.1:{port}", Path(data_dir))
+                yield LoadedServer(server.address, under_load, requests)
 
 
 def free_port() -> int:
-    """A port of the loopback interface that nobody has at the moment."""
+    """A port of the loopback interface that is free at the moment."""
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         return int(found.getsockname()[1])
-
-
-@asynccontextmanager
-async def calling(server: LoadedServer, clients: int, deadline_s: float) -> AsyncIterator[Target]:
-    """Connections to Localize."""
-    async with connected(server.address, METHOD, clients, deadline_s, read_answer) as target:
-        yield target
 
 
 async def find_saturation(

@@ -1,4 +1,4 @@
-"""The least that a server in Python can do, as a program: grpc.aio, bytes in, bytes out."""
+"""The simplest gRPC server in Python, as a program: grpc.aio, bytes in, bytes out."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .sender import MAX_MESSAGE_BYTES
 ECHO_METHOD = "/mapless.load.Bare/Echo"
 SHORT_METHOD = "/mapless.load.Bare/Short"
 SHORT_BYTES = 300
-"""What `Short` sends back of what it got: about as long as an answer of the server that computes nothing."""
+"""Length of the answers of `Short`: about that of an answer of the server that computes nothing."""
 
 
 async def main() -> None:

@@ -1,4 +1,4 @@
-"""What serving costs without computing: calls a second at most, and the time that is ours beyond grpc's own."""
+"""What serving costs without computing: calls a second at most, and the time beyond that of a bare gRPC server."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from .records import Fate
 from .report import Check
 from .requests import METHOD, photo_request, read_answer, store_references
 from .sender import Target, connected, send_closed_loop
-from .step import ServerUnderLoad, Step, run_step
+from .step import Step, run_step
+from .watch import ServerUnderLoad
 
 MIN_CALLS_PER_S = 300.0
 MAX_OVERHEAD_MS = 2.0
@@ -36,7 +37,7 @@ class OverheadOptions:
 
     Attributes:
         message_bytes: size of the photograph; 0.3 MB is a phone's at 1024 px.
-        rounds: the servers take turns so often, so that what else the machine does hits all alike.
+        rounds: the servers take turns so often, so that other work of the machine affects all alike.
         unloaded_s: calls one after the other, a round.
         saturated_s: calls side by side, a round.
         concurrency: of these; enough to keep a server busy, and no more than it has room for.
@@ -92,7 +93,7 @@ def measure_overhead(options: OverheadOptions, progress: Progress) -> list[Subje
 
 
 def overhead_checks(subjects: Sequence[Subject]) -> list[Check]:
-    """The bars; the server is held against the bare one that answers as shortly, which is the harder comparison."""
+    """The bars; the server is compared with the bare one whose answers are as short, which is the harder comparison."""
     by_name = {subject.name: subject for subject in subjects}
     ours, bare = by_name[MAPLESS], by_name[BARE]
     rounds = [_p50_ms(a) - _p50_ms(b) for a, b in zip(ours.unloaded, bare.unloaded, strict=True)]
@@ -172,7 +173,7 @@ async def _compare(
             targets[name] = await stack.enter_async_context(
                 connected(server.address, method, options.clients, 30.0, reader)
             )
-            await _step(name, server, targets[name], request, 4, 0.5)  # what happens once, happens now
+            await _step(name, server, targets[name], request, 4, 0.5)  # once, so that no round pays for the start
         for done in range(options.rounds):
             progress("overhead, rounds", done, options.rounds)
             for name, (server, _) in places.items():

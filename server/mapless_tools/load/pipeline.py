@@ -1,4 +1,4 @@
-"""The real server with a real scene under less and more than it can do: latency, goodput and refusals against load."""
+"""The real server with a real scene below and above its capacity: latency, goodput and refusals against load."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from mapless_server.settings import available_cores
 from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
 
-from .driving import LoadedServer, calling, closed_step, find_saturation, open_step, server_with_scene
+from .driving import LoadedServer, closed_step, find_saturation, open_step, server_with_scene
 from .records import Fate
 from .report import Check, loop_lag_check, trend_check
+from .requests import METHOD, read_answer
+from .sender import connected
 from .step import Step
 
 MIN_SHARE_OF_IDEAL = 0.9
@@ -24,7 +26,7 @@ MAX_REFUSAL_MS = 50.0
 COMFORTABLE, EXCESSIVE = 0.7, 3.0
 """Shares of saturation that have bars of their own."""
 COMFORTABLE_STEPS = 3
-"""The step whose p99 has a bar takes so many times as long as the others."""
+"""The step whose p99 has a bar is so many times as long as the others."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class PipelineOptions:
 
     Attributes:
         clients: that call independently, each on a connection of its own.
-        deadline_s: of every call: what a robot that calls once a second still has a use for.
+        deadline_s: of every call: later a robot that calls once a second has no use for an answer.
         unloaded_s: calls one after the other.
         ramp_s: with each number of calls side by side, until more of them bring less than 3 % more answers.
         step_s: at each share of saturation; a p99 wants some hundred calls.
@@ -91,7 +93,7 @@ class PipelineResult:
 def measure_pipeline(
     place: Place, options: PipelineOptions, progress: Progress, log: Path | None = None
 ) -> PipelineResult:
-    """Starts a server, finds what it can do at most, and offers it shares of that.
+    """Starts a server, finds the most it can answer, and offers shares of that.
 
     Raises:
         ServerFailed: it did not start.
@@ -138,7 +140,7 @@ def pipeline_json(result: PipelineResult) -> dict[str, Any]:
 
 
 async def _measure(place: Place, server: LoadedServer, options: PipelineOptions, progress: Progress) -> PipelineResult:
-    async with calling(server, options.clients, options.deadline_s) as target:
+    async with connected(server.address, METHOD, options.clients, options.deadline_s, read_answer) as target:
         progress("unloaded", 0, 1)
         unloaded = await closed_step("unloaded", server, target, 1, options.unloaded_s)
         ramp, saturation_per_s = await find_saturation(server, target, options.ramp_s, progress)

@@ -1,4 +1,4 @@
-"""What became of calls: each one in exactly one way, and what they amount to."""
+"""How calls ended, each in exactly one way, and what they amount to."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class Fate(str, Enum):
     ANSWERED = "answered"
     """With a pose, or with the reason why there is none, before its deadline."""
     REFUSED = "refused"
-    """Told that the server will not do it: it has too much to do, or stops."""
+    """The server is overloaded, or stops."""
     BAD_REQUEST = "bad request"
-    """Told that its image is bad, which it was."""
+    """Its image is bad, and the server says so."""
     HUNG_UP = "hung up"
-    """The caller cancelled it before there was an answer."""
+    """Its caller cancelled it before there was an answer."""
     TOO_HURRIED = "too hurried"
-    """Its caller gave it less time than an answer takes, and heard in that time that there is none."""
+    """Its deadline was shorter than an answer takes, and it failed by then."""
     OVERDUE = "overdue"
-    """Neither refused nor answered by its deadline: computing was spent on it, or promised, for nothing."""
+    """Neither refused nor answered by its deadline: computing was wasted on it."""
     FAILED = "failed"
     """Any other error, a lost connection among them; there should be none."""
 
@@ -46,11 +46,11 @@ class CallRecord:
         client: who made it.
         at_s: when it was to be sent.
         sent_s: when it was sent; a generator that is slow itself shows here.
-        ended_s: when its caller knew.
-        deadline_s: what it was given, seconds from sending.
+        ended_s: when its caller had the outcome.
+        deadline_s: seconds from sending.
         code: name of the gRPC status.
-        detail: of an answer what it says, of an error its reason; empty where only our own side knows of it.
-        retry_after_s: when a refusal asks to be tried again, seconds, or None.
+        detail: of an answer its outcome, of an error its reason; empty for an error of the client's own side.
+        retry_after_s: when a refusal asks for another try, seconds, or None.
     """
 
     kind: Kind
@@ -65,7 +65,7 @@ class CallRecord:
 
     @property
     def latency_s(self) -> float:
-        """From when it was to be sent: waiting that the server caused counts, wherever it was spent."""
+        """From when it was to be sent: waiting that the server caused counts, on either side."""
         return self.ended_s - self.at_s
 
     @property
@@ -137,7 +137,7 @@ class Account:
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """The smallest of the values that at least this share of them does not exceed; no interpolation flatters it."""
+    """The smallest of the values that at least this share of them does not exceed, without interpolation."""
     if not values or not 0 < share <= 1:
         raise ValueError("there must be values, and the share above 0 and at most 1")
     ordered = np.sort(np.asarray(values, float))
@@ -153,7 +153,7 @@ def latencies(seconds: Sequence[float]) -> Latencies:
 
 
 def account_of(records: Sequence[CallRecord], duration_s: float, settle_s: float = 0.0) -> Account:
-    """What the calls of a step amount to; the first `settle_s`, when queues are still filling, counts in no rate."""
+    """What the calls of a step amount to; rates leave out the first `settle_s`, when queues are still filling."""
     window_s = duration_s - settle_s
     if not (settle_s >= 0 and window_s > 0):
         raise ValueError(f"of {duration_s:g} s nothing is left after {settle_s:g} s")

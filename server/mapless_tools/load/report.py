@@ -21,13 +21,13 @@ from .step import TREND_CONFIDENCE, Step
 
 @dataclass(frozen=True)
 class Check:
-    """A figure and what is asked of it.
+    """A figure and the bar it has to meet.
 
     Attributes:
         figure: what was measured.
         value: in words.
-        bar: what it should be.
-        met: whether it is; None where it was not measured.
+        bar: in words.
+        met: whether the value meets it; None where it was not measured.
     """
 
     figure: str
@@ -84,8 +84,8 @@ def step_lines(steps: Sequence[Step]) -> list[str]:
 
 def loop_lag_check(steps: Sequence[Step], bar_s: float = 0.02) -> Check:
     """Whether the server's event loop was never held up for longer."""
-    told = [step.told.longest_lag_s for step in steps if step.told is not None]
-    longest = max((lag for lag in told if lag is not None), default=None)
+    lags = [step.scraped.longest_lag_s for step in steps if step.scraped is not None]
+    longest = max((lag for lag in lags if lag is not None), default=None)
     value = (
         "-" if longest is None else "beyond the widest bucket" if math.isinf(longest) else f"< {1000 * longest:g} ms"
     )

@@ -1,4 +1,4 @@
-"""The requests that are sent, serialized beforehand, and what the answers say."""
+"""The requests that are sent, serialized beforehand, and the outcomes of answers."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ METHOD = "/mapless.v1.LocalizationService/Localize"
 
 
 def store_references(client: Client, references: Sequence[Photograph]) -> None:
-    """Makes the scene and stores the references in it."""
+    """Creates the scene and stores the references in it."""
     client.create_scene(SCENE)
     client.add_references(SCENE, [NewReference(p.name, p.data, p.camera, p.world_from_camera) for p in references])
 
 
 def requests_for(client: Client, queries: Sequence[Photograph]) -> Requests:
-    """Requests that name the references which the server chooses when it is asked without names; and bad ones.
+    """Requests that name the references which the server would choose; and bad ones.
 
     A robot that localizes once a second knows its neighbourhood; comparing with a whole scene would be another load.
     """
@@ -44,7 +44,7 @@ def mixed_requests(named: Requests, queries: Sequence[Photograph]) -> Requests:
 
     Args:
         named: requests with names, and bad ones.
-        queries: what else is asked with.
+        queries: photographs for the others.
     """
     chosen = [photo_request(query.data, query.camera, ()) for query in queries]
     camera = queries[0].camera
@@ -68,7 +68,7 @@ def photo_request(image: bytes, camera: Camera, references: Sequence[str]) -> by
 
 
 def read_answer(data: bytes) -> str:
-    """What it says: "localized", "coarse" for a pose that there was no time to refine, or "rejected" and why."""
+    """Its outcome: "localized", "coarse" for a pose that there was no time to refine, or "rejected" and why."""
     answer = pb.LocalizeResponse.FromString(data)
     if answer.WhichOneof("outcome") == "rejection":
         reasons: wire.ProtoEnum = pb.RejectionReason

@@ -1,4 +1,4 @@
-"""The server's own account, from its metrics: calls by status, and how long its event loop was held up."""
+"""The server's metrics at a moment: calls by status, delays of the event loop, and sums of all series."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import urllib.error
 import urllib.request
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -18,19 +18,21 @@ LOOP_LAG = "mapless_event_loop_lag_seconds"
 
 @dataclass(frozen=True)
 class Scrape:
-    """Counters at one moment, all since the server began.
+    """Metrics at one moment, or the difference of two.
 
     Attributes:
         started: calls of Localize that began.
         handled: those that ended, by status.
         terminated: admitted jobs that ended, by outcome.
         lag_buckets: times that the event loop was late, by upper edge, seconds; each also counts in the wider ones.
+        totals: every series, its labels added up.
     """
 
     started: int
     handled: Mapping[str, int]
     terminated: Mapping[str, int]
     lag_buckets: Mapping[float, int]
+    totals: Mapping[str, float] = field(default_factory=dict)
 
     def since(self, before: Scrape) -> Scrape:
         """What happened between two moments."""
@@ -39,26 +41,22 @@ class Scrape:
             _difference(self.handled, before.handled),
             _difference(self.terminated, before.terminated),
             {edge: number - before.lag_buckets.get(edge, 0) for edge, number in self.lag_buckets.items()},
+            {name: value - before.totals.get(name, 0.0) for name, value in self.totals.items()},
         )
 
     @property
     def longest_lag_s(self) -> float | None:
-        """The edge below which the event loop always was; infinite beyond the last one, None where it is not told."""
+        """The edge below which the event loop always was; infinite beyond the last one, None without the metric."""
         total = self.lag_buckets.get(math.inf, 0)
         if total == 0:
             return None
         return min(edge for edge, number in self.lag_buckets.items() if number == total)
 
-
-@dataclass(frozen=True)
-class Series:
-    """All values of a metrics page, by the name of their series; labels are left out, and the values added up."""
-
-    values: Mapping[str, float]
-
-    def total(self, name: str) -> float:
-        """Of a series, over all its labels; 0 if there is none."""
-        return self.values.get(name, 0.0)
+    @property
+    def mean_lag_ms(self) -> float:
+        """How late timers of the event loop were, on average; 0 if there were none."""
+        count = self.totals.get(f"{LOOP_LAG}_count", 0.0)
+        return 1000 * self.totals[f"{LOOP_LAG}_sum"] / count if count else 0.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ class Reconciliation:
         handled: calls that the server says have ended.
         running: calls that the server says have begun and not ended; all have ended for the client.
         missing: calls of a status that only the server gives, which the server did not count: by status.
-        surplus: calls that the server counted beyond what the client was told and beyond those it hung up on.
+        surplus: calls that the server counted beyond those that ended for the client and those it cancelled.
         unseen: calls that the client gave up before the server began with them.
     """
 
@@ -87,19 +85,8 @@ class Reconciliation:
         return not self.missing and self.surplus == 0 and self.running == 0 and self.unseen >= 0
 
 
-def read_series(address: str) -> Series:
-    """Scrapes the server for everything; OSError if it does not answer."""
-    with urllib.request.urlopen(f"http://{address}/metrics", timeout=TIMEOUT_S) as response:
-        page = response.read().decode()
-    values: dict[str, float] = {}
-    for family in text_string_to_metric_families(page):
-        for sample in family.samples:
-            values[sample.name] = values.get(sample.name, 0.0) + sample.value
-    return Series(values)
-
-
 def read_metrics(address: str) -> Scrape | None:
-    """Scrapes the server; None if it serves no metrics there."""
+    """Scrapes the server; None if it serves no metrics there, OSError if it does not answer."""
     try:
         with urllib.request.urlopen(f"http://{address}/metrics", timeout=TIMEOUT_S) as response:
             return parse_metrics(response.read().decode())
@@ -110,37 +97,38 @@ def read_metrics(address: str) -> Scrape | None:
 
 
 def parse_metrics(page: str) -> Scrape:
-    """What a metrics page says."""
+    """The metrics of a page."""
     started = 0
     handled: Counter[str] = Counter()
     terminated: Counter[str] = Counter()
     lag: Counter[float] = Counter()
-    for family in text_string_to_metric_families(page):
-        for sample in family.samples:
-            value, labels = round(sample.value), sample.labels
-            if sample.name == "grpc_server_started_total" and labels["grpc_method"] == LOCALIZE:
-                started += value
-            elif sample.name == "grpc_server_handled_total" and labels["grpc_method"] == LOCALIZE:
-                handled[labels["grpc_code"]] += value
-            elif sample.name == "mapless_jobs_terminated_total":
-                terminated[labels["outcome"]] += value
-            elif sample.name == f"{LOOP_LAG}_bucket":
-                lag[float(labels["le"])] += value
-    return Scrape(started, dict(handled), dict(terminated), dict(lag))
+    totals: dict[str, float] = {}
+    for sample in (sample for family in text_string_to_metric_families(page) for sample in family.samples):
+        value, labels = round(sample.value) if math.isfinite(sample.value) else 0, sample.labels
+        totals[sample.name] = totals.get(sample.name, 0.0) + sample.value
+        if sample.name == "grpc_server_started_total" and labels["grpc_method"] == LOCALIZE:
+            started += value
+        elif sample.name == "grpc_server_handled_total" and labels["grpc_method"] == LOCALIZE:
+            handled[labels["grpc_code"]] += value
+        elif sample.name == "mapless_jobs_terminated_total":
+            terminated[labels["outcome"]] += value
+        elif sample.name == f"{LOOP_LAG}_bucket":
+            lag[float(labels["le"])] += value
+    return Scrape(started, dict(handled), dict(terminated), dict(lag), totals)
 
 
 def reconcile(codes: Sequence[str], server: Scrape) -> Reconciliation:
     """The statuses of a client's calls against what the server counted meanwhile.
 
-    The two may differ in calls that the client gave up, by hanging up or at their deadline: the server may have been
-    done with these already, or never have begun.
+    The two may differ in calls that the client gave up, by cancelling or at their deadline: the server may have
+    finished these already, or never have begun.
     """
-    told = Counter(codes)
-    given_up = told["CANCELLED"] + told["DEADLINE_EXCEEDED"]
-    sure = {code: number for code, number in told.items() if code not in ("CANCELLED", "DEADLINE_EXCEEDED")}
-    missing = {code: n - server.handled.get(code, 0) for code, n in sure.items() if n > server.handled.get(code, 0)}
+    counts = Counter(codes)
+    given_up = counts["CANCELLED"] + counts["DEADLINE_EXCEEDED"]
+    certain = {code: number for code, number in counts.items() if code not in ("CANCELLED", "DEADLINE_EXCEEDED")}
+    missing = {code: n - server.handled.get(code, 0) for code, n in certain.items() if n > server.handled.get(code, 0)}
     handled = sum(server.handled.values())
-    others = handled - sum(min(n, server.handled.get(code, 0)) for code, n in sure.items())
+    others = handled - sum(min(n, server.handled.get(code, 0)) for code, n in certain.items())
     return Reconciliation(
         sent=len(codes),
         handled=handled,

@@ -21,20 +21,20 @@ from .records import CallRecord, Fate
 
 MAX_MESSAGE_BYTES = 64 * 2**20
 REFUSED_PAUSE_S = 0.1
-"""Before a caller in a closed loop comes back whom the server refuses without saying when to."""
+"""Before a refused caller in a closed loop calls again, where the server does not say when."""
 
 ReadAnswer = Callable[[bytes], str]
-"""What an answer says, in a few words."""
+"""The outcome of an answer, in a few words."""
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What is called.
+    """The method that is called.
 
     Attributes:
         methods: one of each client, on a connection of its own.
-        deadline_s: that calls are given.
-        read_answer: what an answer says.
+        deadline_s: of calls without one of their own.
+        read_answer: gives the outcome of an answer.
     """
 
     methods: Sequence[Any]
@@ -52,15 +52,15 @@ async def connected(
         address: host:port.
         method: path of the RPC, "/package.Service/Method".
         clients: how many.
-        deadline_s: that calls are given.
-        read_answer: what an answer says.
+        deadline_s: of calls without one of their own.
+        read_answer: gives the outcome of an answer.
     """
     options = [
         # Channels to one address share a connection otherwise, and the server would see one client.
         ("grpc.use_local_subchannel_pool", 1),
         ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
         ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-        # A refusal is what is measured, not what comes of trying again.
+        # A refusal is measured, not the outcome of a retry.
         ("grpc.enable_retries", 0),
     ]
     channels = [grpc.aio.insecure_channel(address, options) for _ in range(clients)]
@@ -74,10 +74,10 @@ async def connected(
 
 
 async def send_open_loop(target: Target, plan: Sequence[PlannedCall], start_s: float | None = None) -> list[CallRecord]:
-    """Makes every call of a plan when its time has come, whatever became of those before it.
+    """Makes every call of a plan at its time, whatever the outcome of those before it.
 
     Args:
-        target: what is called.
+        target: the method that is called.
         plan: in order of time; its clients are those of the target, the last one's number modulo theirs.
         start_s: when the plan begins, by the event loop's clock; None for now.
 
@@ -100,8 +100,8 @@ async def send_closed_loop(
 ) -> list[CallRecord]:
     """Keeps so many calls in progress for a while: what a server can do at most; with one, what an unloaded one does.
 
-    Says nothing about latency under load, since the callers wait for the server. One that is refused comes back
-    when the server asks for it: refusals are cheap, and would be most of what is measured.
+    It does not measure latency under load, since the callers wait for the server. A refused caller calls again when
+    the server asks for it: refusals are cheap, and would be most of what is measured.
     """
     loop = asyncio.get_running_loop()
     begin_s = loop.time()
@@ -141,7 +141,7 @@ async def _call(target: Target, planned: PlannedCall, begin_s: float) -> CallRec
         code, detail, retry_after_s = known.code, _reason(known), known.retry_after_s
     except asyncio.CancelledError:
         if not call.cancelled() or hang_up is None:
-            raise  # this task is cancelled, not the call
+            raise  # this task was cancelled, not the call
         ended_s = loop.time()
         code, detail = "CANCELLED", ""
     finally:
@@ -161,5 +161,5 @@ async def _call(target: Target, planned: PlannedCall, begin_s: float) -> CallRec
 
 
 def _reason(known: MaplessError) -> str:
-    """The server's own; empty if it gave none, or did not speak."""
+    """The server's own; empty if it gave none, or did not answer."""
     return "" if known.reason == known.code and not known.request_id else known.reason

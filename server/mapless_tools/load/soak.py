@@ -1,8 +1,7 @@
 """A server in use for an hour: what it holds at the end it should have held after its first minutes.
 
-Queries of all kinds come as a Poisson process, some hung up on, some in too great a hurry, some with images that are
-none; beside them go the workers of `churn`. Nine tenths of what the server can do is asked of it, or a rate that a
-machine with other work can bear.
+Queries of all kinds come as a Poisson process: some are cancelled, some have too short a deadline, some a bad image;
+beside them run the workers of `churn`. The rate is nine tenths of the server's capacity, or one that is given.
 """
 
 from __future__ import annotations
@@ -20,14 +19,15 @@ from mapless_tools.progress import Progress
 
 from .arrivals import Mix
 from .churn import WORK, Outcomes, Workers, churning
-from .driving import LoadedServer, calling, closed_step, find_saturation, open_step, server_with_scene
+from .driving import LoadedServer, closed_step, find_saturation, open_step, server_with_scene
 from .records import Fate
 from .report import Check, loop_lag_check
-from .requests import mixed_requests
+from .requests import METHOD, mixed_requests, read_answer
 from .scrape import Reconciliation, reconcile
+from .sender import connected
 from .slopes import CONFIDENCE, MIN_SAMPLES, Slope, slope
-from .state import FIELDS, ServerState, Watched, column, states
 from .step import Step
+from .watch import FIELDS, ServerState, column, server_states
 
 UNITS: Mapping[str, str] = {
     "resident_mib": "MiB",
@@ -42,10 +42,10 @@ UNITS: Mapping[str, str] = {
 }
 """Of what slopes are taken of."""
 BOUND = ("resident_mib", "unique_mib", "python_blocks", "threads", "descriptors", "sockets")
-"""What must not grow. The others are told: the data folder grows by what is remembered of the deleted."""
+"""What must not grow. The others are reported: the data folder grows by what is kept of deleted scenes."""
 
 MIN_SETTLED_S = 300.0
-"""In less nothing that takes minutes, as allocators and caches do, can be told from growth."""
+"""In less, what takes minutes, as allocators and caches do, looks like growth."""
 
 
 @dataclass(frozen=True)
@@ -161,10 +161,10 @@ def soak_checks(result: SoakResult) -> list[Check]:
 
 def soak_lines(result: SoakResult) -> list[str]:
     """What went on beside the queries."""
-    told: dict[str, list[str]] = {}
+    counted: dict[str, list[str]] = {}
     for (worker, code), count in sorted(result.outcomes.counts.items()):
-        told.setdefault(worker, []).append(f"{count} {code}")
-    lines = [f"- {worker}, who {WORK[worker]}: {', '.join(counts)}" for worker, counts in told.items()]
+        counted.setdefault(worker, []).append(f"{count} {code}")
+    lines = [f"- {worker} ({WORK[worker]}): {', '.join(counts)}" for worker, counts in counted.items()]
     return ["Beside the queries, by how calls ended:", "", *(lines or ["- nothing"]), ""]
 
 
@@ -185,9 +185,8 @@ def soak_json(result: SoakResult) -> dict[str, Any]:
 
 async def _measure(place: Place, server: LoadedServer, options: SoakOptions, progress: Progress) -> SoakResult:
     seconds = 60 * options.minutes
-    watched = Watched(server.under_load.process_id, str(server.under_load.metrics_address), server.data_dir)
     workers = Workers(server.address, place, Outcomes(), options.churn)
-    async with calling(server, options.clients, options.deadline_s) as target:
+    async with connected(server.address, METHOD, options.clients, options.deadline_s, read_answer) as target:
         progress("unloaded", 0, 1)
         before = [await closed_step("unloaded", server, target, 1, options.ramp_s)]
         p50_ms = before[0].account.answers.p50_ms or 1000.0
@@ -197,7 +196,7 @@ async def _measure(place: Place, server: LoadedServer, options: SoakOptions, pro
             before += ramp
             rate_per_s = options.share * saturation_per_s / (1 - options.bad_share)
         progress(f"soak, {options.minutes:g} minutes", 0, 1)
-        async with states(watched, options.sample_every_s) as found:
+        async with server_states(server.under_load, options.sample_every_s) as found:
             step = await open_step(
                 "soak",
                 server,
@@ -211,14 +210,14 @@ async def _measure(place: Place, server: LoadedServer, options: SoakOptions, pro
                 beside=lambda: churning(workers, options.seed) if options.churn else nullcontext(),
             )
     account = None
-    if step.told is not None:
-        account = reconcile([*step.codes, *workers.outcomes.localize_codes], step.told)
+    if step.scraped is not None:
+        account = reconcile([*step.codes, *workers.outcomes.localize_codes], step.scraped)
     slopes = slopes_of(found, options.settle_share * seconds)
     return SoakResult(place.title, options, before, rate_per_s, step, found, slopes, workers.outcomes, account)
 
 
 def _mix(options: SoakOptions, p50_ms: float) -> Mix:
-    """Those who hang up and those in a hurry do so before about half of the answers."""
+    """Cancelled and hurried calls end before about half of the answers."""
     return Mix(
         options.cancelled_share,
         options.bad_share,
@@ -229,7 +228,7 @@ def _mix(options: SoakOptions, p50_ms: float) -> Mix:
 
 
 def _slope_check(field: str, found: Slope | None, is_bound: bool, options: SoakOptions) -> Check:
-    figure, bar = f"slope of {field}", f"0 within {100 * CONFIDENCE:.0f} %" if is_bound else "told"
+    figure, bar = f"slope of {field}", f"0 within {100 * CONFIDENCE:.0f} %" if is_bound else "reported"
     if found is None:
         return Check(figure, f"{options.minutes:g} minutes are too short, {least_minutes(options)} are not", bar, None)
     unit = f" {UNITS[field]}".rstrip()

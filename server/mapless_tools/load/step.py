@@ -1,4 +1,4 @@
-"""One step of a measurement: calls are made for a while, and client, server and process each give their account."""
+"""One step of a measurement: calls are made for a while, and counted by the client and by the server."""
 
 from __future__ import annotations
 
@@ -10,35 +10,18 @@ from statistics import fmean
 from typing import Any
 
 from .records import Account, CallRecord, Fate, account_of
-from .scrape import Scrape, read_metrics
+from .scrape import Scrape
 from .slopes import MIN_SAMPLES, Slope, slope
-from .watch import SAMPLE_EVERY_S, ProcessSample, watched
+from .watch import SAMPLE_EVERY_S, ProcessSample, ServerUnderLoad, process_samples
 
 Send = Callable[[], Awaitable[list[CallRecord]]]
 TREND_CONFIDENCE = 0.95
 TREND_FIELDS = ("resident_mib", "threads", "descriptors")
 
 
-@dataclass(frozen=True)
-class ServerUnderLoad:
-    """What is measured.
-
-    Attributes:
-        process_id: of the server.
-        metrics_address: where it tells of itself; None if it does not.
-    """
-
-    process_id: int
-    metrics_address: str | None = None
-
-    def scrape(self) -> Scrape | None:
-        """Its own account so far."""
-        return None if self.metrics_address is None else read_metrics(self.metrics_address)
-
-
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What a step came to.
+    """The result of a step.
 
     Attributes:
         name: of the step.
@@ -48,7 +31,7 @@ class Step:
         codes: statuses of all calls, for comparing with the server's account.
         samples: of the server's process, from before the first call until all had ended.
         settle_s: the beginning that rates leave out; trends do, too.
-        told: what the server counted meanwhile; None if it serves no metrics.
+        scraped: what the server counted meanwhile; None if it serves no metrics.
         own_cpu_s: used by the generator itself.
         wall_s: from the first sample to the last.
     """
@@ -60,7 +43,7 @@ class Step:
     codes: Sequence[str]
     samples: Sequence[ProcessSample]
     settle_s: float
-    told: Scrape | None
+    scraped: Scrape | None
     own_cpu_s: float
     wall_s: float
 
@@ -107,7 +90,7 @@ class Step:
 
     def as_json(self) -> dict[str, Any]:
         """All figures, for programs."""
-        longest_lag_s = None if self.told is None else self.told.longest_lag_s
+        longest_lag_s = None if self.scraped is None else self.scraped.longest_lag_s
         return {
             "name": self.name,
             "asked_per_s": self.asked_per_s,
@@ -120,8 +103,8 @@ class Step:
             "server_end": vars(self.samples[-1]),
             "server_trends_per_minute": {name: self._trend_json(name) for name in TREND_FIELDS},
             "event_loop_lag_below_s": _finite(longest_lag_s),
-            "server_handled": None if self.told is None else dict(self.told.handled),
-            "server_terminated": None if self.told is None else dict(self.told.terminated),
+            "server_handled": None if self.scraped is None else dict(self.scraped.handled),
+            "server_terminated": None if self.scraped is None else dict(self.scraped.terminated),
             "generator_cpu_share_of_a_core": self.own_share,
         }
 
@@ -136,20 +119,20 @@ async def run_step(
     settle_s: float = 0.0,
     sample_every_s: float = SAMPLE_EVERY_S,
 ) -> Step:
-    """Makes calls and takes everybody's account.
+    """Makes calls, and measures client, server and process meanwhile.
 
     Args:
         name: of the step.
         server: what is watched.
         send: makes the calls.
         duration_s: for which it makes them.
-        asked_per_s: the rate it was told.
+        asked_per_s: the rate that it was given.
         settle_s: what rates and trends leave out.
         sample_every_s: between samples of the process.
     """
     before = server.scrape()
     own_s, start_s = time.process_time(), time.monotonic()
-    async with watched(server.process_id, sample_every_s) as samples:
+    async with process_samples(server.process_id, sample_every_s) as samples:
         records = await send()
     own_s, wall_s = time.process_time() - own_s, time.monotonic() - start_s
     after = server.scrape()
@@ -161,7 +144,7 @@ async def run_step(
         codes=[record.code for record in records],
         samples=samples,
         settle_s=settle_s,
-        told=None if before is None or after is None else after.since(before),
+        scraped=None if before is None or after is None else after.since(before),
         own_cpu_s=own_s,
         wall_s=wall_s,
     )

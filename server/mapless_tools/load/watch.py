@@ -1,16 +1,40 @@
-"""What the server's process holds and uses, from /proc."""
+"""A server seen from outside: its process in /proc, its metrics and its data folder, at a moment and for a while."""
 
 from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import TypeVar
+
+from .scrape import Scrape, read_metrics
+
+T = TypeVar("T")
 
 SAMPLE_EVERY_S = 1.0
 NICENESS_STEP = 5
+
+
+@dataclass(frozen=True)
+class ServerUnderLoad:
+    """The server that is measured.
+
+    Attributes:
+        process_id: of the server.
+        metrics_address: "host:port" of its metrics; empty if it serves none.
+        data_dir: its data folder, where that is watched.
+    """
+
+    process_id: int
+    metrics_address: str = ""
+    data_dir: Path = Path()
+
+    def scrape(self) -> Scrape | None:
+        """Its metrics now; None if it serves none."""
+        return read_metrics(self.metrics_address) if self.metrics_address else None
 
 
 @dataclass(frozen=True)
@@ -32,6 +56,40 @@ class ProcessSample:
     cpu_s: float
 
 
+@dataclass(frozen=True)
+class ServerState:
+    """A server at a moment.
+
+    Attributes:
+        at_s: by the event loop's clock.
+        resident_mib: memory, with what it shares with other processes.
+        unique_mib: memory that would be free without it.
+        python_blocks: pieces of memory that Python's objects hold, whatever the allocator keeps beside.
+        threads: how many.
+        descriptors: open files and sockets.
+        sockets: of these, sockets.
+        data_mib: the data folder on the disk.
+        waiting_jobs: in the queue.
+        loop_lag_ms: how late timers of the event loop ran, on average since the moment before.
+        cpu_s: used so far.
+    """
+
+    at_s: float
+    resident_mib: float
+    unique_mib: float
+    python_blocks: float
+    threads: float
+    descriptors: float
+    sockets: float
+    data_mib: float
+    waiting_jobs: float
+    loop_lag_ms: float
+    cpu_s: float
+
+
+FIELDS = tuple(field.name for field in fields(ServerState) if field.name != "at_s")
+
+
 def read_process(process_id: int, at_s: float) -> ProcessSample:
     """The process now.
 
@@ -39,24 +97,102 @@ def read_process(process_id: int, at_s: float) -> ProcessSample:
         OSError: it is gone, or the system has no /proc.
     """
     folder = Path(f"/proc/{process_id}")
-    fields = dict(line.split(":", 1) for line in (folder / "status").read_text().splitlines())
+    status = dict(line.split(":", 1) for line in (folder / "status").read_text().splitlines())
     # The name, in parentheses, may hold anything; user and system time are the 14th and 15th field of all.
     times = (folder / "stat").read_text().rpartition(")")[2].split()[11:13]
     return ProcessSample(
         at_s=at_s,
-        resident_mib=int(fields["VmRSS"].split()[0]) / 1024,
-        threads=int(fields["Threads"]),
+        resident_mib=int(status["VmRSS"].split()[0]) / 1024,
+        threads=int(status["Threads"]),
         descriptors=len(os.listdir(folder / "fd")),
         cpu_s=sum(map(int, times)) / os.sysconf("SC_CLK_TCK"),
     )
 
 
-@contextmanager
-def going_first(process_id: int) -> Iterator[None]:
-    """Lets this process go before another, where both want a core, until the block is left.
+def read_state(server: ServerUnderLoad, at_s: float, before: Scrape | None) -> tuple[ServerState, Scrape]:
+    """The state now, and its metrics, for the next time.
 
-    Callers are elsewhere in earnest: one that waits for a core would take its own waiting for the server's. Only who
-    may do so raises its own priority; else the other's is lowered, which lets everybody else go before it, too.
+    Raises:
+        OSError: the process is gone, or its metrics do not answer.
+    """
+    process, folder = read_process(server.process_id, at_s), Path(f"/proc/{server.process_id}")
+    scrape = server.scrape()
+    if scrape is None:
+        raise ConnectionRefusedError(f"there are no metrics on {server.metrics_address}")
+    state = ServerState(
+        at_s=at_s,
+        resident_mib=process.resident_mib,
+        unique_mib=_unique_mib(folder),
+        python_blocks=scrape.totals.get("mapless_python_allocated_blocks", 0.0),
+        threads=process.threads,
+        descriptors=process.descriptors,
+        sockets=_sockets(folder),
+        data_mib=_size_mib(server.data_dir),
+        waiting_jobs=scrape.totals.get("mapless_queue_depth", 0.0),
+        loop_lag_ms=(scrape if before is None else scrape.since(before)).mean_lag_ms,
+        cpu_s=process.cpu_s,
+    )
+    return state, scrape
+
+
+@asynccontextmanager
+async def process_samples(process_id: int, every_s: float = SAMPLE_EVERY_S) -> AsyncIterator[list[ProcessSample]]:
+    """Samples of a process: one at once, one at the end of the block, and in between every so often."""
+    loop = asyncio.get_running_loop()
+    async with _sampled(lambda: read_process(process_id, loop.time()), every_s) as samples:
+        yield samples
+    samples.append(read_process(process_id, loop.time()))
+
+
+@asynccontextmanager
+async def server_states(server: ServerUnderLoad, every_s: float) -> AsyncIterator[list[ServerState]]:
+    """States of a server until the block is left: one at once, then one every so often."""
+    loop = asyncio.get_running_loop()
+    before: Scrape | None = None
+
+    def read() -> ServerState:
+        nonlocal before
+        state, before = read_state(server, loop.time(), before)
+        return state
+
+    async with _sampled(read, every_s) as states:
+        yield states
+
+
+@asynccontextmanager
+async def _sampled(read: Callable[[], T], every_s: float) -> AsyncIterator[list[T]]:
+    """What `read` gives, at once and then every so often, each time in a thread; RuntimeError once it fails."""
+    loop = asyncio.get_running_loop()
+    samples = [await asyncio.to_thread(read)]
+
+    async def keep_reading() -> None:
+        due_s = loop.time()
+        while True:
+            due_s += every_s
+            await asyncio.sleep(max(0.0, due_s - loop.time()))
+            samples.append(await asyncio.to_thread(read))
+
+    reading = asyncio.create_task(keep_reading())
+    try:
+        yield samples
+    finally:
+        reading.cancel()
+        (ended,) = await asyncio.gather(reading, return_exceptions=True)
+        if not isinstance(ended, asyncio.CancelledError):
+            raise RuntimeError("the server can no longer be watched") from ended
+
+
+def column(samples: Sequence[ServerState], field: str) -> list[float]:
+    """One of `FIELDS` of all states."""
+    return [float(getattr(sample, field)) for sample in samples]
+
+
+@contextmanager
+def priority_over(process_id: int) -> Iterator[None]:
+    """Gives this process priority over another, where both want a core, until the block is left.
+
+    Callers are on other machines in earnest: one that waits for a core would count its own waiting as the server's.
+    With the right to do so this process raises its own priority; else it lowers the other's, below that of all others.
 
     Raises:
         OSError: the process is gone, or the system has no /proc.
@@ -74,28 +210,29 @@ def going_first(process_id: int) -> Iterator[None]:
         _set_niceness(own_id, own)
 
 
-@asynccontextmanager
-async def watched(process_id: int, every_s: float = SAMPLE_EVERY_S) -> AsyncIterator[list[ProcessSample]]:
-    """Samples of a process: one at once, one at the end of the block, and in between every so often."""
-    loop = asyncio.get_running_loop()
-    samples = [read_process(process_id, loop.time())]
-
-    async def keep_reading() -> None:
-        while True:
-            await asyncio.sleep(every_s)
-            samples.append(read_process(process_id, loop.time()))
-
-    reading = asyncio.create_task(keep_reading())
-    try:
-        yield samples
-    finally:
-        reading.cancel()
-        await asyncio.gather(reading, return_exceptions=True)
-    samples.append(read_process(process_id, loop.time()))
-
-
 def _set_niceness(process_id: int, niceness: int) -> None:
     """Of all threads; those they start later inherit it."""
     for thread in os.listdir(f"/proc/{process_id}/task"):
         with suppress(ProcessLookupError):  # it has just ended
             os.setpriority(os.PRIO_PROCESS, int(thread), niceness)
+
+
+def _unique_mib(folder: Path) -> float:
+    lines = (folder / "smaps_rollup").read_text().splitlines()
+    return sum(int(line.split()[1]) for line in lines if line.startswith("Private_")) / 1024
+
+
+def _sockets(folder: Path) -> int:
+    count = 0
+    for descriptor in os.listdir(folder / "fd"):
+        with suppress(FileNotFoundError):  # it has just been closed
+            count += os.readlink(folder / "fd" / descriptor).startswith("socket:")
+    return count
+
+
+def _size_mib(folder: Path) -> float:
+    size_bytes = 0
+    for path in folder.rglob("*"):
+        with suppress(FileNotFoundError):
+            size_bytes += path.stat().st_size
+    return size_bytes / 2**20

@@ -15,7 +15,8 @@ from mapless_tools.load import no_op
 from mapless_tools.load.report import Check
 from mapless_tools.load.requests import METHOD, SCENE, photo_request, read_answer
 from mapless_tools.load.sender import Target, connected, send_closed_loop
-from mapless_tools.load.step import ServerUnderLoad, Step, run_step
+from mapless_tools.load.step import Step, run_step
+from mapless_tools.load.watch import ServerUnderLoad
 from mapless_tools.progress import Progress
 
 from .callers import Scenes

@@ -17,8 +17,8 @@ from mapless_tools.load.records import Fate
 from mapless_tools.load.report import Check
 from mapless_tools.load.requests import METHOD, read_answer, requests_for, store_references
 from mapless_tools.load.sender import Target, connected, send_closed_loop
-from mapless_tools.load.step import ServerUnderLoad, Step, run_step
-from mapless_tools.load.watch import read_process
+from mapless_tools.load.step import Step, run_step
+from mapless_tools.load.watch import ServerUnderLoad, read_process
 from mapless_tools.progress import Progress
 
 from .cluster import Cluster, application, running_cluster
