@@ -467,7 +467,7 @@ def random_poses(count: int, offset_m: float = 0.0) -> list[RigidTransform]:
 
 def normalized(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     stacked = torch.from_numpy(poses)[None]
-    return normalize_poses(stacked, torch.ones(1).double(), torch.zeros(1, dtype=torch.bool))[0].numpy()
+    return normalize_poses(stacked)[0].numpy()
 
 
 def test_the_querys_stand_in_does_not_count_for_the_scale() -> None:
@@ -518,8 +518,8 @@ def test_pi3x_answers_as_if_the_query_were_left_out_of_the_mean(monkeypatch: pyt
     assert np.abs(misled - plain).max() > 1e-3 * float(np.abs(plain).max())
 
 
-def _normalize_without_the_last(poses: torch.Tensor, unit: torch.Tensor, uses_depth: torch.Tensor) -> torch.Tensor:
-    return torch.cat([normalize_poses(poses[:, :-1], unit, uses_depth), torch.eye(4)[None, None]], dim=1)
+def _normalize_without_the_last(poses: torch.Tensor) -> torch.Tensor:
+    return torch.cat([normalize_poses(poses[:, :-1]), torch.eye(4)[None, None]], dim=1)
 
 
 def _official_picture(view: View) -> NDArray[np.float32]:

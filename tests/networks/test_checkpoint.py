@@ -14,7 +14,7 @@ import pytest
 torch = pytest.importorskip("torch")
 library = pytest.importorskip("safetensors.torch")
 
-from mapless_server.networks.checkpoint import TRAINING_ONLY, expected_tensors, load_strictly  # noqa: E402
+from mapless_server.networks.checkpoint import UNUSED, expected_tensors, load_strictly  # noqa: E402
 from mapless_server.networks.weights import CATALOGUE, CheckpointError  # noqa: E402
 
 Tensors = dict[str, Any]
@@ -153,9 +153,9 @@ def test_all_that_differs_is_said_at_once(tensors: Tensors, file: Path) -> None:
     )
 
 
-def test_training_only_tensors_are_passed_over_if_asked(tensors: Tensors, file: Path) -> None:
+def test_unused_tensors_are_skipped_if_asked(tensors: Tensors, file: Path) -> None:
     surplus = {"omega": torch.tensor([math.nan]), "flow_head.weight": torch.zeros(3)}
-    network, identity = load(tensors | surplus, file, ignored_prefixes=TRAINING_ONLY)
+    network, identity = load(tensors | surplus, file, ignored_prefixes=UNUSED)
     assert torch.equal(network.scale, tensors["scale"])
     assert identity == hashlib.sha256(file.read_bytes()).hexdigest()
 
@@ -174,15 +174,22 @@ def test_files_of_another_kind_are_refused_unopened(tensors: Tensors, file: Path
 
 
 @pytest.mark.parametrize("name", ["pi3", "pi3x"])
-def test_the_official_file_has_the_size_of_exactly_our_tensors(name: str) -> None:
-    """The header of a float32 file without metadata, as the library writes it, and its data, to the byte."""
+def test_the_official_file_has_the_size_of_its_tensors(name: str) -> None:
+    """The header of a float32 file without metadata, as the library writes it, and its data, to the byte.
+
+    Pi3X's holds, besides ours, a second encoder for depths, of two channels.
+    """
     (weights,) = [weights for weights in CATALOGUE if weights.name == name]
     module, class_name = weights.network.split(":")
     with torch.device("meta"):
         network = getattr(pytest.importorskip(module), class_name)()
+    shapes = {key: list(tensor.shape) for key, tensor in network.state_dict().items()}
+    if name == "pi3x":
+        shapes |= {f"depth_{key}": shape for key, shape in shapes.items() if key.startswith("encoder.")}
+        shapes |= {"depth_encoder.patch_embed.proj.weight": [1024, 2, 14, 14], "depth_emb": [1, 1, 1024]}
     header, end = {}, 0
-    for key, tensor in sorted(network.state_dict().items()):
-        begin, end = end, end + 4 * tensor.numel()
-        header[key] = {"dtype": "F32", "shape": list(tensor.shape), "data_offsets": [begin, end]}
+    for key, shape in sorted(shapes.items()):
+        begin, end = end, end + 4 * math.prod(shape)
+        header[key] = {"dtype": "F32", "shape": shape, "data_offsets": [begin, end]}
     length = len(json.dumps(header, separators=(",", ":")))
     assert weights.size_bytes == 8 + length + -length % 8 + end

@@ -66,7 +66,9 @@ def runner(name: str) -> Iterator[NetworkRunner]:
 def test_it_answers_as_the_network_does() -> None:
     network = ruled_network("pi3")
     runner = NetworkRunner(network, "pi3", "sha")
-    expected, found = network(some_images(4)[None]), localize(runner, 4)
+    layout = network.layout(GRID)
+    expected = network.reconstruct(network.encode(some_images(4), layout)[None], layout, 4)
+    found = localize(runner, 4)
     for field in ("camera_poses", "local_points", "confidence_logits"):
         values = vars(found)[field]
         torch.testing.assert_close(values, vars(expected)[field][:, : values.shape[1]], rtol=0, atol=2e-5)

@@ -9,9 +9,9 @@ from support.parity_rule import images, ruled_network
 from torch import Tensor
 
 from mapless_server.networks.blocks import rope_table
-from mapless_server.networks.conditions import invert_poses, mean_depth, normalize_poses
+from mapless_server.networks.conditions import invert_poses, normalize_poses
 from mapless_server.networks.network import Network, NetworkOutput, patch_grid
-from mapless_server.networks.pi3x import Conditions, Pi3X
+from mapless_server.networks.pi3x import Pi3X
 from mapless_server.networks.rotation import nearest_rotation
 
 GRID = (4, 5)
@@ -26,9 +26,10 @@ def some_images(views: int, grid: tuple[int, int] = GRID) -> Tensor:
     return torch.from_numpy(images("laws", (views, 3, grid[0] * 14, grid[1] * 14)))
 
 
-def reconstruct(network: Network, given: Tensor, mapped: int) -> NetworkOutput:
+def reconstruct(network: Network, given: Tensor, mapped: int, poses: Tensor | None = None) -> NetworkOutput:
     layout = network.layout(patch_grid(given))
-    return network.reconstruct(network.encode(given, layout)[None], layout, mapped)
+    posed = None if poses is None else torch.arange(len(given))[None]
+    return network.reconstruct(network.encode(given, layout)[None], layout, mapped, poses, posed)
 
 
 def assert_close(found: Tensor, expected: Tensor, tolerance: float = 1e-5) -> None:
@@ -69,11 +70,6 @@ def test_scenes_of_a_batch_do_not_see_each_other(network: Network) -> None:
         alone = network.reconstruct(tokens[scene : scene + 1], layout, 3)
         assert_close(together.local_points[scene : scene + 1], alone.local_points)
         assert_close(together.camera_poses[scene : scene + 1], alone.camera_poses)
-
-
-def test_forward_is_encode_then_reconstruct(network: Network) -> None:
-    given = some_images(3)
-    assert_close(network(given[None]).camera_poses, reconstruct(network, given, 3).camera_poses)
 
 
 def test_nan_in_one_view_is_nan_out(network: Network) -> None:
@@ -149,27 +145,24 @@ def poses_at(*positions: tuple[float, float, float]) -> Tensor:
     return poses
 
 
-NO_DEPTH = (torch.ones(1), torch.tensor([False]))
-
-
 def test_normalized_poses_do_not_depend_on_frame_or_unit() -> None:
     poses = poses_at((1, 2, 3), (2, 2, 3), (1, 5, 3))
     moved = poses_at((9, -4, 0))[:, :1] @ poses
     moved[..., :3, 3] *= 30
-    expected = normalize_poses(poses, *NO_DEPTH)
-    torch.testing.assert_close(normalize_poses(moved, *NO_DEPTH), expected, rtol=0, atol=1e-5)
+    expected = normalize_poses(poses)
+    torch.testing.assert_close(normalize_poses(moved), expected, rtol=0, atol=1e-5)
     torch.testing.assert_close(expected[0, 0], torch.eye(4), rtol=0, atol=1e-6)
     torch.testing.assert_close(expected[0, 1:, :3, 3].norm(dim=-1).mean(), torch.tensor(1.0))
 
 
 def test_stand_ins_for_unknown_poses_count_for_the_scale() -> None:
     known = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
-    alone = normalize_poses(known, *NO_DEPTH)
+    alone = normalize_poses(known)
 
     def with_placeholder(distance: float) -> Tensor:
         placeholder = torch.eye(4)[None, None].clone()
         placeholder[..., 0, 3] = distance
-        return normalize_poses(torch.cat([known, placeholder], dim=1), *NO_DEPTH)[:, :3]
+        return normalize_poses(torch.cat([known, placeholder], dim=1))[:, :3]
 
     torch.testing.assert_close(with_placeholder(2.0), alone)  # the mean of 1 and 3
     far = with_placeholder(200.0)
@@ -178,25 +171,16 @@ def test_stand_ins_for_unknown_poses_count_for_the_scale() -> None:
 
 def test_views_that_stand_still_keep_their_scale() -> None:
     poses = poses_at((0, 0, 0), (0.01, 0, 0))
-    torch.testing.assert_close(normalize_poses(poses, *NO_DEPTH)[0, 1, :3, 3].norm(), torch.tensor(0.01))
-
-
-def test_with_depths_the_mean_depth_is_the_unit() -> None:
-    depths = torch.tensor([2.0, 0.0, 4.0, 0.0]).view(1, 2, 1, 2)
-    assert mean_depth(depths) == 3
-    assert mean_depth(torch.zeros(1, 2, 1, 2)) == 1
-    normalized = normalize_poses(poses_at((0, 0, 0), (6, 0, 0)), mean_depth(depths), torch.tensor([True]))
-    torch.testing.assert_close(normalized[0, 1, :3, 3].norm(), torch.tensor(2.0))
+    torch.testing.assert_close(normalize_poses(poses)[0, 1, :3, 3].norm(), torch.tensor(0.01))
 
 
 def test_a_rigid_change_of_all_poses_changes_nothing() -> None:
     network = ruled_network("pi3x")
-    given = some_images(3)[None]
+    given = some_images(3)
     poses = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
-    posed = torch.tensor([[True, True, True]])
-    plain = network(given, Conditions(poses=poses, has_pose=posed))
-    moved = network(given, Conditions(poses=poses_at((5, 5, 5)) @ poses, has_pose=posed))
-    without = network(given)
+    plain = reconstruct(network, given, 3, normalize_poses(poses))
+    moved = reconstruct(network, given, 3, normalize_poses(poses_at((5, 5, 5)) @ poses))
+    without = reconstruct(network, given, 3)
     assert_close(moved.camera_poses, plain.camera_poses, 1e-4)
     assert (without.camera_poses - plain.camera_poses).abs().max() > 1e-2
 
@@ -207,20 +191,11 @@ def test_the_pose_of_an_unposed_view_only_affects_the_scale() -> None:
     layout = network.layout(GRID)
     tokens = network.encode(some_images(3), layout)[None]
     posed = torch.tensor([[0, 1]])
-    poses = normalize_poses(poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0)), *NO_DEPTH)
+    poses = normalize_poses(poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0)))
     other = poses.clone()
     other[0, 2] = poses_at((7, 7, 7))[0, 0]
     first, second = (network.reconstruct(tokens, layout, 2, p, posed) for p in (poses, other))
     torch.testing.assert_close(first.camera_poses, second.camera_poses, rtol=0, atol=0)
-
-
-def test_without_depth_parts_the_rest_answers_the_same() -> None:
-    whole, lean = ruled_network("pi3x"), ruled_network("pi3x")
-    assert isinstance(lean, Pi3X)
-    lean.forget_depths()
-    given = some_images(3)
-    assert torch.equal(reconstruct(lean, given, 2).local_points, reconstruct(whole, given, 2).local_points)
-    assert not [key for key in lean.state_dict() if key.startswith("depth_")]
 
 
 def test_inverse_poses() -> None:
@@ -231,14 +206,14 @@ def test_inverse_poses() -> None:
 @pytest.mark.parametrize("name", ["pi3", "pi3x"])
 def test_every_parameter_has_a_say(name: str) -> None:
     network = ruled_network(name).requires_grad_(True)
-    given = some_images(3)[None]
+    given = some_images(3)
+    layout = network.layout(GRID)
     if isinstance(network, Pi3X):
-        posed = torch.ones(1, 3, dtype=torch.bool)
-        depths, rays = torch.rand(1, 3, 56, 70), torch.rand(1, 3, 2, 56, 70)
-        poses = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
-        output = network(given, Conditions(rays, posed, depths, posed, poses, posed))
+        tokens = network.encode(given, layout, torch.eye(3).expand(3, 3, 3) * 50)
+        poses = normalize_poses(poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0)))
+        output = network.reconstruct(tokens[None], layout, 3, poses, torch.arange(3)[None])
     else:
-        output = network(given)
+        output = reconstruct(network, given, 3)
     sum((tensor * torch.rand(tensor.shape)).sum() for tensor in vars(output).values()).backward()
     silent = [key for key, p in network.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
     assert silent == []

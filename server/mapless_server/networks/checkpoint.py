@@ -19,8 +19,11 @@ IMAGE_NORMALIZATION: Mapping[str, Sequence[float]] = {
 }
 """ImageNet's constants, red, green, blue, for images in 0..1: buffers of Pi3 and Pi3X that a checkpoint may lack."""
 
-TRAINING_ONLY = ("omega", "flow_decoder.", "flow_head.", "global_points_decoder.", "global_point_head.")
-"""Beginnings of names that only the training of Pi3 and Pi3X uses."""
+UNUSED = (
+    *("omega", "flow_decoder.", "flow_head.", "global_points_decoder.", "global_point_head."),
+    *("depth_encoder.", "depth_emb"),
+)
+"""Beginnings of names in checkpoints of Pi3 and Pi3X that only their training uses, and that are for given depths."""
 
 _DTYPES = {
     "F64": torch.float64,

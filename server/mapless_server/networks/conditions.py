@@ -1,7 +1,7 @@
-"""What Pi3X may be told beside the images: rays, depths and poses of some of the views.
+"""What Pi3X takes beside the images: rays of all views, and poses of some.
 
 Poses enter through attention whose queries, keys and values are moved by the cameras (PRoPE, Li et al. 2025), among the
-views that have one; rays and depths are added to the patch tokens.
+views that have one; rays are added to the patch tokens.
 """
 
 from __future__ import annotations
@@ -35,11 +35,6 @@ def rays_from_intrinsics(intrinsics: Tensor, height_px: int, width_px: int) -> T
     return rays[:, :2] / rays[:, 2:]
 
 
-def rays_from_directions(directions: Tensor) -> Tensor:
-    """The same (V, 2, H, W) from directions (V, H, W, 3)."""
-    return (directions[..., :2] / (directions[..., 2:] + 1e-6)).permute(0, 3, 1, 2)
-
-
 def invert_small(matrices: Tensor) -> Tensor:
     """Inverses of (..., 3, 3)."""
     a, b, c = matrices.unbind(-2)
@@ -53,33 +48,24 @@ def invert_poses(poses: Tensor) -> Tensor:
     return torch.cat([torch.cat([rotation, -rotation @ translation], dim=-1), poses[..., 3:, :]], dim=-2)
 
 
-def mean_depth(depths: Tensor) -> Tensor:
-    """Mean (B,) of the positive depths (B, N, H, W) of each scene, whether or not a view's are used; 1 without any."""
-    known = depths > 0
-    count = known.sum((1, 2, 3))
-    return torch.where(count > 0, (depths * known).sum((1, 2, 3)) / count.clamp_min(1), 1.0)
-
-
-def normalize_poses(poses: Tensor, unit: Tensor, uses_depth: Tensor) -> Tensor:
+def normalize_poses(poses: Tensor) -> Tensor:
     """Poses of each scene's views relative to its first, at a scale that the network knows.
 
-    Where depths are used, the mean depth is 1. Where none are, the mean distance of the other views from the first is;
-    of all of them, also of those whose pose is then not used (so what stands in for an unknown pose matters).
+    The mean distance of the other views from the first is 1: of all of them, also of those whose pose is then not used
+    (so what stands in for an unknown pose matters).
 
     Args:
         poses: (B, N, 4, 4) world_from_camera.
-        unit: (B,) mean depth, in the unit of the poses.
-        uses_depth: (B,) whether the depth of any view is used.
 
     Returns:
         (B, N, 4, 4), the first of each scene the identity.
     """
     relative = invert_poses(poses[:, :1]) @ poses
-    translation = relative[..., :3, 3] / (unit[:, None, None] + 1e-8)
+    translation = relative[..., :3, 3]
     if poses.shape[1] > 1:
         distance = translation[:, 1:].norm(dim=-1)
         moves = distance.amax(1) >= MIN_MOTION
-        scale = torch.where(moves & ~uses_depth, distance.mean(1) + 1e-8, 1.0)
+        scale = torch.where(moves, distance.mean(1) + 1e-8, 1.0)
         translation = translation / scale[:, None, None]
     normalized = relative.clone()
     normalized[..., :3, 3] = translation

@@ -30,17 +30,17 @@ class PatchEmbedding(nn.Module):
 class Encoder(nn.Module):
     """Normalized images to patch tokens."""
 
-    def __init__(self, width: int, heads: int, depth: int, channels: int = 3) -> None:
+    def __init__(self, width: int, heads: int, depth: int) -> None:
         super().__init__()
         self.cls_token = nn.Parameter(torch.empty(1, 1, width))
         self.pos_embed = nn.Parameter(torch.empty(1, 1 + POSITION_SIDE**2, width))
         self.register_tokens = nn.Parameter(torch.empty(1, REGISTERS, width))
-        self.patch_embed = PatchEmbedding(channels, width)
+        self.patch_embed = PatchEmbedding(3, width)
         self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
         self.norm = LayerNorm(width, eps=BLOCK_EPS)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Images (V, channels, H, W), sides multiples of 14, to tokens (V, P, C) float32, P = H/14 * W/14, by rows."""
+        """Images (V, 3, H, W), sides multiples of 14, to tokens (V, P, C) float32, P = H/14 * W/14, by rows."""
         grid = (images.shape[2] // PATCH_PX, images.shape[3] // PATCH_PX)
         of_class, of_patches = self.positions(grid).split([1, grid[0] * grid[1]], dim=1)
         views = len(images)

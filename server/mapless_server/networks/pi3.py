@@ -7,7 +7,7 @@ from torch import Tensor
 
 from .decoder import Layout
 from .heads import LinearHead
-from .network import Network, NetworkOutput, Sizes, patch_grid
+from .network import Network, NetworkOutput, Sizes
 
 
 class Pi3(Network):
@@ -41,13 +41,6 @@ class Pi3(Network):
         decoded = self.decode(tokens, layout)
         points, logits = self.maps(decoded[:, :mapped], layout)
         return NetworkOutput(points, logits, self.cameras(decoded, layout))
-
-    def forward(self, images: Tensor) -> NetworkOutput:
-        """Everything of images (B, N, 3, H, W) in [0, 1]."""
-        scenes, views = images.shape[:2]
-        layout = self.layout(patch_grid(images))
-        tokens = self.encode(images.flatten(0, 1), layout).unflatten(0, (scenes, views))
-        return self.reconstruct(tokens, layout, views)
 
     def read_maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
         """See Network.read_maps."""

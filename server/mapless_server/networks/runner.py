@@ -215,9 +215,7 @@ class NetworkRunner:
             return None, None
         indices = posed.nonzero()[:, 1].view(len(posed), -1)
         poses = poses.to(self.device, torch.float32, non_blocking=True)
-        none = torch.zeros(len(poses), dtype=torch.bool, device=self.device)
-        normalized = normalize_poses(poses, torch.ones(len(poses), device=self.device), none)
-        return normalized, indices.to(self.device, non_blocking=True)
+        return normalize_poses(poses), indices.to(self.device, non_blocking=True)
 
     def _warm_up(self, bucket: Bucket) -> None:
         height, width = (side * PATCH_PX for side in bucket.grid)

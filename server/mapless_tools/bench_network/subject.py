@@ -42,7 +42,7 @@ def _scaled(key: str, noise: Tensor) -> Tensor:
     name = key.rsplit(".", 1)[-1]
     if name == "gamma":
         return 0.1 + 0.03 * noise
-    if name in ("cls_token", "pos_embed", "register_tokens", "register_token", "metric_token", "depth_emb"):
+    if name in ("cls_token", "pos_embed", "register_tokens", "register_token", "metric_token"):
         return 0.3 * noise
     if noise.ndim == 1:
         return (1.0 if name == "weight" else 0.0) + 0.05 * noise
@@ -87,7 +87,7 @@ class Scene:
             self.intrinsics = k.repeat(views, 1, 1).to(device)
             poses = torch.eye(4).repeat(1, views, 1, 1)
             poses[..., 0, 3] = torch.arange(views)
-            self.poses = normalize_poses(poses, torch.ones(1), torch.zeros(1, dtype=torch.bool)).to(device)
+            self.poses = normalize_poses(poses).to(device)
             self.posed = torch.arange(views - 1, device=device)[None]
 
     def encode(self, network: Network, views: slice) -> Tensor:

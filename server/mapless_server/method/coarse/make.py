@@ -93,7 +93,7 @@ def _load(
 ) -> Reconstructor:
     import torch
 
-    from mapless_server.networks.checkpoint import TRAINING_ONLY, load_strictly
+    from mapless_server.networks.checkpoint import UNUSED, load_strictly
     from mapless_server.networks.pi3 import Pi3
     from mapless_server.networks.pi3x import Pi3X
     from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions
@@ -106,9 +106,7 @@ def _load(
     with torch.device("meta"):
         network = Pi3() if backend == "pi3" else Pi3X()
     # On the host, where the runner reduces the precision before anything goes to the device.
-    weights_sha256 = load_strictly(network, weights, ignored_prefixes=TRAINING_ONLY)
-    if isinstance(network, Pi3X):
-        network.forget_depths()
+    weights_sha256 = load_strictly(network, weights, ignored_prefixes=UNUSED)
     runner_options = RunnerOptions(compile_backend="inductor" if compiled_views else None)
     runner = NetworkRunner(network, backend, weights_sha256, device, runner_options)
     if compiled_views:

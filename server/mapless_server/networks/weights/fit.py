@@ -29,14 +29,14 @@ def compare_names(header: Header, weights: Weights, called: str) -> str | None:
     try:
         import torch
 
-        from ..checkpoint import IMAGE_NORMALIZATION, TRAINING_ONLY, expected_tensors
+        from ..checkpoint import IMAGE_NORMALIZATION, UNUSED, expected_tensors
 
         network = getattr(importlib.import_module(module_name), class_name)
     except ImportError as error:
         return install_hint(error)
     with torch.device("meta"):
         expected = expected_tensors(network())
-    check_fit(header, expected, IMAGE_NORMALIZATION.keys(), TRAINING_ONLY, f"{called} does not fit {class_name}")
+    check_fit(header, expected, IMAGE_NORMALIZATION.keys(), UNUSED, f"{called} does not fit {class_name}")
     return None
 
 
