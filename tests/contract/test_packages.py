@@ -18,6 +18,8 @@ from support.waiting import LIMIT_S
 ROOT = Path(__file__).parents[2]
 SOURCES = ("client", "server", "deploy/ray/mapless_ray", "pyproject.toml", "README.md", "LICENSE")
 BUILD_LIMIT_S = 170.0
+UV = (sys.executable, ROOT / ".ci" / "uv.py")
+"""uv, with the package sources of pip."""
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(600)]
 
@@ -53,7 +55,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def wheel(source: Path) -> Path:
     """The wheel, built from the sdist."""
-    run(sys.executable, "-m", "build", "--installer", "uv", source)
+    run(sys.executable, "-m", "build", source)
     (found,) = (source / "dist").glob("*.whl")
     return found
 
@@ -64,9 +66,9 @@ def install(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[
 
     def install(extras: str) -> Path:
         folder = tmp_path_factory.mktemp("environment")
-        run(sys.executable, "-m", "uv", "venv", "--clear", "--python", sys.executable, folder)
+        run(*UV, "venv", "--clear", "--python", sys.executable, folder)
         python = folder / "bin" / "python"
-        run(sys.executable, "-m", "uv", "pip", "install", "--python", python, f"mapless{extras} @ {wheel.as_uri()}")
+        run(*UV, "pip", "install", "--python", python, f"mapless{extras} @ {wheel.as_uri()}")
         return folder / "bin"
 
     return install
@@ -86,7 +88,7 @@ def test_the_wheel_holds_every_file_of_the_packages_and_no_other(source: Path, w
 def test_the_client_alone_needs_neither_server_nor_torch(install: Callable[[str], Path]) -> None:
     programs = install("")
     run(programs / "mapless", "--help")
-    installed = json.loads(run(sys.executable, "-m", "uv", "pip", "list", "-q", "--format=json", "-p", programs.parent))
+    installed = json.loads(run(*UV, "pip", "list", "-q", "--format=json", "-p", programs.parent))
     assert {it["name"] for it in installed} == {
         "googleapis-common-protos",
         "grpcio",

@@ -394,17 +394,15 @@ def test_additions_through_one_replica_are_used_by_the_other(guarded: Guarded) -
 def called(guarded: Guarded) -> Iterator[Calls]:
     """Callers of all kinds meanwhile; at the end no call has failed and nothing that was acknowledged is lost."""
     scenes = Scenes(4, PHOTO, CAMERA)
-    made: list[Calls] = []
 
-    def long(client: Client, _: int) -> None:
+    def long(client: Client, *_: Any) -> None:
         client.localize(PHOTO, CAMERA, "slow")
 
     with guarded.client() as client:
         scenes.remove(client)
         scenes.store(client)
-    kinds = [scenes.localize, scenes.get, long, scenes.adding(lambda: made[0], "added")]
+    kinds = [scenes.localize, scenes.get, long, scenes.add]
     with calling(guarded.cluster.address, kinds, 0.02, guarded.options()) as calls:
-        made.append(calls)
         wait_until(lambda: len(calls.ended) > 20)
         yield calls
         begin_s = time.monotonic()

@@ -1,6 +1,6 @@
-"""mapless on Ray Serve: replicas that each are a whole mapless server but for the socket.
+"""The adapter to Ray Serve: each replica is a whole mapless server without a socket of its own.
 
-`app.build` makes the application of a Serve config, `replica` is what one replica is, `ingress` puts mapless's
-handlers on the gRPC server that Serve opens in it, and `scaling` says how many replicas there should be. Nothing of
-mapless knows of this package.
+May import the client and the server. Begin with `app.build`, the application of a Serve config; `replica` is one
+replica, `ingress` puts mapless's handlers on Serve's gRPC server, `scaling` is the autoscaling policy, and
+`environment` has the variables that Ray is started with. No module of mapless imports this package.
 """

@@ -10,11 +10,11 @@ from ray.serve import Application
 from .replica import MaplessReplica
 
 DRAIN_GRACE_S = 60.0
-"""For calls that run when a replica is to go, beyond the time in which load balancers forget it."""
+"""Time for the running calls of a replica that ends, after load balancers have removed it."""
 
 
 def build(settings: dict[str, Any]) -> Application:
-    """One deployment; how many replicas it has and what device each gets, the config's `deployments` says.
+    """One deployment; the config's `deployments` sets the number of replicas and the device of each.
 
     Args:
         settings: the config's `args`: settings of mapless by name. Secrets belong into the environment instead.
@@ -23,7 +23,7 @@ def build(settings: dict[str, Any]) -> Application:
 
 
 def deployed(replica: type[MaplessReplica], settings: dict[str, Any]) -> Application:
-    """The application whose replicas are of that class."""
+    """The application with replicas of a class."""
     deployment = serve.deployment(
         name="mapless",
         graceful_shutdown_timeout_s=DRAIN_GRACE_S,

@@ -1,7 +1,6 @@
-"""What a Ray cluster has to be told beside the Serve config: environment variables of `ray start`, on every node.
+"""Environment variables of `ray start`, on every node: what a Serve config cannot set.
 
-Serve takes these from nowhere else. `python -m mapless_ray.environment` prints them for a shell; the manifests repeat
-them, and a test compares.
+`python -m mapless_ray.environment` prints them for a shell; the manifests repeat them, and a test compares.
 """
 
 from __future__ import annotations
@@ -14,41 +13,40 @@ from mapless_server.serve.assembly import StartupError
 from mapless_server.settings import Settings
 
 LEAVING_S = 10.0
-"""How long a replica that is to go still answers before it takes no more calls: HAProxy has forgotten it in one or two
-seconds, on a busy machine in five. Serve's own 30 s would only make redeploys slower."""
+"""Time for which a replica that ends still accepts calls: HAProxy removes it in one or two seconds, on a busy machine
+in five. Serve's default of 30 s would only make redeploys slower."""
 
 _MIB = 2**20
 
 WINDOW_BYTES = _MIB
-"""What may be on the way of one call without an acknowledgement: a photograph, rather than HAProxy's 64 KiB, each of
-which would wait for the next round trip."""
+"""Data of one call in transit without acknowledgement: a photograph. HAProxy's default is 64 KiB a round trip."""
 
 _BALANCING = """\
 hdr(x-mapless-scene)
     hash-type consistent
     hash-balance-factor 150
 """
-"""Calls of a scene go to the replica that has its references in memory, unless it has half as many calls again as the
-others have on average; calls that name none go around."""
+"""Calls of a scene go to the replica that has its references in memory, unless it has 1.5 times as many calls as the
+average; calls without a scene go to the replicas by turns."""
 
 _LOST = """\
     http-error status {} content-type application/grpc hdr grpc-status 14 hdr grpc-message "{}"
 """
-"""Serve has HAProxy answer with HTTP 500, which gRPC makes UNKNOWN of, and nobody tries UNKNOWN again."""
+"""UNAVAILABLE, which clients retry, instead of Serve's HTTP 500, which gRPC reports as UNKNOWN."""
 
 
 def variables(max_message_mib: int = 32, leaving_s: float = LEAVING_S) -> dict[str, str]:
     """The variables.
 
-    HAProxy's configuration is a template of Serve's whose section for all proxies ends with the way of balancing: what
-    follows that, in the same variable, are further lines of the section.
+    Serve's template of HAProxy's configuration ends its section for all proxies with the balancing algorithm, so that
+    further lines in that variable are further lines of the section.
 
     Args:
-        max_message_mib: as in the settings, which Serve's gRPC servers do not know.
+        max_message_mib: as in the settings, which Serve's gRPC servers do not use.
         leaving_s: see `LEAVING_S`.
     """
     lost = _LOST.format(502, "the replica ended") + _LOST.format(503, "no replica took the call")
-    lost += _LOST.format(504, "the replica fell silent")
+    lost += _LOST.format(504, "the replica does not answer")
     return {
         "RAY_SERVE_ENABLE_HA_PROXY": "1",
         # The replica lives in the event loop in which its gRPC server calls it.
@@ -62,7 +60,7 @@ def variables(max_message_mib: int = 32, leaving_s: float = LEAVING_S) -> dict[s
 
 
 def check_environment(settings: Settings, environment: Mapping[str, str] = os.environ) -> None:
-    """Looks for what callers would otherwise notice first.
+    """Checks the variables without which calls fail.
 
     Raises:
         StartupError: a variable is missing or contradicts the settings.

@@ -1,10 +1,9 @@
 """mapless's own handlers on the gRPC server that Serve opens in every replica.
 
-In Serve's HAProxy mode (RAY_SERVE_ENABLE_HA_PROXY=1) a call goes from the load balancer straight to a gRPC server in
+In Serve's HAProxy mode (RAY_SERVE_ENABLE_HA_PROXY=1) a call goes from the load balancer directly to a gRPC server in
 the replica's process. Serve would read the request there, call a method of the deployment, and turn exceptions into
-statuses; on that way the caller's deadline, its time to send the message, rich error details and health by
-grpc.health.v1 are lost. So the handlers are registered as they are on a server of mapless's own: what a caller meets
-there it meets here.
+statuses, which loses the caller's deadline, the time limit of its message, rich error details and grpc.health.v1. So
+mapless's own handlers are registered, and a caller sees no difference from a plain server.
 """
 
 from __future__ import annotations
@@ -35,27 +34,27 @@ _SERVICES = (
 
 
 class ServeServer(Protocol):
-    """What is used of Serve's gRPC server, a grpc.aio.Server."""
+    """The methods in use of Serve's gRPC server, a grpc.aio.Server."""
 
     async def stop(self, grace: float | None) -> None:
-        """Serve calls this when HAProxy has had time to forget the replica; running calls get `grace` seconds."""
+        """Serve calls this when HAProxy has removed the replica; running calls get `grace` seconds."""
 
     def add_passthrough_service(self, service_name: str) -> None:
-        """The service's handlers, which are added after this, are not replaced by Serve's."""
+        """Keeps Serve from replacing the service's handlers, which are added after this."""
 
     def add_generic_rpc_handlers(self, handlers: Any) -> None:
         """As of grpc.aio.Server."""
 
 
 _LAST_BYTES_S = 5.0
-"""For answers that are on their way when the last call has ended; to wait costs nothing, since others are served."""
+"""Time for answers in transit when the last call has ended; long, since other replicas serve meanwhile."""
 
 
 class Ingress:
-    """What brings a replica its calls; there is one a process. Implements `mapless_server.serve.running.Listener`.
+    """Receives the calls of a replica; one a process. Implements `mapless_server.serve.running.Listener`.
 
     Attributes:
-        address: unknown; Serve opens the port, which it chooses, once the replica is ready.
+        address: unknown: Serve chooses and opens the port when the replica is ready.
     """
 
     address = "ray"
@@ -63,19 +62,21 @@ class Ingress:
 
     def __init__(self, settings: Settings, services: Services, credentials: grpc.ServerCredentials | None) -> None:
         if credentials is not None:
-            raise StartupError("Serve's gRPC server knows no TLS: unset tls_certificate, and end TLS at the gateway")
+            raise StartupError(
+                "Serve's gRPC server has no TLS: unset tls_certificate, and terminate TLS at the gateway"
+            )
         self.services = services
         self.loop = asyncio.get_running_loop()
 
     async def start(self) -> None:
-        """Serve opens its server once the replica's constructor has returned."""
+        """Serve opens its server when the replica's constructor has returned."""
         Ingress.current = self
 
     async def stop(self) -> None:
-        """Serve has stopped its server before it lets the replica go."""
+        """Serve stops its server before it ends the replica."""
 
     def drained(self, stop: Stop) -> Stop:
-        """A server's way to stop, with the services drained first: streams without end would hold it up."""
+        """A server's `stop` that drains the services first, because endless streams would delay it."""
 
         async def drain_and_stop(grace_s: float | None) -> None:
             await self.services.drain(0.0, grace_s or 0.0)
@@ -84,18 +85,18 @@ class Ingress:
         return drain_and_stop
 
     async def close(self) -> None:
-        """Nothing is left to close."""
+        """There is nothing to close."""
         Ingress.current = None
 
 
 def add_services(_: object, server: ServeServer) -> None:
-    """The function that Serve's config names; called with each gRPC server that Serve makes, in its event loop."""
+    """Named in Serve's config; Serve calls it with each of its gRPC servers, in the server's event loop."""
     ingress = Ingress.current
     if ingress is None:
         _add_refusals(server)
         return
     if asyncio.get_running_loop() is not ingress.loop:
-        raise AssertionError("the replica lives in another event loop than its gRPC server: see `environment`")
+        raise AssertionError("the replica runs in another event loop than its gRPC server: see `environment`")
     for service in ingress.services.handlers:
         server.add_passthrough_service(service)
     ingress.services.add_to(server)
@@ -103,7 +104,7 @@ def add_services(_: object, server: ServeServer) -> None:
 
 
 def _add_refusals(server: ServeServer) -> None:
-    """In Serve's proxies, to which calls come when no replica is ready; health says so rather than fail."""
+    """For Serve's proxies, which receive calls when no replica is ready: UNAVAILABLE, and NOT_SERVING for health."""
     error = Unavailable("no replica is ready", reason="STARTING", retry_after_s=1.0)
     status = rpc_status.to_status(to_status(error))
 

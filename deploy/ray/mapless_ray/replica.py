@@ -1,4 +1,4 @@
-"""One replica: one device, with the whole pipeline and its queue, as a server of mapless's own has."""
+"""One replica: a device with its own queue and pipeline, as in a plain server."""
 
 from __future__ import annotations
 
@@ -24,39 +24,39 @@ from .scaling import Reporter
 log = logging.getLogger(__name__)
 
 SERVE_HOST = "0.0.0.0"
-"""Where Serve's gRPC servers listen, whatever the settings say; what has to be protected is decided by it."""
+"""Address of Serve's gRPC servers, whatever the settings say; the check for missing protection uses it."""
 
 METRICS_PORTS = 16
-"""How many ports, from `metrics_port` on, are tried for the metrics: replicas of one machine each need one."""
+"""Ports, from `metrics_port` on, for the metrics of the replicas of one machine."""
 
 HEARTBEAT_LIMIT_S = 5.0
-"""A queue that has shown no life for longer makes Serve replace the replica."""
+"""Serve replaces a replica whose queue is silent for longer."""
 
 
 class MaplessReplica:
-    """Serve's deployment class; its calls do not come through it but through `ingress`.
+    """Serve's deployment class; calls come through `ingress`, not through its methods.
 
     Attributes:
-        make: makes the engine; those of tests and measurements compute other things.
+        make: makes the engine; tests and measurements replace it.
     """
 
     make: MakeEngine = staticmethod(make_engine)
 
     async def __init__(self, settings: dict[str, Any]) -> None:  # type: ignore[misc]  # Serve awaits it
-        """Returns when the first localization has succeeded; only then does Serve send calls.
+        """Returns when the first localization has succeeded; then Serve sends calls.
 
         Args:
-            settings: of mapless, by name; the rest comes from the environment (MAPLESS_...).
+            settings: of mapless, by name; the others come from the environment (MAPLESS_...).
 
         Raises:
-            StartupError: it cannot serve; Serve tries again a few times and then tells the operator.
+            StartupError: it cannot serve; Serve tries again a few times and then reports it to the operator.
         """
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         loaded = load_settings({**settings, "host": SERVE_HOST})
         check_environment(loaded.settings)
         configure_logging(loaded.settings)
         log.info("mapless on Ray Serve %s\n%s", ray.__version__, loaded)
-        # Serve itself keeps a replica that is to go reachable for a while.
+        # Serve itself keeps a replica that ends reachable for a while.
         port, self._claim = claim_metrics_port(loaded.settings)
         update = {"metrics_port": port, "drain_delay_s": 0.0}
         own = loaded.settings.model_copy(update=update)
@@ -64,32 +64,32 @@ class MaplessReplica:
             self._running = await stack.enter_async_context(running_server(own, self.make, listen=Ingress))
             self._stack = stack.pop_all()
         self._reporter = Reporter(self._running.engine.queue)
-        self._failing = asyncio.ensure_future(self._end_when_broken())
+        self._failing = asyncio.ensure_future(self._exit_when_failed())
 
-    async def _end_when_broken(self) -> None:
-        """Ends the process, which Serve notices at once, rather than wait for its health checks."""
+    async def _exit_when_failed(self) -> None:
+        """Ends the process, which Serve notices at once, before its health checks do."""
         await asyncio.wait({self._running.failed})
         await exit_failed()
 
     async def check_health(self) -> None:
-        """Serve asks this; raising makes it replace the replica."""
+        """Called by Serve, which replaces the replica if this raises."""
         if not self._running.engine.queue.is_alive_within(HEARTBEAT_LIMIT_S):
-            raise RuntimeError("the queue has shown no life for a while")
+            raise RuntimeError(f"the queue has been silent for more than {HEARTBEAT_LIMIT_S:g} s")
 
     async def record_autoscaling_stats(self) -> dict[str, float]:
-        """What `scaling` decides by; Serve asks once in `metrics_interval_s`."""
+        """The figures for `scaling`; called by Serve once in `metrics_interval_s`."""
         return self._reporter.report()
 
     async def __del__(self) -> None:
-        """Serve calls this when the gRPC server has been stopped and all calls are answered."""
+        """Called by Serve when the gRPC server has stopped and all calls are answered."""
         self._failing.cancel()
         await self._stack.aclose()
 
 
 def claim_metrics_port(settings: Settings) -> tuple[int, socket.socket | None]:
-    """The first port from `metrics_port` on that nobody has, and what keeps it from other replicas until it is closed.
+    """The first free port from `metrics_port` on, and a socket that reserves it among the replicas until it is closed.
 
-    A socket without a file is claimed, since several replicas may look at a moment when none of them listens yet.
+    The reservation is an abstract Unix socket, because several replicas may search before one of them listens.
     """
     if not settings.metrics_port:
         return 0, None

@@ -1,7 +1,7 @@
-"""How many replicas there should be, by the devices' seconds: those that wait, and those that are spent.
+"""The autoscaling policy: the number of replicas follows the devices' seconds, queued and spent.
 
-Serve's own measure, the number of calls, says little where one takes 20 ms and another a second. The queue of a replica
-knows what its calls are predicted to cost, and what they did cost.
+Serve's own measure, the number of calls, means little if one takes 20 ms and another a second. A replica's queue has
+the predicted and the actual costs of its calls.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from typing import Protocol
 from ray.serve.config import AutoscalingContext
 
 QUEUED, BUSY = "queued_device_seconds", "busy_device_share"
-"""What replicas report: computing that is admitted and not done, seconds; and the share of the time they computed."""
+"""Names of a replica's figures: computing that is admitted and not done, seconds; share of time spent computing."""
 
 TARGET_QUEUED_S = 0.5
-"""A quarter of what a replica admits by default (`max_queued_s`): callers wait half a second more, and there is room
-for what arrives before new replicas are warm."""
+"""A quarter of what a replica admits by default (`max_queued_s`): callers wait half a second more, and calls that
+arrive before new replicas are warm are still admitted."""
 TARGET_BUSY = 0.7
-"""Queues grow steeply beyond; see BENCHMARKS.md, "Under load". Fewer replicas are enough only below it."""
+"""Above it, queues grow steeply; see BENCHMARKS.md, "Under load"."""
 
 
 class Load(Protocol):
-    """What a replica's queue says of itself; seconds of the lane that has most of them, a thread."""
+    """The load of a replica's queue: seconds a thread, of the busiest lane."""
 
     @property
     def backlog_s(self) -> float:
@@ -31,11 +31,11 @@ class Load(Protocol):
 
     @property
     def busy_s(self) -> float:
-        """Computing that was done since the start."""
+        """Computing done since the start."""
 
 
 class Reporter:
-    """Turns a queue's readings into what the policy needs; asked once a period by Serve."""
+    """Makes the policy's figures from a queue's load, once a period."""
 
     def __init__(self, load: Load, clock: Callable[[], float] = time.monotonic) -> None:
         self._load = load
@@ -43,7 +43,7 @@ class Reporter:
         self._busy_s, self._read_s = load.busy_s, clock()
 
     def report(self) -> dict[str, float]:
-        """The readings by name; the share is of the time since the last report."""
+        """The figures by name; the share is of the time since the last report."""
         busy_s, now_s = self._load.busy_s, self._clock()
         share = (busy_s - self._busy_s) / max(now_s - self._read_s, 1e-9)
         self._busy_s, self._read_s = busy_s, now_s
@@ -51,18 +51,18 @@ class Reporter:
 
 
 def replicas_for(queued_s: Iterable[float], busy: Iterable[float]) -> float:
-    """How many replicas would have neither too much waiting nor too little time, sharing what there is evenly.
+    """The number of replicas that meet both targets with an evenly shared load.
 
     Args:
-        queued_s: of each replica that has reported; a new one that has not is idle.
+        queued_s: of each replica; a new one that has not reported is idle.
         busy: likewise, 0 to 1.
     """
     return max(sum(queued_s) / TARGET_QUEUED_S, sum(busy) / TARGET_BUSY)
 
 
 def by_device_seconds(context: AutoscalingContext) -> tuple[float, dict[str, object]]:
-    """Serve's autoscaling policy; the config's limits and delays are applied to it by Serve."""
+    """Serve's autoscaling policy; Serve applies the config's limits and delays."""
     reported = context.aggregated_metrics or {}
-    if not reported.get(QUEUED):  # nobody has reported yet
+    if not reported.get(QUEUED):  # no replica has reported yet
         return context.target_num_replicas, {}
     return replicas_for(reported[QUEUED].values(), reported.get(BUSY, {}).values()), {}

@@ -1,4 +1,4 @@
-"""The adapter tried for real on one machine: a Ray cluster of its own, for tests and measurements.
+"""Replicas on Ray Serve, measured on this machine: `python -m mapless_tools.load_ray`.
 
-`python -m mapless_tools.load_ray` measures; `cluster` is what starts and ends the cluster.
+Begin with `__main__`, which has the four measurements, and `cluster`, which starts and ends a Ray cluster of its own.
 """

@@ -16,9 +16,15 @@ from mapless_tools.progress import Progress, progress_bars
 
 from .cluster import ClusterFailed
 from .database import NoDatabase
-from .failover import failover_checks, failover_lines, measure_failover
 from .overhead import OverheadOptions, measure_overhead, overhead_checks, overhead_json, overhead_lines
-from .redeploys import measure_redeploys, redeploys_checks, redeploys_lines
+from .replacing import (
+    failover_checks,
+    kill_one,
+    measure_replacements,
+    redeploy,
+    redeploys_checks,
+    replacement_lines,
+)
 from .throughput import (
     ThroughputOptions,
     measure_throughput,
@@ -29,7 +35,7 @@ from .throughput import (
 
 KILLS, REDEPLOYS = 10, 20
 Part = tuple[list[str], list[Check], dict[str, Any]]
-"""What is printed, the bars, and the figures for programs."""
+"""Printed lines, checks, and the figures for programs."""
 
 
 def overhead(given: argparse.Namespace, progress: Progress) -> Part:
@@ -48,15 +54,15 @@ def throughput(given: argparse.Namespace, progress: Progress) -> Part:
 
 
 def failover(given: argparse.Namespace, progress: Progress) -> Part:
-    """When a replica is killed."""
-    result = measure_failover(given.count or (2 if given.quick else KILLS), progress)
-    return failover_lines(result), failover_checks(result), asdict(result)
+    """Of kills of one replica."""
+    result = measure_replacements(kill_one, given.count or (2 if given.quick else KILLS), "failover", progress)
+    return replacement_lines(result, "of which one is killed"), failover_checks(result), asdict(result)
 
 
 def redeploys(given: argparse.Namespace, progress: Progress) -> Part:
-    """When all replicas are replaced."""
-    result = measure_redeploys(given.count or (1 if given.quick else REDEPLOYS), progress)
-    return redeploys_lines(result), redeploys_checks(result), asdict(result)
+    """Of replacements of all replicas."""
+    result = measure_replacements(redeploy, given.count or (1 if given.quick else REDEPLOYS), "redeploys", progress)
+    return replacement_lines(result, "replaced one after the other"), redeploys_checks(result), asdict(result)
 
 
 PARTS: dict[str, Callable[[argparse.Namespace, Progress], Part]] = {
@@ -68,7 +74,7 @@ PARTS: dict[str, Callable[[argparse.Namespace, Progress], Part]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 1 if a bar was missed or a cluster did not come up."""
+    """Exit code 1 if a check failed or the cluster did not start."""
     parser = argparse.ArgumentParser(prog="python -m mapless_tools.load_ray", description=__doc__)
     parser.add_argument("part", choices=[*PARTS, "all"])
     parser.add_argument("--count", type=int, help=f"kills or redeploys; default: {KILLS} and {REDEPLOYS}")

@@ -1,4 +1,4 @@
-"""Callers that go on calling while replicas come and go: how every call ended, and whether what was stored is lost."""
+"""Callers that go on calling while replicas come and go: how every call ended, and which stored references are lost."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ END_LIMIT_S = 60.0
 
 @dataclass(frozen=True)
 class Call:
-    """One that has ended; `time.monotonic`.
+    """A call that has ended; times of `time.monotonic`.
 
     Attributes:
-        caller: who made it.
-        begin_s, end_s: with all its retries.
-        error: what the caller was told in the end; empty if it was answered.
+        caller: its caller's number.
+        begin_s: before its first attempt.
+        end_s: after its last one.
+        error: its final error; empty if it was answered.
     """
 
     caller: int
@@ -30,19 +31,14 @@ class Call:
     end_s: float
     error: str = ""
 
-    @property
-    def duration_s(self) -> float:
-        """Retries and pauses are in it."""
-        return self.end_s - self.begin_s
-
 
 @dataclass
 class Calls:
-    """All that were made.
+    """All calls that were made.
 
     Attributes:
-        ended: in order of their end.
-        acknowledged: (scene, reference) of all that a caller was told are stored.
+        ended: in the order of their ends.
+        acknowledged: (scene, reference) of all that the server reported as stored.
     """
 
     ended: list[Call] = field(default_factory=list)
@@ -50,7 +46,7 @@ class Calls:
 
     @property
     def failed(self) -> list[Call]:
-        """Those that a caller could not have mended by waiting."""
+        """Those that failed in spite of the client's retries."""
         return [call for call in self.ended if call.error]
 
     def between(self, begin_s: float, end_s: float) -> Calls:
@@ -59,12 +55,12 @@ class Calls:
 
     @property
     def slowest_s(self) -> float:
-        """The longest that a caller waited for one call; 0 if there was none."""
-        return max((call.duration_s for call in self.ended), default=0.0)
+        """The longest duration of a call with its retries; 0 if there was none."""
+        return max((call.end_s - call.begin_s for call in self.ended), default=0.0)
 
     @property
     def longest_gap_s(self) -> float:
-        """The longest that a caller who always called heard nothing."""
+        """The longest time that one caller was without an answer."""
         last: dict[int, float] = {}
         longest_s = 0.0
         for call in self.ended:
@@ -74,31 +70,31 @@ class Calls:
         return longest_s
 
 
-Make = Callable[[Client, int], None]
-"""Makes one call, the so-manyth."""
+Kind = Callable[[Client, int, Calls], None]
+"""Makes one call; its arguments are the client, the number of the call and all calls so far."""
 
 
 @contextmanager
 def calling(
-    address: str, kinds: Sequence[Make], pause_s: float = 0.0, options: ConnectOptions | None = None
+    address: str, kinds: Sequence[Kind], pause_s: float = 0.0, options: ConnectOptions | None = None
 ) -> Iterator[Calls]:
-    """A caller for each kind, with a connection of its own and the client's usual retries, until the block is left.
+    """A caller for each kind of call, each with a connection of its own, until the block is left.
 
     Args:
         address: "host:port".
         kinds: of calls.
         pause_s: between a caller's calls.
-        options: how they connect; the client's own by default, retries and all.
+        options: of the connections; None for the client's defaults, with retries.
     """
     calls, done, lock = Calls(), threading.Event(), threading.Lock()
 
-    def call_on(caller: int, make: Make) -> None:
+    def call_on(caller: int, kind: Kind) -> None:
         with Client(address, replace(options or ConnectOptions(), client_id=f"caller-{caller}")) as client:
             number = 0
             while not done.is_set():
                 begin_s, error = time.monotonic(), ""
                 try:
-                    make(client, number)
+                    kind(client, number, calls)
                 except MaplessError as failure:
                     error = f"call {caller}-{number}, {time.monotonic() - begin_s:.2f} s: {failure.code}: {failure}"
                 with lock:
@@ -120,12 +116,12 @@ def calling(
 
 @dataclass(frozen=True)
 class Scenes:
-    """Scenes of which nothing is computed, and what to do with them.
+    """Scenes whose calls cost no computing, and the kinds of calls on them.
 
     Attributes:
         count: how many; calls of different scenes go to different replicas.
-        photo: that all consist of.
-        camera: of it.
+        photo: of all references and queries.
+        camera: of the photo.
     """
 
     count: int = 16
@@ -133,50 +129,42 @@ class Scenes:
     camera: Camera = CAMERA
 
     def store(self, client: Client) -> None:
-        """Makes the scenes, with two references each."""
+        """Creates the scenes, with two references each."""
         for scene in map(self.scene, range(self.count)):
             client.create_scene(scene)
             client.add_references(scene, [self.reference(f"r{i}") for i in range(2)])
 
     def remove(self, client: Client) -> None:
-        """Deletes those of them that there are."""
+        """Deletes the scenes that exist."""
         own = set(map(self.scene, range(self.count)))
         for scene in [it.scene_id for it in client.list_scenes()]:
             if scene in own:
                 client.delete_scene(scene)
 
     def scene(self, number: int) -> str:
-        """Its id; they go around."""
+        """The id of the scene of a call, by turns."""
         return f"called-{number % self.count}"
 
     def reference(self, name: str) -> NewReference:
         """A reference of that name."""
         return NewReference(name, self.photo, self.camera, RigidTransform.identity())
 
-    def localize(self, client: Client, number: int) -> None:
-        """Asks where a photograph was taken."""
+    def localize(self, client: Client, number: int, _: Calls) -> None:
+        """A kind of call: localizes the photograph."""
         client.localize(self.photo, self.camera, self.scene(number), ("r0", "r1"))
 
-    def get(self, client: Client, number: int) -> None:
-        """Fetches a stored photograph; one that is another is an error."""
-        found = client.get_reference(self.scene(number), "r0", include_image=True)
-        assert found.image == self.photo
+    def get(self, client: Client, number: int, _: Calls) -> None:
+        """A kind of call: gets a stored photograph, which must be the right one."""
+        assert client.get_reference(self.scene(number), "r0", include_image=True).image == self.photo
 
-    def adding(self, calls: Callable[[], Calls], caller: str) -> Make:
-        """Adds references of its own, and remembers those of which it was told that they are stored."""
-
-        def add(client: Client, number: int) -> None:
-            scene, name = self.scene(number), f"{caller}-{number}"
-            client.add_reference(scene, self.reference(name))
-            calls().acknowledged.append((scene, name))
-
-        return add
+    def add(self, client: Client, number: int, calls: Calls) -> None:
+        """A kind of call: adds a reference; only one caller may make it."""
+        scene, name = self.scene(number), f"added-{number}"
+        client.add_reference(scene, self.reference(name))
+        calls.acknowledged.append((scene, name))
 
     def lost(self, client: Client, calls: Calls) -> set[tuple[str, str]]:
-        """What was acknowledged and is not stored."""
-        stored = {
-            (scene, it.reference_id)
-            for scene in map(self.scene, range(self.count))
-            for it in client.list_references(scene)
-        }
+        """References that were acknowledged and are not stored."""
+        scenes = map(self.scene, range(self.count))
+        stored = {(scene, it.reference_id) for scene in scenes for it in client.list_references(scene)}
         return set(calls.acknowledged) - stored

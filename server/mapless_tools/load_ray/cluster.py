@@ -1,8 +1,8 @@
-"""A Ray cluster of one's own on this machine, with Serve's ingress, HAProxy, in front of replicas of mapless.
+"""A temporary Ray cluster on this machine, with Serve's ingress, HAProxy, in front of replicas of mapless.
 
-It runs in processes of its own, on ports and in a folder of its own, so that neither the program that starts it nor
-another cluster is touched; all of it is gone when the block is left. Ray and HAProxy listen on loopback as far as they
-can be told to: the replicas' own servers listen on all addresses, and so does what HAProxy tells of itself.
+It has its own processes, ports and folder, so that it affects neither the program that starts it nor another cluster;
+all of it is deleted when the block is left. Ray and HAProxy listen on loopback, except for the replicas' own servers
+and HAProxy's statistics, which cannot be configured to.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from mapless_ray.environment import variables
 START_LIMIT_S = 120.0
 END_LIMIT_S = 20.0
 LEAVING_S = 2.0
-"""On one machine HAProxy hears of changes at once, and tests wait for it."""
+"""Short, because on one machine HAProxy learns of changes at once, and tests wait for it."""
 
 PORTS = 200
-"""A replica's port is used again only after minutes: one a replica and redeploy, times two protocols."""
+"""Ports of replicas, for each of two protocols; a port is reused only minutes after its replica ended."""
 
 _MARK = "TRIAL_CLUSTER"
 _POLL_S = 0.1
@@ -42,15 +42,15 @@ Json = dict[str, Any]
 
 
 class ClusterFailed(Exception):
-    """The cluster, or the application, did not come up; the message ends with what was logged last."""
+    """The cluster or the application did not start; the message ends with the last lines of the logs."""
 
 
 @dataclass(frozen=True)
 class Replica:
-    """A replica that calls go to.
+    """A replica that receives calls.
 
     Attributes:
-        name: Serve's.
+        name: Serve's name of it.
         process_id: of its process.
         address: "host:port" of its own gRPC server, behind the ingress.
     """
@@ -62,12 +62,12 @@ class Replica:
 
 @dataclass
 class Cluster:
-    """A cluster that runs.
+    """A running cluster.
 
     Attributes:
         address: "host:port" of the ingress.
         folder: of logs and configurations.
-        application: what was deployed last, as in a Serve config.
+        application: the last deployed one, as in a Serve config.
     """
 
     address: str
@@ -77,40 +77,40 @@ class Cluster:
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def deploy(self, application: Mapping[str, Any], limit_s: float = START_LIMIT_S) -> None:
-        """Returns when all replicas run as the config says, and no others are left.
+        """Returns when exactly the replicas of the config run.
 
         Args:
             application: one of the `applications` of a Serve config; its name is "mapless".
-            limit_s: how long that may take.
+            limit_s: time limit.
 
         Raises:
-            ClusterFailed: it did not come to that.
+            ClusterFailed: they did not within the limit.
         """
         self.application = dict(application)
         self._ask({"deploy": self.application, "limit_s": limit_s})
         give_up_s = time.monotonic() + limit_s
         while {it.name for it in self.replicas()} != set(re.findall(_SERVER, self.balancer_config())):
             if time.monotonic() > give_up_s:
-                raise ClusterFailed(f"HAProxy did not hear of the replicas\n{self.logged()}")
+                raise ClusterFailed(f"HAProxy's configuration does not have the replicas\n{self.logged()}")
             time.sleep(_POLL_S)
 
     def replicas(self) -> list[Replica]:
-        """Those that calls go to now."""
+        """The replicas that receive calls now."""
         found = self._ask({"replicas": True})["replicas"]
         return [Replica(it["name"], it["process_id"], f"127.0.0.1:{it['port']}") for it in found]
 
     def balancer_config(self) -> str:
-        """HAProxy's configuration, as Serve wrote it last."""
+        """HAProxy's latest configuration, written by Serve."""
         (path,) = self.folder.glob("ha/*/haproxy.cfg")
         return path.read_text(encoding="utf-8")
 
     def balancer_processes(self) -> list[int]:
-        """HAProxy's processes; those of earlier configurations that still have calls are among them."""
+        """HAProxy's processes, with those of earlier configurations that still have calls."""
         config = f"{self.folder}/ha/".encode()
         return [it for it in _processes(f"{_MARK}={self.folder}") if config in _read(it, "cmdline")]
 
     def logged(self, last: int = 2000) -> str:
-        """What the cluster printed, and Serve's controller and the replicas logged; the last characters of each."""
+        """The last characters of the output of the cluster and of the logs of Serve and the replicas."""
         logs = self.folder / "ray" / "session_latest" / "logs"
         paths = [self.folder / "log", *sorted(logs.glob("serve/*.log")), *sorted(logs.glob("worker-*.err"))]
         texts = [path.read_text(encoding="utf-8", errors="replace")[-last:] for path in paths]
@@ -145,7 +145,7 @@ def application(
     environment: Mapping[str, str] | None = None,
     **deployment: Any,
 ) -> Json:
-    """An application of a Serve config, for tries: replicas that do not wait for devices of their own."""
+    """An application of a Serve config whose replicas need no device of their own."""
     return {
         "name": "mapless",
         "route_prefix": "/",
@@ -162,17 +162,17 @@ def application(
 def running_cluster(
     environment: Mapping[str, str] | None = None, leaving_s: float = LEAVING_S, cpus: int = 4
 ) -> Iterator[Cluster]:
-    """A cluster without an application, until the block is left, however.
+    """A cluster without an application, until the block is left.
 
     Args:
-        environment: for all its processes; settings of mapless that are not in the application's arguments, above all.
-        leaving_s: how long replicas that are to go still answer.
-        cpus: what Ray believes to have.
+        environment: variables of all its processes, such as settings that are not in the application's arguments.
+        leaving_s: see `mapless_ray.environment`.
+        cpus: number that Ray assumes.
 
     Raises:
         ClusterFailed: it did not start.
     """
-    # Sockets lie in it, whose paths may not be longer than 107 bytes.
+    # It holds sockets, whose paths are limited to 107 bytes.
     folder = Path(tempfile.mkdtemp(prefix="mr-", dir="/tmp"))
     ports = _free_ports(8)
     given = os.environ | variables(leaving_s=leaving_s) | _own_places(folder, ports) | dict(environment or {})
@@ -185,7 +185,7 @@ def running_cluster(
             stderr=log,
             text=True,
             env=given,
-            start_new_session=True,  # so that Ctrl-C comes to us alone
+            start_new_session=True,  # so that only this process receives Ctrl-C
         )
     deadline = threading.Timer(START_LIMIT_S, process.kill)
     deadline.start()
@@ -201,7 +201,7 @@ def running_cluster(
 
 
 def _own_places(folder: Path, ports: list[int]) -> dict[str, str]:
-    """Where Ray and HAProxy would otherwise meet those of another cluster."""
+    """Variables that separate Ray and HAProxy from those of another cluster."""
     http, grpc = _free_block(PORTS), _free_block(PORTS)
     return {
         _MARK: str(folder),
@@ -221,22 +221,22 @@ def _own_places(folder: Path, ports: list[int]) -> dict[str, str]:
         "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(http + PORTS),
         "RAY_SERVE_DIRECT_INGRESS_MIN_GRPC_PORT": str(grpc),
         "RAY_SERVE_DIRECT_INGRESS_MAX_GRPC_PORT": str(grpc + PORTS),
-        # A machine that does much else is slow, not broken.
+        # A busy machine is slow.
         "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",
         "RAY_SERVE_PROXY_HEALTH_CHECK_TIMEOUT_S": "60",
-        # One machine with two cores, of which the replicas are to have most.
+        # One thread, to leave the cores to the replicas.
         "RAY_SERVE_HAPROXY_NBTHREAD": "1",
     }
 
 
 def _free_ports(count: int) -> list[int]:
-    """Ports of loopback that nobody has at the moment."""
+    """Ports of loopback that are free now."""
     with _bound([0] * count) as sockets:
         return [it.getsockname()[1] for it in sockets]
 
 
 def _free_block(count: int) -> int:
-    """The first of so many ports in a row, below those that the system itself gives out."""
+    """The first of `count` free ports in a row, below those that the system assigns."""
     for _ in range(100):
         first = 10_000 + secrets.randbelow(20_000)
         with suppress(OSError), _bound(range(first, first + count + 1)):
@@ -258,7 +258,7 @@ def _bound(ports: Any) -> Iterator[list[socket.socket]]:
 
 
 def _end(process: subprocess.Popen[str], mark: str) -> None:
-    """Has the cluster end itself; what is left of it after a while is killed."""
+    """Ends the cluster; kills the processes that remain after the limit."""
     assert process.stdin is not None
     assert process.stdout is not None
     with suppress(BrokenPipeError):
@@ -276,7 +276,7 @@ def _end(process: subprocess.Popen[str], mark: str) -> None:
 
 
 def _processes(mark: str) -> list[int]:
-    """Processes, zombies left out, that have this in their environment: all of a cluster inherit it."""
+    """Processes, without zombies, with this in their environment, which all processes of a cluster inherit."""
     wanted = mark.encode()
     return [
         int(it.name)

@@ -1,4 +1,4 @@
-"""A PostgreSQL for a measurement: that of the environment, or one of its own from the system's package."""
+"""A PostgreSQL for a measurement: that of the environment, or a temporary one from the system's package."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ START_LIMIT_S = 30.0
 
 
 class NoDatabase(Exception):
-    """There is no PostgreSQL to measure with; the message says what is missing."""
+    """There is no PostgreSQL; the message says what is missing."""
 
 
 @contextmanager
 def database_url() -> Iterator[str]:
-    """The URL that MAPLESS_DATABASE_URL says; else that of an empty one on loopback, gone when the block is left."""
+    """The URL in MAPLESS_DATABASE_URL; else that of an empty database on loopback, deleted when the block is left."""
     if VARIABLE in os.environ:
         yield os.environ[VARIABLE]
         return
@@ -41,21 +41,15 @@ def database_url() -> Iterator[str]:
 @contextmanager
 def _running(programs: Path, folder: Path) -> Iterator[str]:
     user: dict[str, Any] = {}
-    if os.geteuid() == 0:  # which PostgreSQL refuses
+    if os.geteuid() == 0:  # which PostgreSQL does not run as
         account = pwd.getpwnam("postgres")
         shutil.chown(folder, account.pw_uid, account.pw_gid)
         user = {"user": account.pw_uid, "group": account.pw_gid, "extra_groups": []}
     data, port = folder / "data", free_port()
-    make: list[str | Path] = [
-        programs / "initdb",
-        "-D",
-        data,
-        "--auth=trust",
-        "--username=mapless",
-        "--encoding=UTF8",
-        "--locale=C",
-    ]
-    subprocess.run(make, check=True, stdout=subprocess.DEVNULL, cwd=folder, **user)
+    options = ["--auth=trust", "--username=mapless", "--encoding=UTF8", "--locale=C"]
+    subprocess.run(
+        [programs / "initdb", "-D", data, *options], check=True, stdout=subprocess.DEVNULL, cwd=folder, **user
+    )
     options = ["-c", "listen_addresses=127.0.0.1", "-c", f"port={port}", "-c", "unix_socket_directories="]
     with (folder / "log").open("wb") as log:
         server = subprocess.Popen(

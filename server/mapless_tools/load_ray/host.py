@@ -1,7 +1,6 @@
-"""The process that holds a Ray cluster and does with it what its parent says; a program of `cluster`.
+"""The program that holds a Ray cluster for its parent process, `cluster`.
 
-It reads a JSON object a line from standard input, and answers each with one on standard output. When its input ends, it
-ends the cluster and itself.
+It reads JSON objects, one a line, from standard input, and answers each on standard output. It ends with its input.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from ray.serve.context import _get_global_client
 from ray.serve.schema import ServeDeploySchema
 
 OBJECT_STORE_BYTES = 100 * 2**20
-"""Nothing of ours goes through it."""
+"""Small, because mapless does not use it."""
 
 APPLICATION = "mapless"
 POLL_S = 0.1
@@ -38,7 +37,7 @@ def cluster(options: Json) -> Iterator[ServeControllerClient]:
         object_store_memory=OBJECT_STORE_BYTES,
         _temp_dir=options["folder"],
         _node_ip_address="127.0.0.1",
-        log_to_driver=False,  # which would cost more than what is measured
+        log_to_driver=False,  # which costs more than what is measured
     )
     try:
         serve.start(
@@ -59,7 +58,7 @@ def cluster(options: Json) -> Iterator[ServeControllerClient]:
 
 
 def deploy(client: ServeControllerClient, application: Json, limit_s: float) -> Json:
-    """Gives Serve the application's config, as `serve deploy` does, and waits until it runs as the config says."""
+    """Deploys an application, as `serve deploy` does, and waits until it runs as configured."""
     client.deploy_apps(ServeDeploySchema.model_validate({"applications": [application]}))
     give_up_s = time.monotonic() + limit_s
     while True:
@@ -72,10 +71,10 @@ def deploy(client: ServeControllerClient, application: Json, limit_s: float) -> 
 
 
 def replicas(client: ServeControllerClient) -> Json:
-    """Of all replicas that calls go to: name, process and port of the gRPC server."""
+    """Name, process and port of the gRPC server of all replicas that receive calls."""
     deployments = client.get_serve_details()["applications"][APPLICATION]["deployments"].values()
     processes = {it["actor_name"]: it.get("pid") for deployment in deployments for it in deployment["replicas"]}
-    # Serve's details tell of the ingress here, which is what callers are to know.
+    # Serve's details have the ports of the ingress, and its controller those of the replicas.
     groups = ray.get(client._controller.get_target_groups.remote(from_proxy_manager=True))
     targets = [it for group in groups if group.protocol == "gRPC" and group.app_name for it in group.targets]
     found = [
@@ -104,23 +103,23 @@ def main() -> None:
     answers = _own_output()
     options = json.loads(sys.argv[1])
     with cluster(options) as client:
-        _say(answers, {})
+        _send(answers, {})
         for line in sys.stdin:
             command = json.loads(line)
             if "deploy" in command:
-                _say(answers, deploy(client, command["deploy"], command["limit_s"]))
+                _send(answers, deploy(client, command["deploy"], command["limit_s"]))
             else:
-                _say(answers, replicas(client))
+                _send(answers, replicas(client))
 
 
 def _own_output() -> TextIO:
-    """What was standard output; from now on what others print there goes to standard error, as Ray does much."""
+    """The standard output for answers; what Ray prints there goes to standard error from now on."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     return answers
 
 
-def _say(answers: TextIO, answer: Json) -> None:
+def _send(answers: TextIO, answer: Json) -> None:
     print(json.dumps(answer), file=answers, flush=True)
 
 

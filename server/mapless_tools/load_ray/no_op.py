@@ -1,4 +1,4 @@
-"""Replicas that compute nothing: what is left is what serving costs."""
+"""Replicas that compute nothing, to measure the cost of serving."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mapless_tools.load.no_op import make_no_op_engine
 
 
 class NoOpReplica(MaplessReplica):
-    """The same but for the engine."""
+    """A replica with another engine."""
 
     make = staticmethod(make_no_op_engine)
 

@@ -1,9 +1,10 @@
-"""What the ingress costs a call: the same replica asked through HAProxy and at its own port, by turns."""
+"""The cost of the ingress: one replica called through HAProxy and at its own port, and a plain server, by turns."""
 
 from __future__ import annotations
 
 import asyncio
 import os
+from collections.abc import Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from statistics import median
@@ -22,7 +23,7 @@ from mapless_tools.progress import Progress
 from .callers import Scenes
 from .cluster import application, running_cluster
 from .database import VARIABLE, database_url
-from .failover import NO_OP
+from .replacing import NO_OP
 
 MAX_OVERHEAD_MS = 3.0
 THROUGH, DIRECT, PLAIN = "through HAProxy", "replica's own port", "plain server"
@@ -36,10 +37,10 @@ class OverheadOptions:
 
     Attributes:
         message_bytes: size of the photograph; 0.3 MB is a phone's at 1024 px.
-        rounds: the ways take turns so often, so that what else the machine does hits all alike.
-        unloaded_s: calls one after the other, a round.
-        saturated_s: calls side by side, a round.
-        concurrency: of these.
+        rounds: number of turns, so that other load of the machine affects all ways alike.
+        unloaded_s: time of calls one after the other, a round.
+        saturated_s: time of parallel calls, a round.
+        concurrency: number of parallel calls.
     """
 
     message_bytes: int = 300_000
@@ -51,7 +52,7 @@ class OverheadOptions:
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """A way to be called: its steps, one a round."""
+    """A way to call, with its steps, one a round."""
 
     name: str
     unloaded: list[Step]
@@ -87,15 +88,9 @@ def overhead_checks(ways: list[Way]) -> list[Check]:
     """The bar."""
     by_name = {way.name: way.p50s_ms for way in ways}
     rounds = [a - b for a, b in zip(by_name[THROUGH], by_name[DIRECT], strict=True)]
-    overhead = median(rounds)
-    return [
-        Check(
-            "p50 overhead of the ingress, one call at a time",
-            f"{overhead:.2f} ms (rounds {min(rounds):.2f} to {max(rounds):.2f})",
-            f"at most {MAX_OVERHEAD_MS:g} ms",
-            overhead <= MAX_OVERHEAD_MS,
-        )
-    ]
+    value = f"{median(rounds):.2f} ms (rounds {min(rounds):.2f} to {max(rounds):.2f})"
+    bar, met = f"at most {MAX_OVERHEAD_MS:g} ms", median(rounds) <= MAX_OVERHEAD_MS
+    return [Check("p50 overhead of the ingress, one call at a time", value, bar, met)]
 
 
 def overhead_lines(ways: list[Way], options: OverheadOptions) -> list[str]:
@@ -104,7 +99,7 @@ def overhead_lines(ways: list[Way], options: OverheadOptions) -> list[str]:
         f"Messages of {options.message_bytes / 1e6:g} MB to a server that computes nothing, {options.rounds} rounds by "
         f"turns; load average {os.getloadavg()[0]:.1f}:",
         "",
-        "| called | p50 of one at a time, ms | p99 of it, ms | calls/s with 16 side by side | generator's core |",
+        "| called | p50 of one at a time, ms | p99 of it, ms | calls/s with 16 in parallel | generator's core |",
         "|---|---|---|---|---|",
     ]
     for way in ways:
@@ -116,15 +111,12 @@ def overhead_lines(ways: list[Way], options: OverheadOptions) -> list[str]:
 
 
 def overhead_json(ways: list[Way], options: OverheadOptions) -> dict[str, Any]:
-    """For programs."""
+    """The figures for programs."""
     return {
         "options": vars(options),
         "ways": [
-            {
-                "name": way.name,
-                "unloaded": [step.as_json() for step in way.unloaded],
-                "saturated": [step.as_json() for step in way.saturated],
-            }
+            {"name": way.name}
+            | {kind: [step.as_json() for step in getattr(way, kind)] for kind in ("unloaded", "saturated")}
             for way in ways
         ],
     }
@@ -135,28 +127,42 @@ async def _compare(
 ) -> list[Way]:
     ways = {name: Way(name, [], []) for name in places}
     async with AsyncExitStack() as stack:
-        targets: dict[str, Target] = {}
-        for name, (address, process_id) in places.items():
-            targets[name] = await stack.enter_async_context(connected(address, METHOD, 4, 30.0, read_answer))
-            await _step(name, process_id, targets[name], request, 4, 0.5)  # what happens once, happens now
+        targets = {
+            name: await stack.enter_async_context(connected(address, METHOD, 4, 30.0, read_answer))
+            for name, (address, _) in places.items()
+        }
+
+        async def step(name: str, concurrency: int, duration_s: float) -> Step:
+            it = await closed_loop(name, places[name][1], targets[name], [request], concurrency, duration_s)
+            if set(it.account.outcomes) != _EXPECTED:
+                raise RuntimeError(f"{name}: calls ended as {dict(it.account.outcomes)}")
+            return it
+
+        for name in places:
+            await step(name, 4, 0.5)  # what is slow once, is slow now
         for done in range(options.rounds):
             progress("overhead, rounds", done, options.rounds)
-            for name, (_, process_id) in places.items():
-                ways[name].unloaded.append(await _step(name, process_id, targets[name], request, 1, options.unloaded_s))
-            for name, (_, process_id) in places.items():
-                ways[name].saturated.append(
-                    await _step(name, process_id, targets[name], request, options.concurrency, options.saturated_s)
-                )
+            for name, way in ways.items():
+                way.unloaded.append(await step(name, 1, options.unloaded_s))
+            for name, way in ways.items():
+                way.saturated.append(await step(name, options.concurrency, options.saturated_s))
     return list(ways.values())
 
 
-async def _step(name: str, process_id: int, target: Target, request: bytes, at_a_time: int, duration_s: float) -> Step:
-    step = await run_step(
-        f"{name}, {at_a_time} at a time",
+async def closed_loop(
+    name: str,
+    process_id: int,
+    target: Target,
+    requests: Sequence[bytes],
+    concurrency: int,
+    duration_s: float,
+    settle_s: float = 0.0,
+) -> Step:
+    """A step of `concurrency` callers, each of which calls again when it is answered."""
+    return await run_step(
+        f"{name}, {concurrency} at a time",
         ServerUnderLoad(process_id),
-        lambda: send_closed_loop(target, [request], at_a_time, duration_s),
+        lambda: send_closed_loop(target, requests, concurrency, duration_s),
         duration_s,
+        settle_s=settle_s,
     )
-    if set(step.account.outcomes) != _EXPECTED:
-        raise RuntimeError(f"{step.name}: calls ended as {dict(step.account.outcomes)}")
-    return step

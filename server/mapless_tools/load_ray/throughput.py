@@ -1,4 +1,4 @@
-"""What two replicas on two cores answer, against one on one core: the real method on a real scene."""
+"""Throughput of two replicas on two cores and of one on one core: the real method on a real scene."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from mapless_tools.demo import Place
 from mapless_tools.load.records import Fate
 from mapless_tools.load.report import Check
 from mapless_tools.load.requests import METHOD, read_answer, requests_for, store_references
-from mapless_tools.load.sender import Target, connected, send_closed_loop
-from mapless_tools.load.step import Step, run_step
-from mapless_tools.load.watch import ServerUnderLoad, read_process
+from mapless_tools.load.sender import Target, connected
+from mapless_tools.load.step import Step
+from mapless_tools.load.watch import read_process
 from mapless_tools.progress import Progress
 
 from .cluster import Cluster, application, running_cluster
 from .database import VARIABLE, database_url
+from .overhead import closed_loop
 
 MIN_GAIN = 1.7
 
@@ -32,9 +33,9 @@ class ThroughputOptions:
     """Options of the comparison.
 
     Attributes:
-        rounds: one replica and two take turns so often, so that what else the machine does hits both alike.
-        step_s: calls side by side, a round and way; the first fifth does not count.
-        concurrency: calls side by side, a replica: one computes, the next is decoded, one is on its way.
+        rounds: number of turns of one replica and two, so that other load of the machine affects both alike.
+        step_s: time of parallel calls, a round and way; the first fifth does not count.
+        concurrency: parallel calls a replica: one computes, the next is decoded, one is in transit.
     """
 
     rounds: int = 4
@@ -47,9 +48,9 @@ class Round:
     """Both ways, one after the other.
 
     Attributes:
-        one: one replica on one core, called at its own port: the other core carries no ingress, and nothing else.
-        two: two replicas on a core each, through the ingress, which together with the generator shares their cores.
-        balancer_share: of one core, what HAProxy used of it meanwhile.
+        one: one replica on one core, called at its own port; the other core is idle. two: two replicas on a core each,
+        called through the ingress, which shares the cores with them and the generator. balancer_share: share of one
+        core that HAProxy used meanwhile.
     """
 
     one: Step
@@ -58,15 +59,15 @@ class Round:
 
     @property
     def gain(self) -> float:
-        """How many times as many answers a second."""
+        """Ratio of the answers a second."""
         return self.two.account.completed_per_s / self.one.account.completed_per_s
 
 
 def measure_throughput(place: Place, options: ThroughputOptions, progress: Progress) -> list[Round]:
-    """Starts two replicas, each with one thread that computes on a core of its own.
+    """Starts two replicas, each with one computing thread on its own core.
 
     Raises:
-        RuntimeError: a call did not end with an answer, or there are no two cores.
+        RuntimeError: a call did not end with an answer, or there are fewer than two cores.
     """
     cores = sorted(os.sched_getaffinity(0))[:2]
     if len(cores) < 2:
@@ -92,21 +93,15 @@ _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 def throughput_checks(rounds: list[Round]) -> list[Check]:
     """The bar."""
     gains = [it.gain for it in rounds]
-    gain = median(gains)
-    return [
-        Check(
-            "answers a second of two replicas on two cores, of those of one on one core",
-            f"{gain:.2f} times (rounds {min(gains):.2f} to {max(gains):.2f})",
-            f"at least {MIN_GAIN:g} times",
-            gain >= MIN_GAIN,
-        )
-    ]
+    value = f"{median(gains):.2f} times (rounds {min(gains):.2f} to {max(gains):.2f})"
+    figure = "answers a second of two replicas on two cores, of those of one on one core"
+    return [Check(figure, value, f"at least {MIN_GAIN:g} times", median(gains) >= MIN_GAIN)]
 
 
 def throughput_lines(rounds: list[Round], place: Place, options: ThroughputOptions) -> list[str]:
     """A table with a row a round."""
     lines = [
-        f"{place.title}; {options.concurrency} calls side by side a replica; load average {os.getloadavg()[0]:.1f}:",
+        f"{place.title}; {options.concurrency} parallel calls a replica; load average {os.getloadavg()[0]:.1f}:",
         "",
         "| round | one replica, answers/s | its CPU, s/answer | two replicas, answers/s | gain | generator's core "
         "| HAProxy's core |",
@@ -122,7 +117,7 @@ def throughput_lines(rounds: list[Round], place: Place, options: ThroughputOptio
 
 
 def throughput_json(rounds: list[Round], options: ThroughputOptions) -> dict[str, Any]:
-    """For programs."""
+    """The figures for programs."""
     steps = [{"one": it.one.as_json(), "two": it.two.as_json(), "haproxy_share": it.balancer_share} for it in rounds]
     return {"options": vars(options), "rounds": steps}
 
@@ -132,39 +127,31 @@ async def _compare(
 ) -> list[Round]:
     first = cluster.replicas()[0]
     rounds = []
+
+    async def step(name: str, target: Target, concurrency: int) -> Step:
+        duration_s = options.step_s
+        it = await closed_loop(name, first.process_id, target, requests, concurrency, duration_s, duration_s / 5)
+        if it.answers != it.account.sent:
+            late = it.account.count(Fate.OVERDUE)
+            raise RuntimeError(f"{name}: calls ended as {dict(it.account.outcomes)}, {late} late")
+        return it
+
     async with AsyncExitStack() as stack:
         enter = stack.enter_async_context
         direct = await enter(connected(first.address, METHOD, 4, 30.0, read_answer))
         through = await enter(connected(cluster.address, METHOD, 4, 30.0, read_answer))
         for done in range(options.rounds):
             progress("throughput, rounds", done, options.rounds)
-            one = await _step("one", first.process_id, direct, requests, options.concurrency, options.step_s)
+            one = await step("one", direct, options.concurrency)
             balancer = cluster.balancer_processes()
             before_s = _cpu_s(balancer)
-            two = await _step("two", first.process_id, through, requests, 2 * options.concurrency, options.step_s)
+            two = await step("two", through, 2 * options.concurrency)
             rounds.append(Round(one, two, (_cpu_s(balancer) - before_s) / two.wall_s))
     return rounds
 
 
-async def _step(
-    name: str, process_id: int, target: Target, requests: Sequence[bytes], at_a_time: int, duration_s: float
-) -> Step:
-    step = await run_step(
-        name,
-        ServerUnderLoad(process_id),
-        lambda: send_closed_loop(target, requests, at_a_time, duration_s),
-        duration_s,
-        settle_s=duration_s / 5,
-    )
-    if step.answers != step.account.sent:
-        raise RuntimeError(
-            f"{name}: calls ended as {dict(step.account.outcomes)}, {step.account.count(Fate.OVERDUE)} late"
-        )
-    return step
-
-
 def _pin(process_id: int, cores: Iterable[int]) -> None:
-    """All threads there are; later ones inherit it."""
+    """Pins all present threads; later ones inherit it."""
     for thread in Path(f"/proc/{process_id}/task").iterdir():
         os.sched_setaffinity(int(thread.name), cores)
 
