@@ -23,12 +23,11 @@ from mapless_server.method.views import Features, View
 from mapless_server.networks.network import Sizes
 from mapless_tools.bench_network import host
 from mapless_tools.bench_network.command import bench_network
-from mapless_tools.bench_network.forward import Forward, max_difference
+from mapless_tools.bench_network.forward import Forward, max_difference, with_low_precision_stream
 from mapless_tools.bench_network.operations import H200, Operations, count_operations
 from mapless_tools.bench_network.planted import UNITS_PER_METRE, PlantedReconstructor, Truth, true_points
 from mapless_tools.bench_network.report import Figure, markdown, table
 from mapless_tools.bench_network.subject import Work, make_network, operations_of
-from mapless_tools.bench_network.variants import with_low_precision_stream
 
 GRID = (3, 4)
 SIZES = SMALL["pi3"]

@@ -1,4 +1,4 @@
-"""All parts in order. A part that fails says so in the table, and the rest goes on: device time is scarce."""
+"""All parts in order. A part that fails is reported in the table, and the rest goes on: device time is scarce."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Any
 
 import torch
 
+from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions
 from mapless_server.observability.provenance import cpu_model
 
 from . import host
-from .ceilings import measure_rates
-from .forward import measure_forward, measure_kernels, reason_of
+from .device import measure_memory, measure_rates
+from .forward import measure_attention, measure_forward, measure_kernels, measure_variants, reason_of
 from .operations import H200, Rates
 from .report import Figure, as_json, markdown, table
-from .subject import make_network
-from .variants import measure_attention, measure_variants
+from .subject import GRID, REFERENCES, make_network
 
 OUTPUT = Path("bench-output")
 HOST_PARTS = ("operations", "blocks", "kept", "rounding", "compilations")
@@ -52,7 +52,7 @@ def bench_network(quick: bool = False, only: Sequence[str] | None = None, output
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if device.type == "cpu":
         print("There is no CUDA device: no figure below is a GPU's, and what needs one is not measured.", flush=True)
-        torch.set_num_threads(1)  # so that figures do not depend on who else uses the cores
+        torch.set_num_threads(1)  # so that figures do not depend on the load of the other cores
     bench = _Bench(device, quick)
     output.mkdir(parents=True, exist_ok=True)
     for part in only or (CUDA_PARTS if device.type == "cuda" else HOST_PARTS):
@@ -63,7 +63,7 @@ def bench_network(quick: bool = False, only: Sequence[str] | None = None, output
 
 
 class _Bench:
-    """The parts, and what they gave so far."""
+    """The parts, and their figures so far."""
 
     def __init__(self, device: torch.device, quick: bool) -> None:
         self.device = device
@@ -101,54 +101,38 @@ class _Bench:
             torch.cuda.empty_cache()
 
     def _part(self, part: str) -> Iterator[Figure]:
-        if part in HOST_PARTS:
-            yield from self._host_part(part)
-            return
-        if self.device.type != "cuda":
+        if part not in HOST_PARTS and self.device.type != "cuda":
             raise RuntimeError("there is no CUDA device")
         kind, _, name = part.partition("-")
-        device, compiles = self.device, not self.quick
         parts: dict[str, Callable[[], Iterator[Figure]]] = {
-            "attention": lambda: measure_attention(self.rates, device, self._repeats),
-            "memory": lambda: self._memory(name),
-            "forward": lambda: measure_forward(name, self.rates, device, self._repeats, compiles),
+            "operations": lambda: host.count_all(self.rates, self.quick),
+            "blocks": lambda: host.measure_blocks(1 if self.quick else 3),
+            "kept": host.compare_kept_tokens,
+            "rounding": host.compare_rounding,
+            "compilations": host.count_compilations,
+            "attention": lambda: measure_attention(self.rates, self.device, self._repeats),
+            "memory": lambda: measure_memory(lambda: self._runner(name, "cpu"), self.device),
+            "forward": lambda: measure_forward(name, self.rates, self.device, self._repeats, not self.quick),
             "query": lambda: self._query(name),
             "kernels": lambda: self._kernels(name),
-            "variants": lambda: measure_variants(name, device, self._repeats),
+            "variants": lambda: measure_variants(name, self.device, self._repeats),
         }
         yield from parts[kind]()
 
-    def _host_part(self, part: str) -> Iterator[Figure]:
-        if part == "operations":
-            yield from host.count_forward(self.rates, self.quick)
-            yield from host.count_memory()
-            yield from host.count_pixel_heads()
-        elif part == "blocks":
-            yield from host.measure_blocks(1 if self.quick else 3)
-        elif part == "kept":
-            yield from host.compare_kept_tokens()
-        elif part == "rounding":
-            yield from host.compare_rounding()
-        else:
-            yield from host.count_compilations()
-
-    def _memory(self, name: str) -> Iterator[Figure]:
-        from .memory import measure_memory
-        from .query import make_runner
-
-        def runner() -> Any:
-            return make_runner(make_network(name), name, self.device, self._backend)
-
-        return measure_memory(runner, self.device)
+    def _runner(self, name: str, weights_on: torch.device | str) -> NetworkRunner:
+        """The network as the server runs it, with the shapes of a query of ten references compiled."""
+        options = RunnerOptions(compile_backend=self._backend)
+        runner = NetworkRunner(make_network(name, device=weights_on), name, "random weights", self.device, options)
+        runner.warm_up([Bucket(GRID, REFERENCES + 1)])
+        return runner
 
     def _query(self, name: str) -> Iterator[Figure]:
-        from . import query
+        from . import query  # its imports are more than torch and NumPy
 
-        options = query.QueryOptions(compile_backend=self._backend, query_count=2 if self.quick else 8)
+        options = query.QueryOptions(query_count=2 if self.quick else 8)
         tier, note = query.make_tier(options.features, self.device)
-        room = query.photographs(options.query_count)
-        bench = query.Bench(room, tier)
-        runner = query.make_runner(make_network(name, device=self.device), name, self.device, self._backend)
+        bench = query.Bench(query.photographs(options.query_count), tier)
+        runner = self._runner(name, self.device)
         for on_device in (True, False):
             yield from self._tried(query.measure_queries(runner, bench, options, note, on_device), f"query-{name}")
         runner.close()

@@ -1,4 +1,4 @@
-"""The network's forward pass on a CUDA device, step by step, each beside its floor and what was predicted of it."""
+"""The network's forward pass on a CUDA device: its steps beside floor and prediction, its kernels, its variants."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from mapless_server.networks.blocks import Attention
 from mapless_server.networks.network import Network, NetworkOutput
 
-from .ceilings import median_s
-from .operations import Rates
+from .device import median_s
+from .operations import ATTENTION_EFFICIENCY, Rates
 from .report import Figure
 from .subject import GRID, REFERENCES, Scene, Work, make_network, operations_of
 
@@ -30,6 +30,14 @@ PLAIN_MS, KEPT_MS = 90.0, 60.0
 MAX_DIFFERENCE = 0.2
 """Between two ways to compute the same in bfloat16, largest of all pixels, as a share of the largest value: rounding in
 sixty blocks makes some hundredths of it, a wrong block about 1."""
+
+
+BACKENDS = {
+    "flash": SDPBackend.FLASH_ATTENTION,
+    "cuDNN": SDPBackend.CUDNN_ATTENTION,
+    "memory efficient": SDPBackend.EFFICIENT_ATTENTION,
+}
+HEADS, HEAD_WIDTH = 16, 64
 
 
 @dataclass(frozen=True)
@@ -175,7 +183,7 @@ def measure_kernels(name: str, device: torch.device) -> tuple[list[Figure], dict
     blocks = sizes.encoder_depth + sizes.decoder_depth + 3 * sizes.head_depth
     part = f"{name} kernels, eager, tokens kept"
     figures = [Figure(part, kind, value, "ms") for kind, value in milliseconds.items()]
-    note = f"{blocks} blocks; and whatever else attends"
+    note = f"{blocks} blocks; and all else that attends"
     figures += [Figure(part, "flash attention", flash_count, "calls", target=blocks, target_is_least=True, note=note)]
     figures += [Figure(part, "the host waits", _waits(forward, work), "times", target=0)]
     longest = sorted(kernels, key=lambda event: -event.self_device_time_total)[:25]
@@ -201,3 +209,62 @@ def _kind(kernel: str) -> str:
     if any(word in name for word in ("gemm", "cutlass", "nvjet", "xmma", "cublas", "conv", "wgrad", "dgrad")):
         return "matrix products"
     return "between"
+
+
+def measure_attention(rates: Rates, device: torch.device, repeats: int) -> Iterator[Figure]:
+    """Attention alone, over the scene and within its views, by each kernel."""
+    tokens = 5 + GRID[0] * GRID[1]
+    for batch, count in ((1, VIEWS * tokens), (VIEWS, tokens)):
+        q, k, v = torch.randn(3, batch, HEADS, count, HEAD_WIDTH, device=device, dtype=torch.bfloat16)
+        flop = 4 * batch * HEADS * count**2 * HEAD_WIDTH
+        floor_ms = 1e3 * flop / rates.matrix_flops
+        part = f"attention alone, {batch} x {count} tokens, 16 heads of 64"
+        for name, backend in BACKENDS.items():
+            predicted = floor_ms / ATTENTION_EFFICIENCY if name == "flash" else None
+            try:
+                with torch.no_grad(), sdpa_kernel(backend):
+                    times = median_s(lambda: F.scaled_dot_product_attention(q, k, v), device, repeats)  # noqa: B023
+            except Exception as error:  # a kernel that this device lacks
+                yield Figure(part, name, None, "ms", None, floor_ms, predicted, note=reason_of(error))
+                continue
+            note = f"{flop / times[0] / 1e12:.0f} TFLOP/s"
+            yield Figure(part, name, 1e3 * times[0], "ms", 1e3 * times[1], floor_ms, predicted, note=note)
+
+
+def measure_variants(name: str, device: torch.device, repeats: int) -> Iterator[Figure]:
+    """Eager forward passes with the references' tokens kept, one thing changed at a time."""
+    part = f"{name} forward, eager, tokens kept, otherwise"
+    network = make_network(name, device=device)
+    for label, backend in BACKENDS.items():
+        yield _figure(part, f"{label} attention", network, backend, device, repeats)
+    with_low_precision_stream(network)
+    yield _figure(
+        part, "main decoder's residual stream in bfloat16", network, SDPBackend.FLASH_ATTENTION, device, repeats
+    )
+    yield _rounding(part, make_network(name, device=device))
+
+
+def _rounding(part: str, network: Network) -> Figure:
+    """What bfloat16 changes at full size; casts the network to it."""
+    scene = Scene(network, VIEWS, GRID)
+    with torch.no_grad():
+        exact = scene.reconstruct(network, scene.encode(network, slice(None))[None], REFERENCES)
+    rounded = Forward(network).run(Work(1, REFERENCES))
+    note = "of the largest value, with random weights"
+    return Figure(part, "largest difference from float32", max_difference(rounded, exact), "", note=note)
+
+
+def _figure(part: str, label: str, network: Network, backend: SDPBackend, device: torch.device, repeats: int) -> Figure:
+    try:
+        forward = Forward(network, backend)
+        times = median_s(lambda: forward.run(Work(1, REFERENCES)), device, repeats)
+    except Exception as error:  # the others can still be measured
+        return Figure(part, label, None, "ms", note=reason_of(error))
+    return Figure(part, label, 1e3 * times[0], "ms", 1e3 * times[1])
+
+
+def with_low_precision_stream(network: Network) -> None:
+    """Lets the main decoder carry bfloat16, which the official code does not."""
+    network.set_compute_type(torch.bfloat16)
+    network.decoder.to(torch.bfloat16)
+    network.register_token.data = network.register_token.to(torch.bfloat16)

@@ -11,9 +11,8 @@ from mapless_server.networks.decoder import SPECIALS
 from mapless_server.networks.network import Network, NetworkOutput, Sizes
 from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions
 
-from .ceilings import median_s
+from .device import CACHED, median_s
 from .forward import max_difference
-from .memory import CACHED
 from .operations import H200, Operations, Rates, compiled_graphs, count_operations
 from .report import Figure
 from .subject import GRID, REFERENCES, Scene, Work, make_network, meta_network, operations_of
@@ -28,6 +27,13 @@ WORKS = {
 }
 SMALL = Sizes(64, 4, 3, 10, 2, 32, (64, 32, 16), 8, 32, 2, 2)
 MEDIUM = Sizes(384, 6, encoder_depth=8, decoder_depth=12, head_depth=3, camera_width=128)
+
+
+def count_all(rates: Rates, quick: bool) -> Iterator[Figure]:
+    """Operations of forward passes and of the layers for each pixel, and bytes on the device."""
+    yield from count_forward(rates, quick)
+    yield from count_memory()
+    yield from count_pixel_heads()
 
 
 def count_forward(rates: Rates = H200, quick: bool = False) -> Iterator[Figure]:

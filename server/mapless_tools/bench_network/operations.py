@@ -1,4 +1,4 @@
-"""Counts what a network executes, on the meta device, where it costs nothing; and predicts its time from that."""
+"""Counts the operations of a network on the meta device, where none is executed, and predicts its time from them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A network's backend whose answer is replaced by the truth, so that the stages after it have real work.
 
-Random weights say nothing about a scene, and what the stages after them do depends on it. Here the network computes all
-that it would, and instead of its output the rendered room's true depths and poses are handed on, up to a scale.
+The output of random weights has no relation to a scene, and the time of the stages after them depends on it. Here the
+network computes as it would, and its output is replaced by the rendered room's true depths and poses, up to a scale.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class PlantedReconstructor:
         return Reconstruction(posed[-1], tuple(posed[:-1]))
 
     def _on_device(self, outcome: DeviceReconstruction, keys: Sequence[str], poses: Array) -> DeviceReconstruction:
-        # Launched after the network on the same stream, so whoever waits for this waits for the network as well.
+        # Launched after the network on the same stream, so that to wait for this is to wait for the network.
         maps = torch.stack([self._maps[key] for key in keys])
         confidence = torch.ones_like(outcome.confidence)
         on_device = torch.from_numpy(poses.astype(np.float32)).to(maps.device, non_blocking=True)

@@ -26,8 +26,7 @@ from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.views import Photograph, PosedView
-from mapless_server.networks.network import Network
-from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions
+from mapless_server.networks.runner import NetworkRunner
 from mapless_server.networks.weights import WeightsError
 from mapless_server.serve.assembly import make_tiers
 from mapless_server.settings import load_settings
@@ -37,7 +36,7 @@ from mapless_tools.demo import depth_map_m, room
 from .operations import compiled_graphs
 from .planted import PlantedReconstructor, Truth
 from .report import Figure
-from .subject import GRID, REFERENCES
+from .subject import REFERENCES
 
 LATENCY_MS, QUERIES_PER_S = 150.0, 12.0
 THREADS = 8
@@ -50,13 +49,11 @@ class QueryOptions:
 
     Attributes:
         features: local features, by name; `sift` serves if their weights are not there.
-        compile_backend: see RunnerOptions.
         query_count: different photographs.
         rounds: how often each is localized in one measurement.
     """
 
     features: str = "aliked"
-    compile_backend: str | None = "inductor"
     query_count: int = 8
     rounds: int = 3
 
@@ -126,13 +123,6 @@ class Bench:
         view = replace(view, photograph=Photograph(key, photo.camera, lambda: pixels))
         answer = localize(view, self.nearest(photo), pipeline, LocalizeOptions())
         return answer, {**stages, **answer.stage_seconds, "total": time.perf_counter() - start_s}
-
-
-def make_runner(network: Network, name: str, device: torch.device, compile_backend: str | None) -> NetworkRunner:
-    """The network as the server runs it, with the shapes of a query of ten references compiled."""
-    runner = NetworkRunner(network, name, "random weights", device, RunnerOptions(compile_backend=compile_backend))
-    runner.warm_up([Bucket(GRID, REFERENCES + 1)])
-    return runner
 
 
 def measure_queries(

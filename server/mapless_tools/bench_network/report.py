@@ -20,7 +20,7 @@ class Figure:
         again: the same measured a second time.
         floor_ms: what no program is faster than.
         predicted_ms: before it was measured.
-        target: what is wanted.
+        target: the wanted value.
         target_is_least: whether more is better.
         note: anything else, the reason if it was not measured.
     """
@@ -86,7 +86,7 @@ def as_json(title: str, figures: Sequence[Figure], details: dict[str, Any]) -> d
 
 
 def _cells(figure: Figure) -> tuple[str, ...]:
-    """What stands below `HEADINGS`."""
+    """The cells below `HEADINGS`."""
     ratio = figure.value / figure.floor_ms if figure.value and figure.floor_ms and figure.unit == "ms" else None
     met = {True: "yes", False: "no", None: ""}[figure.is_met]
     measured = "not measured" if figure.value is None else f"{_short(figure.value)} {figure.unit}".rstrip()

@@ -1,22 +1,29 @@
-"""Times of work, and what a device reaches at most."""
+"""What a device reaches at most, and the memory of a network that serves on it."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import torch
 
+from mapless_server.networks.runner import NetworkRunner
+
 from .operations import Rates
+from .report import Figure
+from .subject import GRID, REFERENCES, Scene
 
 PRODUCT_SIDE = 8192
 COPY_BYTES = 4 * 2**30
 """Much larger than any cache."""
+CACHED = 100
+"""References whose tokens lie on the device."""
+LIMIT_GB = 8.0
 
 
 def median_s(work: Callable[[], object], device: torch.device, repeats: int, warm_up: int = 3) -> tuple[float, float]:
-    """The median time of `work`, seconds, taken twice: versions that differ by less than these two do not differ."""
+    """The median time of `work`, seconds, taken twice: versions that differ by less than these two are equal."""
     for _ in range(warm_up):
         work()
     first, second = (_median_s(work, device, repeats) for _ in range(2))
@@ -62,3 +69,30 @@ def _launch_s(device: torch.device, count: int = 2000) -> float:
     took_s = time.perf_counter() - start_s
     torch.cuda.synchronize(device)
     return took_s / count
+
+
+def measure_memory(make_runner: Callable[[], NetworkRunner], device: torch.device) -> Iterator[Figure]:
+    """The peak while the network is loaded, warmed up and used, with the tokens of a hundred references on the device.
+
+    The figures are of the whole process: nothing else may be on the device before.
+    """
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats(device)
+    runner = make_runner()
+    part = f"{runner.name} memory"
+    yield Figure(part, "weights and recorded graphs", torch.cuda.memory_allocated(device) / 1e9, "GB")
+    scene = Scene(runner.network, REFERENCES + 1, GRID)
+    intrinsics = None if scene.intrinsics is None else scene.intrinsics[:1]
+    kept = [runner.encode(scene.images[:1], intrinsics).clone() for _ in range(CACHED)]
+    posed = None if scene.posed is None else (torch.arange(REFERENCES + 1) < REFERENCES)[None]
+    for _ in range(3):
+        query = runner.encode(scene.images[:1], intrinsics)
+        runner.reconstruct(torch.cat([*kept[:REFERENCES], query])[None], GRID, REFERENCES, scene.poses, posed)
+    torch.cuda.synchronize(device)
+    yield Figure(part, f"tokens of {CACHED} references", sum(it.nbytes for it in kept) / 1e9, "GB")
+    peak = torch.cuda.max_memory_allocated(device) / 1e9
+    yield Figure(part, "peak, of tensors", peak, "GB", target=LIMIT_GB)
+    free, total = torch.cuda.mem_get_info(device)
+    note = "with the driver's and the allocator's own, and other processes'"
+    yield Figure(part, "taken from the device", (total - free) / 1e9, "GB", target=LIMIT_GB, note=note)
+    runner.close()
