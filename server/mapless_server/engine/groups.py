@@ -1,4 +1,4 @@
-"""Several photographs in one call: each goes through the queue like any other, and then they are posed together."""
+"""The photographs of a rig or a sequence, each localized like any other; `joint` poses them together."""
 
 from __future__ import annotations
 
@@ -7,23 +7,12 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
 
-from mapless.geometry import RigidTransform
 from mapless_server.errors import Overloaded, RequestError
-from mapless_server.method.groups.checks import check_mounting, check_unit
-from mapless_server.method.groups.hints import hinted_group
-from mapless_server.method.groups.images import GroupImage
-from mapless_server.method.groups.rig import RigEstimate, RigOptions, solve_rig
-from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOptions, solve_sequence
-from mapless_server.method.options import Variant
-from mapless_server.method.rejection import Rejection
 from mapless_server.scheduling import Job
 
 from .interface import Engine
 from .query import Caller, Result
-
-Joint = TypeVar("Joint", RigEstimate, SequenceEstimate)
 
 MAX_RIG_IMAGES = 8
 MIN_FRAMES, MAX_FRAMES = 2, 16
@@ -43,50 +32,6 @@ class GroupResult:
     results: tuple[Result, ...]
     queued_s: tuple[float, ...]
     seconds: tuple[float, ...]
-
-    def images(self) -> list[GroupImage]:
-        """For posing them together."""
-        return [_image(result) for result in self.results]
-
-    def hinted(self, outcome: Joint | Rejection) -> Joint | Rejection:
-        """The joint outcome, with a hint if it is a rejection."""
-        if not isinstance(outcome, Rejection):
-            return outcome
-        return hinted_group(outcome, [(result.answer, result.references) for result in self.results])
-
-
-async def localize_rig(
-    engine: Engine, group: GroupResult, rig_from_camera: Sequence[RigidTransform], caller: Caller
-) -> RigEstimate | Rejection:
-    """The pose of the rig that took the photographs.
-
-    Raises:
-        RequestError: a passed deadline.
-    """
-    images = group.images()
-    found = await engine.join(lambda: solve_rig(images, rig_from_camera, RigOptions()), caller)
-    if not isinstance(found, Rejection):
-        found = check_mounting(found, [result.answer for result in group.results])
-    return group.hinted(found)
-
-
-async def localize_sequence(
-    engine: Engine,
-    group: GroupResult,
-    session_from_camera: Sequence[RigidTransform],
-    estimate_scale: bool,
-    caller: Caller,
-) -> SequenceEstimate | Rejection:
-    """The poses of the frames of a sequence, OpenCV's axes.
-
-    Raises:
-        RequestError: a passed deadline.
-    """
-    images, options = group.images(), SequenceOptions()
-    found = await engine.join(lambda: solve_sequence(images, session_from_camera, estimate_scale, options), caller)
-    if not isinstance(found, Rejection) and not estimate_scale:
-        found = check_unit(found, session_from_camera)
-    return group.hinted(found)
 
 
 async def localize_each(engine: Engine, jobs: Sequence[Job], caller: Caller, list_name: str) -> GroupResult:
@@ -167,8 +112,3 @@ class _Group:
         first = (next(iter(job.records), None) for job in self.jobs)
         queued_s = tuple(0.0 if it is None else it.start_s - it.queued_s for it in first)
         return GroupResult(results, queued_s, seconds)
-
-
-def _image(result: Result) -> GroupImage:
-    pipeline = result.tier.pipeline
-    return GroupImage(result.answer, pipeline.options.match(Variant.BEST, pipeline.matcher.options.guided_similarity))

@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import Protocol
 
+from mapless.geometry import RigidTransform
 from mapless_server.images.decode import ImageLimits
+from mapless_server.method.groups.rig import RigEstimate
+from mapless_server.method.groups.sequence import SequenceEstimate
+from mapless_server.method.rejection import Rejection
 from mapless_server.scenes.audit.coverage import Coverage
 from mapless_server.scenes.audit.verdict import ReferenceAudit
 from mapless_server.scenes.auditing import Viewpoint
@@ -18,8 +22,6 @@ from mapless_server.security.tenancy import SceneKey
 
 from .query import Caller, Description, Photo, Query, Result, Tier
 from .tiers import EscalationOptions
-
-Joined = TypeVar("Joined")
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,20 @@ class Engine(Protocol):
         """The result of a query's job; a job that was refused may be run again."""
         ...
 
-    async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
-        """Computes from several photographs' answers, however full the queue is."""
+    async def pose_rig(
+        self, results: Sequence[Result], rig_from_camera: Sequence[RigidTransform], caller: Caller
+    ) -> RigEstimate | Rejection:
+        """The pose of the rig that took the photographs, however full the queue is."""
+        ...
+
+    async def pose_sequence(
+        self,
+        results: Sequence[Result],
+        session_from_camera: Sequence[RigidTransform],
+        estimate_scale: bool,
+        caller: Caller,
+    ) -> SequenceEstimate | Rejection:
+        """The poses of the frames of a sequence, however full the queue is; OpenCV's axes."""
         ...
 
     def hold(self, queries: Sequence[Query], caller: Caller) -> AbstractContextManager[None]:

@@ -39,6 +39,21 @@ class Tier:
     extractor: FeatureExtractor
     pipeline: Pipeline
 
+    @property
+    def features(self) -> str:
+        """Name of the local features, with their options: "sift-2048-1024px-0.02"."""
+        return self.extractor.name
+
+    @property
+    def backend(self) -> str:
+        """Name of the coarse stage's backend."""
+        return self.pipeline.reconstructor.name
+
+    @property
+    def weights_sha256(self) -> str:
+        """Of the backend's weights; empty without any."""
+        return self.pipeline.reconstructor.weights_sha256
+
 
 @dataclass(frozen=True)
 class Caller:

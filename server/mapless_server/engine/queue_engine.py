@@ -8,8 +8,12 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import Any, TypeVar, cast
 
+from mapless.geometry import RigidTransform
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError, Unavailable
 from mapless_server.method.context import StageContext
+from mapless_server.method.groups.rig import RigEstimate
+from mapless_server.method.groups.sequence import SequenceEstimate
+from mapless_server.method.rejection import Rejection
 from mapless_server.scenes.audit.coverage import Coverage
 from mapless_server.scenes.audit.verdict import ReferenceAudit
 from mapless_server.scenes.auditing import Viewpoint
@@ -33,6 +37,7 @@ from mapless_server.scheduling import (
 )
 from mapless_server.security.tenancy import SceneKey
 
+from . import joint
 from .failures import failure_of
 from .interface import EngineOptions
 from .query import Caller, Description, Photo, Query, Result, Tier
@@ -213,6 +218,22 @@ class QueueEngine:
     def parallel_queries(self) -> int:
         """How many queries of one call are worth computing at a time."""
         return max(self.options.workers, self.options.max_batch)
+
+    async def pose_rig(
+        self, results: Sequence[Result], rig_from_camera: Sequence[RigidTransform], caller: Caller
+    ) -> RigEstimate | Rejection:
+        """The pose of the rig that took the photographs."""
+        return await self.join(lambda: joint.pose_rig(results, rig_from_camera), caller)
+
+    async def pose_sequence(
+        self,
+        results: Sequence[Result],
+        session_from_camera: Sequence[RigidTransform],
+        estimate_scale: bool,
+        caller: Caller,
+    ) -> SequenceEstimate | Rejection:
+        """The poses of the frames of a sequence, OpenCV's axes."""
+        return await self.join(lambda: joint.pose_sequence(results, session_from_camera, estimate_scale), caller)
 
     async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
         """Computes from several photographs' answers, in its turn, however full the queue is.

@@ -168,7 +168,7 @@ class QueryStages:
                 return _emptied() if is_outdated else error
             # A failed attempt at a better answer must not cost the answer at hand.
             if not isinstance(error, NotDescribedYet):
-                name = self._tiers[run.tier].extractor.name
+                name = self._tiers[run.tier].features
                 log.warning("%s failed; the first answer is given", name, exc_info=error)
             return self._unfinished(run)
 
@@ -282,7 +282,7 @@ class QueryStages:
 
     def _unfinished(self, run: QueryRun) -> Done:
         assert run.best is not None
-        unfinished = {f"{self._tiers[run.tier].extractor.name}{UNFINISHED}": time.monotonic() - run.start_s}
+        unfinished = {f"{self._tiers[run.tier].features}{UNFINISHED}": time.monotonic() - run.start_s}
         result = replace(run.best, stage_seconds=run.best.stage_seconds | unfinished)
         return Done(result, _ending(result))
 
@@ -293,7 +293,7 @@ class QueryStages:
         assert run.view is not None
         tier, narrowing = self._tiers[run.tier], run.query.narrowing
         answer = hinted(_checked_against(narrowing, answer), run.view, run.references, not narrowing.is_empty)
-        prefix = "" if run.best is None else f"{tier.extractor.name}/"
+        prefix = "" if run.best is None else f"{tier.features}/"
         seconds = {} if run.best is None else dict(run.best.stage_seconds)
         for stage, spent_s in (run.context.stage_seconds | answer.stage_seconds).items():
             seconds[f"{prefix}{stage}"] = spent_s

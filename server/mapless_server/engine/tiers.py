@@ -94,8 +94,8 @@ def better_of(cheaper: Result, stronger: Result, options: EscalationOptions) -> 
     if second.inlier_count >= options.clearly_more * first.inlier_count:
         return stronger
     message = (
-        f"the features disagree: the pose of {cheaper.tier.extractor.name} ({first.inlier_count} inliers) and that of "
-        f"{stronger.tier.extractor.name} ({second.inlier_count}) are {apart_m:.2f} m and {apart_deg:.1f} degrees apart"
+        f"the features disagree: the pose of {cheaper.tier.features} ({first.inlier_count} inliers) and that of "
+        f"{stronger.tier.features} ({second.inlier_count}) are {apart_m:.2f} m and {apart_deg:.1f} degrees apart"
     )
     return replace(stronger, answer=replace(stronger.answer, outcome=Rejection(RejectionReason.GATE, message)))
 

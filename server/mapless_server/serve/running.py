@@ -185,11 +185,10 @@ def _serve_metrics(
 
 def _observe_engine(engine: QueueEngine, metrics: Metrics) -> None:
     first = engine.tiers[0]
-    reconstructor = first.pipeline.reconstructor
-    metrics.built(__version__, reconstructor.name, first.extractor.name, reconstructor.weights_sha256)
+    metrics.built(__version__, first.backend, first.features, first.weights_sha256)
     metrics.scraped.retrieval_index = lambda: engine.references.index_bytes
     metrics.scraped.gpu_memory = gpu_memory
-    cache = getattr(reconstructor, "cache", None)  # of tokens; networks have one
+    cache = getattr(first.pipeline.reconstructor, "cache", None)  # of tokens; networks have one
     if cache is not None:
         metrics.scraped.token_cache = lambda: cache.counters
 

@@ -11,8 +11,6 @@ from mapless_server.engine.groups import (
     MIN_FRAMES,
     GroupResult,
     localize_each,
-    localize_rig,
-    localize_sequence,
 )
 from mapless_server.engine.interface import Engine
 from mapless_server.engine.query import Query
@@ -41,7 +39,7 @@ async def answer_rig(
     session_from_rig = session_from_rig_from_message(request)
     with engine.hold(queries, call.caller):
         group = await _localize_each(engine, queries, call, "images")
-        outcome = await localize_rig(engine, group, rig_from_camera, call.caller)
+        outcome = await engine.pose_rig(group.results, rig_from_camera, call.caller)
     response = rig_to_message(outcome, group, queries, request, session_from_rig)
     _conclude(response, outcome, group, call, metrics)
     if recorder is not None:
@@ -60,7 +58,7 @@ async def answer_sequence(
     scale_is_free = request.estimate_session_scale
     with engine.hold(queries, call.caller):
         group = await _localize_each(engine, queries, call, "frames")
-        outcome = await localize_sequence(engine, group, session_from_camera, scale_is_free, call.caller)
+        outcome = await engine.pose_sequence(group.results, session_from_camera, scale_is_free, call.caller)
     response = sequence_to_message(outcome, group, queries, request, axes)
     _conclude(response, outcome, group, call, metrics)
     if recorder is not None:

@@ -10,18 +10,23 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
+from mapless.geometry import RigidTransform
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.interface import Engine, EngineOptions
+from mapless_server.engine.joint import pose_rig, pose_sequence
 from mapless_server.engine.query import UNFINISHED, Caller, Query, Result, Tier
 from mapless_server.engine.references import QueryViews
 from mapless_server.engine.stages import COARSE, PREPARE, REFINE, Method, QueryRun, QueryStages
 from mapless_server.method.answer import Answer
+from mapless_server.method.groups.rig import RigEstimate
+from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.localize import refine
 from mapless_server.method.pipeline import Coarse, coarse_answer
+from mapless_server.method.rejection import Rejection
 from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc.call import Call
 from mapless_server.scheduling import Done, Flow, Job
@@ -33,8 +38,6 @@ from mapless_server.services.watching import Watchers
 from mapless_server.store import SceneAttributes, Store
 
 from .stand_ins import RETRIEVAL, Blobs, RecordedSource
-
-Joined = TypeVar("Joined")
 
 MESSAGES: dict[str, tuple[Any, Any]] = {
     "Localize": (pb.LocalizeRequest, pb.LocalizeResponse),
@@ -125,8 +128,19 @@ class _Recomputing:
     def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
         yield
 
-    async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
-        return await asyncio.to_thread(compute)
+    async def pose_rig(
+        self, results: Sequence[Result], rig_from_camera: Sequence[RigidTransform], caller: Caller
+    ) -> RigEstimate | Rejection:
+        return await asyncio.to_thread(pose_rig, results, rig_from_camera)
+
+    async def pose_sequence(
+        self,
+        results: Sequence[Result],
+        session_from_camera: Sequence[RigidTransform],
+        estimate_scale: bool,
+        caller: Caller,
+    ) -> SequenceEstimate | Rejection:
+        return await asyncio.to_thread(pose_sequence, results, session_from_camera, estimate_scale)
 
 
 def _compute(stages: QueryStages, job: Job) -> Result:

@@ -31,13 +31,12 @@ DECISIVE_SETTINGS = ("device", "coverage", "retrieval", "max_batch", "compiled_v
 
 def circumstances_of(settings: Settings, tiers: Sequence[Tier]) -> dict[str, str]:
     """Of a server with these settings and tiers, here and now, by name."""
-    reconstructor = tiers[0].pipeline.reconstructor
     found = {
         "mapless": __version__,
         "commit": commit_of(ROOT),
-        "backend": reconstructor.name,
-        "weights_sha256": reconstructor.weights_sha256,
-        "features": ", ".join(tier.extractor.name for tier in tiers),
+        "backend": tiers[0].backend,
+        "weights_sha256": tiers[0].weights_sha256,
+        "features": ", ".join(tier.features for tier in tiers),
         "processor": f"{cpu_model()}, {platform.machine()}",
         "python": platform.python_version(),
         "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS", ""),

@@ -235,7 +235,7 @@ class Recorder:
         if self._found is None:
             self._found = self._circumstances(waiting.tiers)
         tenant, scene_id = waiting.call.principal.tenant, waiting.scene_id
-        extractors, blobs = tuple(tier.extractor.name for tier in waiting.tiers), dict[str, bytes]()
+        extractors, blobs = tuple(tier.features for tier in waiting.tiers), dict[str, bytes]()
         # First: a scene that is made anew while its references are read has others, which is then found out.
         scene = self._store.get_scene(key_of(tenant, scene_id))
         parts = tuple(self._gatherer.part(scene, used, extractors, blobs) for used in waiting.parts)

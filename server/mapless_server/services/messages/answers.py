@@ -54,8 +54,7 @@ def claim_of(covariance: Array | None, result: Result, options: LocalizeOptions)
     """What is told of a pose's error, by its covariance (6, 6) and the scene's calibration; None if there is none."""
     if covariance is None:
         return None
-    backend = result.tier.pipeline.reconstructor.name
-    conditions = Conditions(result.tier.extractor.name, backend, options.variant.name, __version__)
+    conditions = Conditions(result.tier.features, result.tier.backend, options.variant.name, __version__)
     return claimed(accuracy_from_covariance(covariance), covariance, conditions, result.attributes.calibration)
 
 
@@ -140,11 +139,11 @@ def _hint_to_message(hint: Hint) -> pb.Hint:
 
 def diagnostics_to_message(result: Result, options: LocalizeOptions) -> pb.Diagnostics:
     """Message of what was used and where the time went; the caller knows the call's id and durations."""
-    answer, reconstructor = result.answer, result.tier.pipeline.reconstructor
+    answer, tier = result.answer, result.tier
     message = pb.Diagnostics(
-        backend=reconstructor.name,
-        weights_sha256=reconstructor.weights_sha256,
-        features=result.tier.extractor.name,
+        backend=tier.backend,
+        weights_sha256=tier.weights_sha256,
+        features=tier.features,
         variant=enum_to_message(options.variant, pb.Variant),
         store_generation=result.generation,
         scale=_scale_to_message(answer.scale) if answer.scale else None,
