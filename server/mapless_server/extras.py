@@ -15,12 +15,12 @@ _EXTRA_OF = {
     "transformers": "superpoint",
     "viser": "view",
 }
-"""By the name under which a package is imported; what is not here belongs to `server`."""
+"""By the name under which a package is imported; all others belong to `server`."""
 
 
 def install_hint(error: ImportError) -> str:
-    """What is missing, or too old, and what to run, for the operator."""
-    if not error.name:  # a shared library, say: no package of ours brings it
+    """The missing or outdated package and how to install it, for the operator."""
+    if not error.name:  # such as a shared library, which no extra brings
         return str(error)
     package = error.name.partition(".")[0]
     is_absent = isinstance(error, ModuleNotFoundError) and error.name == package

@@ -387,7 +387,7 @@ class TestCommand:
             (("create", "--name", "a", "--role", "king"), 1, "role"),
             (("create", "--name", "a", "--role", "read", "--expires", "soon"), 2, "--expires"),
             (("create", "--name", "a", "--role", "read", "--expires", "2099-01-01T00:00:00"), 2, "--expires"),
-            (("create", "--name", "a", "--role", "read", "--expires", "2001-01-01T00:00:00Z"), 2, "over already"),
+            (("create", "--name", "a", "--role", "read", "--expires", "2001-01-01T00:00:00Z"), 2, "in the future"),
             (("create", "--name", "old", "--role", "read"), 1, "already"),
             (("revoke", "a"), 1, "no token"),
         ],

@@ -348,7 +348,7 @@ class Metrics(Observer):
         self._captured = counter("mapless_captured", "Calls that were captured.")
         dropped = counter("mapless_capture_dropped", "Calls that were to be captured and were not.", ["reason"])
         self._capture_dropped = _Children(dropped, [(reason,) for reason in CAPTURE_DROPS])
-        self._serving = gauge("mapless_health_serving", "1 if health says SERVING, else 0.")
+        self._serving = gauge("mapless_health_serving", "1 if health reports SERVING, else 0.")
         self._warm_up = gauge("mapless_warmup_seconds", "Time of the warm-up; 0 if there was none.")
         blocks = gauge("mapless_python_allocated_blocks", "Pieces of memory that Python's objects hold.")
         blocks.set_function(sys.getallocatedblocks)

@@ -38,7 +38,7 @@ class Call:
         arrived_s: when its headers arrived, `time.monotonic`; its message may take longer.
         deadline_s: when the servicer must have answered, `time.monotonic`.
         principal: the caller, authenticated.
-        client: tells callers apart: the id that the caller gives, else the address of its connection.
+        client: distinguishes callers: the id that the caller gives, else the address of its connection.
         history: what was done for it so far.
     """
 

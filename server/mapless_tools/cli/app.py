@@ -49,7 +49,7 @@ def _options(
 
 
 def _add_tool(name: str, command: Callable[..., None], extra: str = "tools") -> None:
-    """Adds a command that ends with one sentence, before it begins, where a package of its extra is missing."""
+    """Adds a command that first checks that the packages of its extra are installed."""
 
     @functools.wraps(command)
     def checked(**arguments: Any) -> None:

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from mapless import ReferenceAudit
 
 ALARMS = ("SWAPPED_IMAGE", "WRONG_POSE_AND_INTRINSICS", "WRONG_POSE", "WRONG_INTRINSICS", "SCENE_CHANGED")
-"""Findings that mislead whoever is localized, the worst first."""
+"""Findings that cause wrong poses, the worst first."""
 
 MAX_PAGE = 100
 MAX_TIMEOUT_S = 600.0
-"""Servers give no call more, unless they are set to."""
+"""The default of the server's setting max_deadline_s."""
 
 _ORDER = (*ALARMS, "DUPLICATE", "UNVERIFIABLE", "CONSISTENT")
 
@@ -42,7 +42,7 @@ def audit_command(
 ) -> None:
     """Examine the references of a scene against their neighbours; exit code 1 when any of them is wrong.
 
-    What was found by then is told, too, when it ends early: exit code 1 after an error, 130 after Ctrl-C.
+    Findings are also reported if it ends early: exit code 1 after an error, 130 after Ctrl-C.
     """
     from mapless import MaplessError
     from mapless_server.serve.signals import terminable
@@ -77,19 +77,19 @@ def audit_command(
         raise
     finally:
         if examined.total is not None:
-            _tell(examined, everything, report, html)
+            _report(examined, everything, report, html)
     if any(a.verdict in ALARMS for a in examined.audits):
         raise typer.Exit(1)
 
 
 @dataclass
 class Examined:
-    """How far an audit came.
+    """The findings of an audit that may have ended early.
 
     Attributes:
-        scene: which.
-        audits: of the references so far, in the order they came.
-        total: how many references the scene has; None before that is known.
+        scene: its id.
+        audits: of the references so far, in the server's order.
+        total: number of references of the scene; None before it is known.
         stopped: why it ended early; empty if it did not.
     """
 
@@ -100,12 +100,12 @@ class Examined:
 
 
 def timeout_s(page_size: int) -> float:
-    """Deadline of a page: some seconds, and three times what a reference takes at most, as far as servers go along."""
+    """Deadline of a page: some seconds, and three times the longest time of a reference, up to the server's limit."""
     return min(5.0 + 3.0 * (page_size or MAX_PAGE), MAX_TIMEOUT_S)
 
 
-def _tell(examined: Examined, everything: bool, report: Path | None, html: Path | None) -> None:
-    """Prints and writes what was found, all of it or as far as it came."""
+def _report(examined: Examined, everything: bool, report: Path | None, html: Path | None) -> None:
+    """Prints and writes the findings."""
     from rich.console import Console
 
     from mapless_tools.output_files import write_json
@@ -125,7 +125,7 @@ def _tell(examined: Examined, everything: bool, report: Path | None, html: Path 
 
 
 def worst_first(audits: Iterable[ReferenceAudit]) -> list[ReferenceAudit]:
-    """By finding, then by how far the position is off, then by name."""
+    """Sorted by finding, then by offset, then by name."""
     return sorted(audits, key=lambda a: (_rank(a.verdict), -a.position_offset_m, -a.rotation_offset_deg, a.name))
 
 
@@ -134,7 +134,7 @@ def _rank(verdict: str) -> int:
 
 
 def summary_of(examined: Examined) -> str:
-    """How many there are of each finding, in one line."""
+    """The number of each finding, in one line."""
     counts = Counter(a.verdict for a in examined.audits)
     parts = [f"{counts[v]} {v.lower().replace('_', ' ')}" for v in sorted(counts, key=_rank)]
     found = f"{len(examined.audits)} references: {', '.join(parts) or 'none'}"
@@ -149,7 +149,7 @@ def reference_id_of(audit: ReferenceAudit) -> str:
 
 
 def cells_of(audit: ReferenceAudit) -> tuple[str, ...]:
-    """The figures of one reference, in the order of `COLUMNS`; a dash where one is not known."""
+    """The figures of one reference, in the order of `COLUMNS`; a dash for an unknown one."""
     is_known = audit.focal_ratio > 0
     return (
         reference_id_of(audit),
@@ -167,7 +167,7 @@ COLUMNS = ("reference", "finding", "off, cm", "turned, deg", "focal, %", "agree"
 
 
 def table_of(audits: Sequence[ReferenceAudit]) -> Table:
-    """The table for a terminal: the figures; words would not fit beside them."""
+    """The table for a terminal: figures only, because messages would not fit."""
     from rich.table import Table
 
     table = Table()
@@ -191,7 +191,7 @@ def to_json(examined: Examined) -> dict[str, Any]:
 
 
 def to_html(examined: Examined) -> str:
-    """The report as one page that needs nothing else."""
+    """The report as one self-contained page."""
     from mapless_tools.pages import render
 
     kinds = ["alarm" if a.verdict in ALARMS else "" if a.verdict == "CONSISTENT" else "note" for a in examined.audits]

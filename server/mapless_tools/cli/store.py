@@ -25,7 +25,7 @@ DataDir = Annotated[Path | None, typer.Option(help="Folder of the store; default
 @store_app.command("migrate")
 def migrate_command(config: Config = None, data_dir: DataDir = None) -> None:
     """Bring the store to this program's schema, as the server does when it starts; makes one where there is none."""
-    with _faults_said(), closing(_open(config, data_dir)) as database:
+    with _store_errors(), closing(_open(config, data_dir)) as database:
         from mapless_server.store import SCHEMA_VERSION
 
         print(f"database {database.name} has schema version {SCHEMA_VERSION}")
@@ -37,11 +37,11 @@ def verify_command(
     config: Config = None,
     data_dir: DataDir = None,
 ) -> None:
-    """Read every row of the store or of a backup and say what is damaged; exit code 1 if anything is."""
+    """Read every row of the store or of a backup and report damage; exit code 1 if there is any."""
     from mapless_server.store import SqliteDatabase, verify
 
     with (
-        _faults_said(),
+        _store_errors(),
         _progress() as on_progress,
         closing(SqliteDatabase.open_as_is(file) if file else _look(config, data_dir)) as database,
         database.read() as connection,
@@ -60,7 +60,7 @@ def backup_command(
     """Copy the store to one file, whether it is served or not; exit code 1 if something in the store is damaged."""
     from mapless_server.store import back_up
 
-    with _faults_said(), _progress() as on_progress, closing(_look(config, data_dir)) as database:
+    with _store_errors(), _progress() as on_progress, closing(_look(config, data_dir)) as database:
         found = back_up(database, file, on_progress)
     _report(found, f"written to {file}, read again and found whole")
 
@@ -74,7 +74,7 @@ def restore_command(
     """Check a backup and copy it into the store, which must be empty: all of it or nothing."""
     from mapless_server.store import SqliteDatabase, restore
 
-    with _faults_said(), _progress() as on_progress:
+    with _store_errors(), _progress() as on_progress:
         SqliteDatabase.open_as_is(file).close()  # before a store is made for it
         with closing(_open(config, data_dir)) as database:
             found = restore(file, database, on_progress)
@@ -90,7 +90,7 @@ def _open(config: Path | None, data_dir: Path | None) -> Database:
 
 
 def _look(config: Path | None, data_dir: Path | None) -> Database:
-    """The settings' store as it is, whoever else uses it."""
+    """The settings' store, read-only, while others may use it."""
     from mapless_server.store import DATABASE_FILE, PostgresqlDatabase, SqliteDatabase
 
     url, folder = _settings(config, data_dir)
@@ -107,8 +107,8 @@ def _settings(config: Path | None, data_dir: Path | None) -> tuple[str | None, P
 
 
 @contextmanager
-def _faults_said() -> Iterator[None]:
-    """What goes wrong with the store ends the command with one line."""
+def _store_errors() -> Iterator[None]:
+    """An error of the store or the settings ends the command with one line."""
     from mapless_server.errors import RequestError
     from mapless_server.settings import ConfigError
     from mapless_server.store import StoreError

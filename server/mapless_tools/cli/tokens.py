@@ -1,4 +1,4 @@
-"""`mapless-server token`: create, list, revoke. The token alone goes to standard output, for programs to catch."""
+"""`mapless-server token`: create, list, revoke. Standard output has the token alone, for programs."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ import typer
 from mapless_server.security.principal import DEFAULT_TENANT
 from mapless_server.serve.command import fail
 
-token_app = typer.Typer(help="Tokens that callers must show: make, list and revoke them.", no_args_is_help=True)
+token_app = typer.Typer(help="Tokens that callers must have: create, list and revoke them.", no_args_is_help=True)
 
 TokensFile = Annotated[Path | None, typer.Option(help="The file of tokens; default: the server's setting.")]
 
 
 @token_app.command("create")
 def create_command(
-    name: Annotated[str, typer.Option(help="Whose it is; unique, and what the server's log will say.")],
-    role: Annotated[str, typer.Option(help="What it allows: read, localize (and read), or write (everything).")],
-    tenant: Annotated[str, typer.Option(help="Whose scenes it opens.")] = DEFAULT_TENANT,
+    name: Annotated[str, typer.Option(help="Name of the holder; unique, and the caller's name in the log.")],
+    role: Annotated[str, typer.Option(help="Rights of the holder: read, localize (and read), or write (everything).")],
+    tenant: Annotated[str, typer.Option(help="Tenant whose scenes the holder can access.")] = DEFAULT_TENANT,
     expires: Annotated[str | None, typer.Option(help="When it ends, 2027-01-01T00:00:00Z; default: never.")] = None,
     tokens_file: TokensFile = None,
 ) -> None:
-    """Make a token and print it, once: the file keeps its hash only."""
+    """Create a token and print it, once: the file has only its hash."""
     from mapless_server.security.tokens import create_token
 
     with _tokens_file(tokens_file) as path:
@@ -37,7 +37,7 @@ def create_command(
 
 @token_app.command("list")
 def list_command(tokens_file: TokensFile = None) -> None:
-    """Show whose tokens there are, and what they allow."""
+    """Show all tokens with their roles, tenants and expiry."""
     from mapless_server.security.tokens import read_tokens
 
     with _tokens_file(tokens_file) as path:
@@ -55,7 +55,7 @@ def list_command(tokens_file: TokensFile = None) -> None:
 def revoke_command(
     name: Annotated[str, typer.Argument(help="The token's name, as listed.")], tokens_file: TokensFile = None
 ) -> None:
-    """Remove a token; a running server refuses it about a second later."""
+    """Remove a token; a running server rejects it about a second later."""
     from mapless_server.security.tokens import revoke_token
 
     with _tokens_file(tokens_file) as path:
@@ -64,29 +64,29 @@ def revoke_command(
 
 @contextmanager
 def _tokens_file(given: Path | None) -> Iterator[Path]:
-    """The file of tokens; what goes wrong with it ends the command with one line."""
+    """The file of tokens; an error ends the command with one line."""
     from mapless_server.security.errors import SecurityError
     from mapless_server.settings import ConfigError, load_settings
 
     try:
         path = load_settings({"tokens_file": given}).settings.tokens_file
         if path is None:
-            fail("which file? give --tokens-file, or set MAPLESS_TOKENS_FILE", code=2)
+            fail("no file of tokens: give --tokens-file, or set MAPLESS_TOKENS_FILE")
         yield path
     except ConfigError as error:
-        fail(str(error), code=2)
+        fail(str(error))
     except SecurityError as error:
         fail(str(error), code=1)
 
 
 def _read_time(text: str) -> datetime:
-    """A moment to come; ends the command if it is none."""
+    """A time in the future; ends the command if it is none."""
     from pydantic import AwareDatetime, TypeAdapter, ValidationError
 
     try:
         time: datetime = TypeAdapter(AwareDatetime).validate_strings(text)
     except ValidationError:
-        fail(f"--expires takes a time with its zone, 2027-01-01T00:00:00Z, not {text!r}", code=2)
+        fail(f"--expires takes a time with its zone, 2027-01-01T00:00:00Z, not {text!r}")
     if time <= datetime.now(timezone.utc):
-        fail(f"--expires: {text} is over already", code=2)
+        fail(f"--expires must be in the future, not {text}")
     return time

@@ -95,7 +95,7 @@ def add_command(
 
 @weights_app.command("check")
 def check_command(name: Name, weights_dir: WeightsDir = None) -> None:
-    """Read a file of the weights folder from end to end and compare it with what is known of it."""
+    """Read a file of the weights folder from end to end and compare it with the official digest and the network."""
     with _weights_folder(weights_dir) as folder:
         weights = named(name)
         with _bar(f"checking {name}", look_up(weights, folder).path) as progress:

@@ -37,7 +37,7 @@ def cluster(options: Json) -> Iterator[ServeControllerClient]:
         object_store_memory=OBJECT_STORE_BYTES,
         _temp_dir=options["folder"],
         _node_ip_address="127.0.0.1",
-        log_to_driver=False,  # which costs more than what is measured
+        log_to_driver=False,  # it would cost more than the measured calls
     )
     try:
         serve.start(

@@ -139,7 +139,7 @@ async def _compare(
             return it
 
         for name in places:
-            await step(name, 4, 0.5)  # what is slow once, is slow now
+            await step(name, 4, 0.5)  # a warm-up
         for done in range(options.rounds):
             progress("overhead, rounds", done, options.rounds)
             for name, way in ways.items():
