@@ -5,23 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from mapless.geometry import RigidTransform
 from mapless_server.images.decode import ImageLimits
-from mapless_server.method.groups.rig import RigEstimate
-from mapless_server.method.groups.sequence import SequenceEstimate
-from mapless_server.method.rejection import Rejection
-from mapless_server.scenes.audit.coverage import Coverage
-from mapless_server.scenes.audit.verdict import ReferenceAudit
-from mapless_server.scenes.auditing import Viewpoint
-from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.scenes.retrieval.narrowing import Narrowing
 from mapless_server.scheduling import Job, WorkQueueOptions
-from mapless_server.security.tenancy import SceneKey
 
-from .query import Caller, Description, Photo, Query, Result, Tier
 from .tiers import EscalationOptions
+
+if TYPE_CHECKING:  # services need not load what computes
+    from mapless.geometry import RigidTransform
+    from mapless_server.method.groups.rig import RigEstimate
+    from mapless_server.method.groups.sequence import SequenceEstimate
+    from mapless_server.method.rejection import Rejection
+    from mapless_server.scenes.audit.coverage import Coverage
+    from mapless_server.scenes.audit.verdict import ReferenceAudit
+    from mapless_server.scenes.auditing import Viewpoint
+    from mapless_server.scenes.retrieval.chosen import Choice
+    from mapless_server.scenes.retrieval.narrowing import Narrowing
+    from mapless_server.security.tenancy import SceneKey
+
+    from .query import Caller, Description, Photo, Query, Result, Tier
 
 
 @dataclass(frozen=True)

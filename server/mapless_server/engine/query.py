@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from mapless.geometry import Camera
-from mapless_server.method.answer import Answer
-from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.priors.known import NO_PRIORS, Priors
-from mapless_server.method.views import PosedView, View
-from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.scenes.retrieval.descriptor import Vector
-from mapless_server.scenes.retrieval.narrowing import Narrowing
-from mapless_server.scheduling import Flow
-from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import SceneAttributes
+
+if TYPE_CHECKING:
+    from mapless.geometry import Camera
+    from mapless_server.method.answer import Answer
+    from mapless_server.method.features import FeatureExtractor
+    from mapless_server.method.options import LocalizeOptions
+    from mapless_server.method.pipeline import Pipeline
+    from mapless_server.method.views import PosedView, View
+    from mapless_server.scenes.retrieval.chosen import Choice
+    from mapless_server.scenes.retrieval.descriptor import Vector
+    from mapless_server.scenes.retrieval.narrowing import Narrowing
+    from mapless_server.scheduling import Flow
+    from mapless_server.security.tenancy import SceneKey
 
 UNFINISHED = "/unfinished"
 """Ends the name of a stage: its tier came to no answer, see `Result`."""

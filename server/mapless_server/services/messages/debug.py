@@ -7,13 +7,17 @@ again, in one step.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, normalize
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.method.results import Support
-from mapless_server.method.views import View
+
+if TYPE_CHECKING:
+    from mapless_server.method.results import Support
+    from mapless_server.method.views import View
 
 MAX_MATCHES = 2000
 """Some 100 KB of message, and more than a picture shows."""

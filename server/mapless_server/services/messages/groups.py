@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,12 +12,7 @@ from mapless.axes import WORLD_FROM_RIGHT_HANDED, Axes, pose_from
 from mapless.geometry import Array, RigidTransform, Similarity
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
-from mapless_server.engine.groups import GroupResult
-from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Query
-from mapless_server.method.groups.images import PosedImage
-from mapless_server.method.groups.rig import RigEstimate
-from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.options import Variant
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
@@ -43,6 +38,13 @@ from .queries import (
     reference_count_from_message,
     reference_ids_from_names,
 )
+
+if TYPE_CHECKING:
+    from mapless_server.engine.groups import GroupResult
+    from mapless_server.engine.interface import EngineOptions
+    from mapless_server.method.groups.images import PosedImage
+    from mapless_server.method.groups.rig import RigEstimate
+    from mapless_server.method.groups.sequence import SequenceEstimate
 
 
 def queries_from_message(
