@@ -11,7 +11,6 @@ import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from random import Random
 from unittest.mock import patch
 
 from mapless_server.security.binding import assess_binding
@@ -19,7 +18,7 @@ from mapless_server.settings import PREFIX, ConfigError, LoadedSettings, Setting
 from mapless_server.store import StoreError, postgresql
 
 from . import folders
-from .target import MutateBytes, Target
+from .target import Target
 
 _FILE = "mapless.toml"
 _PASSWORD = "hunter2"
@@ -106,15 +105,10 @@ def seeds() -> list[bytes]:
     ]
 
 
-def mutate(data: bytes, random: Random, mutate_bytes: MutateBytes) -> bytes:
-    """See Target."""
-    return folders.mutate(data, random, mutate_bytes)
-
-
 TARGET = Target(
     seeds,
     check,
-    mutate,
+    folders.mutate,
     max_bytes=1024,
     words=tuple(f"{it} = ".encode() for it in Settings.model_fields)
     + tuple(f"{it.upper()}=".encode() for it in Settings.model_fields)

@@ -7,8 +7,7 @@ unit length where its type says so, survives the wire, and can be computed with.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
-from random import Random
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -44,7 +43,7 @@ from mapless_server.store import SceneAttributes
 from . import messages
 from .images import seeds as image_seeds
 from .laws import answered, check_covariance, check_pose, check_received_camera, check_unit
-from .target import MutateBytes, Target
+from .target import Target
 
 KINDS = (pb.LocalizeRequest, pb.LocalizeRigRequest, pb.LocalizeSequenceRequest, pb.WatchQueriesRequest)
 ENGINE = EngineOptions()
@@ -200,9 +199,4 @@ def photograph() -> bytes:
     return min((it for it in image_seeds() if image_size(it, ENGINE.image_limits) == (32, 33)), key=len)
 
 
-def mutate(data: bytes, random: Random, mutate_bytes: MutateBytes) -> bytes:
-    """See Target."""
-    return messages.mutate(KINDS, data, random, mutate_bytes)
-
-
-TARGET = Target(seeds, check, mutate, max_bytes=16384)
+TARGET = Target(seeds, check, partial(messages.mutate, KINDS), max_bytes=16384)

@@ -12,7 +12,6 @@ import logging
 import re
 from datetime import datetime, timezone
 from functools import cache
-from random import Random
 from typing import Any
 
 import grpc
@@ -26,7 +25,7 @@ from mapless_server.security.errors import SecurityError
 from mapless_server.security.tokens import Token, Tokens, read_tokens, sha256_of
 
 from . import folders
-from .target import MutateBytes, Target
+from .target import Target
 
 NOW = datetime(2026, 11, 21, tzinfo=timezone.utc)
 GOOD = "mapless_good"
@@ -199,15 +198,10 @@ def seeds() -> tuple[bytes, ...]:
     )
 
 
-def mutate(data: bytes, random: Random, mutate_bytes: MutateBytes) -> bytes:
-    """See Target."""
-    return folders.mutate(data, random, mutate_bytes)
-
-
 TARGET = Target(
     seeds,
     check,
-    mutate,
+    folders.mutate,
     max_bytes=4096,
     words=(
         b"authorization",

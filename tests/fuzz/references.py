@@ -10,8 +10,7 @@ import asyncio
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import datetime, timezone
-from functools import cache
-from random import Random
+from functools import cache, partial
 from typing import Any
 from unittest.mock import patch
 
@@ -41,7 +40,7 @@ from mapless_server.store import NewReference, ReferenceRecord, SceneAttributes,
 from . import messages
 from .laws import answered, check_pose, check_received_camera
 from .localization import CAMERA, POSE, photograph
-from .target import MutateBytes, Target
+from .target import Target
 
 _SERVICE = pb.DESCRIPTOR.services_by_name["ReferenceService"]
 METHODS = {GetMessageClass(method.input_type): method.name for method in _SERVICE.methods}
@@ -276,9 +275,4 @@ def _token(request: Any) -> str:
     return token
 
 
-def mutate(data: bytes, random: Random, mutate_bytes: MutateBytes) -> bytes:
-    """See Target."""
-    return messages.mutate(KINDS, data, random, mutate_bytes)
-
-
-TARGET = Target(seeds, check, mutate, max_bytes=16384)
+TARGET = Target(seeds, check, partial(messages.mutate, KINDS), max_bytes=16384)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import struct
 from datetime import datetime, timezone
-from random import Random
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from mapless_server.store import ContradictingDown, SceneAttributes, codec
 
 from . import folders
 from .localization import POSE
-from .target import MutateBytes, Target
+from .target import Target
 
 OWNER, OTHER = "scene a", "scene b"
 _CAMERAS = (
@@ -171,15 +170,10 @@ def seeds() -> list[bytes]:
     ]
 
 
-def mutate(data: bytes, random: Random, mutate_bytes: MutateBytes) -> bytes:
-    """See Target."""
-    return folders.mutate(data, random, mutate_bytes)
-
-
 TARGET = Target(
     seeds,
     check,
-    mutate,
+    folders.mutate,
     max_bytes=4096,
     words=(b'"camera"', b'"distortion"', b'"model"', b'"fisheye"', b"null", b"NaN", b'"world_from_camera"', b'"count"')
     + tuple(struct.pack("<d", it) for it in (0.0, 1.0, -1.0, 1e308, 5e-324, float("nan"), float("inf"))),
