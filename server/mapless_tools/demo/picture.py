@@ -6,6 +6,7 @@ structure, below the numbers and a plan of the place.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -13,7 +14,6 @@ from typing import Any
 import cv2
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -86,9 +86,9 @@ def draw(
     for i, line in enumerate(lines):
         y = STRIP - (0.06 + 0.042 * i)
         figure.text(0.015, y, line, color=DIM if i else INK, fontsize=11.5 if i else 17)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    pixels = io.BytesIO()
+    figure.savefig(pixels, format="rgba", dpi=100)
+    return np.frombuffer(pixels.getvalue(), np.uint8).reshape(SIZE_PX[1], SIZE_PX[0], 4)[..., :3]
 
 
 def contact_sheet(pictures: Sequence[Canvas], columns: int = 2) -> Canvas:
