@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,13 @@ def use_logarithms(*axes: Axis) -> None:
         set_scale = axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale
         set_scale("log")
         axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
+        axis.set_minor_formatter(partial(_minor_label, axis))
+
+
+def _minor_label(axis: Axis, x: float, _: object) -> str:
+    """2 and 5 in each decade; in less than a decade all."""
+    low, high = axis.get_view_interval()
+    return f"{x:g}" if high < 10 * low or f"{x:e}"[0] in "25" else ""
 
 
 def plot(

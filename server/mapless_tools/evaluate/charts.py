@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from mapless_tools.charts import figure_of, new_axes, plot, use_logarithms
 
@@ -121,6 +122,7 @@ def along_sequence(group: Group, scene: str) -> list[Figure]:
         thinned = f"; the worst of each {stride}" if stride > 1 else ""
         x_label = f"query, in the order of the sequence{thinned}"
         axes = new_axes(f"{scene}, {method.label}", x_label, measure.label)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         use_logarithms(axes.yaxis)
         for setting, results in runs.items():
             errors = [max(measure.of_query(it), measure.smallest) for it in results]

@@ -11,6 +11,7 @@ from statistics import median
 from typing import Any
 
 from mapless import Client, RigidTransform
+from mapless_server.method.options import check_bounds
 from mapless_tools.child import ChildServer, child_module
 from mapless_tools.demo import Photograph
 from mapless_tools.progress import Progress
@@ -52,10 +53,8 @@ class OverheadOptions:
     clients: int = 4
 
     def __post_init__(self) -> None:
-        if min(self.message_bytes, self.rounds, self.concurrency, self.clients) < 1:
-            raise ValueError("message_bytes, rounds, concurrency and clients must be at least 1")
-        if not min(self.unloaded_s, self.saturated_s) > 0:
-            raise ValueError("times must be above 0")
+        check_bounds(self, "message_bytes rounds concurrency clients", at_least=1)
+        check_bounds(self, "unloaded_s saturated_s", above=0)
 
 
 @dataclass(frozen=True, eq=False)

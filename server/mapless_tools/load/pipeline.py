@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mapless_server.method.options import check_bounds
 from mapless_server.settings import available_cores
 from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
@@ -54,10 +55,11 @@ class PipelineOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.clients < 1 or not self.shares or min(self.shares) <= 0:
-            raise ValueError("clients must be at least 1, shares above 0 and at least one")
-        if not min(self.deadline_s, self.unloaded_s, self.ramp_s) > 0 or not 0 <= self.settle_s < self.step_s:
-            raise ValueError("times must be above 0, settle_s at least 0 and below step_s")
+        check_bounds(self, "clients", at_least=1)
+        check_bounds(self, "shares deadline_s unloaded_s ramp_s", above=0)
+        check_bounds(self, "settle_s", at_least=0, below=self.step_s)
+        if not self.shares:
+            raise ValueError("PipelineOptions.shares must have at least one share")
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mapless_server.method.options import check_bounds
 from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
 
@@ -81,13 +82,12 @@ class SoakOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        times = (self.minutes, self.share, self.deadline_s, self.ramp_s, self.sample_every_s)
-        if not min(times) > 0 or self.clients < 1 or self.churn < 0:
-            raise ValueError("times, share and clients must be above 0, churn at least 0")
-        if self.rate_per_s is not None and not self.rate_per_s > 0:
-            raise ValueError("rate_per_s must be above 0")
-        if not (0 <= self.settle_share < 1 and 0 <= self.bad_share < 1):
-            raise ValueError("settle_share and bad_share must be at least 0 and below 1")
+        check_bounds(self, "minutes share deadline_s ramp_s sample_every_s", above=0)
+        check_bounds(self, "clients", at_least=1)
+        check_bounds(self, "churn", at_least=0)
+        check_bounds(self, "settle_share bad_share", at_least=0, below=1)
+        if self.rate_per_s is not None:
+            check_bounds(self, "rate_per_s", above=0)
 
 
 @dataclass(frozen=True, eq=False)

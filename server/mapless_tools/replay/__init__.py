@@ -1,5 +1,5 @@
 """Answers of captured calls, computed again and compared: `mapless-server replay`.
 
-`recompute` answers a captured call on the `stand_ins` of store and choice; `comparing` lists what differs, `report`
-does so for a whole folder.
+`recompute` answers a captured call on its `recorded` inputs, `comparing` lists the differences, and `report` does so
+for a whole folder. It may import the services, the engine and the method, whose results it reproduces.
 """

@@ -1,11 +1,13 @@
-"""`mapless-server replay`: computes captured answers anew, and says what has changed since."""
+"""`mapless-server replay`: computes captured answers again, and prints the differences."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from mapless_server.serve.command import fail
 
 if TYPE_CHECKING:
     from .report import Replayed, Report
@@ -28,10 +30,10 @@ def replay_command(
     device: Annotated[str | None, typer.Option(help="As the server's setting.")] = None,
     weights_dir: Annotated[Path | None, typer.Option(help="As the server's setting.")] = None,
 ) -> None:
-    """Compute captured answers anew, by this program and its settings; exit code 1 unless all are the same.
+    """Compute captured answers again, by this program and its settings; exit code 1 unless all are identical.
 
-    The same is to the last bit. References are those that were captured, and so is the choice among them; no store is
-    asked.
+    Identical is to the last bit. References are those that were captured, and so is the choice among them; no store is
+    read.
     """
     from mapless_server.serve.libraries import configure_libraries
     from mapless_server.settings import ConfigError, load_settings
@@ -40,7 +42,7 @@ def replay_command(
     try:
         settings = load_settings(flags, config).settings
     except ConfigError as error:
-        _fail(str(error))
+        fail(str(error))
     configure_libraries(settings)
 
     from mapless_server.services.capture.calls import CaptureError
@@ -51,7 +53,7 @@ def replay_command(
         selection = Selection(frozenset(request_id or ()), last, tenant, scene)
         report = replay(folder, selection, settings)
     except CaptureError as error:
-        _fail(str(error))
+        fail(str(error))
     if json_output:
         _print_json(report)
     else:
@@ -96,8 +98,3 @@ def _print_call(call: Replayed) -> None:
         print(f"    {change.field}: {change.then} → {change.now}")
     if len(call.changes) > SHOWN_CHANGES:
         print(f"    and {len(call.changes) - SHOWN_CHANGES} more, see --json")
-
-
-def _fail(message: str) -> NoReturn:
-    typer.echo(f"mapless-server: {message}", err=True)
-    raise typer.Exit(2)

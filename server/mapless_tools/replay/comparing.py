@@ -1,7 +1,7 @@
-"""What is different between an answer and the same answer computed anew.
+"""The differences between an answer and the same answer computed again.
 
-Durations, the call's id, the server's version and whether it was captured are no part of an answer; what it was
-computed with is compared apart.
+Durations, the call's id, the server's version and whether it was captured are no part of an answer; versions, settings
+and weights are compared separately.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mapless_server.engine.query import UNFINISHED
 from mapless_server.services.capture.calls import Response, diagnostics_of
 
 DESCRIBE = "describe"
-"""The stage in which a server finds features once and for all: a replay has them."""
+"""The stage in which a server extracts the features that a replay already has."""
 
 ABSENT = "-"
 
@@ -32,7 +32,7 @@ MAX_CHANGES = 40
 
 @dataclass(frozen=True)
 class Change:
-    """Something that is different: where, and as text what it was and what it is."""
+    """A difference: the field, and both values as text."""
 
     field: str
     then: str
@@ -41,11 +41,11 @@ class Change:
 
 @dataclass(frozen=True)
 class Comparison:
-    """An answer beside the same one computed anew.
+    """An answer beside the same one computed again.
 
     Attributes:
         is_identical: to the last bit.
-        changes: what is different, in the order of the fields; the first of them.
+        changes: the first differences, in the order of the fields.
         apart_cm: how far the poses are apart; None where not both have one.
         apart_deg: likewise, their rotations.
     """
@@ -69,7 +69,7 @@ def compare(then: Response, now: Response) -> Comparison:
 
 
 def changed(then: Mapping[str, str], now: Mapping[str, str]) -> list[Change]:
-    """What is different of that which answers are computed with."""
+    """The differences of versions, settings and weights."""
     names = [it for it in {**then, **now} if then.get(it, ABSENT) != now.get(it, ABSENT)]
     return [Change(it, then.get(it, ABSENT), now.get(it, ABSENT)) for it in names]
 
@@ -84,7 +84,7 @@ def stage_seconds(response: Response) -> dict[str, float]:
 
 
 def outcome_of(response: Any) -> str:
-    """In a word: "localized", or why not."""
+    """In a word: "localized", or the reason of the rejection."""
     if response.HasField("localization"):
         return "localized"
     known = response.rejection.DESCRIPTOR.fields_by_name["reason"].enum_type.values_by_number

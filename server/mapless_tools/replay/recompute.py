@@ -1,8 +1,8 @@
-"""Computing the answer of a captured call anew: the services and the method themselves, on what was captured.
+"""Computes the answer of a captured call again: the services and the method themselves, on the recorded inputs.
 
-In place of the engine and its queue stands one computation after another, without limits of time. Where time decided
-then, it decides the same: features that were not tried to their end are not tried, and a pose that was not refined is
-not refined.
+Instead of the engine and its queue, one computation after another, without deadlines. Where time limited the captured
+answer, this one is limited alike: features that were not tried to their end are not tried, and a pose that was not
+refined is not refined.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from mapless_server.services.localization import LocalizationService
 from mapless_server.services.watching import Watchers
 from mapless_server.store import SceneAttributes, Store
 
-from .stand_ins import RETRIEVAL, Blobs, RecordedSource
+from .recorded import RETRIEVAL, Blobs, RecordedSource
 
 MESSAGES: dict[str, tuple[Any, Any]] = {
     "Localize": (pb.LocalizeRequest, pb.LocalizeResponse),
@@ -48,23 +48,23 @@ MESSAGES: dict[str, tuple[Any, Any]] = {
 
 
 def response_of(call: CapturedCall) -> Response:
-    """What was answered; CaptureError if it is of a method that this program does not know."""
+    """The captured answer; CaptureError if it is of a method that this program does not know."""
     if call.method not in MESSAGES:
         raise CaptureError(f"this program knows no method {call.method}")
     return cast(Response, MESSAGES[call.method][1].FromString(call.response))
 
 
 def recompute(call: CapturedCall, blobs: Blobs, tiers: Sequence[Tier], options: EngineOptions) -> Response:
-    """What is answered to a captured call now.
+    """The answer to a captured call now.
 
     Args:
-        call: that was answered then.
+        call: that was captured.
         blobs: of the references.
-        tiers: what computes now.
+        tiers: that compute now.
         options: limits and defaults of now.
 
     Raises:
-        CaptureError: a part of what was captured is gone, or its method is not known.
+        CaptureError: a part of the capture is missing, or its method is not known.
         RequestError, FieldError: the call is refused now.
     """
     then = response_of(call)
@@ -76,7 +76,7 @@ def recompute(call: CapturedCall, blobs: Blobs, tiers: Sequence[Tier], options: 
 
 
 class _Attributes:
-    """Of the store, what services ask themselves."""
+    """The part of the store that services call."""
 
     def __init__(self, call: CapturedCall) -> None:
         self._attributes = call.attributes
@@ -86,7 +86,7 @@ class _Attributes:
 
 
 class _Recomputing:
-    """Of the engine, what services ask; a photograph is known by its field in the request."""
+    """The part of the engine that services call; a photograph is identified by its field in the request."""
 
     parallel_queries = 1
 
@@ -107,13 +107,13 @@ class _Recomputing:
         described = zip(self._parts, diagnostics_of(then), strict=True)
         stages = {field: [it.stage for it in about.stages] for field, about in described}
         self._unfinished = {field: _unfinished(names) for field, names in stages.items()}
-        self._looked_at = {field for field, names in stages.items() if RETRIEVAL in names}
+        self._described = {field for field, names in stages.items() if RETRIEVAL in names}
         self._method = _unrefined() if _is_cut_short(request, then) else Method()
 
     def query_job(self, query: Query, caller: Caller, source: object = None, on_coarse: object = None) -> Job:
         field = query.photo.field
         extractor, part = self._tiers[0].extractor, self._parts[field]
-        recorded = RecordedSource(self._call, part, self._blobs, extractor, field in self._looked_at)
+        recorded = RecordedSource(self._call, part, self._blobs, extractor, field in self._described)
         views = QueryViews(query.photo, self.options.image_limits)
         return Job(Flow("", ""), QueryRun(query, recorded, views, math.inf).first_step, math.inf, 0)
 

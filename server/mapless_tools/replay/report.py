@@ -1,4 +1,4 @@
-"""A folder of captured calls, computed anew: which, by what, and what has changed since."""
+"""A folder of captured calls, computed again: which calls, and what has changed since."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from mapless_server.settings import Settings
 
 from .comparing import Change, changed, compare, outcome_of, stage_seconds
 from .recompute import recompute, response_of
-from .stand_ins import Blobs
+from .recorded import Blobs
 
 IDENTICAL, CHANGED, NOT_COMPUTED = "identical", "changed", "not computed"
-"""Verdicts on a call; the last says nothing of its answer: a part of what was captured is damaged, or unknown here."""
+"""Verdicts on a call; the last: a part of the capture is damaged, or unknown to this version."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Which calls; what is empty or None selects all.
+    """Which calls; empty values and None select all.
 
     Attributes:
-        request_ids: of these calls.
-        last: so many, the latest.
-        tenant: of this tenant.
-        scene_id: in its scenes of this id.
+        request_ids: calls of these ids.
+        last: the latest so many.
+        tenant: calls of this tenant.
+        scene_id: calls in scenes of this id.
     """
 
     request_ids: frozenset[str] = frozenset()
@@ -55,18 +55,18 @@ class Selection:
 
 @dataclass(frozen=True)
 class Replayed:
-    """A captured call and its answer computed anew.
+    """A captured call and its answer computed again.
 
     Attributes:
         request_id, time, method, tenant, scene_id: of the call; the time is UTC.
         verdict: see `IDENTICAL`.
-        outcome_then, outcome_now: "localized", or why not; empty where there is no answer.
+        outcome_then, outcome_now: "localized", or the reason of the rejection; empty without an answer.
         seconds_then, seconds_now: computing time of its stages.
         stages_then, stages_now: of each stage.
         apart_cm, apart_deg: how far the poses are apart; None where there are no two, or the answers are identical.
-        changes: what is different; the first of it.
+        changes: the first differences.
         error: why there is no answer now.
-        found_anew: references whose captured features this version cannot read, so that it found them anew.
+        found_anew: references whose captured features this version cannot read, so that it extracted them again.
     """
 
     request_id: str
@@ -90,11 +90,11 @@ class Replayed:
 
 @dataclass(frozen=True)
 class Report:
-    """What became of the calls, the oldest first.
+    """The replayed calls, the oldest first.
 
     Attributes:
         calls: each of them.
-        circumstances: what else is different between then and now, of any of the calls.
+        circumstances: differences of versions, settings and weights, of any of the calls.
         unreadable: files that are damaged, and why.
     """
 
@@ -109,12 +109,12 @@ class Report:
 
 
 def replay(folder: Path, selection: Selection, settings: Settings) -> Report:
-    """Computes captured answers anew.
+    """Computes captured answers again.
 
     Args:
         folder: a capture folder, whether a server uses it or not; nothing in it is changed.
         selection: which calls.
-        settings: by which features, backend and so on; where they listen and store does not matter.
+        settings: of features, backend and so on; those of listening and storing have no effect.
 
     Raises:
         CaptureError: it is no capture folder, holds no such calls, or the settings ask for what is not there.
@@ -141,7 +141,7 @@ def replay(folder: Path, selection: Selection, settings: Settings) -> Report:
 
 
 def select(folder: Path, selection: Selection, unreadable: list[str]) -> list[Path]:
-    """Files of the calls, the oldest first; of files that cannot be read nobody knows whether they were meant."""
+    """Files of the calls, the oldest first; files that cannot be read are added to `unreadable`, selected or not."""
     found: list[Path] = []
     ids: set[str] = set()
     for path, call in _read(selection.files(folder), folder, unreadable):
@@ -156,7 +156,7 @@ def select(folder: Path, selection: Selection, unreadable: list[str]) -> list[Pa
         faults = f"; {len(unreadable)} files cannot be read" if unreadable else ""
         raise CaptureError(f"{folder} holds no {which}{faults}")
     if selection.request_ids:
-        unreadable.clear()  # all that were asked for are there
+        unreadable.clear()  # all selected calls are there
     return found[::-1]
 
 
@@ -197,7 +197,7 @@ def _replayed(call: CapturedCall, blobs: Blobs, tiers: tuple[Tier, ...], options
         outcome_then, stages_then = outcome_of(then), stage_seconds(then)
         now = recompute(call, blobs, tiers, options)
         comparison, stages_now = compare(then, now), stage_seconds(now)
-    except Exception as error:  # whatever this version cannot do with one call is said of it, and the others are told
+    except Exception as error:  # one call that this version cannot compute does not stop the others
         name = "" if isinstance(error, CaptureError) else f"{type(error).__name__}: "
         return Replayed(*about, NOT_COMPUTED, outcome_then, stages_then=stages_then, error=f"error: {name}{error}")
     return Replayed(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import sys
 import threading
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
+from mapless_server.serve.command import fail
 from mapless_tools.connection import Connection, Scene, with_connection_flags
 
 _ALLOW_WATCHING = {"MAPLESS_ALLOW_WATCHING": "true"}
@@ -39,14 +40,14 @@ def view_command(
     from mapless_tools.connection import reachable
 
     if not is_loopback(host):
-        _fail(
-            f"--host {host} is not a loopback address: the page asks nobody who they are, and shows the scene's "
+        fail(
+            f"--host {host} is not a loopback address: the page has no authentication, and shows the scene's "
             f"photographs; from another machine, use a tunnel: ssh -L {port}:127.0.0.1:{port} THIS-MACHINE"
         )
     try:
         from .viewer import ViewOptions, viewer
     except ImportError as error:
-        _fail(install_hint(error))
+        fail(install_hint(error))
     try:
         options = ViewOptions(host, port, max_pictured, seeds)
         settings = load_settings({}).settings
@@ -55,17 +56,17 @@ def view_command(
             reachable(connection, settings, _ALLOW_WATCHING) as (server, connect),
             viewer(server, connect, scene, options) as page,
         ):
-            _tell(page, "" if connection.address else server, no_open)
+            _announce(page, "" if connection.address else server, no_open)
             threading.Event().wait()
     except (ValueError, ConfigError) as error:
-        _fail(str(error))
+        fail(str(error))
     except (MaplessError, ServerFailed, RuntimeError) as error:
-        _fail(str(error), code=1)
+        fail(str(error), code=1)
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
 
 
-def _tell(page: str, own_server: str, no_open: bool) -> None:
+def _announce(page: str, own_server: str, no_open: bool) -> None:
     if own_server:
         print(f"queries sent to {own_server} are shown", file=sys.stderr)
     # Read by programs that take any port: keep its form.
@@ -74,8 +75,3 @@ def _tell(page: str, own_server: str, no_open: bool) -> None:
         import webbrowser
 
         webbrowser.open(page)
-
-
-def _fail(message: str, code: int = 2) -> NoReturn:
-    print(f"mapless-server: {message}", file=sys.stderr)
-    raise typer.Exit(code)

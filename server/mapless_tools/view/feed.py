@@ -1,4 +1,4 @@
-"""Queries as they are answered, from WatchQueries: for as long as somebody looks, however often the connection ends."""
+"""Queries as they are answered, from WatchQueries, until it is closed, however often the connection ends."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 RETRY_S = 3.0
 """Between two tries to watch: servers end a connection now and then, so that it moves on to another."""
 _HOPELESS = ("FAILED_PRECONDITION", "PERMISSION_DENIED", "UNAUTHENTICATED", "UNIMPLEMENTED", "NOT_FOUND")
-"""What another try does not change."""
+"""Errors that another try does not change."""
 
 
 class Feed:
@@ -46,7 +46,7 @@ class Feed:
             options: how to connect.
             scene: its id.
             show: given each query; called in the feed's thread.
-            say: told how the watching goes, in a few words, and whether there will be queries.
+            say: called with the state of the watching, in a few words, and whether there will be queries.
         """
         self._channel = options.channel(address)
         self._metadata = options.metadata()
@@ -54,7 +54,7 @@ class Feed:
         self._request = pb.WatchQueriesRequest(scene=scene_name(scene))
         self._stub = LocalizationServiceStub(self._channel)
         self._show, self._say = show, say
-        # So that what is asked here is known among what is watched.
+        # So that the viewer's own calls are recognized among those that are watched.
         self._own = f"view-{uuid.uuid4().hex[:12]}"
         self._count = 0
         self._closing = threading.Event()
@@ -62,7 +62,7 @@ class Feed:
         self._thread.start()
 
     def localize(self, image: bytes, camera: Camera, references: Sequence[str]) -> LocalizationResult | Rejected:
-        """What the server says of a photograph against some references, with the matches; it is not shown.
+        """Localizes a photograph against some references, with the matches; it is not shown.
 
         Raises:
             MaplessError: the call failed.
@@ -102,7 +102,7 @@ class Feed:
                     return
             except FieldError as error:
                 log.warning("an answer of the server breaks its contract: %s", error)
-            except ValueError:  # grpc's own word for a channel that was closed meanwhile
+            except ValueError:  # the channel was closed meanwhile
                 return
             self._closing.wait(RETRY_S)
 

@@ -1,9 +1,9 @@
-"""viser's server as we want it: on this machine alone, and for nobody's web pages but its own.
+"""viser's server, on this machine alone, and for its own web pages only.
 
-A web page that is open in the same browser may connect to any WebSocket of the machine; browsers do not keep it from
-that, but they say whose page it is (`Origin`), and by which name it reached the server (`Host`), which tells pages
-whose name has been pointed at this machine. viser asks neither, and can be told to publish itself through a tunnel; so
-it gets a check before each request, and no tunnel.
+A web page that is open in the same browser may connect to any WebSocket of the machine. Browsers do not prevent that,
+but they send the page's `Origin`, and the name by which it reached the server (`Host`), which shows names that were
+pointed at this machine. viser checks neither, and can publish itself through a tunnel; so it gets a check before each
+request, and no tunnel.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class GuardedViser(viser.ViserServer):
         Raises:
             RuntimeError: the port is taken; or viser does not serve as it used to, so that it could not be guarded.
         """
-        # It prints its address, which is ours to tell.
+        # It prints its address, which the command prints, too.
         with _guarded_connections() as guarded, redirect_stdout(io.StringIO()):
             super().__init__(host=host, port=port, label=label, verbose=False)
         if not guarded:
@@ -43,7 +43,7 @@ class GuardedViser(viser.ViserServer):
             raise RuntimeError(f"port {port} of {host} is taken: say another, or 0 for any")
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """There is none: what the viewer shows is not for everybody."""
+        """There is none: what the viewer shows is not public."""
         return None
 
 
@@ -52,7 +52,7 @@ def is_own(host: str | None, origin: str | None) -> bool:
 
     Args:
         host: its header `Host`, "127.0.0.1:8080".
-        origin: its header `Origin`, "http://127.0.0.1:8080"; None where it comes from no page.
+        origin: its header `Origin`, "http://127.0.0.1:8080"; None from other programs than browsers.
     """
     name = (host or "").rpartition(":")[0] or (host or "")
     return name in _LOOPBACK_NAMES and origin in (None, f"http://{host}")
@@ -60,7 +60,7 @@ def is_own(host: str | None, origin: str | None) -> bool:
 
 @contextmanager
 def _guarded_connections() -> Iterator[list[bool]]:
-    """Whatever begins to listen meanwhile checks its requests; the list says whether something did."""
+    """Servers that begin to listen meanwhile check their requests; the list is empty if none did."""
     serve, guarded = websockets.asyncio.server.serve, []
 
     def guarded_serve(*arguments: Any, process_request: Callable[..., Any] | None = None, **options: Any) -> Any:
@@ -68,7 +68,7 @@ def _guarded_connections() -> Iterator[list[bool]]:
 
         def check(connection: Any, request: Any) -> Any:
             if not is_own(request.headers.get("Host"), request.headers.get("Origin")):
-                return connection.respond(HTTPStatus.FORBIDDEN, "This page is for itself alone.\n")
+                return connection.respond(HTTPStatus.FORBIDDEN, "Only the viewer's own page may connect.\n")
             return None if process_request is None else process_request(connection, request)
 
         return serve(*arguments, process_request=check, **options)

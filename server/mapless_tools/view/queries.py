@@ -1,4 +1,4 @@
-"""A query as the viewer knows it, and what is said of it."""
+"""A query as the viewer shows it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Query:
 
     @property
     def pose(self) -> RigidTransform | None:
-        """Where it was taken; None if that is not known."""
+        """The answered pose; None for a rejection."""
         return self.answer.world_from_camera if isinstance(self.answer, LocalizationResult) else None
 
     @property
@@ -31,7 +31,7 @@ class Query:
         return f"#{self.number} localized" + (f" to {_length(radius.position_95_m)}" if radius is not None else "")
 
     def details(self) -> str:
-        """What there is to say, as Markdown; what came from elsewhere stands in code, where nothing is marked up."""
+        """All details as Markdown; text from other sources is in code spans, where nothing is marked up."""
         answer, used = self.answer, self.answer.diagnostics
         lines = []
         if isinstance(answer, Rejected):
@@ -62,7 +62,7 @@ class Query:
 
 
 def _code(text: str) -> str:
-    """Text as it is: what is within a code span is not read as Markdown."""
+    """Text in a code span, which is not read as Markdown."""
     shown = " ".join(text.replace("`", "'").split())
     return f"`{shown}`" if shown else ""
 

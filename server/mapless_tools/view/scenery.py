@@ -1,4 +1,4 @@
-"""What there is to see before anybody asks anything: references, how they lie, and which are worth a picture."""
+"""The layout of a scene's references: where they are drawn, how large, and which of them with their photographs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mapless.geometry import Array, RigidTransform
 _TURN_WEIGHT = 0.4
 """How far apart two cameras count that stand at one place and look opposite ways, in spreads of the scene."""
 _ALIKE = 0.5
-"""Length of the mean of the cameras' downward axes from which on it tells which way is down."""
+"""Least length of the mean of the cameras' downward axes to take it for down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ def _spots(references: Sequence[Reference]) -> Array:
 
 
 def _down(scene: Scene, references: Sequence[Reference]) -> Array:
-    """What the scene says, or its datum; else what most cameras call down."""
+    """As the scene says, or its datum; else the mean downward axis of the cameras."""
     if scene.down_in_world is not None:
         return np.asarray(scene.down_in_world, float)
     if scene.datum is not None:

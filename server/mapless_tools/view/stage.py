@@ -1,4 +1,4 @@
-"""What people see and do: the drawn scene, the panel beside it, and the dialogue of a query that was clicked."""
+"""The drawn scene, the panel beside it, and the dialogue of a query that was clicked."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .queries import Query
 from .scenery import Scenery
 
 MAX_QUERIES = 12
-"""Queries that stay to be looked at; each keeps its photograph in memory."""
+"""Queries that are kept; each has its photograph in memory."""
 MAX_POINTS = 150_000
 _QUERY_SIZE = 1.5
 """Of a query's frustum beside those of references."""
@@ -37,7 +37,7 @@ _WIDE = "<style>.mantine-Modal-content { flex: 0 0 min(1000px, 94vw) !important;
 
 @dataclass(eq=False)
 class _Shown:
-    """A query and what of it is on the stage."""
+    """A query and what is drawn of it."""
 
     query: Query
     button: Any
@@ -69,7 +69,7 @@ class Stage:
         self._panel(title)
 
     def say(self, status: str, is_watching: bool) -> None:
-        """How the watching goes, and whether there will be queries."""
+        """Shows the state of the watching, and whether there will be queries."""
         with self._lock:
             self._status.content = f"Queries: **{status}**"
             self._nothing.content = _NONE_YET if is_watching else "None."
@@ -114,7 +114,7 @@ class Stage:
         self._select(shown)
 
     def _select(self, shown: _Shown) -> None:
-        """Draws what one query rests on, and of no other."""
+        """Draws the support of one query only."""
         with self._lock:
             self._selected = shown
             for it in self._shown:
@@ -212,8 +212,8 @@ class Stage:
 
 
 def _dialogue(client: Any, title: str, picture: Picture, details: str) -> None:
-    """A picture and what there is to say of it, for who clicked."""
-    if client is None:  # who has gone meanwhile
+    """A picture with its details, for the browser that clicked."""
+    if client is None:  # it was closed meanwhile
         return
     with client.gui.add_modal(title) as modal:
         client.gui.add_html(_WIDE)

@@ -1,4 +1,4 @@
-"""The viewer put together: what is asked of the server, by whom, and where it goes."""
+"""The viewer put together: a client of the server, the stage, and what fills it in the background."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from .stage import Stage
 log = logging.getLogger(__name__)
 
 _TRIES, _BUSY_S = 20, 1.0
-"""How often a busy server is asked, and how long to wait where it does not say."""
+"""Tries of a call to a busy server, and the wait between them where it does not say."""
 _FIRST = 40
-"""Photographs that are loaded before points are asked for."""
+"""Photographs that are loaded before the first points."""
 SEED_NEIGHBOURS = 8
 """References that one is localized against to show points."""
 
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """What to show and where.
+    """What the viewer shows, and where.
 
     Attributes:
         host: a loopback address: there is no authentication.
@@ -68,7 +68,7 @@ def viewer(address: str, connect: ConnectOptions, scene: str, options: ViewOptio
         options: see there.
 
     Raises:
-        MaplessError: the server cannot be reached, or will not tell.
+        MaplessError: the server cannot be reached, or rejects a call.
         ValueError: the scene has no references.
         RuntimeError: viser cannot be guarded.
     """
@@ -91,11 +91,11 @@ def viewer(address: str, connect: ConnectOptions, scene: str, options: ViewOptio
 
 
 class _Background:
-    """What is done while people look already: photographs onto frustums, points, and live queries."""
+    """What fills the stage after it is shown: photographs onto frustums, points, and live queries."""
 
     def __init__(self, client: Client, scene: str, scenery: Scenery, stage: Stage) -> None:
         self._client, self._scene, self._scenery, self._stage = client, scene, scenery, stage
-        # One call at a time: the server has others to serve.
+        # One call at a time: the server has other clients.
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="view")
         self._closing = threading.Event()
 
@@ -107,12 +107,12 @@ class _Background:
             self._pool.submit(self._do, work)
 
     def close(self) -> None:
-        """Ends after what it is at."""
+        """Ends after the current call."""
         self._closing.set()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def show_query(self, query: Query) -> None:
-        """A query that was answered."""
+        """Shows an answered query."""
         try:
             self._stage.show_query(query)
             self._show_points(query)
@@ -120,7 +120,7 @@ class _Background:
             log.warning("query %d cannot be shown: %s", query.number, error)
 
     def _do(self, work: Callable[[], None]) -> None:
-        """Does it, later if the server is busy, unless it is over; what fails is told, and the rest goes on without."""
+        """Runs it, again if the server is busy, unless the viewer closes; a failure is logged, and the rest goes on."""
         for _ in range(_TRIES):
             if self._closing.is_set():
                 return

@@ -1,4 +1,4 @@
-"""References and choices as a captured call has them, in place of the store's and the server's own."""
+"""The inputs that a captured call recorded, in place of the store: references, and the choice among them."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from mapless_server.store import LruCache, SceneAttributes, codec
 RETRIEVAL = "retrieval"
 """The stage in which references are chosen."""
 
-_REMEMBERED_BYTES = 512 * 2**20
+_CACHE_BYTES = 512 * 2**20
 
 
 class Blobs:
-    """Photographs and features of references in a capture folder; what was read is remembered for the next call.
+    """Photographs and features of references in a capture folder, cached for the next call.
 
     Attributes:
         found_anew: keys of the references whose features this program could not read.
@@ -43,13 +43,13 @@ class Blobs:
     def __init__(self, folder: Path) -> None:
         self.found_anew: set[str] = set()
         self._folder = folder
-        self._views: LruCache[View] = LruCache(_REMEMBERED_BYTES)
+        self._views: LruCache[View] = LruCache(_CACHE_BYTES)
 
     def view(self, tenant: str, reference: CapturedReference, extractor: FeatureExtractor) -> View:
-        """What an extractor found in a reference: as it was captured, or found anew.
+        """The features of a reference: those that were captured, or extracted again.
 
-        That is so if the extractor finds other features than those that were captured, or if another version wrote them
-        in a form that this one cannot read; the latter is noted.
+        They are extracted again where those of this extractor were not captured, and where another version wrote them
+        in a form that this one cannot read; the latter is added to `found_anew`.
 
         Raises:
             DamagedCapture: it is not there, or not what was written.
@@ -72,7 +72,7 @@ class Blobs:
             data = self._read(tenant, reference.views[extractor.name])
             try:
                 return codec.decode_view("", data, codec.sha256_for("", data))
-            except codec.Damaged:  # its bytes are what was written, so it is its form that is unknown
+            except codec.Damaged:  # its bytes are as written, so it is the form that is unknown
                 self.found_anew.add(reference.key)
         return extractor.extract(self.pixels(tenant, reference), reference.camera)
 
@@ -139,7 +139,7 @@ class RecordedSource:
             raise DamagedCapture("no choice of references was captured")
         if self.is_described:
             views.view(self.extractor, context)
-            with context.stage(RETRIEVAL):  # it is over, but the answer lists it
+            with context.stage(RETRIEVAL):  # it takes no time, but the answer lists it
                 pass
         return self.part.choice
 
