@@ -23,9 +23,9 @@ from mapless_server.method.answer import Localization
 from mapless_server.method.features import FEATURES, make_extractor
 from mapless_server.method.views import Features, View
 from mapless_server.networks.weights import find_weights
+from mapless_server.scenes import RankOptions, Selection, VladDescriptor, rank_references
 from mapless_server.scenes.retrieval.index import Entries, SceneIndex
-from mapless_server.scenes.retrieval.ranking import RankOptions, rank_references
-from mapless_server.scenes.retrieval.vlad import DIMENSION, VladDescriptor
+from mapless_server.scenes.retrieval.vlad import DIMENSION
 from mapless_server.store import IndexedReference, SceneChanges
 from mapless_tools.dataset import read_folder
 from mapless_tools.evaluate.metrics import pose_error
@@ -69,7 +69,8 @@ class Case:
         """The answer of RetrieveReferences."""
         vector = self.descriptor.describe(self.place.views[query])
         among = {str(reference) for reference in self.others(query)}
-        return [int(it.reference_id) for it in rank_references(self.entries, vector, count, None, among, options)]
+        selection = Selection(count, among=among, options=options or RankOptions())
+        return [int(it.reference_id) for it in rank_references(self.entries, vector, selection)]
 
     def matched(self, query: int, shortlist: Sequence[int]) -> list[int]:
         """Those of a shortlist with the most feature matches."""
@@ -179,7 +180,7 @@ def time_table() -> Iterator[str]:
     yield "|---|---|---|---|"
     for size in SIZES:
         index = _random_index(random, size)
-        milliseconds = _ms(partial(rank_references, index.entries(), vector, COUNT))
+        milliseconds = _ms(partial(rank_references, index.entries(), vector, Selection(COUNT)))
         held = index.size_bytes
         yield f"| {size:,} | {milliseconds} | {held / 2**20:.0f} MiB | {held / size:.0f} bytes |"
 

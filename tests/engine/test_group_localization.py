@@ -23,7 +23,7 @@ from mapless_server.engine.stages import PREPARE
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.rpc.call import Call
-from mapless_server.scenes.retrieval.narrowing import Narrowing
+from mapless_server.scenes import Narrowing
 from mapless_server.scheduling import (
     Flow,
     ItemList,

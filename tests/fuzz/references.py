@@ -27,10 +27,7 @@ from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Caller, Description, Photo
 from mapless_server.method.views import Features, View
 from mapless_server.rpc.call import Call
-from mapless_server.scenes.audit.coverage import Coverage, CoverageVerdict
-from mapless_server.scenes.auditing import Viewpoint
-from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.scenes.retrieval.narrowing import Narrowing
+from mapless_server.scenes import Choice, Coverage, CoverageVerdict, Narrowing, Viewpoint
 from mapless_server.security.principal import Principal
 from mapless_server.security.tenancy import SceneKey, key_of, scene_id_of, tenant_of
 from mapless_server.services import references as reference_service

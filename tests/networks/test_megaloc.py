@@ -29,7 +29,7 @@ from mapless_server.networks.megaloc import Backbone, MegaLoc, signed_groups
 from mapless_server.networks.salad import Salad, transport
 from mapless_server.networks.weights import CheckpointError, named
 from mapless_server.networks.weights.install import add
-from mapless_server.scenes.retrieval.descriptor import GlobalDescriptor
+from mapless_server.scenes import GlobalDescriptor
 from mapless_server.scenes.retrieval.megaloc import SIDE_PX, MegaLocDescriptor, MegaLocOptions
 
 OPTIONS = MegaLocOptions(dimension=24, batch=3)

@@ -12,21 +12,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.audits import audit_references, finder_of
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.images.decode import ImageLimits, decode_image
 from mapless_server.method.features import make_extractor
 from mapless_server.method.views import PosedView
-from mapless_server.scenes.audit import (
-    CoverageVerdict,
-    PairMatches,
-    Verdict,
-    audit_references,
-    check_coverage,
-    surroundings_of,
-)
+from mapless_server.scenes import AuditVerdict, CoverageVerdict, PairMatches, ReferenceAudit
+from mapless_server.scenes.audit.coverage import check_coverage
 from mapless_server.scenes.audit.resection import with_focal
-from mapless_server.scenes.audit.verdict import ReferenceAudit
 from mapless_tools.dataset import Dataset, read_folder
 
 pytestmark = [pytest.mark.realdata, pytest.mark.timeout(300)]
@@ -46,9 +40,11 @@ def described(folder: Path) -> tuple[PosedView, ...]:
     chosen = np.linspace(0, len(dataset.frames) - 1, COUNTS[dataset.name]).round().astype(int)
     extractor = make_extractor("sift")
     views = []
-    for frame in (dataset.frames[i] for i in chosen):
+    for i in chosen:
+        frame = dataset.frames[i]
         view = extractor.extract(decode_image(frame.image_path.read_bytes(), ImageLimits()), frame.camera)
-        views.append(PosedView(f"{dataset.name}/{frame.name}", frame.name, view, frame.world_from_camera))
+        key, name = f"{dataset.name}/{frame.name}", f"scenes/real/references/r{i}"
+        views.append(PosedView(key, name, view, frame.world_from_camera))
     return tuple(views)
 
 
@@ -58,7 +54,7 @@ def load(photographs: Photographs, name: str) -> list[PosedView]:
 
 def audit(references: list[PosedView], indices: list[int] | None = None) -> list[ReferenceAudit]:
     names = [references[i].name for i in indices or range(len(references))]
-    return audit_references(names, surroundings_of(references), pairs=PAIRS)
+    return audit_references(names, finder_of(references), pairs=PAIRS)
 
 
 def plant(reference: PosedView, fault: str, random: np.random.Generator) -> PosedView:
@@ -77,13 +73,13 @@ def plant(reference: PosedView, fault: str, random: np.random.Generator) -> Pose
 
 def check_fault(found: ReferenceAudit, fault: str) -> None:
     if fault.startswith("moved"):
-        assert found.verdict is Verdict.WRONG_POSE, found.message
+        assert found.verdict is AuditVerdict.WRONG_POSE, found.message
         assert found.position_offset_m == pytest.approx(0.05, abs=0.012)
     elif fault == "turned":
-        assert found.verdict is Verdict.WRONG_POSE, found.message
+        assert found.verdict is AuditVerdict.WRONG_POSE, found.message
         assert found.rotation_offset_deg == pytest.approx(2.0, abs=0.3)
     else:
-        assert found.verdict is Verdict.WRONG_INTRINSICS, found.message
+        assert found.verdict is AuditVerdict.WRONG_INTRINSICS, found.message
         assert found.focal_ratio == pytest.approx(1 / {"long": 1.05, "short": 0.95}[fault], abs=0.01)
 
 
@@ -93,9 +89,11 @@ def check_fault(found: ReferenceAudit, fault: str) -> None:
 def test_nothing_is_found_where_nothing_was_planted(photographs: Photographs, scene: str) -> None:
     """On the drive the first poses are off by 6 to 11 cm themselves: there it may be in doubt, but accuses nobody."""
     audits = audit(load(photographs, scene))
-    fine = {Verdict.CONSISTENT, Verdict.UNVERIFIABLE} if scene == "kitti-drive-a" else {Verdict.CONSISTENT}
+    fine = (
+        {AuditVerdict.CONSISTENT, AuditVerdict.UNVERIFIABLE} if scene == "kitti-drive-a" else {AuditVerdict.CONSISTENT}
+    )
     assert [(a.reference, a.message) for a in audits if a.verdict not in fine] == []
-    assert sum(a.verdict is Verdict.CONSISTENT for a in audits) >= len(audits) - 8
+    assert sum(a.verdict is AuditVerdict.CONSISTENT for a in audits) >= len(audits) - 8
 
 
 @pytest.mark.parametrize("fault", ["moved", "moved ahead", "turned", "long", "short"])
@@ -118,7 +116,7 @@ def test_a_planted_fault_is_named_and_nothing_else(
         near = [i for i in range(len(references)) if abs(i - victim) <= 2]
         audits = dict(zip(near, audit(references, near), strict=True))
         check_fault(audits.pop(victim), fault)
-        assert [(a.reference, a.message) for a in audits.values() if a.verdict is not Verdict.CONSISTENT] == []
+        assert [(a.reference, a.message) for a in audits.values() if a.verdict is not AuditVerdict.CONSISTENT] == []
 
 
 @pytest.mark.parametrize(
@@ -140,15 +138,15 @@ def test_swapped_photographs_name_each_other_and_nothing_else(
     asked = sorted({i for at in pair for i in (at - 1, at, at + 1)})
     found = {a.reference: a for a in audit(references, asked)}
     assert [found[first.name].other, found[second.name].other] == [second.name, first.name]
-    assert found.pop(first.name).verdict is Verdict.SWAPPED_IMAGE
-    assert found.pop(second.name).verdict is Verdict.SWAPPED_IMAGE
-    assert [(a.reference, a.message) for a in found.values() if a.verdict is not Verdict.CONSISTENT] == []
+    assert found.pop(first.name).verdict is AuditVerdict.SWAPPED_IMAGE
+    assert found.pop(second.name).verdict is AuditVerdict.SWAPPED_IMAGE
+    assert [(a.reference, a.message) for a in found.values() if a.verdict is not AuditVerdict.CONSISTENT] == []
 
 
 def test_coverage_is_predicted_where_photographs_were_taken(photographs: Photographs) -> None:
     """From every other reference, of the ones between: all of these are localized by the method."""
     views = load(photographs, KITCHEN)
-    around = surroundings_of(views[::2])
+    around = finder_of(views[::2])
     verdicts = [
         check_coverage(v.view.camera, v.world_from_camera, around, PAIRS).verdict is CoverageVerdict.LOCALIZABLE
         for v in views[1::2]

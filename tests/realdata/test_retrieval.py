@@ -10,10 +10,8 @@ import pytest
 
 from mapless_server.images.decode import ImageLimits, decode_image
 from mapless_server.method.features import SiftExtractor
-from mapless_server.scenes.retrieval.descriptor import Vector
+from mapless_server.scenes import RankedReference, RankOptions, Selection, Vector, VladDescriptor, rank_references
 from mapless_server.scenes.retrieval.index import SceneIndex
-from mapless_server.scenes.retrieval.ranking import RankedReference, RankOptions, rank_references
-from mapless_server.scenes.retrieval.vlad import VladDescriptor
 from mapless_server.store import IndexedReference, SceneChanges
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.evaluate.metrics import pose_error
@@ -59,7 +57,7 @@ def test_kitchen_queries_find_a_near_reference(photographs: Photographs) -> None
     entries = index_of([frames[i] for i in split.references]).entries()
     queries = list(zip([frames[i] for i in split.queries], described([frames[i] for i in split.queries]), strict=True))
     for options in (RankOptions(), RankOptions(nearby_weight=1.0)):
-        found = [rank_references(entries, vector, 10, options=options) for _, vector in queries]
+        found = [rank_references(entries, vector, Selection(10, options=options)) for _, vector in queries]
         shares = np.mean([sees_the_same(frame, it) for (frame, _), it in zip(queries, found, strict=True)])
         assert shares >= 0.95
 

@@ -7,15 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.audits import audit_references, finder_of
 from support.scenes import SceneOptions, make_scene
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.views import Features, PosedView
-from mapless_server.scenes.audit import AuditOptions, PairMatches, Verdict, audit_references, surroundings_of
+from mapless_server.scenes import AuditVerdict, PairMatches, ReferenceAudit
 from mapless_server.scenes.audit.auditor import Auditor
+from mapless_server.scenes.audit.finder import ReferenceGone
+from mapless_server.scenes.audit.options import AuditOptions
 from mapless_server.scenes.audit.resection import with_focal
-from mapless_server.scenes.audit.surroundings import Gone, PosedName, Surroundings, places_of
-from mapless_server.scenes.audit.verdict import ReferenceAudit
 
 SCENE = SceneOptions(point_count=250, reference_count=6, baseline_m=0.4, noise_px=0.3, distractor_count=40)
 VICTIM = 2
@@ -33,7 +34,7 @@ def pairs() -> PairMatches:
 
 
 def audit(references: list[PosedView], pairs: PairMatches) -> list[ReferenceAudit]:
-    return audit_references([r.name for r in references], surroundings_of(references), pairs=pairs)
+    return audit_references([r.name for r in references], finder_of(references), pairs=pairs)
 
 
 def altered(references: list[PosedView], index: int, reference: PosedView) -> list[PosedView]:
@@ -47,13 +48,13 @@ def moved(reference: PosedView, by_m: tuple[float, float, float]) -> PosedView:
 
 def only_fault(audits: list[ReferenceAudit], index: int) -> ReferenceAudit:
     """The audit of the only reference that is not consistent."""
-    assert [a.verdict for i, a in enumerate(audits) if i != index] == [Verdict.CONSISTENT] * (len(audits) - 1)
+    assert [a.verdict for i, a in enumerate(audits) if i != index] == [AuditVerdict.CONSISTENT] * (len(audits) - 1)
     return audits[index]
 
 
 def test_nothing_is_found_where_nothing_is_wrong(references: list[PosedView], pairs: PairMatches) -> None:
     audits = audit(references, pairs)
-    assert {a.verdict for a in audits} == {Verdict.CONSISTENT}
+    assert {a.verdict for a in audits} == {AuditVerdict.CONSISTENT}
     assert max(a.position_offset_m or 0 for a in audits) < 0.01
     assert max(a.error_px or 0 for a in audits) < 1.0
 
@@ -63,7 +64,7 @@ def test_a_moved_pose_is_named_with_its_distance(
     references: list[PosedView], pairs: PairMatches, by_m: tuple[float, float, float]
 ) -> None:
     found = only_fault(audit(altered(references, VICTIM, moved(references[VICTIM], by_m)), pairs), VICTIM)
-    assert found.verdict is Verdict.WRONG_POSE
+    assert found.verdict is AuditVerdict.WRONG_POSE
     assert found.position_offset_m == pytest.approx(np.linalg.norm(by_m), abs=0.01)
     assert found.rotation_offset_deg is not None
     assert found.rotation_offset_deg < 0.2
@@ -77,7 +78,7 @@ def test_a_turned_pose_is_named_with_its_angle(
     turned = RigidTransform(rotation_from_vector(np.radians(2) * np.array(axis)) @ pose.rotation, pose.translation)
     victim = replace(references[VICTIM], world_from_camera=turned)
     found = only_fault(audit(altered(references, VICTIM, victim), pairs), VICTIM)
-    assert found.verdict is Verdict.WRONG_POSE
+    assert found.verdict is AuditVerdict.WRONG_POSE
     assert found.rotation_offset_deg == pytest.approx(2, abs=0.1)
 
 
@@ -88,7 +89,7 @@ def test_a_wrong_focal_length_is_named_with_what_puts_it_right(
     view = references[VICTIM].view
     victim = replace(references[VICTIM], view=replace(view, camera=with_focal(view.camera, ratio)))
     found = only_fault(audit(altered(references, VICTIM, victim), pairs), VICTIM)
-    assert found.verdict is Verdict.WRONG_INTRINSICS
+    assert found.verdict is AuditVerdict.WRONG_INTRINSICS
     assert found.focal_ratio == pytest.approx(1 / ratio, abs=0.005)
     assert f"{100 * (ratio - 1):+.1f} %" in found.message
 
@@ -99,7 +100,7 @@ def test_wrong_pose_and_focal_length_together_are_told_apart(references: list[Po
         moved(references[VICTIM], (0.0, 0.3, 0.0)), view=replace(view, camera=with_focal(view.camera, 1.1))
     )
     found = only_fault(audit(altered(references, VICTIM, victim), pairs), VICTIM)
-    assert found.verdict is Verdict.WRONG_POSE_AND_INTRINSICS
+    assert found.verdict is AuditVerdict.WRONG_POSE_AND_INTRINSICS
     assert found.position_offset_m == pytest.approx(0.3, abs=0.03)
     assert found.focal_ratio == pytest.approx(1 / 1.1, abs=0.01)
 
@@ -109,17 +110,17 @@ def test_swapped_photographs_name_each_other(references: list[PosedView], pairs:
     swapped = altered(references, 1, replace(a, view=b.view, key=b.key))
     swapped = altered(swapped, 4, replace(b, view=a.view, key=a.key))
     audits = audit(swapped, pairs)
-    assert [x.verdict for i, x in enumerate(audits) if i not in (1, 4)] == [Verdict.CONSISTENT] * 4
-    assert (audits[1].verdict, audits[1].other) == (Verdict.SWAPPED_IMAGE, b.name)
-    assert (audits[4].verdict, audits[4].other) == (Verdict.SWAPPED_IMAGE, a.name)
+    assert [x.verdict for i, x in enumerate(audits) if i not in (1, 4)] == [AuditVerdict.CONSISTENT] * 4
+    assert (audits[1].verdict, audits[1].other) == (AuditVerdict.SWAPPED_IMAGE, b.name)
+    assert (audits[4].verdict, audits[4].other) == (AuditVerdict.SWAPPED_IMAGE, a.name)
 
 
 def test_a_photograph_stored_twice_is_a_duplicate(references: list[PosedView], pairs: PairMatches) -> None:
     copy = replace(references[VICTIM], key="copy", name="scenes/synthetic/references/copy")
     audits = audit([*references, copy], pairs)
     assert [a.verdict.is_alarm for a in audits] == [False] * 7
-    assert (audits[VICTIM].verdict, audits[VICTIM].other) == (Verdict.DUPLICATE, copy.name)
-    assert (audits[6].verdict, audits[6].other) == (Verdict.DUPLICATE, references[VICTIM].name)
+    assert (audits[VICTIM].verdict, audits[VICTIM].other) == (AuditVerdict.DUPLICATE, copy.name)
+    assert (audits[6].verdict, audits[6].other) == (AuditVerdict.DUPLICATE, references[VICTIM].name)
 
 
 def test_a_copy_at_a_wrong_pose_bears_no_witness(references: list[PosedView], pairs: PairMatches) -> None:
@@ -128,7 +129,7 @@ def test_a_copy_at_a_wrong_pose_bears_no_witness(references: list[PosedView], pa
     copy = replace(wrong, key="copy", name="scenes/synthetic/references/copy")
     audits = audit([*altered(references, VICTIM, wrong), copy], pairs)
     assert [a.verdict.is_alarm for a in audits] == [i in (VICTIM, 6) for i in range(7)]
-    assert (audits[6].verdict, audits[6].other) == (Verdict.WRONG_POSE, wrong.name)
+    assert (audits[6].verdict, audits[6].other) == (AuditVerdict.WRONG_POSE, wrong.name)
     assert audits[6].position_offset_m == pytest.approx(0.1, abs=0.01)
 
 
@@ -142,29 +143,29 @@ def test_a_photograph_half_changed_means_a_changed_scene(references: list[PosedV
     view = replace(references[VICTIM].view, features=Features(features.keypoints, descriptors, features.sizes_px))
     victim = replace(references[VICTIM], key="changed", view=view)
     found = only_fault(audit(altered(references, VICTIM, victim), PairMatches()), VICTIM)
-    assert found.verdict is Verdict.SCENE_CHANGED
+    assert found.verdict is AuditVerdict.SCENE_CHANGED
     assert found.changed_share is not None
     assert 0.35 < found.changed_share < 0.65
 
 
 def test_what_nobody_else_sees_is_unverifiable_and_no_alarm(references: list[PosedView], pairs: PairMatches) -> None:
     elsewhere = make_scene(np.random.default_rng(99), replace(SCENE, reference_count=2)).references[0]
-    alone = moved(replace(elsewhere, key="alone", name="alone"), (50.0, 0.0, 0.0))
+    alone = moved(replace(elsewhere, key="alone", name="scenes/synthetic/references/alone"), (50.0, 0.0, 0.0))
     audits = audit([*references, alone], pairs)
-    assert [a.verdict for a in audits] == [Verdict.CONSISTENT] * 6 + [Verdict.UNVERIFIABLE]
+    assert [a.verdict for a in audits] == [AuditVerdict.CONSISTENT] * 6 + [AuditVerdict.UNVERIFIABLE]
     assert not audits[-1].verdict.is_alarm
     assert audits[-1].position_offset_m is None
 
 
 def test_one_reference_alone_is_unverifiable(references: list[PosedView], pairs: PairMatches) -> None:
-    assert [a.verdict for a in audit(references[:1], pairs)] == [Verdict.UNVERIFIABLE]
+    assert [a.verdict for a in audit(references[:1], pairs)] == [AuditVerdict.UNVERIFIABLE]
 
 
 def test_the_verdict_does_not_depend_on_who_else_is_asked(references: list[PosedView], pairs: PairMatches) -> None:
     scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
     together = audit(scene, pairs)
     neighbour = VICTIM + 1
-    alone = audit_references([scene[neighbour].name], surroundings_of(scene), pairs=pairs)
+    alone = audit_references([scene[neighbour].name], finder_of(scene), pairs=pairs)
     assert alone == [together[neighbour]]
 
 
@@ -179,17 +180,17 @@ def test_the_verdict_does_not_depend_on_where_the_world_begins(references: list[
 
 def test_references_are_loaded_as_they_are_needed(references: list[PosedView], pairs: PairMatches) -> None:
     """Of a scene with a far part only the near part is read."""
-    far = [moved(replace(r, name=f"far-{i}"), (1000.0 + i, 0.0, 0.0)) for i, r in enumerate(references)]
+    far = [moved(replace(r, name=f"{r.name}-far"), (1000.0 + i, 0.0, 0.0)) for i, r in enumerate(references)]
     by_name = {r.name: r for r in [*references, *far]}
     loaded: list[str] = []
 
-    def load(names: object) -> list[PosedView]:
-        loaded.extend(names)  # type: ignore[arg-type]
-        return [by_name[name] for name in names]  # type: ignore[attr-defined]
+    def load(names: Sequence[str]) -> list[PosedView]:
+        loaded.extend(names)
+        return [by_name[name] for name in names]
 
-    around = Surroundings(places_of([PosedName(r.name, r.world_from_camera) for r in by_name.values()]), load)
+    finder = finder_of(list(by_name.values()), load)
     options = AuditOptions(candidate_count=4, neighbour_count=4)
-    assert audit_references([references[0].name], around, options, pairs)[0].verdict is Verdict.CONSISTENT
+    assert audit_references([references[0].name], finder, options, pairs)[0].verdict is AuditVerdict.CONSISTENT
     assert set(loaded) <= {r.name for r in references}
     assert len(loaded) == len(set(loaded)) == 5
 
@@ -205,25 +206,25 @@ def test_a_neighbour_that_cannot_be_loaded_is_no_witness(references: list[PosedV
         asked.extend(names)
         return [left[name] for name in names if name in left]
 
-    around = Surroundings(places_of([PosedName(r.name, r.world_from_camera) for r in scene]), load)
+    finder = finder_of(scene, load)
     names = [r.name for r in scene if r.name != lost]
-    audits = audit_references(names, around, pairs=pairs)
+    audits = audit_references(names, finder, pairs=pairs)
     assert [a.verdict for a in audits] == [a.verdict for a in audit(list(left.values()), pairs)]
     assert asked.count(lost) == 1
-    with pytest.raises(Gone):
-        audit_references([lost], around, pairs=pairs)
+    with pytest.raises(ReferenceGone):
+        audit_references([lost], finder, pairs=pairs)
 
 
 def test_what_is_remembered_of_neighbours_changes_no_verdict(references: list[PosedView], pairs: PairMatches) -> None:
     scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
     names = [r.name for r in scene]
-    forgetful = Auditor(surroundings_of(scene), AuditOptions(), pairs, remembered_findings=1)
+    forgetful = Auditor(finder_of(scene), AuditOptions(), pairs, cached_findings=1)
     assert [forgetful.audit(name) for name in names] == audit(scene, pairs)
-    assert len(forgetful._findings) == 1
+    assert forgetful._findings.used == 1
 
 
-def test_options_outside_their_bounds_are_refused() -> None:
-    with pytest.raises(ValueError, match="must be"):
+def test_an_option_out_of_range_is_named() -> None:
+    with pytest.raises(ValueError, match=r"AuditOptions.position_tolerance_m must be above 0, is 0"):
         AuditOptions(position_tolerance_m=0.0)
 
 
@@ -231,5 +232,5 @@ def test_one_among_many_faulty_ones_is_never_consistent(references: list[PosedVi
     """Every second pose is wrong by as much: who is right cannot be told, and that is what is said."""
     many = [moved(r, (0.1 * (i - 2), 0.15, 0.0)) if i % 2 else r for i, r in enumerate(references)]
     audits = audit(many, pairs)
-    assert all(a.verdict is not Verdict.CONSISTENT for i, a in enumerate(audits) if i % 2)
-    assert all((a.error_px or 0) < 3 for a in audits if a.verdict is Verdict.CONSISTENT)
+    assert all(a.verdict is not AuditVerdict.CONSISTENT for i, a in enumerate(audits) if i % 2)
+    assert all((a.error_px or 0) < 3 for a in audits if a.verdict is AuditVerdict.CONSISTENT)

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.audits import finder_of
 from support.scenes import SceneOptions, SyntheticScene, look_at, make_scene
 
 from mapless.geometry import RigidTransform
-from mapless_server.scenes.audit import CoverageVerdict, PairMatches, check_coverage, surroundings_of
-from mapless_server.scenes.audit.coverage import Coverage, CoverageOptions
+from mapless_server.scenes import Coverage, CoverageVerdict, PairMatches
+from mapless_server.scenes.audit.coverage import CoverageOptions, check_coverage
 from mapless_server.scenes.audit.visibility import VisibilityOptions
 
 
@@ -25,7 +26,7 @@ def pairs() -> PairMatches:
 
 
 def check(scene: SyntheticScene, pairs: PairMatches, world_from_camera: RigidTransform) -> Coverage:
-    return check_coverage(scene.query.camera, world_from_camera, surroundings_of(scene.references), pairs)
+    return check_coverage(scene.query.camera, world_from_camera, finder_of(scene.references), pairs)
 
 
 def test_among_the_references_one_is_localized(scene: SyntheticScene, pairs: PairMatches) -> None:
@@ -69,8 +70,8 @@ def test_the_further_off_the_fewer_matches(scene: SyntheticScene, pairs: PairMat
 
 def test_without_two_references_nothing_is_known(scene: SyntheticScene, pairs: PairMatches) -> None:
     for references in ((), scene.references[:1]):
-        around = surroundings_of(references)
-        coverage = check_coverage(scene.query.camera, scene.world_from_query, around, pairs)
+        finder = finder_of(references)
+        coverage = check_coverage(scene.query.camera, scene.world_from_query, finder, pairs)
         assert coverage.verdict is CoverageVerdict.NOT_LOCALIZABLE
         assert "at least 2" in coverage.message
 
@@ -78,14 +79,14 @@ def test_without_two_references_nothing_is_known(scene: SyntheticScene, pairs: P
 def test_the_forecast_does_not_depend_on_where_the_world_begins(scene: SyntheticScene, pairs: PairMatches) -> None:
     offset = np.array([4.5e5, 5.4e6, 300.0])
     far = [replace(r, world_from_camera=r.world_from_camera.shifted(offset)) for r in scene.references]
-    there = check_coverage(scene.query.camera, scene.world_from_query.shifted(offset), surroundings_of(far), pairs)
+    there = check_coverage(scene.query.camera, scene.world_from_query.shifted(offset), finder_of(far), pairs)
     here = check(scene, pairs, scene.world_from_query)
     assert there.expected_match_count == pytest.approx(here.expected_match_count, abs=2)
     assert there.position_68_m == pytest.approx(here.position_68_m, rel=0.05)
 
 
-def test_options_outside_their_bounds_are_refused() -> None:
-    with pytest.raises(ValueError, match="must be"):
+def test_an_option_out_of_range_is_named() -> None:
+    with pytest.raises(ValueError, match=r"CoverageOptions.least_matches must be above 0 and at most 80, is 100"):
         CoverageOptions(least_matches=100.0)
-    with pytest.raises(ValueError, match="must be"):
+    with pytest.raises(ValueError, match=r"VisibilityOptions.max_scale must be above 1, is 1"):
         VisibilityOptions(max_scale=1.0)

@@ -23,8 +23,8 @@ from mapless_server.errors import DataLoss, NotFound, RequestError
 from mapless_server.images.decode import ImageLimits
 from mapless_server.method.context import StageContext
 from mapless_server.method.views import View
+from mapless_server.scenes import FeaturesMissing, Loaded, ReferenceLibrary, load_usable
 from mapless_server.scenes import library as library_module
-from mapless_server.scenes.library import Loaded, NotDescribedYet, ReferenceLibrary, load_usable
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import DATABASE_FILE, NewReference, Store
 from mapless_server.store.sqlite import choose_library
@@ -173,11 +173,11 @@ class TestDescribing:
 
         new, library = Picky("new"), ReferenceLibrary(store)
         for _ in range(3):
-            with pytest.raises(NotDescribedYet):
+            with pytest.raises(FeaturesMissing):
                 library.load(SCENE, IDS, new, turn(), waits=False)
         others = [it for it in IDS if it != "r1"]
         for _ in range(500):
-            with suppress(NotDescribedYet):
+            with suppress(FeaturesMissing):
                 library.load(SCENE, others, new, turn(), waits=False)
                 break
             time.sleep(0.01)

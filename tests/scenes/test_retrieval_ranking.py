@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from support.scenes import random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.scenes import Cone, Narrowing, RankedReference, RankOptions, Selection, Sphere, rank_references
 from mapless_server.scenes.retrieval.index import Entries, SceneIndex
-from mapless_server.scenes.retrieval.narrowing import Cone, Narrowing, Sphere
-from mapless_server.scenes.retrieval.ranking import RankedReference, RankOptions, rank_references, spread
+from mapless_server.scenes.retrieval.ranking import spread
 from mapless_server.store import IndexedReference, SceneChanges
 
 DIMENSION = 16
@@ -52,13 +52,19 @@ def planted(
     return index.entries()
 
 
+def rank(
+    entries: Entries, vector: NDArray[np.float32] | None, count: int, narrowing: Narrowing | None = None, **more: Any
+) -> list[RankedReference]:
+    return rank_references(entries, vector, Selection(count, narrowing or Narrowing(), **more))
+
+
 def ids(ranked: list[RankedReference]) -> str:
     return " ".join(it.reference_id for it in ranked)
 
 
 class TestOrder:
     def test_the_most_similar_comes_first(self) -> None:
-        ranked = rank_references(planted([0.2, 0.9, -0.1, 0.5]), QUERY, 10)
+        ranked = rank(planted([0.2, 0.9, -0.1, 0.5]), QUERY, 10)
         assert ids(ranked) == "1 3 0 2"
         assert [it.similarity for it in ranked] == pytest.approx([0.9, 0.5, 0.2, -0.1], abs=0.01)
         assert ranked[0].key == "key-1"
@@ -66,27 +72,27 @@ class TestOrder:
 
     @pytest.mark.parametrize("count", [0, 1, 3, 4, 100])
     def test_never_more_than_there_are(self, count: int) -> None:
-        assert len(rank_references(planted([0.1, 0.2, 0.3, 0.4]), QUERY, count)) == min(count, 4)
+        assert len(rank(planted([0.1, 0.2, 0.3, 0.4]), QUERY, count)) == min(count, 4)
 
     def test_an_empty_scene_has_none(self) -> None:
-        assert rank_references(planted([]), QUERY, 10) == []
+        assert rank(planted([]), QUERY, 10) == []
 
     def test_those_without_descriptor_come_last_nearest_first(self) -> None:
         entries = planted([None, -0.9, None, None], x_m=[9.0, 0.0, 1.0, 4.0])
         near = Narrowing(Sphere(np.zeros(3), 1.0))
-        ranked = rank_references(entries, QUERY, 4, near)
+        ranked = rank(entries, QUERY, 4, near)
         assert ids(ranked) == "1 2 3 0"
         assert [math.isnan(it.similarity) for it in ranked] == [False, True, True, True]
 
     def test_a_photograph_without_descriptor_ranks_by_place(self) -> None:
         entries = planted([0.9, 0.8, 0.7], x_m=[5.0, 1.0, 3.0])
-        assert ids(rank_references(entries, None, 3, Narrowing(Sphere(np.zeros(3), 1.0)))) == "1 2 0"
-        assert ids(rank_references(entries, None, 3)) == "0 1 2"
+        assert ids(rank(entries, None, 3, Narrowing(Sphere(np.zeros(3), 1.0)))) == "1 2 0"
+        assert ids(rank(entries, None, 3)) == "0 1 2"
 
     def test_only_named_references_are_ranked_unknown_ones_skipped(self) -> None:
         entries = planted([0.2, 0.9, -0.1, 0.5])
-        assert ids(rank_references(entries, QUERY, 10, among=["0", "3", "elsewhere"])) == "3 0"
-        assert rank_references(entries, QUERY, 10, among=[]) == []
+        assert ids(rank(entries, QUERY, 10, among=["0", "3", "elsewhere"])) == "3 0"
+        assert rank(entries, QUERY, 10, among=["elsewhere"]) == []
 
     def test_a_large_scene_is_ranked_as_by_sorting(self) -> None:
         """Only a pool is looked at; without thinning that must not show."""
@@ -95,32 +101,32 @@ class TestOrder:
         exact = entries.similarities(QUERY, entries.rows())
         expected = np.argsort(-exact, kind="stable")[:7].tolist()
         options = replace(UNTHINNED, pool=1, smallest_pool=1)
-        assert [int(it.reference_id) for it in rank_references(entries, QUERY, 7, options=options)] == expected
+        assert [int(it.reference_id) for it in rank(entries, QUERY, 7, options=options)] == expected
 
 
 class TestNarrowing:
     def test_a_position_prior_keeps_what_is_in_radius_and_margin(self) -> None:
         entries = planted([0.1, 0.2, 0.3, 0.4], x_m=[0.0, 11.9, 12.1, 50.0])
         prior = Narrowing(Sphere(np.zeros(3), 2.0), margin_m=10.0)
-        assert ids(rank_references(entries, QUERY, 10, prior)) == "1 0"
+        assert ids(rank(entries, QUERY, 10, prior)) == "1 0"
 
     def test_a_heading_keeps_what_looks_the_same_way(self) -> None:
         entries = planted([0.1, 0.2, 0.3, 0.4], turned_deg=[0.0, 29.0, -31.0, 180.0])
         heading = Narrowing(heading=Cone(AHEAD, 30.0), margin_deg=0.0)
-        assert ids(rank_references(entries, QUERY, 10, heading)) == "1 0"
+        assert ids(rank(entries, QUERY, 10, heading)) == "1 0"
 
     def test_both_must_hold(self) -> None:
         entries = planted([0.1, 0.2, 0.3], x_m=[0.0, 0.0, 99.0], turned_deg=[0.0, 90.0, 0.0])
         both = Narrowing(Sphere(np.zeros(3), 1.0), Cone(AHEAD, 20.0), margin_m=0.0, margin_deg=0.0)
-        assert ids(rank_references(entries, QUERY, 10, both)) == "0"
+        assert ids(rank(entries, QUERY, 10, both)) == "0"
 
     def test_half_a_turn_keeps_all(self) -> None:
         entries = planted([0.1, 0.2, 0.3], turned_deg=[0.0, 90.0, 180.0])
-        assert len(rank_references(entries, QUERY, 10, Narrowing(heading=Cone(AHEAD, 180.0)))) == 3
+        assert len(rank(entries, QUERY, 10, Narrowing(heading=Cone(AHEAD, 180.0)))) == 3
 
     def test_nothing_left_is_an_empty_answer(self) -> None:
         far = Narrowing(Sphere(np.array([1e6, 0.0, 0.0]), 1.0))
-        assert rank_references(planted([0.9]), QUERY, 10, far) == []
+        assert rank(planted([0.9]), QUERY, 10, far) == []
 
 
 class TestThinning:
@@ -144,16 +150,16 @@ class TestThinning:
 
     def test_neighbours_are_thinned_in_the_ranking_too(self) -> None:
         entries = planted([0.9, 0.89, 0.8, 0.1, 0.1, 0.1, 0.1], x_m=[0.0, 0.1, 5.0, 20.0, 30.0, 40.0, 50.0])
-        assert ids(rank_references(entries, QUERY, 2)) == "0 2"
-        assert ids(rank_references(entries, QUERY, 2, options=UNTHINNED)) == "0 1"
+        assert ids(rank(entries, QUERY, 2)) == "0 2"
+        assert ids(rank(entries, QUERY, 2, options=UNTHINNED)) == "0 1"
 
     def test_few_references_of_a_standing_camera_are_chosen(self) -> None:
         """Three hundred alike, more than are looked at first; then those that are less so, the better first."""
         similarities: list[float | None] = [*[0.99] * 300, 0.5, 0.7, 0.6, *[0.1] * 400]
         places = [0.0001 * i for i in range(300)] + [1.0, 2.0, 3.0] + [10.0 + i for i in range(400)]
-        ranked = rank_references(planted(similarities, places), QUERY, 6)
+        ranked = rank(planted(similarities, places), QUERY, 6)
         assert ids(ranked) == "0 1 2 301 302 300"
-        assert ids(rank_references(planted([0.9, 0.8, 0.7], [0.0, 0.01, 0.02]), QUERY, 2)) == "0 1"
+        assert ids(rank(planted([0.9, 0.8, 0.7], [0.0, 0.01, 0.02]), QUERY, 2)) == "0 1"
 
     @settings(deadline=None)
     @given(
@@ -227,28 +233,29 @@ def test_a_removed_reference_is_never_ranked() -> None:
     index.apply(SceneChanges(1, added, frozenset(), True))
     left = set(map(str, range(200)))
     while left:
-        best = rank_references(index.entries(), vectors[0], 20)
+        best = rank(index.entries(), vectors[0], 20)
         assert {it.reference_id for it in best} <= left
         assert len(best) == min(20, len(left))
         gone = frozenset(it.reference_id for it in best)
         left -= gone
         index.apply(SceneChanges(index.generation + 1, (), gone, False))
-    assert rank_references(index.entries(), vectors[0], 20) == []
+    assert rank(index.entries(), vectors[0], 20) == []
 
 
 @pytest.mark.parametrize(
-    "make",
+    ("field", "value"),
     [
-        lambda: RankOptions(apart_m=-1.0),
-        lambda: RankOptions(apart_deg=181.0),
-        lambda: RankOptions(nearby_weight=1.5),
-        lambda: RankOptions(nearby_weight=math.nan),
-        lambda: RankOptions(same_place_m=-1.0),
-        lambda: RankOptions(per_place=0),
-        lambda: RankOptions(pool=0),
-        lambda: RankOptions(smallest_pool=0),
+        ("apart_m", -1.0),
+        ("apart_deg", 181.0),
+        ("nearby_weight", 1.5),
+        ("nearby_weight", math.nan),
+        ("same_place_m", -1.0),
+        ("per_place", 0),
+        ("pool", 0),
+        ("smallest_pool", 0),
     ],
 )
-def test_options_outside_their_bounds_are_refused(make: Callable[[], RankOptions]) -> None:
-    with pytest.raises(ValueError, match="must be"):
-        make()
+def test_an_option_outside_its_bounds_is_named(field: str, value: float) -> None:
+    options: dict[str, Any] = {field: value}
+    with pytest.raises(ValueError, match=f"RankOptions.{field} must be .* is {value}"):
+        RankOptions(**options)

@@ -15,8 +15,7 @@ from support.servers import CAMERA, StandInDescriptor, StandInExtractor, pose
 
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.context import StageContext
-from mapless_server.scenes.indexes import SceneIndexes
-from mapless_server.scenes.library import ReferenceLibrary
+from mapless_server.scenes import ReferenceLibrary, SceneIndexes
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import NewReference, SceneChanges, Store
 
@@ -97,8 +96,8 @@ class TestMemory:
         store.delete_scene(keys[1])
         with pytest.raises(NotFound):
             indexes.entries(keys[1], turn())
-        assert set(indexes._held) == {keys[0], keys[2], keys[3]}
-        assert indexes.size_bytes == sum(held.index.size_bytes for held in indexes._held.values())
+        assert set(indexes._cached) == {keys[0], keys[2], keys[3]}
+        assert indexes.size_bytes == sum(held.index.size_bytes for held in indexes._cached.values())
 
     def test_one_that_was_deleted_takes_none(self, store: Store) -> None:
         store.add_references(SCENE, [new(0, is_described=True)])
@@ -132,8 +131,8 @@ class TestMemory:
             with pytest.raises(NotFound):
                 indexes.entries(SCENE, turn())
         assert not indexes.is_damaged(SCENE, "r0")
-        indexes.tell_damaged(SCENE, "r0", DataLoss("lost"))
-        assert (indexes.size_bytes, dict(indexes._held)) == (0, {})
+        indexes.report_damaged(SCENE, "r0", DataLoss("lost"))
+        assert (indexes.size_bytes, dict(indexes._cached)) == (0, {})
 
     def test_least_recently_used_scenes_make_room_the_last_stays(self, store: Store) -> None:
         keys = [SceneKey(f"many-{i}") for i in range(4)]
@@ -144,9 +143,9 @@ class TestMemory:
         two = indexes_of(store, capacity_bytes=2 * one.size_bytes)
         for key in (*keys, keys[2]):
             two.entries(key, turn())
-        assert list(two._held) == [keys[3], keys[2]]
+        assert list(two._cached) == [keys[3], keys[2]]
         assert two.size_bytes == 2 * one.size_bytes
         none = indexes_of(store, capacity_bytes=0)
         for key in keys:
             none.entries(key, turn())
-        assert list(none._held) == [keys[3]]
+        assert list(none._cached) == [keys[3]]

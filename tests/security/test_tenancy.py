@@ -27,8 +27,7 @@ from mapless_server.errors import NotFound, RequestError
 from mapless_server.images.decode import ImageLimits
 from mapless_server.method.views import Features, View
 from mapless_server.rpc.call import Call
-from mapless_server.scenes.audit.coverage import Coverage, CoverageVerdict
-from mapless_server.scenes.retrieval.chosen import Choice
+from mapless_server.scenes import Choice, Coverage, CoverageVerdict
 from mapless_server.security.principal import DEFAULT_TENANT, Principal
 from mapless_server.security.tenancy import SceneKey, check_tenant, end_of_keys, key_of, scene_id_of, tenant_of
 from mapless_server.services.references import ReferenceService

@@ -21,8 +21,7 @@ import pytest
 from mapless.geodesy import Datum
 from mapless.geometry import Camera, RadialTangential, RigidTransform, rotation_from_vector
 from mapless_server.observability.metrics import Metrics
-from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.scenes.retrieval.ranking import RankedReference
+from mapless_server.scenes import Choice, RankedReference
 from mapless_server.services.capture import files as blobs_module
 from mapless_server.services.capture import files as files_module
 from mapless_server.services.capture import folder as folder_module

@@ -248,7 +248,7 @@ def test_a_store_that_remembers_nothing_hears_of_every_change(place: Place) -> N
         store.delete_scene(OFFICE)
         with pytest.raises(errors.NotFound):
             other.get_attributes(OFFICE)
-        assert [it.used_bytes for it in (other._described, other._resolved, other._attributes)] == [0, 0, 0]
+        assert [it.used for it in (other._described, other._resolved, other._attributes)] == [0, 0, 0]
 
 
 finite = st.floats(allow_nan=False, allow_infinity=False)

@@ -416,18 +416,18 @@ class TestMemory:
                 if held:
                     plain.remove(held)
                     plain.append(held)
-            assert cache.used_bytes == sum(entry[1] for entry in plain) <= capacity
+            assert cache.used == sum(entry[1] for entry in plain) <= capacity
 
     def test_what_is_deleted_takes_no_memory(self, store: Store) -> None:
         for scene in ("kept", "gone"):
             store.create_scene(SceneKey(scene))
             store.add_references(SceneKey(scene), [make_reference(it) for it in "abc"])
             store.load_references(SceneKey(scene), None, EXTRACTOR)
-        full = store.reference_cache.used_bytes
+        full = store.reference_cache.used
         store.delete_scene(SceneKey("gone"))
-        assert store.reference_cache.used_bytes == full / 2
+        assert store.reference_cache.used == full / 2
         store.delete_reference(SceneKey("kept"), "b")
-        assert store.reference_cache.used_bytes == full / 3
+        assert store.reference_cache.used == full / 3
         assert len(store.load_references(SceneKey("kept"), None, EXTRACTOR).references) == 2
         assert store.reference_cache.evictions == 0
 

@@ -63,13 +63,13 @@ class StandInExtractor:
         return View(camera.pinhole(), features)
 
 
-@dataclass(frozen=True)
+@dataclass
 class StandInDescriptor:
     """Sees four times four grey patches: the same photograph resembles itself, and few others do."""
 
     name: str = "patches"
     dimension: int = 16
-    extractor: None = None
+    extractor: str | None = None
 
     def describe(self, view: View) -> NDArray[np.float32]:
         assert view.photograph is not None

@@ -17,11 +17,7 @@ if TYPE_CHECKING:  # services need not load what computes
     from mapless_server.method.groups.rig import RigEstimate
     from mapless_server.method.groups.sequence import SequenceEstimate
     from mapless_server.method.rejection import Rejection
-    from mapless_server.scenes.audit.coverage import Coverage
-    from mapless_server.scenes.audit.verdict import ReferenceAudit
-    from mapless_server.scenes.auditing import Viewpoint
-    from mapless_server.scenes.retrieval.chosen import Choice
-    from mapless_server.scenes.retrieval.narrowing import Narrowing
+    from mapless_server.scenes import Choice, Coverage, Narrowing, ReferenceAudit, Viewpoint
     from mapless_server.security.tenancy import SceneKey
 
     from .query import Caller, Description, Photo, Query, Result, Tier

@@ -16,9 +16,7 @@ if TYPE_CHECKING:
     from mapless_server.method.options import LocalizeOptions
     from mapless_server.method.pipeline import Pipeline
     from mapless_server.method.views import PosedView, View
-    from mapless_server.scenes.retrieval.chosen import Choice
-    from mapless_server.scenes.retrieval.descriptor import Vector
-    from mapless_server.scenes.retrieval.narrowing import Narrowing
+    from mapless_server.scenes import Choice, Narrowing, Vector
     from mapless_server.scheduling import Flow
     from mapless_server.security.tenancy import SceneKey
 

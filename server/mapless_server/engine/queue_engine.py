@@ -14,11 +14,7 @@ from mapless_server.method.context import StageContext
 from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.rejection import Rejection
-from mapless_server.scenes.audit.coverage import Coverage
-from mapless_server.scenes.audit.verdict import ReferenceAudit
-from mapless_server.scenes.auditing import Viewpoint
-from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.scenes.retrieval.narrowing import Narrowing
+from mapless_server.scenes import Choice, Coverage, Narrowing, ReferenceAudit, Selection, Viewpoint
 from mapless_server.scheduling import (
     ComputeItem,
     Expired,
@@ -185,7 +181,7 @@ class QueueEngine:
 
         def choose(photo: Photo, check: Callable[[], None]) -> Choice:
             views = QueryViews(photo, self.options.image_limits)
-            return self.references.choose(scene_key, views, count, narrowing, (), StageContext(check))
+            return self.references.choose(scene_key, views, Selection(count, narrowing), StageContext(check))
 
         (choice,) = await self._each(RETRIEVE, [photo], choose, caller, len(photo.image))
         return choice
@@ -200,9 +196,9 @@ class QueueEngine:
         Raises:
             RequestError: an unknown scene or named reference, a full queue, a passed deadline.
         """
-        examiner = self.references.examiner(scene_key, () if are_listed else reference_ids)
-        audits = await self._each(AUDIT, reference_ids, examiner.audit, caller, 0, jobs=1)
-        return examiner.generation, [audit for audit in audits if audit is not None]
+        auditor = self.references.auditor(scene_key, () if are_listed else reference_ids)
+        audits = await self._each(AUDIT, reference_ids, auditor.audit, caller, 0, jobs=1)
+        return auditor.generation, [audit for audit in audits if audit is not None]
 
     async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
         """The scene's generation, and whether a photograph would be localized there.
@@ -210,9 +206,9 @@ class QueueEngine:
         Raises:
             RequestError: an unknown scene, a full queue, a passed deadline.
         """
-        examiner = self.references.examiner(scene_key)
-        (coverage,) = await self._each(COVERAGE, [view], examiner.check_coverage, caller, 0)
-        return examiner.generation, coverage
+        auditor = self.references.auditor(scene_key)
+        (coverage,) = await self._each(COVERAGE, [view], auditor.check_coverage, caller, 0)
+        return auditor.generation, coverage
 
     @property
     def parallel_queries(self) -> int:

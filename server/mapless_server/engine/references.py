@@ -12,13 +12,17 @@ from mapless_server.images.decode import ImageLimits, decode_image
 from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import Photograph, View
-from mapless_server.scenes.auditing import SceneExaminer, Tools
-from mapless_server.scenes.indexes import SceneIndexes
-from mapless_server.scenes.library import Loaded, ReferenceLibrary
-from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.scenes.retrieval.descriptor import GlobalDescriptor
-from mapless_server.scenes.retrieval.narrowing import Narrowing
-from mapless_server.scenes.retrieval.ranking import RankOptions, rank_references
+from mapless_server.scenes import (
+    AuditTools,
+    Choice,
+    GlobalDescriptor,
+    Loaded,
+    ReferenceLibrary,
+    SceneAuditor,
+    SceneIndexes,
+    Selection,
+    rank_references,
+)
 from mapless_server.security.tenancy import SceneKey, scene_id_of
 from mapless_server.store import SceneAttributes
 
@@ -75,13 +79,10 @@ class ReferenceSource(Protocol):
         self,
         scene_key: SceneKey,
         views: QueryViews,
-        count: int,
-        narrowing: Narrowing,
-        among: Sequence[str],
+        selection: Selection,
         context: StageContext,
-        options: RankOptions | None = None,
     ) -> Choice:
-        """At most `count` references for a photograph."""
+        """The selected references for a photograph."""
         ...
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
@@ -98,7 +99,7 @@ class References:
         indexes: SceneIndexes,
         descriptor: GlobalDescriptor,
         extractors: Sequence[FeatureExtractor],
-        audit_tools: Tools,
+        audit_tools: AuditTools,
         limits: ImageLimits,
     ) -> None:
         """The first extractor's features are those that the descriptor is made of; ValueError if they are not."""
@@ -130,22 +131,16 @@ class References:
         self,
         scene_key: SceneKey,
         views: QueryViews,
-        count: int,
-        narrowing: Narrowing,
-        among: Sequence[str],
+        selection: Selection,
         context: StageContext,
-        options: RankOptions | None = None,
     ) -> Choice:
-        """At most `count` references for a photograph, by its global descriptor.
+        """The selected references for a photograph, by its global descriptor.
 
         Args:
             scene_key: the scene.
             views: the photograph.
-            count: how many.
-            narrowing: limits of the camera's pose.
-            among: ids of the candidates; empty for all of the scene's.
+            selection: how many references, and of which.
             context: cancels and times.
-            options: of the ranking.
 
         Raises:
             NotFound: there is no such scene (field "scene") or reference (field "references[i]").
@@ -154,7 +149,7 @@ class References:
         """
         # The scene comes first: a wrong name is found before the photograph is described.
         entries = self._indexes.entries(scene_key, context)
-        for index, reference_id in enumerate(among):
+        for index, reference_id in enumerate(selection.among):
             if reference_id not in entries:
                 if self._indexes.is_damaged(scene_key, reference_id):
                     message = f"reference {reference_id!r} is damaged in the store: delete it and add it again"
@@ -166,12 +161,12 @@ class References:
         view = views.view(self._extractors[0], context)
         with context.stage("retrieval"):
             vector = self._descriptor.describe(view)
-            ranked = rank_references(entries, vector, count, narrowing, frozenset(among) if among else None, options)
+            ranked = rank_references(entries, vector, selection)
         return Choice(tuple(ranked), self._descriptor.name, entries.generation)
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
         """Logs, once while the scene is in memory, that a chosen reference is not used because it is damaged."""
-        self._indexes.tell_damaged(scene_key, reference_id, error)
+        self._indexes.report_damaged(scene_key, reference_id, error)
 
     def describe(self, photo: Photo, check: Callable[[], None]) -> Description:
         """Everything that is stored of a photograph: every tier's features; InvalidArgument if it is bad."""
@@ -182,9 +177,9 @@ class References:
         without_pixels = {name: replace(view, photograph=None) for name, view in views.items()}
         return Description(without_pixels, {self._descriptor.name: vector})
 
-    def examiner(self, scene_key: SceneKey, named: Sequence[str] = ()) -> SceneExaminer:
+    def auditor(self, scene_key: SceneKey, named: Sequence[str] = ()) -> SceneAuditor:
         """Audits references of a scene, of which the caller named some."""
-        return SceneExaminer(self._audit_tools, scene_key, named)
+        return SceneAuditor(self._audit_tools, scene_key, named)
 
     def forget_scene(self, scene_key: SceneKey) -> None:
         """Frees what is in memory of a deleted scene."""

@@ -26,10 +26,7 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.retrieve import spread_choice
 from mapless_server.method.views import Matches, PosedView, View
-from mapless_server.scenes.library import Loaded, NotDescribedYet, load_usable
-from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.scenes.retrieval.narrowing import Narrowing
-from mapless_server.scenes.retrieval.ranking import RankOptions
+from mapless_server.scenes import Choice, FeaturesMissing, Loaded, Narrowing, RankOptions, Selection, load_usable
 from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Job, Next, StageResult, Step
 from mapless_server.store import SceneAttributes
 
@@ -167,7 +164,7 @@ class QueryStages:
             if run.best is None:
                 return _emptied() if is_outdated else error
             # A failed attempt at a better answer must not cost the answer at hand.
-            if not isinstance(error, NotDescribedYet):
+            if not isinstance(error, FeaturesMissing):
                 name = self._tiers[run.tier].features
                 log.warning("%s failed; the first answer is given", name, exc_info=error)
             return self._unfinished(run)
@@ -206,9 +203,8 @@ class QueryStages:
         """With the references that have the most matches, among those that resemble the photograph most."""
         query, context = run.query, run.context
         count = SHORTLIST * query.reference_count
-        choice = run.source.choose(
-            query.scene_key, run.views, count, query.narrowing, query.reference_ids, context, THINNED_LATER
-        )
+        selection = Selection(count, query.narrowing, query.reference_ids, THINNED_LATER)
+        choice = run.source.choose(query.scene_key, run.views, selection, context)
         generation, shortlist = self._load_chosen(run, [it.reference_id for it in choice.references], tier)
         view = run.views.view(tier.extractor, context)
         with context.stage("shortlist"):

@@ -11,7 +11,7 @@ from prometheus_client.registry import Collector
 
 if TYPE_CHECKING:
     from mapless_server.method.coarse.token_cache import TokenCacheCounters
-    from mapless_server.store.cache import LruCache
+    from mapless_server.store import LruCache
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ class Scraped(Collector):
             hits.add_metric([], cache.hits)
             misses.add_metric([], cache.misses)
             evictions.add_metric([], cache.evictions)
-            size.add_metric([], cache.used_bytes)
+            size.add_metric([], cache.used)
 
     def _retrieval_index(self, metrics: dict[str, Metric]) -> None:
         size = _gauge(metrics, "mapless_retrieval_index_bytes", "Size of the scenes held to choose references by.")

@@ -1,4 +1,4 @@
-"""Scenes in memory, to choose references by: read once, then kept up to date by what has changed."""
+"""Retrieval indexes of scenes, in memory: read once, then updated by what has changed in the store."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 class SceneIndexes:
-    """Indexes of scenes, those used longest ago forgotten; safe to use from several threads."""
+    """Indexes of scenes, the least recently used evicted; thread-safe."""
 
     def __init__(
         self,
@@ -31,154 +31,155 @@ class SceneIndexes:
         extractor: FeatureExtractor,
         capacity_bytes: int,
     ) -> None:
-        """No index yet.
+        """No indexes yet.
 
         Args:
             store: of the references.
-            library: loads those that have no descriptor yet.
-            descriptor: what the indexes hold.
-            extractor: finds the features that it is made of.
-            capacity_bytes: of all indexes; the scene used last is held however large it is.
+            library: loads references that have no descriptor yet.
+            descriptor: what the indexes contain.
+            extractor: of the features that the descriptor is made of.
+            capacity_bytes: of all indexes; the most recently used one is kept however large it is.
         """
         self._store = store
         self._library = library
         self._descriptor = descriptor
         self._extractor = extractor
         self._capacity_bytes = capacity_bytes
-        self._held: OrderedDict[SceneKey, _Held] = OrderedDict()
+        self._cached: OrderedDict[SceneKey, _CachedIndex] = OrderedDict()
         self._size_bytes = 0
         self._lock = threading.Lock()
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory of all indexes."""
+        with self._lock:
+            return self._size_bytes
 
     def entries(self, scene_key: SceneKey, context: StageContext) -> Entries:
         """The references of a scene as it is now.
 
-        Those without a descriptor are described now, one by one until the turn is over; what was done by then stays
-        done. One that cannot be described because it is damaged stays without.
+        References without a descriptor are described now, one by one, and those done are kept if the context is
+        cancelled. One that cannot be described because it is damaged stays without.
 
         Raises:
             NotFound: there is no such scene (field "scene").
-            Over: the turn is over.
+            Abandoned: the context is cancelled.
         """
-        # Whatever becomes of the scene meanwhile, this call goes on with what it has begun with.
-        held = self._hold(scene_key)
-        entries = self._refresh(scene_key, held)
-        while undescribed := held.describable(entries):
+        # Even if the scene is evicted meanwhile, this call goes on with the same index.
+        cached = self._get(scene_key)
+        entries = self._refresh(scene_key, cached)
+        while undescribed := cached.describable(entries):
             log.info("describing %d references of scene %s for retrieval", len(undescribed), scene_key)
             with context.stage("describe"):
                 for reference_id, key in undescribed:
-                    self._describe(scene_key, held, reference_id, key, context)
-            entries = self._refresh(scene_key, held)
+                    self._describe(scene_key, cached, reference_id, key, context)
+            entries = self._refresh(scene_key, cached)
         return entries
 
     def forget(self, scene_key: SceneKey) -> None:
-        """Takes no more memory for a scene, which has been deleted."""
-        held = self._find(scene_key)
-        if held is not None:
-            self._forget(scene_key, held)
+        """Frees the index of a deleted scene."""
+        cached = self._find(scene_key)
+        if cached is not None:
+            self._drop(scene_key, cached)
 
     def is_damaged(self, scene_key: SceneKey, reference_id: str) -> bool:
-        """Whether a reference is in the scene, but not among its entries, since its pose or descriptor is damaged."""
-        held = self._find(scene_key)
-        if held is None or reference_id not in held.damaged_ids:
+        """Whether a reference is in the scene but not among its entries, because its pose or descriptor is damaged."""
+        cached = self._find(scene_key)
+        if cached is None or reference_id not in cached.damaged_ids:
             return False
         try:
             self._store.get_reference(scene_key, reference_id)
         except DataLoss:
             return True
-        except NotFound:  # its deletion was told by its key, which nobody knows of one that is damaged
-            held.damaged_ids.discard(reference_id)
+        except NotFound:  # deletions are listed by key, which is not known of a damaged reference
+            cached.damaged_ids.discard(reference_id)
             return False
         return True
 
-    def tell_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
-        """Logs, once while the scene is held, that a reference is not used because it is damaged."""
-        held = self._find(scene_key)
-        if held is None or reference_id not in held.told:
-            if held is not None:
-                held.told.add(reference_id)
+    def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
+        """Logs, once while the scene is in memory, that a reference is not used because it is damaged."""
+        cached = self._find(scene_key)
+        if cached is None or reference_id not in cached.reported_ids:
+            if cached is not None:
+                cached.reported_ids.add(reference_id)
             log.error("reference %s of scene %s is not used: %s", reference_id, scene_key, error)
 
-    def _describe(self, scene_key: SceneKey, held: _Held, reference_id: str, key: str, context: StageContext) -> None:
-        """Finds and keeps a reference's descriptor; nothing if it was deleted since."""
+    def _describe(
+        self, scene_key: SceneKey, cached: _CachedIndex, reference_id: str, key: str, context: StageContext
+    ) -> None:
+        """Computes and stores a reference's descriptor, unless the reference has been deleted."""
         context.check()
-        claims = self._library.claims
-        with claims.claimed((key, self._descriptor.name)) as is_mine:
+        locks = self._library.locks
+        with locks.try_lock((key, self._descriptor.name)) as is_mine:
             if not is_mine:
-                claims.wait((key, self._descriptor.name), context.check)
+                locks.wait((key, self._descriptor.name), context.check)
                 return
             try:
-                _, (reference,) = self._library.load(
-                    scene_key, (reference_id,), self._extractor, StageContext(context.check)
-                )
-                if reference.key != key:  # another one of the same name by now
+                untimed = StageContext(context.check)
+                _, (reference,) = self._library.load(scene_key, (reference_id,), self._extractor, untimed)
+                if reference.key != key:  # it was replaced by another one with the same id
                     return
                 vector = self._descriptor.describe(reference.view)
                 self._store.add_descriptor(key, self._descriptor.name, vector)
             except NotFound:
                 return
             except DataLoss as error:
-                held.undescribable.add(key)
-                self.tell_damaged(scene_key, reference_id, error)
+                cached.undescribable.add(key)
+                self.report_damaged(scene_key, reference_id, error)
                 return
-        held.describe({key: vector})
+        cached.describe({key: vector})
 
-    def _refresh(self, scene_key: SceneKey, held: _Held) -> Entries:
+    def _refresh(self, scene_key: SceneKey, cached: _CachedIndex) -> Entries:
         try:
-            entries = held.refresh(self._store, scene_key, self._descriptor.name)
+            entries = cached.refresh(self._store, scene_key, self._descriptor.name)
         except Exception:
-            # What cannot be brought up to date is not to be believed; and a scene that is gone takes no memory.
-            self._forget(scene_key, held)
+            # An index that cannot be updated is not valid, and that of a deleted scene wastes memory.
+            self._drop(scene_key, cached)
             raise
-        self._make_room(scene_key, held)
+        self._make_room(scene_key, cached)
         return entries
 
-    @property
-    def size_bytes(self) -> int:
-        """What all indexes hold in memory."""
+    def _find(self, scene_key: SceneKey) -> _CachedIndex | None:
         with self._lock:
-            return self._size_bytes
+            return self._cached.get(scene_key)
 
-    def _find(self, scene_key: SceneKey) -> _Held | None:
+    def _get(self, scene_key: SceneKey) -> _CachedIndex:
+        """The scene's index, created if missing, as the most recently used one."""
         with self._lock:
-            return self._held.get(scene_key)
+            cached = self._cached.get(scene_key)
+            if cached is None:
+                cached = self._cached[scene_key] = _CachedIndex(SceneIndex(self._descriptor.dimension))
+            self._cached.move_to_end(scene_key)
+            return cached
 
-    def _hold(self, scene_key: SceneKey) -> _Held:
-        """What is held of a scene that is asked for, from now on at the latest."""
+    def _drop(self, scene_key: SceneKey, cached: _CachedIndex) -> None:
         with self._lock:
-            held = self._held.get(scene_key)
-            if held is None:
-                held = self._held[scene_key] = _Held(SceneIndex(self._descriptor.dimension))
-            self._held.move_to_end(scene_key)
-            return held
+            if self._cached.get(scene_key) is cached:
+                del self._cached[scene_key]
+                self._size_bytes -= cached.counted_bytes
 
-    def _forget(self, scene_key: SceneKey, held: _Held) -> None:
+    def _make_room(self, used: SceneKey, cached: _CachedIndex) -> None:
+        """Updates the size of an index, and evicts the least recently used ones until all fit."""
         with self._lock:
-            if self._held.get(scene_key) is held:
-                del self._held[scene_key]
-                self._size_bytes -= held.counted_bytes
-
-    def _make_room(self, used: SceneKey, held: _Held) -> None:
-        """Counts what the scene takes now, and forgets those used longest ago until there is room for it."""
-        with self._lock:
-            if self._held.get(used) is not held:
+            if self._cached.get(used) is not cached:
                 return
-            size_bytes = held.index.size_bytes
-            self._size_bytes += size_bytes - held.counted_bytes
-            held.counted_bytes = size_bytes
-            while self._size_bytes > self._capacity_bytes and len(self._held) > 1:
-                _, oldest = self._held.popitem(last=False)
+            size_bytes = cached.index.size_bytes
+            self._size_bytes += size_bytes - cached.counted_bytes
+            cached.counted_bytes = size_bytes
+            while self._size_bytes > self._capacity_bytes and len(self._cached) > 1:
+                _, oldest = self._cached.popitem(last=False)
                 self._size_bytes -= oldest.counted_bytes
 
 
-class _Held:
-    """An index and the lock of who brings it up to date.
+class _CachedIndex:
+    """An index, and the lock of the thread that updates it.
 
     Attributes:
         index: of the scene.
-        counted_bytes: what it took when it was last counted.
-        damaged_ids: of references that were left out of it; some may be deleted by now.
+        counted_bytes: its size when it was last counted.
+        damaged_ids: of references that are not in the index; some may have been deleted.
         undescribable: keys of references that were found damaged when they were to be described.
-        told: ids of references that the log has been told of.
+        reported_ids: of references whose damage has been logged.
     """
 
     def __init__(self, index: SceneIndex) -> None:
@@ -186,7 +187,7 @@ class _Held:
         self.counted_bytes = 0
         self.damaged_ids: set[str] = set()
         self.undescribable: set[str] = set()
-        self.told: set[str] = set()
+        self.reported_ids: set[str] = set()
         self._updating = threading.Lock()
 
     def describable(self, entries: Entries) -> list[tuple[str, str]]:

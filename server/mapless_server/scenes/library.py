@@ -1,16 +1,16 @@
-"""The stored references as the pipeline wants them: with the features asked for and, at hand, the photographs.
+"""Stored references as the pipeline needs them: with the requested features, and with photographs that load lazily.
 
-Features are computed once, when a reference is added. A store that was filled under other features lacks those of a
-new extractor: they are then computed from the stored photographs by the first calls that need them, and kept.
+Features are computed once, when a reference is added. A store that was filled with other features lacks those of a new
+extractor: the first calls that need them compute them from the stored photographs, and store them.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 
@@ -26,38 +26,67 @@ from mapless_server.method.views import Photograph, PosedView
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import DescribedReference, ReferenceRecord, SceneAttributes, Store
 
-from .keyed_locks import Claims
-
 log = logging.getLogger(__name__)
 
 STORED_IMAGES = ImageLimits(max_bytes=2**31, max_pixels=2**30, min_side_px=1, max_side_px=2**20)
-"""Stored photographs were let in under the limits of their time; limits set lower since do not make them unreadable."""
+"""Stored photographs were accepted with the limits of their time; lower limits do not make them unreadable."""
+
+_POLL_S = 0.05
 
 Loaded = tuple[int, tuple[PosedView, ...]]
 """A scene's generation, and references of it."""
 
 
-class NotDescribedYet(Exception):
-    """References lack the features asked for, and whoever asked does not wait for them."""
+class FeaturesMissing(Exception):
+    """References lack the requested features, and the caller does not wait for them."""
+
+
+class KeyedLocks:
+    """A lock for each key in use, so that threads do nothing twice."""
+
+    def __init__(self) -> None:
+        self._locked: set[tuple[str, str]] = set()
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def try_lock(self, key: tuple[str, str]) -> Iterator[bool]:
+        """Locks a key during the block; False if another thread has it."""
+        with self._changed:
+            is_mine = key not in self._locked
+            self._locked.add(key)
+        try:
+            yield is_mine
+        finally:
+            if is_mine:
+                with self._changed:
+                    self._locked.remove(key)
+                    self._changed.notify_all()
+
+    def wait(self, key: tuple[str, str], check: Callable[[], None]) -> None:
+        """Returns when the key is not locked; calls `check` repeatedly, which may raise."""
+        with self._changed:
+            while key in self._locked:
+                check()
+                self._changed.wait(_POLL_S)
 
 
 class ReferenceLibrary:
-    """Loads references from the store; safe to use from several threads.
+    """Loads references from the store; thread-safe.
 
     Attributes:
-        claims: what threads are describing, by the reference's key and the name of what describes it.
+        locks: of what threads are computing, by the reference's key and the name of the extractor or descriptor.
     """
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self.claims = Claims()
+        self.locks = KeyedLocks()
         self._background = ThreadPoolExecutor(1, "describe")
-        self._announced: set[tuple[str, str]] = set()
-        self._announcing = threading.Lock()
+        self._scheduled: set[tuple[str, str]] = set()
+        self._scheduling = threading.Lock()
         self._closing = threading.Event()
 
     def close(self) -> None:
-        """Ends what is done in the background, after the reference that it is at."""
+        """Ends the background work after its current reference."""
         self._closing.set()
         self._background.shutdown(wait=True, cancel_futures=True)
 
@@ -69,16 +98,16 @@ class ReferenceLibrary:
         context: StageContext,
         waits: bool = True,
     ) -> Loaded:
-        """The scene's generation and references of it, in the order asked for.
+        """The scene's generation and references of it, in the order given.
 
-        Those without features of the extractor are described now, one by one until the turn is over; what was done by
-        then stays done. Who does not wait is told so, and they are described in the background. The photographs of
-        references are read when somebody asks for the pixels, not before.
+        References without features of the extractor are described now, one by one, and those done are kept if the
+        context is cancelled; with `waits` False they are described in the background. Photographs are read when their
+        pixels are first used.
 
         Raises:
-            NotDescribedYet: somebody who does not wait would have to.
+            FeaturesMissing: references lack features and `waits` is False.
             NotFound: there is no such scene (field "scene") or reference (field "references[i]").
-            Over: the turn is over.
+            Abandoned: the context is cancelled.
             DataLoss: what is stored of one of them is damaged.
         """
         while True:
@@ -87,51 +116,49 @@ class ReferenceLibrary:
                 return snapshot.generation, tuple(map(self._posed_view, snapshot.references))
             if not waits:
                 self._describe_later(snapshot.undescribed, extractor)
-                raise NotDescribedYet
-            log.info(
-                "describing %d references of scene %s with %s", len(snapshot.undescribed), scene_key, extractor.name
-            )
+                raise FeaturesMissing
+            _log_describing(snapshot.undescribed, extractor)
             with context.stage("describe"):
                 self._describe_all(snapshot.undescribed, extractor, context.check)
 
     def attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        """What is known of a scene as a whole; errors as `Store.get_attributes`."""
+        """Attributes of a scene as a whole; errors as `Store.get_attributes`."""
         return self._store.get_attributes(scene_key)
 
     def _describe_later(self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:
-        with self._announcing:
-            new = [record for record in records if (record.key, extractor.name) not in self._announced]
-            self._announced |= {(record.key, extractor.name) for record in new}
+        with self._scheduling:
+            new = [record for record in records if (record.key, extractor.name) not in self._scheduled]
+            self._scheduled |= {(record.key, extractor.name) for record in new}
         if new:
-            _announce(new, extractor)
+            _log_describing(new, extractor)
         for record in new:
-            self._background.submit(self._describe_unasked, record, extractor)
+            self._background.submit(self._describe_in_background, record, extractor)
 
-    def _describe_unasked(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
+    def _describe_in_background(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
         if self._closing.is_set():
             return
         try:
             self._describe_all([record], extractor, lambda: None)
-        except Exception as error:  # one that is damaged or gone must not keep the others from being described
+        except Exception as error:  # a damaged or deleted reference must not keep the others from being described
             log.warning("reference %s of scene %s: %s", record.reference_id, record.scene_key, error)
 
     def _describe_all(
         self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor, check: Callable[[], None]
     ) -> None:
-        """Describes references, but those that other threads are at: these it waits for, not for their success."""
-        taken: list[ReferenceRecord] = []
+        """Describes references; waits for those that other threads are describing, whether they succeed or not."""
+        elsewhere: list[ReferenceRecord] = []
         for record in records:
             check()
-            with self.claims.claimed((record.key, extractor.name)) as is_mine:
+            with self.locks.try_lock((record.key, extractor.name)) as is_mine:
                 if is_mine:
                     self._describe(record, extractor)
                 else:
-                    taken.append(record)
-        for record in taken:
-            self.claims.wait((record.key, extractor.name), check)
+                    elsewhere.append(record)
+        for record in elsewhere:
+            self.locks.wait((record.key, extractor.name), check)
 
     def _describe(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
-        # Another thread may have been done with it between our look and our claim.
+        # Another thread may have finished between reading the store and taking the lock.
         if not self._store.has_features(record.key, extractor.name):
             view = extractor.extract(self._pixels(record), record.camera)
             with suppress(AlreadyExists):  # another server on the same store was faster
@@ -148,7 +175,7 @@ class ReferenceLibrary:
         )
 
     def _pixels(self, record: ReferenceRecord) -> NDArray[np.uint8]:
-        """The reference's photograph, (H, W, 3) RGB; NotFound if it was deleted since, DataLoss if it is damaged."""
+        """The photograph, (H, W, 3) RGB. Raises NotFound if the reference was deleted, DataLoss if it is damaged."""
         data = self._store.read_image_of(record.key)
         try:
             return decode_image(data, STORED_IMAGES)
@@ -160,41 +187,36 @@ def load_usable(
     load: Callable[[Sequence[str]], Loaded],
     reference_ids: Sequence[str],
     unusable: tuple[type[RequestError], ...],
-    tell: Callable[[str, RequestError], None],
+    report: Callable[[str, RequestError], None],
 ) -> Loaded:
-    """References of these ids, in order, less those that cannot be had.
+    """References with these ids, in order, except those that cannot be loaded.
 
-    Where all can be had they are read at one moment, and so are those that are left after a second look.
+    All are read at one moment; if some cannot be loaded, the others are read again, at one moment.
 
     Args:
-        load: how to load some; it fails if it fails for one of them.
+        load: loads some references; fails if one of them fails.
         reference_ids: of the references.
-        unusable: what loading one of them raises that is to be left out; about the scene it is let through.
-        tell: called for each that is left out.
+        unusable: errors of a reference that is to be omitted; those about the scene are raised.
+        report: called for each reference that is omitted.
     """
+
+    def is_usable(reference_id: str) -> bool:
+        try:
+            load([reference_id])
+        except unusable as error:
+            if error.field == "scene":
+                raise
+            report(reference_id, error)
+            return False
+        return True
+
     try:
         return load(reference_ids)
     except unusable as error:
         if error.field == "scene":
             raise
-    return load([it for it in reference_ids if _is_usable(load, it, unusable, tell)])
+    return load([it for it in reference_ids if is_usable(it)])
 
 
-def _is_usable(
-    load: Callable[[Sequence[str]], Loaded],
-    reference_id: str,
-    unusable: tuple[type[RequestError], ...],
-    tell: Callable[[str, RequestError], None],
-) -> bool:
-    try:
-        load([reference_id])
-    except unusable as error:
-        if error.field == "scene":
-            raise
-        tell(reference_id, error)
-        return False
-    return True
-
-
-def _announce(records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:
+def _log_describing(records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:
     log.info("describing %d references of scene %s with %s", len(records), records[0].scene_key, extractor.name)

@@ -22,12 +22,14 @@ from mapless_server.method.features import FEATURES, FeatureExtractor, make_extr
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.networks.weights import CATALOGUE, WeightsError, WeightsMissing, find_weights
 from mapless_server.observability.metrics import Metrics
-from mapless_server.scenes.audit.neighbourhood import PairMatches
-from mapless_server.scenes.auditing import Tools
-from mapless_server.scenes.indexes import SceneIndexes
-from mapless_server.scenes.library import ReferenceLibrary
-from mapless_server.scenes.retrieval.descriptor import GlobalDescriptor
-from mapless_server.scenes.retrieval.vlad import VladDescriptor
+from mapless_server.scenes import (
+    AuditTools,
+    GlobalDescriptor,
+    PairMatches,
+    ReferenceLibrary,
+    SceneIndexes,
+    VladDescriptor,
+)
 from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
 from mapless_server.security.rate import RateLimiter
 from mapless_server.settings import Settings, available_cores
@@ -134,7 +136,7 @@ def engine_over(
     library = ReferenceLibrary(store)
     indexes = SceneIndexes(store, library, descriptor, first, options.index_cache_bytes)
     pairs = PairMatches(tiers[0].pipeline.matcher.options.reference_ratio, CACHED_AUDIT_PAIRS)
-    audit_tools = Tools(library, indexes, descriptor, first, pairs)
+    audit_tools = AuditTools(library, indexes, descriptor, first, pairs)
     references = References(library, indexes, descriptor, extractors, audit_tools, options.image_limits)
     return QueueEngine(tiers, references, options, observer, quota, method)
 

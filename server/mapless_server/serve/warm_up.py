@@ -24,8 +24,7 @@ from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.views import Photograph, PosedView
-from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.scenes.retrieval.narrowing import Narrowing
+from mapless_server.scenes import Choice, Narrowing
 from mapless_server.scheduling import Flow
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import SceneAttributes

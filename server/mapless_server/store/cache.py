@@ -11,20 +11,20 @@ Value = TypeVar("Value")
 
 
 class LruCache(Generic[Value]):
-    """Holds values of at most `capacity_bytes` together; 0 holds nothing.
+    """Holds values whose sizes, in bytes or in any other unit, add up to at most a capacity; 0 holds nothing.
 
     Attributes:
         hits, misses: of `get`.
         evictions: values dropped for lack of room.
-        used_bytes: sum of the sizes of the values held.
+        used: sum of the sizes of the values held.
     """
 
-    def __init__(self, capacity_bytes: int) -> None:
+    def __init__(self, capacity: int) -> None:
         """Raises ValueError if the capacity is negative."""
-        if capacity_bytes < 0:
-            raise ValueError(f"cache capacity must not be negative, is {capacity_bytes} bytes")
-        self._capacity_bytes = capacity_bytes
-        self.hits = self.misses = self.evictions = self.used_bytes = 0
+        if capacity < 0:
+            raise ValueError(f"cache capacity must not be negative, is {capacity}")
+        self._capacity = capacity
+        self.hits = self.misses = self.evictions = self.used = 0
         self._entries: OrderedDict[Hashable, tuple[Value, int]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -47,19 +47,19 @@ class LruCache(Generic[Value]):
         with self._lock:
             gone = [key for key, (value, _) in self._entries.items() if is_gone(key, value)]
             for key in gone:
-                _, size_bytes = self._entries.pop(key)
-                self.used_bytes -= size_bytes
+                _, size = self._entries.pop(key)
+                self.used -= size
         return gone
 
-    def put(self, key: Hashable, value: Value, size_bytes: int) -> None:
+    def put(self, key: Hashable, value: Value, size: int = 1) -> None:
         """Holds a value, unless it is larger than the whole cache."""
-        if size_bytes > self._capacity_bytes:
+        if size > self._capacity:
             return
         with self._lock:
-            _, replaced_bytes = self._entries.pop(key, (None, 0))
-            self._entries[key] = (value, size_bytes)
-            self.used_bytes += size_bytes - replaced_bytes
-            while self.used_bytes > self._capacity_bytes:
-                _, (_, dropped_bytes) = self._entries.popitem(last=False)
-                self.used_bytes -= dropped_bytes
+            _, replaced = self._entries.pop(key, (None, 0))
+            self._entries[key] = (value, size)
+            self.used += size - replaced
+            while self.used > self._capacity:
+                _, (_, dropped) = self._entries.popitem(last=False)
+                self.used -= dropped
                 self.evictions += 1

@@ -18,10 +18,7 @@ from mapless_server.images.decode import decode_image
 from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import Photograph, PosedView, View
-from mapless_server.scenes.library import STORED_IMAGES, Loaded
-from mapless_server.scenes.retrieval.chosen import Choice
-from mapless_server.scenes.retrieval.narrowing import Narrowing
-from mapless_server.scenes.retrieval.ranking import RankOptions
+from mapless_server.scenes import STORED_IMAGES, Choice, Loaded, Selection
 from mapless_server.security.tenancy import SceneKey, scene_id_of
 from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CapturedReference, DamagedCapture
 from mapless_server.services.capture.files import blob_path
@@ -128,11 +125,8 @@ class RecordedSource:
         self,
         scene_key: SceneKey,
         views: QueryViews,
-        count: int,
-        narrowing: Narrowing,
-        among: Sequence[str],
+        selection: Selection,
         context: StageContext,
-        options: RankOptions | None = None,
     ) -> Choice:
         """Implements ReferenceSource: the captured choice, whatever the arguments; DamagedCapture if there is none."""
         if self.part.choice is None:

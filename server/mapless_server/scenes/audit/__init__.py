@@ -1,27 +1,7 @@
-"""Audit and coverage: whether the references are right, and where one would be localized with them.
+"""Audit and coverage: whether references are right, and where a photograph would be localized with them.
 
-Pure analysis of posed views, which knows nothing of grpc or storage.
+Begin with `scene_auditor`, which audits a stored scene; `auditor` has the decisions about one reference. It compares
+(`comparison`) the points that neighbours triangulate (`neighbourhood`) with the reference's photograph, by fitting its
+camera (`resection`). `finder` finds neighbours, `change` detects changes of the scene, `report` writes the result
+(`verdict`). `coverage` predicts matches from the points that would be visible (`visibility`).
 """
-
-from .auditor import audit_references
-from .coverage import Coverage, CoverageOptions, CoverageVerdict, check_coverage
-from .neighbourhood import PairMatches
-from .options import AuditOptions
-from .surroundings import PosedName, Surroundings, surroundings_of
-from .verdict import ALARMS, ReferenceAudit, Verdict
-
-__all__ = [
-    "ALARMS",
-    "AuditOptions",
-    "Coverage",
-    "CoverageOptions",
-    "CoverageVerdict",
-    "PairMatches",
-    "PosedName",
-    "ReferenceAudit",
-    "Surroundings",
-    "Verdict",
-    "audit_references",
-    "check_coverage",
-    "surroundings_of",
-]

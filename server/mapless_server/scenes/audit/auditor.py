@@ -1,66 +1,45 @@
-"""Examines references against their neighbours, and finds out who is at fault.
+"""Audits references against their neighbours, and finds out which of them is wrong.
 
-A first look judges a reference from the neighbours that share the most matches with it, which are robust against a few
-wrong ones among them. Where it finds a fault there are three suspicions to clear before anybody is blamed:
+A first comparison is with the neighbours that share the most matches, which tolerates a few wrong ones among them. If
+it finds a fault, three other causes are excluded before the reference is reported:
 
-* the neighbours are at fault. Those whose own first look finds a fault are left out of a second look; a fault that goes
-  away with them was theirs.
-* all poses there are noisy. An offset must stand out from the neighbours' own.
+* the neighbours are wrong. Those whose own first comparison finds a fault are left out of a second one; a fault that
+  disappears with them was theirs.
+* all poses there are noisy. An offset must exceed the neighbours' own.
 * the photographs of two references are swapped, which shows when each fits the other's pose.
 
-Where the neighbours by pose do not see what the photograph shows, others are asked that look like it.
+If the neighbours by pose do not see what the photograph shows, references that look similar are used.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mapless_server.method.views import PosedView
+from mapless_server.store import LruCache
 
-from .change import SAME_VIEWPOINT, Change, ChangeOptions, changed_region
+from .change import SAME_VIEWPOINT, Change, ChangeOptions, find_change
+from .comparison import Comparison, compare, pose_difference
 from .duplicates import Likeness, likeness
-from .look import Look, look_at, pose_difference
+from .finder import ReferenceFinder
 from .neighbourhood import PairMatches
 from .options import AuditOptions
-from .report import describe
-from .resection import Freedom
-from .surroundings import Surroundings
-from .verdict import ReferenceAudit, Verdict
+from .report import report
+from .resection import Free
+from .verdict import AuditVerdict, ReferenceAudit
 
-_WHOLE_LOOKS = 10
-"""First looks that are kept whole."""
-
-
-def audit_references(
-    names: Sequence[str],
-    surroundings: Surroundings,
-    options: AuditOptions | None = None,
-    pairs: PairMatches | None = None,
-    check: Callable[[], None] = lambda: None,
-) -> list[ReferenceAudit]:
-    """Audits references of a scene, in the order named; the verdicts do not depend on who else is named.
-
-    Args:
-        names: references of the surroundings.
-        surroundings: all references of the scene.
-        options: see there.
-        pairs: remembers matches between calls; with the ratio of the features.
-        check: called before each look, and lets what it raises through.
-    """
-    auditor = Auditor(surroundings, options or AuditOptions(), pairs or PairMatches(), check)
-    return [auditor.audit(name) for name in names]
+_CACHED_COMPARISONS = 10
 
 
 @dataclass(frozen=True)
 class _Finding:
-    """What is remembered of a first look, which itself takes megabytes.
+    """What is kept of a first comparison, which itself takes megabytes.
 
     Attributes:
-        is_usable, offset_m, turn_deg, excess: as of the look; zeros where it is not usable.
+        is_usable, offset_m, turn_deg, excess: of the comparison; zeros where it is not usable.
         is_alarm: whether its verdict is.
     """
 
@@ -71,171 +50,178 @@ class _Finding:
     excess: float = 0.0
 
     @staticmethod
-    def of(look: Look) -> _Finding:
-        if not look.is_usable:
-            return _Finding(False, look.verdict().is_alarm)
-        return _Finding(True, look.verdict().is_alarm, look.offset_m, look.turn_deg, look.excess(Freedom.NOTHING))
+    def of(found: Comparison) -> _Finding:
+        is_alarm = found.verdict().is_alarm
+        if not found.is_usable:
+            return _Finding(False, is_alarm)
+        return _Finding(True, is_alarm, found.offset_m, found.turn_deg, found.excess(Free.NOTHING))
+
+
+@dataclass(frozen=True)
+class _Twin:
+    """The reference most like another one among those that it was compared with; no name without one."""
+
+    name: str = ""
+    likeness: Likeness = Likeness.DIFFERENT
 
 
 class Auditor:
-    """Audits references; of one thread.
+    """Audits references; of one thread. The verdict on one does not depend on which others are audited.
 
-    Neighbours are asked again and again, so what first looks found is remembered, in some hundred bytes each. The last
-    few looks are kept whole, at about 2 MiB each and the references that they look at; beyond these it takes what
-    its surroundings remember.
+    Neighbours are compared again and again, so findings of first comparisons are cached, some hundred bytes each. The
+    last few comparisons are cached whole, about 2 MiB each with their references; the finder caches more references.
     """
 
     def __init__(
         self,
-        surroundings: Surroundings,
+        finder: ReferenceFinder,
         options: AuditOptions,
         pairs: PairMatches,
         check: Callable[[], None] = lambda: None,
-        remembered_findings: int = 3000,
+        cached_findings: int = 3000,
     ) -> None:
-        self._around, self._options, self._pairs, self._check = surroundings, options, pairs, check
-        self._remembered_findings = remembered_findings
-        self._findings: OrderedDict[str, _Finding] = OrderedDict()
-        self._looks: OrderedDict[str, tuple[Look, tuple[str, Likeness]]] = OrderedDict()
+        """An auditor of a scene.
+
+        Args:
+            finder: of the scene's references.
+            options: see there.
+            pairs: caches matches between calls.
+            check: called before each comparison; may raise.
+            cached_findings: number of findings that are kept.
+        """
+        self._finder, self._options, self._pairs, self._check = finder, options, pairs, check
+        self._findings: LruCache[_Finding] = LruCache(cached_findings)
+        self._comparisons: LruCache[tuple[Comparison, _Twin]] = LruCache(_CACHED_COMPARISONS)
 
     def audit(self, name: str) -> ReferenceAudit:
-        """The verdict on one reference. Raises Gone if one cannot be loaded any more that could be before."""
-        look, twin = self._first_look(name)
+        """The result for one reference. Raises ReferenceGone if it or a neighbour cannot be loaded any more."""
+        found, twin = self._first_comparison(name)
         is_wide = False
-        if not look.is_usable:
-            look, twin = self._wide_look(name, twin)
-            is_wide = True
-        verdict, blamed = self._judge(look), ""
+        if not found.is_usable:
+            similar = self._finder.similar(name, self._options.wide_count)
+            found, wide_twin = self._compare(name, similar)
+            twin, is_wide = max(twin, wide_twin, key=lambda it: it.likeness.value), True
+        verdict, contradicted = self._judge(found), ""
         if verdict.is_alarm:
-            look, verdict, blamed = self._without_suspects(look, verdict, is_wide)
-        if verdict in (Verdict.WRONG_POSE, Verdict.WRONG_POSE_AND_INTRINSICS):
-            partner = self._swapped_with(look)
+            found, verdict, contradicted = self._without_suspects(found, verdict, is_wide)
+        if verdict in (AuditVerdict.WRONG_POSE, AuditVerdict.WRONG_POSE_AND_INTRINSICS):
+            partner = self._swapped_with(found)
             if partner:
-                return describe(look, Verdict.SWAPPED_IMAGE, other=partner)
+                return report(found, AuditVerdict.SWAPPED_IMAGE, other=partner)
+        is_same_photograph = twin.likeness is Likeness.SAME_PHOTOGRAPH
         if verdict.is_alarm:
-            return describe(look, verdict, other=twin[0] if twin[1] is Likeness.SAME_PHOTOGRAPH else "")
-        if verdict is Verdict.CONSISTENT and look.verdict().is_alarm:
-            # It is off by too much, and so are its neighbours: nobody can tell who is right.
-            return describe(look, Verdict.UNVERIFIABLE)
-        change = None if blamed else self._change(look, verdict)
+            return report(found, verdict, other=twin.name if is_same_photograph else "")
+        if verdict is AuditVerdict.CONSISTENT and found.verdict().is_alarm:
+            # It is off by too much, and so are its neighbours: which of them is wrong is not decidable.
+            return report(found, AuditVerdict.UNVERIFIABLE)
+        change = None if contradicted else self._find_change(found, verdict)
         if change is not None and change.is_alarm:
-            return describe(look, Verdict.SCENE_CHANGED, change=change)
-        if verdict is Verdict.UNVERIFIABLE:
-            return describe(look, verdict, other=blamed)
-        if twin[0]:
-            return describe(
-                look, Verdict.DUPLICATE, other=twin[0], same=twin[1] is Likeness.SAME_PHOTOGRAPH, change=change
-            )
-        return describe(look, Verdict.CONSISTENT, change=change)
+            return report(found, AuditVerdict.SCENE_CHANGED, change=change)
+        if verdict is AuditVerdict.UNVERIFIABLE:
+            return report(found, verdict, other=contradicted)
+        if twin.name:
+            return report(found, AuditVerdict.DUPLICATE, twin.name, is_same_photograph, change)
+        return report(found, AuditVerdict.CONSISTENT, change=change)
 
-    def _first_look(self, name: str) -> tuple[Look, tuple[str, Likeness]]:
-        """From the neighbours by pose, and the reference most like it among them; the last few are remembered."""
-        if name not in self._looks:
-            self._looks[name] = self._look(name, self._around.near(name, self._options.candidate_count))
-            while len(self._looks) > _WHOLE_LOOKS:
-                self._looks.popitem(last=False)
-        self._looks.move_to_end(name)
-        return self._looks[name]
+    def _first_comparison(self, name: str) -> tuple[Comparison, _Twin]:
+        """With the neighbours by pose; cached."""
+        cached = self._comparisons.get(name)
+        if cached is None:
+            cached = self._compare(name, self._finder.near(name, self._options.candidate_count))
+            self._comparisons.put(name, cached)
+        return cached
 
     def _finding(self, name: str) -> _Finding:
-        """What the first look found; remembered."""
-        if name not in self._findings:
-            self._findings[name] = _Finding.of(self._first_look(name)[0])
-            while len(self._findings) > self._remembered_findings:
-                self._findings.popitem(last=False)
-        self._findings.move_to_end(name)
-        return self._findings[name]
+        """Of the first comparison; cached."""
+        finding = self._findings.get(name)
+        if finding is None:
+            finding = _Finding.of(self._first_comparison(name)[0])
+            self._findings.put(name, finding)
+        return finding
 
-    def _wide_look(self, name: str, twin: tuple[str, Likeness]) -> tuple[Look, tuple[str, Likeness]]:
-        """From those that look like it."""
-        look, wide_twin = self._look(name, self._around.alike(name, self._options.wide_count))
-        return look, max(twin, wide_twin, key=lambda t: t[1].value)
-
-    def _look(self, name: str, candidates: Sequence[str]) -> tuple[Look, tuple[str, Likeness]]:
-        """From the candidates that share the most matches.
-
-        Copies of the same photograph bear no witness: what is wrong with one is wrong with the other.
-        """
+    def _compare(self, name: str, candidates: Sequence[str]) -> tuple[Comparison, _Twin]:
+        """With the candidates that share the most matches, except copies of the photograph, which share its errors."""
         self._check()
-        subject, twin = self._around.view(name), ("", Likeness.DIFFERENT)
+        subject, twin = self._finder.view(name), _Twin()
         counts: dict[str, int] = {}
-        for other in self._around.views(candidates):
+        for other in self._finder.views(candidates):
             matches = self._pairs.match(subject, other)
             alike = likeness(subject, other, matches, self._options)
-            twin = max(twin, (other.name, alike), key=lambda t: t[1].value)
+            twin = max(twin, _Twin(other.name, alike), key=lambda it: it.likeness.value)
             if alike is not Likeness.SAME_PHOTOGRAPH:
                 counts[other.name] = len(matches)
         chosen = sorted(counts, key=lambda n: -counts[n])[: self._options.neighbour_count]
-        return look_at(subject, self._around.views(chosen), self._pairs, self._options), twin
+        return compare(subject, self._finder.views(chosen), self._pairs, self._options), twin
 
-    def _judge(self, look: Look) -> Verdict:
-        """The verdict on a look, with the allowance for noise that its neighbours need where they agree on it."""
-        verdict = look.verdict()
+    def _judge(self, found: Comparison) -> AuditVerdict:
+        """The verdict of a comparison, tolerating the median offset of the neighbours."""
+        verdict = found.verdict()
         if not verdict.is_alarm:
             return verdict
-        findings = [self._finding(reference.name) for reference in look.neighbourhood.references]
+        findings = [self._finding(reference.name) for reference in found.neighbourhood.references]
         usable = [other for other in findings if other.is_usable]
         if not usable:
             return verdict
         noise_m = float(np.median([other.offset_m for other in usable]))
         noise_deg = float(np.median([other.turn_deg for other in usable]))
-        return look.verdict(noise_m, noise_deg)
+        return found.verdict(noise_m, noise_deg)
 
-    def _without_suspects(self, look: Look, verdict: Verdict, is_wide: bool) -> tuple[Look, Verdict, str]:
-        """Look and verdict without neighbours that look faulty; and the worst of them, if too few others are left."""
-        names = [reference.name for reference in look.neighbourhood.references]
+    def _without_suspects(
+        self, found: Comparison, verdict: AuditVerdict, is_wide: bool
+    ) -> tuple[Comparison, AuditVerdict, str]:
+        """Comparison and verdict without neighbours that seem wrong; and the worst of these, if too few are left."""
+        names = [reference.name for reference in found.neighbourhood.references]
         suspects = [name for name in names if self._finding(name).is_alarm]
         if not suspects:
-            return look, verdict, ""
+            return found, verdict, ""
         rest = [name for name in names if name not in suspects]
         if not is_wide:
-            wider = self._around.near(look.subject.name, 2 * self._options.candidate_count)
-            spare = [view.name for view in self._around.views([n for n in wider if n not in names])]
+            wider = self._finder.near(found.subject.name, 2 * self._options.candidate_count)
+            spare = [view.name for view in self._finder.views([n for n in wider if n not in names])]
             rest += [n for n in spare if not self._finding(n).is_alarm]
-        second, _ = self._look(look.subject.name, rest)
+        second, _ = self._compare(found.subject.name, rest)
         if second.is_usable:
             return second, self._judge(second), ""
-        worse = max(suspects, key=lambda n: self._finding(n).excess)
-        if self._finding(worse).excess < look.excess(Freedom.NOTHING):
-            return look, verdict, ""
-        return second, Verdict.UNVERIFIABLE, worse
+        worst = max(suspects, key=lambda n: self._finding(n).excess)
+        if self._finding(worst).excess < found.excess(Free.NOTHING):
+            return found, verdict, ""
+        return second, AuditVerdict.UNVERIFIABLE, worst
 
-    def _swapped_with(self, look: Look) -> str:
+    def _swapped_with(self, found: Comparison) -> str:
         """The reference at whose pose the photograph was taken, if that one's was taken here; empty if none is."""
-        for name in self._around.near_pose(look.world_from_camera, 4, look.subject.name):
-            apart_m, apart_deg = pose_difference(look.world_from_camera, self._around.pose(name))
-            options, sigma = self._options, self._options.significance_sigma
-            reach_m = options.swap_reach * max(options.position_tolerance_m, sigma * look.largest_sigma_m)
-            reach_deg = options.swap_reach * max(options.rotation_tolerance_deg, sigma * look.sigma_deg)
+        options, sigma = self._options, self._options.significance_sigma
+        reach_m = options.swap_reach * max(options.position_tolerance_m, sigma * found.largest_sigma_m)
+        reach_deg = options.swap_reach * max(options.rotation_tolerance_deg, sigma * found.sigma_deg)
+        for name in self._finder.near_pose(found.world_from_camera, 4, found.subject.name):
+            apart_m, apart_deg = pose_difference(found.world_from_camera, self._finder.pose(name))
             if apart_m > reach_m or apart_deg > reach_deg:
                 continue
-            for partner in self._around.views([name]):
-                if self._fits(look.subject, partner) and self._fits(partner, look.subject):
+            for partner in self._finder.views([name]):
+                if self._fits(found.subject, partner) and self._fits(partner, found.subject):
                     return name
         return ""
 
     def _fits(self, photographed: PosedView, posed: PosedView) -> bool:
-        """Whether the one reference's photograph fits the other's pose, by the neighbours of that pose."""
-        names = self._around.near(posed.name, self._options.candidate_count)
-        others = [view for view in self._around.views(names) if view.name != photographed.name]
+        """Whether one reference's photograph fits another's pose, by the neighbours of that pose."""
+        names = self._finder.near(posed.name, self._options.candidate_count)
+        others = [view for view in self._finder.views(names) if view.name != photographed.name]
         others.sort(key=lambda other: -len(self._pairs.match(photographed, other)))
         moved = replace(photographed, world_from_camera=posed.world_from_camera)
-        look = look_at(moved, others[: self._options.neighbour_count], self._pairs, self._options)
-        return self._judge(look) is Verdict.CONSISTENT
+        found = compare(moved, others[: self._options.neighbour_count], self._pairs, self._options)
+        return self._judge(found) is AuditVerdict.CONSISTENT
 
-    def _change(self, look: Look, verdict: Verdict) -> Change | None:
-        """What of the image does not show what the neighbours show; None where that cannot be said."""
-        subject = look.subject
-        if verdict is Verdict.UNVERIFIABLE:
-            nearest = self._around.views(self._around.near(subject.name, self._options.neighbour_count))
-            look, options = look_at(subject, nearest, self._pairs, self._options), SAME_VIEWPOINT
-        else:
-            options = ChangeOptions()
-        change = changed_region(look, options)
+    def _find_change(self, found: Comparison, verdict: AuditVerdict) -> Change | None:
+        """Which part of the image does not show what the neighbours show; None where that cannot be decided."""
+        subject, options = found.subject, ChangeOptions()
+        if verdict is AuditVerdict.UNVERIFIABLE:
+            nearest = self._finder.views(self._finder.near(subject.name, self._options.neighbour_count))
+            found, options = compare(subject, nearest, self._pairs, self._options), SAME_VIEWPOINT
+        change = find_change(found, options)
         if change is None or not change.is_alarm:
             return change
-        # Points of neighbours whose poses are wrong lie where nothing is.
-        honest = [r for r in look.neighbourhood.references if not self._finding(r.name).is_alarm]
-        if len(honest) == len(look.neighbourhood.references):
+        # Points of neighbours with wrong poses are in wrong places.
+        references = found.neighbourhood.references
+        trusted = [reference for reference in references if not self._finding(reference.name).is_alarm]
+        if len(trusted) == len(references):
             return change
-        return changed_region(look_at(subject, honest, self._pairs, self._options), options)
+        return find_change(compare(subject, trusted, self._pairs, self._options), options)

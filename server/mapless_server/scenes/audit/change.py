@@ -1,8 +1,8 @@
-"""What of an image does not show what the neighbours show there: things that moved, or a photograph of elsewhere.
+"""Changes of a scene: regions of an image that do not show what the neighbours show there.
 
-Every known point that should be seen is looked for near its projection. In an unchanged image a good share of them is
-found everywhere; where hardly any is found in a large connected region, the region shows something else. Something that
-stands in front looks the same, so only a large region is called a change.
+Every point that should be visible is searched near its projection. In an unchanged image a good share of them is found
+everywhere; where hardly any is found in a large connected region, the region shows something else. An occlusion looks
+the same, so only a large region is called a change.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mapless_server.method.options import check_bounds
 from mapless_server.method.results import PointMatches
 from mapless_server.method.views import PosedView
 
-from .look import Look
+from .comparison import Comparison
 from .neighbourhood import Neighbourhood
 from .visibility import VisibilityOptions, Visible, visible_points
 
@@ -31,15 +31,15 @@ class ChangeOptions:
 
     Attributes:
         columns, rows: of the grid.
-        max_turn_deg, max_scale: points are expected only where they are seen much as a neighbour sees them.
-        radius_px: a point is found when a similar keypoint is this near to its projection.
+        max_turn_deg, max_scale: points are expected only where they are seen about as a neighbour sees them.
+        radius_px: a point is found if a similar keypoint is this near to its projection.
         min_similarity: smallest cosine of their descriptors.
-        missing_share: a cell misses its points when fewer than this share of the usual share of them is found.
-        max_chance: and when chance would do that in fewer than so many cells.
-        min_points: fewer expected points in the whole image are no ground for a judgement.
-        alarm_share: a connected region that misses its points and is so large a share of the judged image is an alarm.
-            Of 149 unaltered photographs the worst had 0.20, and 0.33 when its best neighbour was faulty; of 12
-            with 60 % of the image replaced 5 are found, the others are told with their share or as unverifiable.
+        missing_share: a cell has changed if fewer than this share of the usual share of its points is found,
+        max_chance: and if the probability of that by chance is smaller than this.
+        min_points: with fewer expected points in the whole image nothing is decided.
+        alarm_share: a connected region of changed cells with at least this share of the judged image is an alarm. Of
+            149 unaltered photographs the worst had 0.20, and 0.33 when its best neighbour was faulty; of 12 with 60 %
+            of the image replaced 5 are found, the others reported with their share or as unverifiable.
     """
 
     columns: int = 8
@@ -59,23 +59,23 @@ class ChangeOptions:
 
 
 SAME_VIEWPOINT = ChangeOptions(max_turn_deg=8.0, max_scale=1.25)
-"""For a photograph that nothing explains. With a wall between it and its neighbours it would show nothing of theirs and
-be right, so it must stand where they stand: whatever is in its way is in theirs."""
+"""For a photograph that no pose fits. A wall between it and its neighbours would hide everything they see, so only
+neighbours at its own viewpoint count, which the wall would hide, too."""
 
 _LEAST_OBSERVERS = 3
-"""So many references must see what a photograph should show; one alone may be the one that changed."""
+"""References that must see what a photograph should show: a single one may itself have changed."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """What was found.
+    """The comparison of an image with its neighbours' points.
 
     Attributes:
         expected_count: points that the image should show.
-        found_count: those it does show.
+        found_count: those it shows.
         judged_share: share of the image's cells with enough expected points to judge.
-        changed_share: share of the judged cells that lie in the largest connected region that misses its points.
-        is_alarm: whether that is a change.
+        changed_share: share of the judged cells that are in the largest connected region of changed cells.
+        is_alarm: whether that is a change of the scene.
     """
 
     expected_count: int
@@ -85,23 +85,23 @@ class Change:
     is_alarm: bool
 
 
-def changed_region(look: Look, options: ChangeOptions | None = None) -> Change | None:
+def find_change(comparison: Comparison, options: ChangeOptions | None = None) -> Change | None:
     """Compares a photograph with its neighbours' points; None with too few of them.
 
-    At the pose that explains its matches, so that what the given one is off within its tolerance does not count; at the
-    given one when nothing explains them.
+    Uses the fitted pose, so that an error of the given one within the tolerance does not matter, or the given one if no
+    pose fits.
     """
     options = options or ChangeOptions()
-    if len(look.neighbourhood.structure.x_in_world) < options.min_points:
+    neighbourhood, subject = comparison.neighbourhood, comparison.subject
+    if len(neighbourhood.structure.x_in_world) < options.min_points:
         return None
-    subject = look.subject
-    if look.is_usable:
-        subject = replace(subject, world_from_camera=look.world_from_camera)
+    if comparison.is_usable:
+        subject = replace(subject, world_from_camera=comparison.world_from_camera)
     bounds = VisibilityOptions(options.max_turn_deg, options.max_scale)
-    visible = visible_points(subject.view.camera, subject.world_from_camera, look.neighbourhood, bounds)
+    visible = visible_points(subject.view.camera, subject.world_from_camera, neighbourhood, bounds)
     if len(visible) < options.min_points or len(np.unique(visible.reference)) < _LEAST_OBSERVERS:
         return None
-    found = _found(subject, look.neighbourhood, visible, options)
+    found = _found(subject, neighbourhood, visible, options)
     camera = subject.view.camera
     cell = np.floor((visible.pixel + 0.5) / (camera.width_px, camera.height_px) * (options.columns, options.rows))
     index = (cell[:, 1] * options.columns + cell[:, 0]).astype(np.intp)
@@ -122,17 +122,17 @@ def changed_region(look: Look, options: ChangeOptions | None = None) -> Change |
 def _missing(
     expected: NDArray[np.intp], found: Array, options: ChangeOptions
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which cells miss their points, and which have enough of them to say so."""
+    """Which cells have changed, and which have enough points to be judged."""
     usual = _usual_share(expected, found)
     limit = options.missing_share * usual
-    # A cell can be judged when finding nothing at all would be no chance.
+    # A cell can be judged if finding none of its points would be unlikely by chance.
     judged = bdtr(0, expected, usual) < options.max_chance
     unlikely = bdtr(found, expected, usual) < options.max_chance
     return judged & unlikely & (found <= limit * expected), judged
 
 
 def _usual_share(expected: NDArray[np.intp], found: Array) -> float:
-    """Share of expected points that is found in the better half of the cells; at least what unchanged scenes have."""
+    """Share of expected points that are found in the best quarter of the cells; at least that of unchanged scenes."""
     known = expected >= 5
     if not known.any():
         return _LEAST_SHARE
@@ -141,13 +141,13 @@ def _usual_share(expected: NDArray[np.intp], found: Array) -> float:
 
 
 _LEAST_SHARE = 0.15
-"""An unchanged photograph shows at least so many of the points that it should show."""
+"""An unchanged photograph shows at least this share of the points that it should show."""
 
 
 def _found(
     subject: PosedView, neighbourhood: Neighbourhood, visible: Visible, options: ChangeOptions
 ) -> NDArray[np.bool_]:
-    """Which visible points (V,) have a similar keypoint near by."""
+    """Which visible points (V,) have a similar keypoint nearby."""
     nothing = np.empty(0, np.intp)
     known = PointMatches(nothing, nothing, np.empty(0, bool), options.radius_px)
     match_options = MatchOptions(radius_px=options.radius_px, min_similarity=options.min_similarity)

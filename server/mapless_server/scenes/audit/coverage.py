@@ -1,11 +1,10 @@
-"""Would a camera be localized here, looking there? Foretold from the references alone, without a photograph.
+"""Coverage: whether a photograph taken at a pose would be localized, predicted from the references alone.
 
-The references near the pose triangulate what they match among themselves. Each of these points that lies in the
-camera's image is found again with a probability that falls with the angle from which it is seen and with the change in
-scale; their sum is the number of matches to expect, and what they say about the pose is the accuracy to expect.
+The references near the pose triangulate their matches. Each of these points that lies in the camera's image is matched
+with a probability that decreases with the angle from which it is seen and with the change in scale. The sum is the
+expected number of matches; their information about the pose gives the expected accuracy.
 
-Nothing is known of what stands in the way, of the light, or of how a photograph will be blurred: the forecast is for a
-good photograph, taken in the open.
+Occlusion, light and blur are not known: the prediction is for a good photograph without occlusion.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from mapless_server.method.structure import StructureOptions
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_server.method.uncertainty.perturbation import motion_jacobian, world_covariance
 
+from .finder import ReferenceFinder
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood
-from .surroundings import Surroundings
 from .visibility import VisibilityOptions, Visible, visible_points
 
 
@@ -36,25 +35,26 @@ class CoverageVerdict(str, Enum):
 
 @dataclass(frozen=True)
 class CoverageOptions:
-    """Options of the forecast; the repeatability was measured with SIFT on kitchen, office, fountain and church.
+    """Options of the prediction; the repeatability was measured with SIFT on kitchen, office, fountain and church.
 
     Attributes:
-        neighbour_count: references that are asked, nearest by position and heading; as many as a query has.
+        neighbour_count: references that are used, nearest by position and heading; as many as a query has.
         epipolar_px: as for matching references.
         repeatability: share of the points that are matched when seen from the same direction and distance; with the two
             below it follows what was found of 60,000 points at less than 15 degrees and 15,000 beyond.
-        turn_deg: angle between the rays at which the share has fallen to 1/e: it is 0.45 up to 15, 0.22 at 25, 0.1 at
-            35.
+        turn_deg: angle between the rays at which the share has decreased to 1/e: it is 0.45 up to 15, 0.22 at 25, 0.1
+            at 35.
         log_scale: logarithm of the ratio of scales at which it has: a ratio of 1.35 costs half.
-        sigma_px: of a match, each coordinate, with what references' poses add.
-        error_inflation: on standard deviations: errors of neighbouring keypoints and of one reference's points go
-            together. On scenes with known poses true errors were 1.5 to 2.8 times what independent ones would be.
+        sigma_px: of a match, each coordinate, including errors of the references' poses.
+        error_inflation: factor on standard deviations, because errors of neighbouring keypoints and of one reference's
+            points are correlated. On scenes with known poses true errors were 1.5 to 2.8 times those of independent
+            ones.
         enough_matches: with so many expected a photograph is localized: 130 of 140 real ones were, the others blurred
-            or with something in the way.
+            or occluded.
         least_matches: with fewer it is not: 31 of 35 were not.
-        enough_image_share, max_radius_m: a pose that rests on less of the image, or that is less certain, is doubtful.
+        enough_image_share, max_radius_m: a pose from a smaller share of the image, or less accurate, is doubtful.
         columns, rows: of the grid that the image is divided into.
-        visibility: beyond these bounds nothing is matched.
+        visibility: bounds beyond which nothing is matched.
     """
 
     neighbour_count: int = 10
@@ -74,22 +74,22 @@ class CoverageOptions:
 
     def __post_init__(self) -> None:
         check_bounds(self, "turn_deg log_scale sigma_px error_inflation max_radius_m columns rows epipolar_px", above=0)
-        check_bounds(self, "neighbour_count", above=1)
+        check_bounds(self, "neighbour_count", at_least=2)
         check_bounds(self, "repeatability enough_image_share", above=0, at_most=1)
         check_bounds(self, "least_matches", above=0, at_most=self.enough_matches)
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """The forecast for one pose.
+    """The prediction for one pose.
 
     Attributes:
         verdict: see there.
-        message: the same for people, with the numbers.
+        message: the verdict as a sentence, with the numbers.
         expected_match_count: matches that agree with the pose.
         image_share: share of the image's cells in which at least one is expected.
-        position_68_m: position error not to be exceeded in 68 % of cases; None where there is no pose to expect.
-        references: names of those that would serve, those that see most first.
+        position_68_m: position error that is not exceeded in 68 % of cases; None where no pose is expected.
+        references: names of those that would be used, those with the most matches first.
     """
 
     verdict: CoverageVerdict
@@ -103,7 +103,7 @@ class Coverage:
 def check_coverage(
     camera: Camera,
     world_from_camera: RigidTransform,
-    surroundings: Surroundings,
+    finder: ReferenceFinder,
     pairs: PairMatches,
     options: CoverageOptions | None = None,
 ) -> Coverage:
@@ -111,31 +111,24 @@ def check_coverage(
 
     Args:
         camera: of the processed image, no distortion.
-        world_from_camera: where it would stand and look, metric.
-        surroundings: the references.
-        pairs: remembers matches between calls.
+        world_from_camera: its pose, metric.
+        finder: of the scene's references.
+        pairs: caches matches between calls.
         options: see there.
     """
     options = options or CoverageOptions()
-    world_from_camera = world_from_camera.shifted(-surroundings.origin)
-    names = surroundings.near_pose(world_from_camera, options.neighbour_count)
-    references = surroundings.views(names)
+    world_from_camera = world_from_camera.shifted(-finder.origin)
+    names = finder.near_pose(world_from_camera, options.neighbour_count)
+    references = finder.views(names)
     if len(references) < 2:
         message = f"{len(references)} references, at least 2 are needed"
         return Coverage(CoverageVerdict.NOT_LOCALIZABLE, message, 0, 0.0, None, ())
     neighbourhood = build_neighbourhood(references, pairs, options.epipolar_px, StructureOptions())
-    return forecast(camera, world_from_camera, neighbourhood, options)
-
-
-def forecast(
-    camera: Camera, world_from_camera: RigidTransform, neighbourhood: Neighbourhood, options: CoverageOptions
-) -> Coverage:
-    """The same from points that are known already."""
     if not len(neighbourhood.structure.x_in_world):
         message = f"not localizable: {len(neighbourhood.references)} references near by share no points"
         return Coverage(CoverageVerdict.NOT_LOCALIZABLE, message, 0, 0.0, None, ())
     visible = visible_points(camera, world_from_camera, neighbourhood, options.visibility)
-    found = probability(visible, options)
+    found = _probability(visible, options)
     expected = float(found.sum())
     share = _image_share(camera, visible, found, options)
     radius_m = _radius_m(camera, world_from_camera, neighbourhood, visible, found, options)
@@ -146,7 +139,7 @@ def forecast(
     return Coverage(verdict, message, round(expected), share, radius_m, tuple(names))
 
 
-def probability(visible: Visible, options: CoverageOptions) -> Array:
+def _probability(visible: Visible, options: CoverageOptions) -> Array:
     """Probability (V,) that each visible point is matched."""
     by_turn = np.exp(-((visible.turn_deg / options.turn_deg) ** 2))
     return np.asarray(options.repeatability * by_turn * np.exp(-np.log(visible.scale) / options.log_scale))
@@ -183,7 +176,7 @@ def _radius_m(
     found: Array,
     options: CoverageOptions,
 ) -> float | None:
-    """Radius that the position error does not exceed in 68 % of cases, each point counted by its probability."""
+    """Radius that the position error does not exceed in 68 % of cases; points are weighted by their probability."""
     if found.sum() < options.least_matches:
         return None
     camera_from_world = world_from_camera.inverse()

@@ -12,21 +12,22 @@ from .options import AuditOptions
 
 
 class Likeness(Enum):
-    """How alike two references are; the more the greater."""
+    """How alike two references are; greater values are more alike."""
 
     DIFFERENT = 0
     SAME_VIEW = 1
-    """Taken from one place in one direction: between them there is no parallax to speak of."""
+    """Taken from one place in one direction, without parallax between them."""
     SAME_PHOTOGRAPH = 2
-    """One photograph, perhaps compressed again."""
+    """One photograph, perhaps recompressed."""
 
 
 def likeness(first: PosedView, second: PosedView, matches: Matches, options: AuditOptions) -> Likeness:
-    """Compares where two photographs show the same things, whatever their poses.
+    """Compares the image positions of two photographs' matches, whatever their poses.
 
-    Photographs of different sizes differ: they are compared in the pixels that features were found in.
+    Photographs of different sizes differ: positions are compared in the pixels that features were found in.
     """
-    if _is_same_file(first, second):
+    photographs = first.view.photograph, second.view.photograph
+    if photographs[0] is not None and photographs[1] is not None and photographs[0].sha256 == photographs[1].sha256:
         return Likeness.SAME_PHOTOGRAPH
     cameras = first.view.camera, second.view.camera
     if (cameras[0].width_px, cameras[0].height_px) != (cameras[1].width_px, cameras[1].height_px):
@@ -40,10 +41,3 @@ def likeness(first: PosedView, second: PosedView, matches: Matches, options: Aud
         return Likeness.SAME_PHOTOGRAPH
     is_near = shift_px < options.same_view_share * cameras[0].width_px
     return Likeness.SAME_VIEW if is_near and matched_share >= options.same_view_matched_share else Likeness.DIFFERENT
-
-
-def _is_same_file(first: PosedView, second: PosedView) -> bool:
-    photographs = first.view.photograph, second.view.photograph
-    if photographs[0] is None or photographs[1] is None:
-        return False
-    return photographs[0].sha256 == photographs[1].sha256

@@ -1,17 +1,14 @@
-"""What a reference's neighbours know of the place: points, from their own poses alone.
+"""The neighbourhood of a reference: points that its neighbours triangulate among themselves.
 
-The reference that is examined takes no part, so whatever is wrong with it cannot bend the points that it is judged by.
-A neighbour that is wrong itself loses its matches to the epipolar check or its points to the residuals, as long as the
-others are more.
+The audited reference takes no part, so its errors cannot affect the points by which it is judged. A neighbour that is
+wrong itself loses its matches in the epipolar check or its points by their residuals, as long as most are right.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from threading import Lock
 
 import numpy as np
 
@@ -24,41 +21,37 @@ from mapless_server.method.results import Structure
 from mapless_server.method.structure import StructureOptions, observe, refine_points
 from mapless_server.method.tracks import Tracks, build_tracks
 from mapless_server.method.views import Matches, PosedView
+from mapless_server.store import LruCache
 
 from .resection import ObservedPoints
 
 
 class PairMatches:
-    """Matches of pairs of photographs by descriptors alone, whatever their poses; remembers. Safe from many threads.
+    """Matches of pairs of photographs by descriptors alone, cached; thread-safe.
 
-    `method.correspond.Matcher` remembers matches that satisfy the given poses, which are what is in question here.
+    `method.correspond.Matcher` caches matches that agree with the given poses, which are what is audited here.
     """
 
-    def __init__(self, ratio: float = 0.9, remembered_pairs: int = 20_000) -> None:
-        self._ratio, self._remembered_pairs = ratio, remembered_pairs
-        self._remembered: OrderedDict[tuple[str, str], Matches] = OrderedDict()
-        self._lock = Lock()
+    def __init__(self, ratio: float = 0.9, cached_pairs: int = 20_000) -> None:
+        """`ratio` is that of the features, see `CorrespondOptions`."""
+        self._ratio = ratio
+        self._cache: LruCache[Matches] = LruCache(cached_pairs)
 
     def match(self, first: PosedView, second: PosedView) -> Matches:
         """Matches (M, 2): keypoints of the first and of the second."""
         if first.key > second.key:
             return np.ascontiguousarray(self.match(second, first)[:, ::-1])
         key = first.key, second.key
-        with self._lock:
-            if key in self._remembered:
-                self._remembered.move_to_end(key)
-                return self._remembered[key]
-        matches = mutual_matches(first.view.features, second.view.features, self._ratio)
-        with self._lock:
-            self._remembered[key] = matches
-            while len(self._remembered) > self._remembered_pairs:
-                self._remembered.popitem(last=False)
+        matches = self._cache.get(key)
+        if matches is None:
+            matches = mutual_matches(first.view.features, second.view.features, self._ratio)
+            self._cache.put(key, matches)
         return matches
 
 
 @dataclass(frozen=True, eq=False)
 class Neighbourhood:
-    """Points that neighbours see.
+    """Points that neighbours triangulate.
 
     Attributes:
         references: the neighbours.
@@ -74,7 +67,7 @@ class Neighbourhood:
 def build_neighbourhood(
     references: Sequence[PosedView], pairs: PairMatches, epipolar_px: float, options: StructureOptions
 ) -> Neighbourhood:
-    """Triangulates what the references match among themselves; possibly nothing."""
+    """Triangulates the matches among the references; there may be none."""
     if len(references) < 2:
         nothing = np.empty(0, np.intp)
         structure = Structure(np.empty((0, 3)), Tracks(nothing, nothing, nothing), options.first_noise)
@@ -95,8 +88,8 @@ def build_neighbourhood(
     return Neighbourhood(tuple(references), structure, covariance[trusted])
 
 
-def sight(subject: PosedView, neighbourhood: Neighbourhood, pairs: PairMatches) -> ObservedPoints:
-    """The neighbourhood's points that the subject's photograph shows, by descriptors alone."""
+def match_points(subject: PosedView, neighbourhood: Neighbourhood, pairs: PairMatches) -> ObservedPoints:
+    """The neighbourhood's points that are matched in the subject's photograph, by descriptors alone."""
     if not len(neighbourhood.structure.x_in_world):
         return ObservedPoints(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0))
     matches = tuple(pairs.match(subject, reference) for reference in neighbourhood.references)

@@ -12,7 +12,7 @@ from .resection import ResectionOptions
 
 @dataclass(frozen=True)
 class AuditOptions:
-    """Options of an audit; figures are of six real scenes with 8 to 60 references, unaltered and with planted faults.
+    """Options of an audit; measured on six real scenes with 8 to 60 references, unaltered and with planted faults.
 
     Attributes:
         position_tolerance_m: smaller offsets are no fault. Of unaltered kitchen, fountain, church and office references
@@ -21,22 +21,22 @@ class AuditOptions:
         focal_tolerance: the same as a share: 0.007, and faults of 0.05 are found to be 0.045 to 0.055.
         significance_sigma: an offset must also be so many standard deviations, its own (from the matches, doubled as in
             the method's final adjustment) along its direction.
-        neighbour_noise: and so many times what its neighbours are off in the median: where all poses of a place are off
-            by 10 cm, as at one end of a drive with GPS poses, one more is not the one to blame.
+        neighbour_noise: and so many times the median offset of its neighbours: where all poses are off by 10 cm, as at
+            one end of a drive with GPS poses, no single one is at fault.
         candidate_count: nearest references by position and heading that are matched.
-        neighbour_count: of these, how many with the most matches are used. Points need two, blame needs more.
+        neighbour_count: of these, how many with the most matches are used. Points need two, a verdict needs more.
         wide_count: references that are matched when the nearest by pose do not show what the photograph shows.
         epipolar_px: as for matching references.
-        min_inliers: fewer are no ground for a judgement. Repeated texture has fooled up to 23.
-        max_log10_false_alarms: as of the pose solver, with a reserve: an audit makes thousands of judgements.
-        swap_reach: a reference so many tolerances from where a photograph was taken may be its partner in a swap, since
-            that was found from neighbours of the wrong place. Whether it is, is then looked at from the right ones.
-        both_excess: robust cost per match that a changed pose or focal length alone must leave unexplained for both to
-            be blamed. One true cause leaves up to 0.75, two leave 4.
-        same_photograph_px: keypoints of the same photograph, recompressed, are closer than this in the median.
-        same_photograph_share: and so large a share of them match.
-        same_view_share: of the image's width: keypoints of views this near in the median add nothing to one another.
-        same_view_matched_share: and so large a share of them match.
+        min_inliers: with fewer there is no verdict. Repeated texture has given up to 23 wrong ones.
+        max_log10_false_alarms: as of the pose solver, with a reserve: an audit makes thousands of decisions.
+        swap_reach: a reference within so many tolerances of where a photograph was taken may be its partner in a swap.
+            So many, because that pose was fitted to neighbours of the wrong place.
+        both_excess: robust cost per match that a changed pose or focal length alone must leave for both to be wrong.
+            One true cause leaves up to 0.75, two leave 4.
+        same_photograph_px: median shift of the keypoints of one photograph, recompressed, is smaller.
+        same_photograph_share: and the share of them that match is larger.
+        same_view_share: median shift of the keypoints of equivalent views is smaller, as a share of the image's width,
+        same_view_matched_share: and the share of them that match is larger.
         structure: of the neighbours' points.
         resection: of the reference's fits.
     """
@@ -63,8 +63,8 @@ class AuditOptions:
 
     def __post_init__(self) -> None:
         check_bounds(self, "position_tolerance_m rotation_tolerance_deg focal_tolerance epipolar_px", above=0)
-        check_bounds(self, "candidate_count wide_count", above=0)
-        check_bounds(self, "neighbour_count", above=1)
-        check_bounds(self, "min_inliers", above=7)
         check_bounds(self, "significance_sigma neighbour_noise swap_reach both_excess same_photograph_px", above=0)
+        check_bounds(self, "candidate_count wide_count", at_least=1)
+        check_bounds(self, "neighbour_count", at_least=2)
+        check_bounds(self, "min_inliers", at_least=8)
         check_bounds(self, "same_photograph_share same_view_share same_view_matched_share", above=0, at_most=1)

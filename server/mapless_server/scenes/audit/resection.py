@@ -1,9 +1,9 @@
-"""Where a photograph was taken and with what focal length, from points that it shows: four explanations to compare.
+"""Camera pose and focal length from known points in a photograph: four fits to compare.
 
-Points known from other references, seen in this one, are explained by the given pose and focal length; or by another
-pose; or by another focal length; or by another of both. Each explanation is a robust fit (see `method.resection`). A
-match's sigma has two parts, the keypoint's own and what the point's uncertainty looks like in this image: where few
-references triangulate a point, it is uncertain along their rays.
+Points known from other references are matched in this one. They are fitted with the given pose and focal length, with
+another pose, with another focal length, and with both changed. Each is a robust fit (see `method.resection`). The
+sigma of a match has two parts: the keypoint's own, and the projection of the point's covariance into this image, since
+a point that few references triangulate is uncertain along their rays.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from mapless_server.method.options import check_bounds
 from mapless_server.method.resection import Resection
 
 _BEHIND_SIGMA = 1e3
-"""A point behind the camera counts as an error so large."""
+"""Residual of a point behind the camera."""
 
 
-class Freedom(Enum):
-    """What an explanation may change; the value says which of x y z rx ry rz focal."""
+class Free(Enum):
+    """What a fit may change; the value lists the indices into x y z rx ry rz focal."""
 
     NOTHING = ()
     POSE = (0, 1, 2, 3, 4, 5)
@@ -38,10 +38,10 @@ class ResectionOptions:
     """Options of a fit.
 
     Attributes:
-        loss_scale_sigma: residual at which the loss turns; as of the method's own final adjustment, a little wider,
+        loss_scale_sigma: residual at which the loss flattens; a little wider than in the method's own final adjustment,
             because the neighbours' poses are not adjusted here.
-        iterations: at most so many Levenberg-Marquardt steps; from a pose that is off by metres it takes about 20.
-        min_decrease: stop when a step lowers the cost by a smaller share.
+        iterations: maximal number of Levenberg-Marquardt steps; from a pose that is off by metres it takes about 20.
+        min_decrease: stops when a step lowers the cost by a smaller share.
         inlier_sigma: largest residual of an inlier.
     """
 
@@ -56,10 +56,10 @@ class ResectionOptions:
 
 @dataclass(frozen=True, eq=False)
 class ObservedPoints:
-    """Points that a photograph shows.
+    """Known points matched in a photograph.
 
     Attributes:
-        pixel: (M, 2) where it shows them.
+        pixel: (M, 2) where they are in the image.
         x_in_world: (M, 3) metres.
         point_covariance: (M, 3, 3) of the points, square metres, world axes.
         keypoint_sigma_px: (M,) of each coordinate of the pixels.
@@ -75,14 +75,14 @@ class ObservedPoints:
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
-    """One fit.
+class CameraFit:
+    """A fitted camera.
 
     Attributes:
         camera: as given, but for the focal length where that was free.
         world_from_camera: as given, or as fitted.
         cost: the robust sum; infinite where a fit was impossible.
-        inliers: (M,) which matches it explains.
+        inliers: (M,) which matches agree with it.
         error_px: (M,) reprojection errors; NaN for points behind the camera.
         information: (7, 7) J^T W J of camera_from_world's left perturbation and the logarithm of the focal length.
     """
@@ -96,48 +96,43 @@ class Explanation:
 
     @property
     def inlier_count(self) -> int:
-        """How many matches it explains."""
+        """Number of matches that agree with it."""
         return int(self.inliers.sum())
 
 
-def explain(
-    observed: ObservedPoints,
-    camera: Camera,
-    starts: tuple[RigidTransform, ...],
-    freedom: Freedom,
-    options: ResectionOptions,
-) -> Explanation:
-    """The best fit of those begun at each start; where the pose is not free, the first start is the pose."""
-    candidates = [
-        _minimize(observed, camera, start, freedom, options) for start in (starts if 0 in freedom.value else starts[:1])
-    ]
-    return min(candidates, key=lambda candidate: candidate.cost)
+def fit_camera(
+    points: ObservedPoints, camera: Camera, starts: tuple[RigidTransform, ...], free: Free, options: ResectionOptions
+) -> CameraFit:
+    """The best of the fits from each start; where the pose is not free, the first start is the pose."""
+    if free in (Free.NOTHING, Free.FOCAL):
+        starts = starts[:1]
+    return min((_fit(points, camera, start, free, options) for start in starts), key=lambda fit: fit.cost)
 
 
-def _minimize(
-    observed: ObservedPoints, camera: Camera, start: RigidTransform, freedom: Freedom, options: ResectionOptions
-) -> Explanation:
+def _fit(
+    points: ObservedPoints, camera: Camera, start: RigidTransform, free: Free, options: ResectionOptions
+) -> CameraFit:
     camera_from_world, loss_scale = start.inverse(), options.loss_scale_sigma
-    sigma_px = _sigma_px(observed, camera, camera_from_world)
+    sigma_px = _sigma_px(points, camera, camera_from_world)
     problem = Resection(
         camera,
-        observed.x_in_world,
-        observed.pixel,
+        points.x_in_world,
+        points.pixel,
         sigma_px,
         loss_scale,
-        freedom.value,
+        free.value,
         behind_sigma=_BEHIND_SIGMA,
         shorten_all=False,
     )
-    iterations = options.iterations if freedom.value else 0
+    iterations = options.iterations if free.value else 0
     steps = MinimizeOptions(iterations, options.min_decrease, damping=1e-3)  # a start may be off by metres
     fit = minimize(problem, problem.at(camera_from_world), steps)
     fitted = with_focal(camera, math.exp(fit.log_ratio))
-    # Weighed by what points look like from where it ended, so that explanations from different starts can be compared.
-    problem = replace(problem, sigma_px=_sigma_px(observed, fitted, fit.camera_from_world))
+    # Weighted with the covariances as seen from the fitted pose, so that fits from different starts are comparable.
+    problem = replace(problem, sigma_px=_sigma_px(points, fitted, fit.camera_from_world))
     fit = problem.at(fit.camera_from_world, fit.log_ratio)
     length = np.linalg.norm(fit.residual, axis=1)
-    return Explanation(
+    return CameraFit(
         fitted,
         fit.camera_from_world.inverse(),
         problem.cost(fit),
@@ -148,17 +143,17 @@ def _minimize(
 
 
 def with_focal(camera: Camera, ratio: float) -> Camera:
-    """The camera with both focal lengths `ratio` times as long."""
+    """The camera with both focal lengths multiplied by `ratio`."""
     return replace(camera, focal_x_px=camera.focal_x_px * ratio, focal_y_px=camera.focal_y_px * ratio)
 
 
-def _sigma_px(observed: ObservedPoints, camera: Camera, camera_from_world: RigidTransform) -> Array:
-    """(M,) of each match's residual, the larger axis of the projected point's ellipse added to the keypoint's noise."""
-    x_in_camera = camera_from_world.apply(observed.x_in_world)
+def _sigma_px(points: ObservedPoints, camera: Camera, camera_from_world: RigidTransform) -> Array:
+    """(M,) of each match's residual: keypoint noise plus the larger axis of the projected point's ellipse."""
+    x_in_camera = camera_from_world.apply(points.x_in_world)
     focal = np.array([camera.focal_x_px, camera.focal_y_px])
     jacobian = normalize_jacobian(x_in_camera) * focal[:, None] @ camera_from_world.rotation
-    projected = jacobian @ observed.point_covariance @ np.swapaxes(jacobian, 1, 2)
+    projected = jacobian @ points.point_covariance @ np.swapaxes(jacobian, 1, 2)
     half_trace = (projected[:, 0, 0] + projected[:, 1, 1]) / 2
     half_difference = (projected[:, 0, 0] - projected[:, 1, 1]) / 2
     largest = half_trace + np.hypot(half_difference, projected[:, 0, 1])
-    return np.asarray(np.sqrt(observed.keypoint_sigma_px**2 + np.nan_to_num(largest)))
+    return np.asarray(np.sqrt(points.keypoint_sigma_px**2 + np.nan_to_num(largest)))

@@ -1,4 +1,4 @@
-"""What an audit says of a reference, in numbers and in one sentence."""
+"""The result of an audit: a verdict on each reference, with numbers and a sentence."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from enum import Enum
 
 
-class Verdict(str, Enum):
-    """What is the matter with a reference; the worst first."""
+class AuditVerdict(str, Enum):
+    """What is wrong with a reference; the worst first."""
 
     SWAPPED_IMAGE = "swapped_image"
-    """Its photograph was taken at another reference's pose, and that one's at its."""
+    """Its photograph was taken at another reference's pose, and vice versa."""
     WRONG_POSE = "wrong_pose"
     WRONG_INTRINSICS = "wrong_intrinsics"
     WRONG_POSE_AND_INTRINSICS = "wrong_pose_and_intrinsics"
@@ -19,49 +19,49 @@ class Verdict(str, Enum):
     DUPLICATE = "duplicate"
     """Nothing is wrong, but another reference is the same photograph, or the same view from the same place."""
     UNVERIFIABLE = "unverifiable"
-    """Too little is seen in common with other references to judge."""
+    """It has too little in common with other references to be judged."""
     CONSISTENT = "consistent"
 
     @property
     def is_alarm(self) -> bool:
-        """Whether somebody should act: the reference misleads whoever is localized with it."""
-        return self in ALARMS
+        """Whether the reference should be corrected, because it misleads queries that use it."""
+        return self in _ALARMS
 
 
-ALARMS = frozenset(
+_ALARMS = frozenset(
     {
-        Verdict.SWAPPED_IMAGE,
-        Verdict.WRONG_POSE,
-        Verdict.WRONG_INTRINSICS,
-        Verdict.WRONG_POSE_AND_INTRINSICS,
-        Verdict.SCENE_CHANGED,
+        AuditVerdict.SWAPPED_IMAGE,
+        AuditVerdict.WRONG_POSE,
+        AuditVerdict.WRONG_INTRINSICS,
+        AuditVerdict.WRONG_POSE_AND_INTRINSICS,
+        AuditVerdict.SCENE_CHANGED,
     }
 )
 
 
 @dataclass(frozen=True)
 class ReferenceAudit:
-    """What is known of one reference.
+    """The result for one reference.
 
     Attributes:
         reference: its name.
         verdict: see there.
-        message: the same for people, with the numbers.
+        message: the verdict as a sentence, with the numbers.
         neighbour_count: references that it was compared with.
         match_count: of its keypoints with points that these triangulate.
-        inlier_count: matches that agree with the best explanation.
-        error_px: median reprojection error of these inliers under the given pose and intrinsics, pixels of the
+        inlier_count: matches that agree with the best fit.
+        error_px: median reprojection error of these inliers with the given pose and intrinsics, pixels of the
             processed image; None without inliers.
-        position_offset_m: how far the pose that explains the matches is from the given one; None where not judged.
-        rotation_offset_deg: the same for its rotation.
+        position_offset_m: distance of the fitted pose from the given one; None where not judged.
+        rotation_offset_deg: the same for the rotation.
         position_sigma_m: standard deviation of the position offset, along it.
-        focal_ratio: focal length that explains the matches by the given one; 1 where the given one does.
+        focal_ratio: fitted by given focal length; 1 where the given one fits.
         changed_share: share of the image that does not show what it should; None where not judged.
         other: name of the partner of a swap or duplicate; empty if there is none.
     """
 
     reference: str
-    verdict: Verdict
+    verdict: AuditVerdict
     message: str
     neighbour_count: int = 0
     match_count: int = 0
@@ -73,8 +73,3 @@ class ReferenceAudit:
     focal_ratio: float | None = None
     changed_share: float | None = None
     other: str = ""
-
-    @property
-    def severity(self) -> tuple[int, float]:
-        """To sort by, the worst first."""
-        return list(Verdict).index(self.verdict), -(self.position_offset_m or 0.0)

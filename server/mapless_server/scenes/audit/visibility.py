@@ -1,9 +1,8 @@
-"""Which known points a camera should show: in its image, and seen much as a reference sees them.
+"""Which known points a camera should show: in its image, and seen about as a reference sees them.
 
-A local feature is found again when it is looked at from about the same direction and distance: SIFT survives a turn of
-the surface of some tens of degrees and, in a photograph of limited size, a factor of about two in scale. A point counts
-as seen when one of the references that observe it looks at it so. Nothing is known of what stands in between, so what
-is counted is an upper bound in rooms full of things.
+A local feature is matched when it is seen from about the same direction and distance: SIFT tolerates a turn of the
+surface of some tens of degrees and, in a photograph of limited size, a factor of about two in scale. A point counts as
+visible if this holds for one of the references that observe it. Occlusion is not known, so the count is an upper bound.
 """
 
 from __future__ import annotations
@@ -43,8 +42,8 @@ class Visible:
     Attributes:
         point: (V,) indices into the structure.
         pixel: (V, 2) where.
-        turn_deg: (V,) angle to the nearest of the viewing rays that it is known by.
-        scale: (V,) ratio of sizes to that reference's image, 1 or more.
+        turn_deg: (V,) angle to the viewing ray of the most similar observation.
+        scale: (V,) ratio of the point's sizes in that reference's image and here, 1 or more.
         reference: (V,) index of that reference.
     """
 
@@ -81,7 +80,7 @@ def visible_points(
 
     alike: NDArray[np.bool_] = inside[point] & (turn_deg < options.max_turn_deg) & (scale < options.max_scale)
     rows = np.flatnonzero(alike)
-    # Of a point's observations the one that is most alike, each step in scale worth its share of the angle.
+    # Of a point's observations the most similar one, weighing angle and scale by their bounds.
     unlikeness = turn_deg[rows] / options.max_turn_deg + np.log(scale[rows]) / np.log(options.max_scale)
     rows = rows[np.lexsort((unlikeness, point[rows]))]
     rows = rows[np.diff(point[rows], prepend=-1) != 0]

@@ -1,13 +1,11 @@
-"""Which references resemble a photograph: global descriptors, an index of a scene, and the ranking.
+"""Retrieval: which references resemble a photograph.
 
-descriptor   the seam: one vector a photograph, whose products are similarities
-vocabulary   what VLAD is made with: the shipped ones, and one that needs no data
-vlad         the descriptor that is made of the local features
-megaloc      the paper's descriptor, a network on the pixels
+descriptor   the interface of global descriptors: one vector per photograph, whose dot products are similarities
+vlad         the descriptor that is made of local features, with the vocabularies in `vocabulary`
+megaloc      the paper's descriptor, a network on the pixels; needs torch
 index        a scene's descriptors and poses in memory
-narrowing    what is known of where the camera is and looks
-ranking      the order: similarity, thinned, narrowed
-learn        how the shipped vocabularies were made; a program
+narrowing    limits and likely values of the camera's pose
+ranking      the selection: by similarity, spread in space, within the limits
 
-Comparing features with a few candidates, without any of this, is `method.retrieve`.
+`method.retrieve` compares the features themselves, of few candidates.
 """

@@ -1,4 +1,4 @@
-"""The seam: a global descriptor is a name and one method that makes a unit vector of a photograph."""
+"""The interface of global descriptors: one unit vector per photograph."""
 
 from __future__ import annotations
 
@@ -10,36 +10,25 @@ from numpy.typing import NDArray
 from mapless_server.method.views import View
 
 Vector = NDArray[np.float32]
-"""(D,) of unit length, so that a dot product is a similarity, -1 to 1; all zero where nothing is to be seen."""
+"""(D,) of unit length, so that a dot product is a similarity, -1 to 1; zeros for a view without features."""
 
 
 class GlobalDescriptor(Protocol):
     """Describes a whole photograph by one vector.
 
     Attributes:
-        name: identifies the descriptor and everything that changes what it computes; the key of stored vectors.
+        name: identifies the descriptor and everything that changes its vectors; the key of stored vectors.
         dimension: D, the length of its vectors.
-        extractor: name of the local features that it is made of; None where it looks at pixels.
+        extractor: name of the local features that it is made of; None if it uses pixels.
     """
 
-    @property
-    def name(self) -> str:
-        """See the class."""
-        ...
-
-    @property
-    def dimension(self) -> int:
-        """See the class."""
-        ...
-
-    @property
-    def extractor(self) -> str | None:
-        """See the class."""
-        ...
+    name: str
+    dimension: int
+    extractor: str | None
 
     def describe(self, view: View) -> Vector:
-        """The vector (D,) of a view; its photograph is needed where the descriptor looks at pixels.
+        """The vector (D,) of a view, which needs its photograph if the descriptor uses pixels.
 
-        A view without anything to describe (a blank wall) gives zeros, which resemble nothing.
+        A view without features (a blank wall) gives zeros, which are similar to nothing.
         """
         ...

@@ -1,18 +1,15 @@
-"""A scene's descriptors and poses in memory: brought up to date by what has changed, read without waiting.
+"""A scene's descriptors and poses in memory: updated by what has changed, read without locks.
 
-The search is exact: every reference's similarity is computed, so nothing is missed and nothing has to be trained. What
-bounds it is memory bandwidth. Descriptors are held as whole numbers of 8 bits with the length of each row, which takes
-a quarter of float32's memory in the same time (parts of the matrix are turned to float32 in the processor's cache), and
-changes a similarity by less than 0.002. A reference takes D bytes and about 0.35 KB for its pose and its names:
-of 1024 numbers 1.4 KB, 1.4 GB for a million. One core of a busy machine ranks 1,000 references in 1 ms, 10,000 in 4 and
-100,000 in 33; a million take a third of a second.
+The search is exact: every reference's similarity is computed, so nothing is missed and nothing has to be trained. It is
+bounded by memory bandwidth. Descriptors are held as 8-bit integers with the norm of each row, which takes a quarter of
+float32's memory in the same time (parts of the matrix are converted to float32 in the processor's cache) and changes a
+similarity by less than 0.002. A reference takes D bytes and about 0.35 KB for its pose and its names: with 1024 numbers
+1.4 KB, 1.4 GB for a million. One core of a busy machine ranks 1,000 references in 1 ms, 10,000 in 4 and 100,000 in 33;
+a million take a third of a second.
 
-Past a million a server, three things are to be done in this order, none of which changes what callers see. Scenes are
-shared out among servers, since no query looks at two. Within a scene a position prior makes the search a small one:
-the centres sorted into cells of a grid give the rows of a prior without looking at all. And for a scene that is larger
-than that, the rows are grouped by their nearest of about sqrt(N) coarse centroids of descriptors; a query looks into
-the 5 % of groups nearest to it, on product-quantized codes of 64 bytes, and the best 1,000 are scored again with the
-rows that are here. That search is approximate, so it has to be measured against this one.
+Beyond a million references per server: distribute scenes over servers, since a query uses one scene; index the centres
+by a grid, so that a position prior selects few rows; and only then search approximately (inverted file with product
+quantization, the best 1,000 scored again with these rows), measured against this search.
 """
 
 from __future__ import annotations
@@ -20,7 +17,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +30,7 @@ from .descriptor import Vector
 Rows = NDArray[np.intp]
 
 _CHUNK_BYTES = 1 << 20
-"""Of float32 that are turned at a time: what fits a core's cache."""
+"""Of float32 that are converted at a time: what fits a core's cache."""
 
 _LARGEST = 127
 _SMALLEST_CAPACITY = 64
@@ -42,10 +39,10 @@ _GROWTH = 1.5
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """What is held, one row a reference. Rows are appended beyond what entries look at, and never change but as said.
+    """One row per reference. Rows are appended beyond those that any Entries use, and not changed except as stated.
 
     Attributes:
-        vectors: (capacity, D) int8. A row is written once, before its norm is known to anybody.
+        vectors: (capacity, D) int8. A row is written once, before its norm is set.
         poses: (capacity, 3, 4), world_from_camera.
         ids, keys: of the references; as many as there are rows.
         row_of_key: of every row.
@@ -65,7 +62,7 @@ class _Table:
         return _Table(np.empty((capacity, dimension), np.int8), np.empty((capacity, 3, 4)), [], [], {}, {})
 
     def size_bytes(self) -> int:
-        """Of the arrays, and of the names as they are on average."""
+        """Size of the arrays, and of the names by that of the first."""
         containers = sum(map(sys.getsizeof, (self.ids, self.keys, self.row_of_key, self.row_of_id)))
         names = sum(map(sys.getsizeof, (*self.ids[:1], *self.keys[:1]))) + sys.getsizeof(1 << 20)
         return self.vectors.nbytes + self.poses.nbytes + containers + names * len(self.ids)
@@ -73,7 +70,7 @@ class _Table:
 
 @dataclass(frozen=True, eq=False)
 class Entries:
-    """The references of a scene at one generation; stays as it is whatever is applied later.
+    """The references of a scene at one generation; not changed by later updates.
 
     Attributes:
         generation: of the scene.
@@ -82,9 +79,9 @@ class Entries:
     generation: int
     _table: _Table
     _inverse_norms: NDArray[np.float32]
-    """(n,): turns products with rows into similarities; 0 for a vector of zeros, NaN where there is none."""
+    """(n,): converts products with rows into similarities; 0 for a vector of zeros, NaN where there is none."""
     _alive: NDArray[np.bool_]
-    """(n,): whether the row's reference is there still."""
+    """(n,): whether the row's reference has not been removed."""
     _count: int
 
     def __len__(self) -> int:
@@ -103,7 +100,7 @@ class Entries:
     def similarities(self, vector: Vector, rows: Rows) -> NDArray[np.float32]:
         """Similarity (N,) of a unit vector (D,) with rows; NaN for references that have no descriptor."""
         vectors = self._table.vectors
-        # Rows that lie close together are read in one go; the others are gathered.
+        # If most rows are wanted, all are read in order; otherwise the wanted ones are gathered.
         is_dense = len(rows) > len(self._alive) // 2
         first, last = (0, len(self._alive)) if is_dense else (0, len(rows))
         products = np.empty(last, np.float32)
@@ -136,29 +133,29 @@ class Entries:
 
     def _find(self, reference_id: str) -> int | None:
         row = self._table.row_of_id.get(reference_id)
-        if row is not None and row >= len(self._alive):  # it was replaced since: what was there then?
+        if row is not None and row >= len(self._alive):  # it was replaced later: find the row of that time
             before = (i for i in np.flatnonzero(self._alive).tolist() if self._table.ids[i] == reference_id)
             row = next(before, None)
         return row if row is not None and self._alive[row] else None
 
 
 class SceneIndex:
-    """One scene in memory: brought up to date by one thread at a time, read by any number without waiting."""
+    """One scene in memory: updated by one thread at a time, read by any number without locks."""
 
     def __init__(self, dimension: int) -> None:
-        """An index of descriptors of `dimension` numbers, of no generation yet."""
+        """An empty index of descriptors of `dimension` numbers."""
         self._dimension = dimension
         self._lock = threading.Lock()
         self._entries = self._empty(-1, 0)
 
     @property
     def generation(self) -> int:
-        """Of the scene, as last applied; -1 before anything was."""
+        """Of the scene at the last update; -1 before the first."""
         return self._entries.generation
 
     @property
     def size_bytes(self) -> int:
-        """What it holds in memory."""
+        """Memory of the index."""
         entries = self._entries
         return entries._table.size_bytes() + entries._inverse_norms.nbytes + entries._alive.nbytes
 
@@ -167,10 +164,10 @@ class SceneIndex:
         return self._entries
 
     def apply(self, changes: SceneChanges) -> None:
-        """Brings the index up to date; readers see all of the change or none.
+        """Updates the index; readers see all of the change or none.
 
         Raises:
-            ValueError: a descriptor has another length; nothing was changed then.
+            ValueError: a descriptor has another length; nothing is changed then.
         """
         for reference in changes.added:
             if reference.descriptor is not None:
@@ -184,7 +181,7 @@ class SceneIndex:
             self._entries = _with(_described(kept, late), new, changes.generation)
 
     def describe(self, vectors: Mapping[str, Vector]) -> None:
-        """Adds vectors that were found later, by the references' keys; those of unknown references are left out.
+        """Adds vectors that were computed later, by the references' keys; ignores unknown references.
 
         Raises:
             ValueError: a vector has another length.
@@ -204,7 +201,7 @@ class SceneIndex:
 
 
 def _without(entries: Entries, keys: Collection[str]) -> Entries:
-    """The entries less those of some keys; where most rows are dead, only the living are taken along."""
+    """The entries without some keys; copied to a new table where most rows have been removed."""
     row_of_key = entries._table.row_of_key
     rows = [row_of_key[key] for key in keys if key in row_of_key]
     if not rows:
@@ -212,8 +209,8 @@ def _without(entries: Entries, keys: Collection[str]) -> Entries:
     alive = entries._alive.copy()
     alive[rows] = False
     count = int(alive.sum())
-    left = Entries(entries.generation, entries._table, entries._inverse_norms, alive, count)
-    return _compacted(left) if len(alive) > 2 * count + _SMALLEST_CAPACITY else left
+    kept = replace(entries, _alive=alive, _count=count)
+    return _compacted(kept) if len(alive) > 2 * count + _SMALLEST_CAPACITY else kept
 
 
 def _compacted(entries: Entries) -> Entries:
@@ -232,13 +229,13 @@ def _described(entries: Entries, vectors: Mapping[str, Vector]) -> Entries:
     for key, vector in vectors.items():
         row = entries._table.row_of_key.get(key)
         if row is not None and np.isnan(norms[row]):
-            # Nobody looks at the row: in all entries that have it, its norm is NaN.
+            # No reader uses the row: in all entries that have it, its norm is NaN.
             entries._table.vectors[row], norms[row] = _quantized(vector)
-    return Entries(entries.generation, entries._table, norms, entries._alive, entries._count)
+    return replace(entries, _inverse_norms=norms)
 
 
 def _with(entries: Entries, added: Collection[IndexedReference], generation: int) -> Entries:
-    """The entries and new ones, of the next generation."""
+    """The entries and new ones, at the next generation."""
     first = len(entries._alive)
     count = first + len(added)
     table = _grown(entries._table, count)
@@ -256,13 +253,13 @@ def _with(entries: Entries, added: Collection[IndexedReference], generation: int
 
 
 def _grown(table: _Table, count: int) -> _Table:
-    """The table with room for so many rows; names are shared, because they are only appended to."""
+    """The table with room for so many rows; names are shared, because they are only appended."""
     capacity, dimension = table.vectors.shape
     if count <= capacity:
         return table
     bigger = _Table.empty(dimension, max(count, int(_GROWTH * capacity)))
     bigger.vectors[:capacity], bigger.poses[:capacity] = table.vectors, table.poses
-    return _Table(bigger.vectors, bigger.poses, table.ids, table.keys, table.row_of_key, table.row_of_id)
+    return replace(table, vectors=bigger.vectors, poses=bigger.poses)
 
 
 def _name(table: _Table, reference_id: str, key: str, row: int) -> None:
@@ -272,7 +269,7 @@ def _name(table: _Table, reference_id: str, key: str, row: int) -> None:
 
 
 def _quantized(vector: Vector) -> tuple[NDArray[np.int8], float]:
-    """A vector in steps of its largest number's 127th, and the inverse of that one's length; 0 if it has none."""
+    """A vector in units of a 127th of its largest number, and the inverse of its norm in these units; 0 for zeros."""
     largest = float(np.abs(vector).max(initial=0.0))
     if not largest > 0:
         return np.zeros(vector.shape, np.int8), 0.0

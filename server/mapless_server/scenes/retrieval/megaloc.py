@@ -1,11 +1,11 @@
-"""The global descriptor of the paper: MegaLoc on the photograph's pixels, shortened.
+"""The global descriptor of the paper: MegaLoc on the photograph's pixels, reduced to 1056 numbers.
 
 MegaLoc gives 8448 numbers. As float16 that is 17 KB a reference, 1.7 GB for 100,000 and 17 GB for a million, and exact
 search reads all of it for every query. So descriptors are reduced to 1056 by random sums of eight (`MegaLoc.reduce`):
 2.1 KB, 0.2 GB, 2.1 GB. A similarity s then has an error around zero with a standard deviation of
-(1 - s^2) / sqrt(1056): 0.02 at s = 0.6, 0.003 at 0.95; float16 adds 0.00002. It swaps references that are about as good
-as each other, which thinning by distance does as well. It needs no data and nothing learned, and the network's largest
-layer shrinks by the same eight: 0.42 GB of weights rather than 0.91.
+(1 - s^2) / sqrt(1056): 0.02 at s = 0.6, 0.003 at 0.95; float16 adds 0.00002. It swaps references that are about equally
+good, as thinning by distance does, too. It needs no data, and the network's largest layer shrinks by the same factor of
+eight: 0.42 GB of weights instead of 0.91.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from .descriptor import Vector
 log = logging.getLogger(__name__)
 
 SIDE_PX = 322
-"""Photographs become squares of this side, whatever their shape: what the network was published and measured with."""
+"""Photographs are resized to squares of this side: what the network was published and measured with."""
 
 _BAND_ROWS = 64
-"""Of a photograph, that are floating-point numbers at a time: 3 MB of one that is 4000 px wide."""
+"""Rows that are converted to floating-point at a time: 3 MB of a photograph that is 4000 px wide."""
 
 _VERSION = 1
-"""Raised by any change of what the same weights and options make of the same photograph."""
+"""Version of the computation; part of the name."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class MegaLocOptions:
 
     Attributes:
         dimension: of the vectors, a divisor of 8448, which is the network's own; see the module about 1056.
-        batch: photographs described in one go by `describe_many`; 16 are 8,480 tokens, enough to fill a device, and
+        batch: photographs that `describe_many` computes together; 16 are 8,480 tokens, enough to occupy a device, and
             take about 0.3 GB beside the weights by calculation.
         dtype: what the transformer computes in; None is bfloat16 on a CUDA device that has flash attention, else
             float32. Not part of the name, so that servers with and without a GPU can share references: it changes
@@ -68,7 +68,7 @@ class MegaLocDescriptor:
     Attributes:
         name: e.g. "megaloc-1056-322px-d4f9f2bc-1"; the letters are the beginning of the weights' SHA-256.
         dimension: of the vectors.
-        extractor: None, since it looks at pixels.
+        extractor: None, since it uses pixels.
         dtype: what the transformer computes in.
 
     Args:
@@ -108,16 +108,16 @@ class MegaLocDescriptor:
 
         Raises:
             ValueError: the view has no photograph.
-            RequestError: the photograph cannot be read any more.
+            RequestError: the photograph cannot be read.
         """
         vector: Vector = self.describe_many([view])[0]
         return vector
 
     @torch.inference_mode()
     def describe_many(self, views: Sequence[View]) -> NDArray[np.float32]:
-        """Vectors (N, D) of views, some at a time; of photographs one is in memory.
+        """Vectors (N, D) of views, computed in batches, with one photograph in memory at a time.
 
-        Company changes a vector by rounding only. Errors as `describe`.
+        Batching changes a vector by rounding only. Errors as `describe`.
         """
         described = np.empty((len(views), self.dimension), np.float32)
         for begin in range(0, len(views), self.options.batch):
@@ -128,13 +128,13 @@ class MegaLocDescriptor:
 
 
 def _picture(view: View) -> Tensor:
-    """The photograph squeezed to a square, (3, SIDE_PX, SIDE_PX) float32 in [0, 1]: bilinear with antialiasing.
+    """The photograph resized to a square, (3, SIDE_PX, SIDE_PX) float32 in [0, 1]: bilinear with antialiasing.
 
-    Across first, some rows at a time, then down. Both at once give the same to the bit, from a float copy of the whole
-    photograph, four times its size, and in thrice the time.
+    Horizontally first, some rows at a time, then vertically. Both at once give the same bits in three times the time,
+    from a float copy of the whole photograph, four times its size.
     """
     if view.photograph is None:
-        raise ValueError("MegaLoc looks at pixels, and the view has no photograph")
+        raise ValueError("MegaLoc uses pixels, and the view has no photograph")
     pixels = torch.from_numpy(np.ascontiguousarray(view.photograph.read())).permute(2, 0, 1)[None]
     bands = [_resized(band.float(), (band.shape[2], SIDE_PX)) for band in pixels.split(_BAND_ROWS, dim=2)]
     return _resized(torch.cat(bands, dim=2), (SIDE_PX, SIDE_PX))[0] / 255

@@ -1,7 +1,7 @@
-"""What is known of where the camera is and where it looks, before its photograph is compared with any.
+"""What is known of a camera's pose before its photograph is compared with any: limits and likely values.
 
-Limits are hard: references beyond them are not considered, and neither is a pose. What is merely likely narrows the
-choice of references too, but not to nothing, and never judges a pose.
+Limits are hard: references beyond them are not considered, and a pose beyond them is rejected. Likely values narrow the
+choice of references, too, but not to nothing, and never reject a pose.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from mapless_server.method.options import check_bounds
 from mapless_server.method.priors.known import PosePrior, PositionPrior, Priors
 
 PRIOR_MARGIN_M = 10.0
-"""References further from where the camera may be than this are not considered: they see other things."""
+"""References further than this from where the camera may be are not considered: they see other things."""
 
 PRIOR_MARGIN_DEG = 60.0
-"""References that look further beside a cone than this are not considered: two cameras with the usual 60 degrees of
-view have then nothing in common."""
+"""References that look further than this outside a cone are not considered: two cameras with the usual 60 degrees of
+view then have nothing in common."""
 
 REACH_SIGMA = 4.0
-"""How many standard deviations from where it is likely a camera may be: further out is one of 2000 of three numbers."""
+"""Standard deviations within which the camera is likely: 1 of 2000 is further out in three dimensions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,34 +71,34 @@ class Cone:
     max_angle_deg: float
 
     def __post_init__(self) -> None:
-        check_bounds(self, "max_angle_deg", at_least=0, at_most=180)
         if not abs(float(np.linalg.norm(self.forward)) - 1) < 1e-3:
-            raise ValueError(f"{type(self).__name__}.forward must have unit length, is {self.forward}")
+            raise ValueError(f"Cone.forward must have unit length, is {self.forward}")
+        check_bounds(self, "max_angle_deg", at_least=0, at_most=180)
 
     def angle_deg(self, axis: Array) -> float:
-        """How far beside the cone an optical axis (3,) of unit length points; negative inside."""
+        """Angle of an optical axis (3,) of unit length outside the cone; negative inside."""
         return float(np.degrees(np.arccos(np.clip(self.forward @ axis, -1.0, 1.0)))) - self.max_angle_deg
 
     def keeps(self, axes: Array, margin_deg: float) -> NDArray[np.bool_]:
-        """Which optical axes (N, 3) point no further beside the cone than the margin, (N,)."""
+        """Which optical axes (N, 3) are no further outside the cone than the margin, (N,)."""
         widest_deg = self.max_angle_deg + margin_deg
         if widest_deg >= 180:
             return np.ones(len(axes), bool)
-        # A hundredth of a degree forgives rounding.
+        # A hundredth of a degree allows for rounding.
         return np.asarray(axes @ self.forward >= math.cos(math.radians(widest_deg + 0.01)))
 
 
 @dataclass(frozen=True, eq=False)
 class Narrowing:
-    """Which references come into question; without anything known, all do.
+    """Which references are considered; all if nothing is known.
 
     Attributes:
-        position: limit of the camera's.
-        heading: limit of the camera's.
-        margin_m: how far beyond the sphere, or where the camera is likely, a reference may stand.
-        margin_deg: how far beside a cone it may look.
-        likely_positions: where the camera likely is; all of them at once.
-        likely_headings: where it likely looks; all of them at once.
+        position: limit of the camera's position.
+        heading: limit of the camera's heading.
+        margin_m: how far outside of the sphere or an ellipsoid a reference may be.
+        margin_deg: how far outside of a cone it may look.
+        likely_positions: where the camera likely is; all hold at once.
+        likely_headings: where it likely looks; all hold at once.
     """
 
     position: Sphere | None = None
@@ -110,7 +110,7 @@ class Narrowing:
 
     @staticmethod
     def of(priors: Priors) -> Narrowing:
-        """What soft priors say of where the references are to be looked for; gravity says nothing of it."""
+        """The likely values of priors; gravity gives none."""
         positions, headings = [], []
         for prior in priors:
             if isinstance(prior, PositionPrior):
@@ -131,13 +131,13 @@ class Narrowing:
 
     @property
     def centre(self) -> Array | None:
-        """About where the camera is, (3,) world; None if nothing says."""
+        """About where the camera is, (3,) world; None if unknown."""
         if self.position is not None:
             return self.position.position
         return self.likely_positions[0].position if self.likely_positions else None
 
     def contradiction(self, world_from_camera: RigidTransform) -> str:
-        """What limits speak against a pose of the camera itself, without the margins; empty if none does."""
+        """Which limit a pose of the camera violates, without the margins; empty if none."""
         if self.position is not None:
             outside_m = self.position.distance_m(world_from_camera.translation)
             if outside_m > 0:
@@ -150,7 +150,7 @@ class Narrowing:
         return ""
 
     def keeps(self, centres: Array, axes: Array) -> NDArray[np.bool_]:
-        """Whether cameras come into question, (N,), by centres (N, 3) and optical axes (N, 3), world."""
+        """Whether cameras are considered, (N,), by centres (N, 3) and optical axes (N, 3), world."""
         kept = np.ones(len(centres), bool)
         if self.position is not None:
             kept &= self.position.keeps(centres, self.margin_m)
@@ -161,7 +161,7 @@ class Narrowing:
             likely &= position.keeps(centres, self.margin_m)
         for heading in self.likely_headings:
             likely &= heading.keeps(axes, self.margin_deg)
-        # Where nothing is likely something said so is wrong, which the pose will tell; a limit stays one.
+        # If no reference is likely, a prior is wrong, which the pose will show; the limits still hold.
         return likely if likely.any() else kept
 
 

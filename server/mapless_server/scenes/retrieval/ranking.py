@@ -1,16 +1,16 @@
-"""The order of references for a photograph: by similarity, thinned to a baseline, narrowed by what is known beforehand.
+"""Selection of references for a photograph: by similarity, spread in space, within what is known of the camera's pose.
 
-Two references at one place that look the same way see the same and triangulate nothing, so after the first of them the
-second counts for less. It is not left out: in a dense sequence the strictly spread ones see so little of the query that
-they cost a third of the accuracy. But where a camera stood still, on a tripod or at a robot's dock, hundreds are more
-alike than any other: of those a few are chosen, and then others before the rest.
+Two references at one place that look the same way see the same and triangulate nothing, so after the first of them is
+chosen the second counts for less. It is not excluded: in a dense sequence, strictly spread references see so little of
+the query that this costs a third of the accuracy. But where a camera stood still, on a tripod or at a robot's dock,
+hundreds of references are more similar than any other: of those a few are chosen, and then others before the rest.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,16 +29,16 @@ class RankOptions:
 
     Attributes:
         apart_m: references closer together than this triangulate nothing (the paper's baseline),
-        apart_deg: if their optical axes are closer than this too: one that looks elsewhere sees other things.
-        nearby_weight: what is left of a reference's lead over the scene's typical similarity when one nearby is chosen
+        apart_deg: if their optical axes are closer than this, too: otherwise they see different things.
+        nearby_weight: what remains of a reference's lead over the scene's typical similarity when one nearby is chosen
             already. 1 does not thin, 0 spreads at any price. In the kitchen of 7-Scenes (100 references, 60 queries)
             the median errors with 1, 0.75 and 0.5 are 0.13, 0.15 and 0.15 cm, and 90 % lie below 0.27, 0.29 and 0.32;
             with 0 the chosen share half as many matches with the query.
-        same_place_m: of references that stand closer together than this and look the same way a photograph of the same
-            place resembles all about equally, and ten of them tell no depth. A video at walking speed has two or three.
+        same_place_m: references closer together than this, looking the same way, are about equally similar to any
+            photograph, and ten of them determine no depth. A video at walking speed has two or three.
         per_place: so many of them are chosen, but no more than half of what is wanted, before all others.
-        pool: so many times the references that are wanted are looked at, the most similar ones. Those behind them are
-            never chosen instead of one that is nearby, unless too few of them stand at places of their own.
+        pool: so many times the wanted references are considered, the most similar ones. Less similar ones are never
+            chosen instead of a nearby one, unless too few of the pool stand at different places.
         smallest_pool: but at least so many.
     """
 
@@ -58,12 +58,29 @@ class RankOptions:
 
 
 @dataclass(frozen=True, eq=False)
+class Selection:
+    """Which references to select.
+
+    Attributes:
+        count: how many at most.
+        narrowing: limits of the camera's pose.
+        among: ids of the candidates, unknown ones ignored; empty for the whole scene.
+        options: of the ranking.
+    """
+
+    count: int
+    narrowing: Narrowing = field(default_factory=Narrowing)
+    among: Collection[str] = ()
+    options: RankOptions = field(default_factory=RankOptions)
+
+
+@dataclass(frozen=True, eq=False)
 class RankedReference:
-    """A reference and how much it resembles the photograph.
+    """A selected reference.
 
     Attributes:
         reference_id: unique in its scene.
-        key: identifies this very reference for good.
+        key: unique for ever.
         similarity: cosine of the descriptors, -1 to 1; NaN where the reference or the photograph has none.
         world_from_camera: its pose, metric.
     """
@@ -74,29 +91,34 @@ class RankedReference:
     world_from_camera: RigidTransform
 
 
-def rank_references(
-    entries: Entries,
-    vector: Vector | None,
-    count: int,
-    narrowing: Narrowing | None = None,
-    among: Collection[str] | None = None,
-    options: RankOptions | None = None,
-) -> list[RankedReference]:
-    """At most `count` references in the order of choice; fewer where fewer come into question.
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The references that were selected for a photograph.
 
-    References without a descriptor come last; these, and all where the photograph has none, are ordered by how near
-    they are to where the camera is thought to be, or as they were stored.
+    Attributes:
+        references: in order, the most similar first except for those that see the same as an earlier one.
+        descriptor: name of the global descriptor that was compared.
+        generation: of the scene.
+    """
+
+    references: tuple[RankedReference, ...]
+    descriptor: str
+    generation: int
+
+
+def rank_references(entries: Entries, vector: Vector | None, selection: Selection) -> list[RankedReference]:
+    """The selected references in the order of choice.
+
+    References without a descriptor come last. They, and all if the photograph has none, are ordered by their distance
+    from the likely position of the camera, or as they were stored.
 
     Args:
         entries: of the scene.
         vector: the photograph's descriptor, (D,); None if it has none.
-        count: how many.
-        narrowing: which references come into question.
-        among: ids of those to choose from; None for all. Unknown ones are passed over.
-        options: see there.
+        selection: which references to select.
     """
-    options, narrowing = options or RankOptions(), narrowing or Narrowing()
-    rows = entries.rows(among)
+    options, narrowing, count = selection.options, selection.narrowing, selection.count
+    rows = entries.rows(selection.among or None)
     if not narrowing.is_empty:
         rows = rows[narrowing.keeps(entries.centres(rows), entries.axes(rows))]
     if not len(rows) or count < 1:
@@ -121,20 +143,20 @@ def rank_references(
 def spread(
     scores: ArrayLike, centres: ArrayLike, axes: ArrayLike, count: int, typical: float, options: RankOptions
 ) -> list[int]:
-    """Takes the best score again and again, where one near a chosen one has less of a lead; ties go to the first.
+    """Chooses the best score repeatedly, where one near a chosen one has less of a lead; ties go to the first.
 
-    Where enough have been taken from one place, the others there are passed over.
+    Once enough are chosen at one place, the others there are skipped.
 
     Args:
         scores: (N,) finite, or -inf.
         centres: (N, 3) camera centres, metres.
         axes: (N, 3) optical axes, unit length.
         count: how many to choose.
-        typical: score that is no lead: those below it lose nothing.
+        typical: score without a lead: lower ones lose nothing.
         options: see there.
 
     Returns:
-        Indices in the order of choice, not more than `count`; fewer if the rest are passed over.
+        Indices in the order of choice; fewer than `count` if the others are skipped.
     """
     score, centre, axis = np.asarray(scores, float), np.asarray(centres, float), np.asarray(axes, float)
     lead = np.maximum(score - typical, 0.0)
@@ -143,23 +165,23 @@ def spread(
     left = np.ones(len(score), bool)
     current = score.copy()
     chosen: list[int] = []
-    taken_there = np.zeros(len(score), int)
+    chosen_there = np.zeros(len(score), int)
     most_there = max(1, min(options.per_place, count // 2))
     while len(chosen) < count and left.any():
         candidates = np.flatnonzero(left)
         best = int(candidates[np.argmax(current[candidates])])
         chosen.append(best)
         away_m = np.linalg.norm(centre - centre[best], axis=1)
-        alike = axis @ axis[best] >= same_way
-        current = np.where((away_m < options.apart_m) & alike, lowered, current)
-        taken_there += (away_m < options.same_place_m) & alike
-        left &= taken_there < most_there
+        is_parallel = axis @ axis[best] >= same_way
+        current = np.where((away_m < options.apart_m) & is_parallel, lowered, current)
+        chosen_there += (away_m < options.same_place_m) & is_parallel
+        left &= chosen_there < most_there
         left[best] = False
     return chosen
 
 
 def _scores(similarity: NDArray[np.float32], entries: Entries, rows: Rows, narrowing: Narrowing) -> Array:
-    """Similarities (N,), and for those that are unknown something lower: the less, the further from the prior."""
+    """Similarities (N,), and lower scores for those that are unknown: the lower, the further from the prior."""
     scores = similarity.astype(np.float64)
     unknown = np.flatnonzero(np.isnan(similarity))
     scores[unknown] = -2.0
@@ -173,7 +195,7 @@ def _best(score: Array, count: int) -> Rows:
     """Indices of the `count` best scores, the best first; ties in order."""
     if count >= len(score):
         return np.argsort(-score, kind="stable")
-    # Partitioning keeps any of those that tie with the last one: take the first of them.
+    # Partitioning keeps any of those that tie with the last one, so the first of them are taken.
     smallest = np.partition(score, len(score) - count)[len(score) - count]
     better, ties = np.flatnonzero(score > smallest), np.flatnonzero(score == smallest)
     best = np.sort(np.concatenate([better, ties[: count - len(better)]]))

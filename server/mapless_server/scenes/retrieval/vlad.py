@@ -1,11 +1,11 @@
 """VLAD: the local features of a photograph as one vector (Jegou et al. 2010; Arandjelovic and Zisserman 2013).
 
-Each feature's descriptor is projected to its 32 principal numbers and goes to the nearest of 32 words. A word's part of
-the vector is the sum of the directions from it to the descriptors that went to it; so the vector has 1024 numbers. The
-square roots of them, signs kept, bring repeated structure down to size. Where in the photograph a feature lies does not
-matter, so a camera that is turned about its axis sees the same.
+Each feature's descriptor is projected to its 32 principal components and assigned to the nearest of 32 words. A word's
+part of the vector is the sum of the directions from it to its descriptors; so the vector has 1024 numbers. Their signed
+square roots reduce the weight of repeated structure. The positions of features do not matter, so a camera that is
+turned about its axis gives the same vector.
 
-It costs about 1 ms for 2048 features, and nothing is downloaded. Vocabularies are in `vocabulary`.
+It takes about 1 ms for 2048 features, and nothing is downloaded. Vocabularies are in `vocabulary`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .descriptor import Vector
 from .vocabulary import REDUCED, WORDS, Vocabulary, dataless, nearest_words, shipped
 
 RULE = 1
-"""Raised by every change of what is made of features and vocabulary: it is part of the name."""
+"""Version of the computation; part of the name."""
 
 DIMENSION = WORDS * REDUCED
 
@@ -27,35 +27,26 @@ DIMENSION = WORDS * REDUCED
 class VladDescriptor:
     """VLAD of one extractor's features, with the vocabulary of their kind, or with one that needs no data.
 
-    Without a shipped vocabulary (SuperPoint, whose weights were not to be had) three times as many of the first ten
+    Without a shipped vocabulary (SuperPoint, whose weights were not available) three times as many of the first ten
     references see something else; see `vocabulary`.
+
+    Attributes:
+        name: for example "vlad-1-0123abcd-sift-2048-1024px-0.02": version, vocabulary, extractor.
+        dimension, extractor: see `GlobalDescriptor`.
     """
 
     def __init__(self, extractor: str, vocabulary: Vocabulary | None) -> None:
         """Of the extractor of that name; without a vocabulary one is made for the length of its descriptors."""
-        self._extractor = extractor
+        used = "dataless" if vocabulary is None else vocabulary.digest()
+        self.name = f"vlad-{RULE}-{used}-{extractor}"
+        self.dimension = DIMENSION
+        self.extractor: str | None = extractor
         self._vocabulary = vocabulary
 
     @staticmethod
     def of(extractor: FeatureExtractor) -> VladDescriptor:
         """With the vocabulary that is shipped for the kind of features, which the extractor's name begins with."""
         return VladDescriptor(extractor.name, shipped(extractor.name.split("-")[0]))
-
-    @property
-    def name(self) -> str:
-        """E.g. "vlad-1-0123abcd-sift-2048-1024px-0.02": rule, vocabulary, extractor."""
-        vocabulary = "dataless" if self._vocabulary is None else self._vocabulary.digest()
-        return f"vlad-{RULE}-{vocabulary}-{self._extractor}"
-
-    @property
-    def dimension(self) -> int:
-        """Length of the vectors."""
-        return DIMENSION
-
-    @property
-    def extractor(self) -> str:
-        """Name of the features' extractor."""
-        return self._extractor
 
     def describe(self, view: View) -> Vector:
         """See GlobalDescriptor.describe.
@@ -69,14 +60,14 @@ class VladDescriptor:
         vocabulary = dataless(descriptors.shape[1]) if self._vocabulary is None else self._vocabulary
         if descriptors.shape[1] != len(vocabulary.mean):
             raise ValueError(
-                f"features of {self._extractor} have {descriptors.shape[1]} numbers, the vocabulary's have "
+                f"features of {self.extractor} have {descriptors.shape[1]} numbers, the vocabulary's have "
                 f"{len(vocabulary.mean)}"
             )
         return vlad(descriptors, vocabulary)
 
 
 def vlad(descriptors: Vector, vocabulary: Vocabulary) -> Vector:
-    """The vector (DIMENSION,), unit length, of descriptors (N, d); zeros if they all are words themselves."""
+    """The vector (DIMENSION,), unit length, of descriptors (N, d); zeros if each of them is a word."""
     points = (descriptors - vocabulary.mean) @ vocabulary.projection
     nearest = nearest_words(points, vocabulary.words)
     residuals = points - vocabulary.words[nearest]

@@ -1,9 +1,9 @@
-"""What VLAD is made with: where descriptors of local features lie, learned once and shipped, or from no data at all.
+"""Vocabularies of VLAD: the distribution of local descriptors, learned once and shipped, or assumed without data.
 
-The shipped vocabularies were learned from photographs that our own code renders (`research.learn_vocabulary`).
-Measured with SIFT in the kitchen of 7-Scenes (100 references, 120 queries), by the share of the first ten that stand
-within 0.5 m and 30 degrees: 0.95 with the rendered vocabulary, 0.94 with one learned from other real places, 0.82 with
-one that needs no data. All three have such a reference among the first ten for every query.
+The shipped vocabularies were learned from rendered photographs (`research.learn_vocabulary`). Measured with SIFT in the
+kitchen of 7-Scenes (100 references, 120 queries), by the share of the first ten that are within 0.5 m and 30 degrees of
+the query: 0.95 with the rendered vocabulary, 0.94 with one learned from other real places, 0.82 with one that needs no
+data. All three have such a reference among the first ten for every query.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ WORDS = 32
 """Centroids. With 16 the share above falls from 0.95 to 0.92; 64 gain less than 0.01 and take twice the memory."""
 
 REDUCED = 32
-"""Numbers of a descriptor after its projection; with 16 the share falls to 0.93."""
+"""Components of a descriptor after its projection; with 16 the share falls to 0.93."""
 
 LEARNED = ("sift", "aliked", "xfeat")
 """Kinds of features that a vocabulary is shipped for; each has three arrays in the file, see `Vocabulary`."""

@@ -25,7 +25,7 @@ from mapless_server.method.priors.known import (
     Priors,
     check_covariance,
 )
-from mapless_server.scenes.retrieval.narrowing import Cone, Narrowing, Sphere
+from mapless_server.scenes import Cone, Narrowing, Sphere
 from mapless_server.store import SceneAttributes
 
 UNKNOWN_HEIGHT_SIGMA_M = 1000.0

@@ -20,9 +20,7 @@ from mapless.scenes import Calibration
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.wire import FieldError, joined
-from mapless_server.scenes.audit.coverage import Coverage
-from mapless_server.scenes.audit.verdict import ReferenceAudit
-from mapless_server.scenes.retrieval.chosen import Choice
+from mapless_server.scenes import Choice, Coverage, ReferenceAudit
 from mapless_server.store import ContradictingDown, ReferenceRecord, SceneAttributes, SceneRecord
 
 from .queries import enum_to_message

@@ -16,12 +16,16 @@ from support.scenes import SceneOptions, make_scene
 from mapless.geometry import RigidTransform
 from mapless_server.errors import NotFound, Unavailable
 from mapless_server.method.views import PosedView, View
-from mapless_server.scenes.audit import PairMatches, PosedName, Verdict
-from mapless_server.scenes.audit.coverage import CoverageVerdict
-from mapless_server.scenes.audit.surroundings import Surroundings, places_of
-from mapless_server.scenes.auditing import SceneExaminer, Tools, Viewpoint
-from mapless_server.scenes.indexes import SceneIndexes
-from mapless_server.scenes.library import ReferenceLibrary
+from mapless_server.scenes import (
+    AuditTools,
+    AuditVerdict,
+    CoverageVerdict,
+    PairMatches,
+    ReferenceLibrary,
+    SceneAuditor,
+    SceneIndexes,
+    Viewpoint,
+)
 from mapless_server.security.tenancy import SceneKey
 from mapless_server.store import NewReference, Store
 
@@ -38,13 +42,13 @@ class Extractor:
         raise NotImplementedError
 
 
-@dataclass(frozen=True)
+@dataclass
 class Descriptor:
     """Tells nothing apart: enough for those that are looked for by pose."""
 
     name: str = "flat"
     dimension: int = 4
-    extractor: str = "planted"
+    extractor: str | None = "planted"
 
     def describe(self, view: View) -> NDArray[np.float32]:
         return np.full(4, 0.5, np.float32)
@@ -65,9 +69,9 @@ def store(tmp_path: Path) -> Iterator[Store]:
         yield store
 
 
-def tools_of(store: Store) -> Tools:
+def tools_of(store: Store) -> AuditTools:
     library, descriptor, extractor = ReferenceLibrary(store), Descriptor(), Extractor()
-    return Tools(
+    return AuditTools(
         library, SceneIndexes(store, library, descriptor, extractor, 2**30), descriptor, extractor, PairMatches()
     )
 
@@ -76,42 +80,42 @@ def go_on() -> None:
     pass
 
 
-def verdicts(examiner: SceneExaminer, ids: list[str]) -> list[Verdict | None]:
-    audits = [examiner.audit(it, go_on) for it in ids]
+def verdicts(auditor: SceneAuditor, ids: list[str]) -> list[AuditVerdict | None]:
+    audits = [auditor.audit(it, go_on) for it in ids]
     return [None if audit is None else audit.verdict for audit in audits]
 
 
 @pytest.mark.parametrize("what", ["features", "descriptor", "pose"])
 def test_a_damaged_reference_is_named_and_neighbours_are_judged(store: Store, what: str) -> None:
     damage(store, KEY, "r2", what)
-    examiner = SceneExaminer(tools_of(store), KEY)
+    auditor = SceneAuditor(tools_of(store), KEY)
     ids = [f"r{i}" for i in range(len(REFERENCES))]
-    consistent = [Verdict.CONSISTENT] * len(REFERENCES)
-    assert verdicts(examiner, ids) == [*consistent[:2], Verdict.UNVERIFIABLE, *consistent[3:]]
-    audit = examiner.audit("r2", go_on)
+    consistent = [AuditVerdict.CONSISTENT] * len(REFERENCES)
+    assert verdicts(auditor, ids) == [*consistent[:2], AuditVerdict.UNVERIFIABLE, *consistent[3:]]
+    audit = auditor.audit("r2", go_on)
     assert audit is not None
     assert audit.message == "is damaged in the store: delete it and add it again"
     view = Viewpoint(REFERENCES[0].view.camera, REFERENCES[0].world_from_camera)
-    coverage = examiner.check_coverage(view, go_on)
+    coverage = auditor.check_coverage(view, go_on)
     assert coverage.verdict is not CoverageVerdict.NOT_LOCALIZABLE
     assert "scenes/s/references/r2" not in coverage.references
 
 
 def test_a_neighbour_deleted_during_an_audit_loses_no_answer(store: Store) -> None:
     """Once before anything was loaded, once when it had been looked at."""
-    examiner = SceneExaminer(tools_of(store), KEY)
-    examiner._read()
+    auditor = SceneAuditor(tools_of(store), KEY)
+    auditor._read()
     store.delete_reference(KEY, "r1")
-    assert verdicts(examiner, ["r0"]) == [Verdict.CONSISTENT]
+    assert verdicts(auditor, ["r0"]) == [AuditVerdict.CONSISTENT]
     store.delete_reference(KEY, "r3")
     view = Viewpoint(REFERENCES[0].view.camera, REFERENCES[0].world_from_camera)
-    assert examiner.check_coverage(view, go_on).verdict is not CoverageVerdict.NOT_LOCALIZABLE
-    assert verdicts(examiner, ["r2", "r3", "r4"]) == [Verdict.CONSISTENT, None, Verdict.CONSISTENT]
+    assert auditor.check_coverage(view, go_on).verdict is not CoverageVerdict.NOT_LOCALIZABLE
+    assert verdicts(auditor, ["r2", "r3", "r4"]) == [AuditVerdict.CONSISTENT, None, AuditVerdict.CONSISTENT]
 
 
 def test_one_that_is_gone_is_an_error_only_for_who_named_it(store: Store) -> None:
     tools = tools_of(store)
-    listed, named = SceneExaminer(tools, KEY), SceneExaminer(tools, KEY, named=["r4", "r0"])
+    listed, named = SceneAuditor(tools, KEY), SceneAuditor(tools, KEY, named=["r4", "r0"])
     listed._read()
     named._read()
     store.delete_reference(KEY, "r0")
@@ -120,34 +124,34 @@ def test_one_that_is_gone_is_an_error_only_for_who_named_it(store: Store) -> Non
         named.audit("r0", go_on)
     assert caught.value.field == "references[1]"
     store.delete_scene(KEY)
-    for examiner in (listed, named):
+    for auditor in (listed, named):
         with pytest.raises(NotFound) as caught:
-            examiner.audit("r4", go_on)
+            auditor.audit("r4", go_on)
         assert caught.value.field == "scene"
 
 
 def test_one_that_was_added_since_the_scene_was_read_is_audited(store: Store) -> None:
     store.delete_reference(KEY, "r5")
-    examiner = SceneExaminer(tools_of(store), KEY)
-    examiner._read()
-    before = examiner.generation
+    auditor = SceneAuditor(tools_of(store), KEY)
+    auditor._read()
+    before = auditor.generation
     store.add_references(KEY, [new(5)])
-    assert verdicts(examiner, ["r5"]) == [Verdict.CONSISTENT]
-    assert examiner.generation > before
+    assert verdicts(auditor, ["r5"]) == [AuditVerdict.CONSISTENT]
+    assert auditor.generation > before
 
 
 def test_a_scene_that_never_holds_still_is_unavailable(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its subject is loaded, and not there any more when it is looked at; again and again."""
-    examiner = SceneExaminer(tools_of(store), KEY)
+    auditor = SceneAuditor(tools_of(store), KEY)
     readings: list[Sequence[str]] = []
 
     def load(names: Sequence[str]) -> list[PosedView]:
         readings.append(names)
         return []
 
-    monkeypatch.setattr(examiner, "_load", load)
+    monkeypatch.setattr(auditor, "_load", load)
     with pytest.raises(Unavailable) as caught:
-        examiner.audit("r0", go_on)
+        auditor.audit("r0", go_on)
     assert caught.value.reason == "SCENE_CHANGED"
     assert len(readings) == 3
 
@@ -159,8 +163,8 @@ def test_a_page_of_a_large_scene_makes_no_pose_per_reference(store: Store) -> No
     far = [RigidTransform(np.eye(3), np.array([1000.0 + i, 0.0, 0.0])) for i in range(100)]
     distant = [NewReference(f"far{i}", b"far %d" % i, view.camera, far[i], {"planted": view}, FLAT) for i in range(100)]
     store.add_references(KEY, distant)
-    examiner = SceneExaminer(tools, KEY)
-    entries, made = examiner._read(), []
+    auditor = SceneAuditor(tools, KEY)
+    entries, made = auditor._read(), []
     original = type(entries).reference
 
     def counting(self: Any, row: int) -> Any:
@@ -169,22 +173,22 @@ def test_a_page_of_a_large_scene_makes_no_pose_per_reference(store: Store) -> No
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(type(entries), "reference", counting)
-        examiner._surroundings(entries.rows())
+        auditor._finder(entries.rows())
         assert made == []
-        found = examiner._surroundings(entries.rows()).near("scenes/s/references/r0", 3)
+        found = auditor._finder(entries.rows()).near("scenes/s/references/r0", 3)
     assert {name.rpartition("/")[2] for name in found} <= {f"r{i}" for i in range(1, 6)}
     assert len(set(made)) <= 4 * 3 + 1
 
 
-def test_places_of_rows_are_those_of_the_listed_references(store: Store) -> None:
-    """By rows of an index with holes as by a list: the same neighbours and poses."""
+def test_neighbours_among_rows_with_holes_are_the_nearest(store: Store) -> None:
     store.delete_reference(KEY, "r1")
-    examiner = SceneExaminer(tools_of(store), KEY)
-    by_rows = examiner._surroundings(examiner._read().rows())
-    left = [i for i in range(len(REFERENCES)) if i != 1]
-    poses = [PosedName(f"scenes/s/references/r{i}", REFERENCES[i].world_from_camera) for i in left]
-    by_list = Surroundings(places_of(poses), lambda names: [])
-    np.testing.assert_array_equal(by_rows.origin, by_list.origin)
-    for pose in poses:
-        assert by_rows.near(pose.name, 4) == by_list.near(pose.name, 4)
-        np.testing.assert_allclose(by_rows.pose(pose.name).matrix(), by_list.pose(pose.name).matrix(), atol=1e-12)
+    auditor = SceneAuditor(tools_of(store), KEY)
+    finder = auditor._finder(auditor._read().rows())
+    left = {f"scenes/s/references/r{i}": REFERENCES[i].world_from_camera for i in range(len(REFERENCES)) if i != 1}
+    np.testing.assert_array_equal(finder.origin, REFERENCES[0].world_from_camera.translation)
+    for name, pose in left.items():
+        np.testing.assert_allclose(finder.pose(name).matrix(), pose.shifted(-finder.origin).matrix(), atol=1e-12)
+        assert set(finder.near(name, 4)) == left.keys() - {name}
+        (nearest,) = finder.near(name, 1)
+        away_m = {it: np.linalg.norm(left[it].translation - pose.translation) for it in left if it != name}
+        assert away_m[nearest] <= 1.5 * min(away_m.values())

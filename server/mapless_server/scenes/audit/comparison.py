@@ -1,0 +1,166 @@
+"""Comparison of a reference with neighbours: whether its pose and focal length fit, and if not, which would."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless_server.method.pnp import PnpOptions, ransac
+from mapless_server.method.trust.gate import false_alarms
+from mapless_server.method.uncertainty.perturbation import world_covariance
+from mapless_server.method.views import PosedView
+
+from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood, match_points
+from .options import AuditOptions
+from .resection import CameraFit, Free, ObservedPoints, fit_camera
+from .verdict import AuditVerdict
+
+_RANSAC = PnpOptions(min_iterations=1000, inlier_px=6.0)
+"""Wider than for queries: a focal length that is off by 5 % shifts pixels by 6 px before a pose compensates for it."""
+
+_INFLATION = 2.0
+"""Factor on standard deviations, because errors of neighbouring keypoints are correlated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A reference compared with neighbours.
+
+    Attributes:
+        subject: the reference.
+        neighbourhood: the others, and their points.
+        points: those that are matched in the subject.
+        fits: by what they may change; empty with too few matches.
+        options: of the audit.
+    """
+
+    subject: PosedView
+    neighbourhood: Neighbourhood
+    points: ObservedPoints
+    fits: dict[Free, CameraFit]
+    options: AuditOptions
+
+    @cached_property
+    def is_usable(self) -> bool:
+        """Whether enough matches agree with any fit."""
+        if not self.fits:
+            return False
+        camera, inliers = self.subject.view.camera, self.fits[Free.BOTH].inlier_count
+        chance = np.pi * _RANSAC.inlier_px**2 / (camera.width_px * camera.height_px)
+        expected = false_alarms(len(self.points), inliers, float(chance))
+        return inliers >= self.options.min_inliers and expected <= self.options.max_log10_false_alarms
+
+    @property
+    def world_from_camera(self) -> RigidTransform:
+        """The pose that fits the matches with the given focal length."""
+        return self.fits[Free.POSE].world_from_camera
+
+    @cached_property
+    def offset_m(self) -> float:
+        """Distance of the fitted pose from the given one."""
+        return self.distance(self.world_from_camera)[0]
+
+    @cached_property
+    def turn_deg(self) -> float:
+        """Angle between the fitted rotation and the given one."""
+        return self.distance(self.world_from_camera)[1]
+
+    def distance(self, world_from_camera: RigidTransform) -> tuple[float, float]:
+        """Distance of a pose from the given one, metres and degrees."""
+        return pose_difference(world_from_camera, self.subject.world_from_camera)
+
+    @cached_property
+    def focal_ratio(self) -> float:
+        """Focal length that fits the matches with the given pose, divided by the given focal length."""
+        return self.fits[Free.FOCAL].camera.focal_x_px / self.subject.view.camera.focal_x_px
+
+    @cached_property
+    def sigma_m(self) -> float:
+        """Standard deviation of the offset along itself."""
+        covariance = self._covariance[:3, :3]
+        shift = self.world_from_camera.translation - self.subject.world_from_camera.translation
+        length = float(np.linalg.norm(shift))
+        if not length > 0:
+            return self.largest_sigma_m
+        return float(np.sqrt(np.clip(shift / length @ covariance @ (shift / length), 0.0, None)))
+
+    @cached_property
+    def largest_sigma_m(self) -> float:
+        """Standard deviation of the position in its worst direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self._covariance[:3, :3])[-1]))
+
+    @cached_property
+    def sigma_deg(self) -> float:
+        """Standard deviation of the rotation, the largest about any axis."""
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self._covariance[3:, 3:])[-1])))
+
+    @cached_property
+    def focal_sigma(self) -> float:
+        """Standard deviation of the focal ratio."""
+        information = float(self.fits[Free.FOCAL].information[6, 6])
+        return float(_INFLATION / np.sqrt(max(information, 1e-12)))
+
+    def excess(self, free: Free) -> float:
+        """Robust cost per match of a fit above that of the freest one."""
+        best = self.fits[Free.BOTH]
+        return (self.fits[free].cost - best.cost) / max(best.inlier_count, 1)
+
+    def verdict(self, noise_m: float = 0.0, noise_deg: float = 0.0) -> AuditVerdict:
+        """The smallest change that fits the matches; the noise is the median offset of the neighbours."""
+        if not self.is_usable:
+            return AuditVerdict.UNVERIFIABLE
+        options = self.options
+        allowed = max(options.focal_tolerance, options.significance_sigma * self.focal_sigma)
+        focal_could_be = self.excess(Free.FOCAL) < self.excess(Free.POSE)
+        if self.severity(noise_m, noise_deg) <= 1 and not (focal_could_be and abs(self.focal_ratio - 1) > allowed):
+            return AuditVerdict.CONSISTENT
+        # With both free, what is right stays, unless the scene is too flat to distinguish them.
+        both = self.fits[Free.BOTH]
+        pose_stays = self.severity(noise_m, noise_deg, both.world_from_camera) <= 1
+        focal_stays = abs(both.camera.focal_x_px / self.subject.view.camera.focal_x_px - 1) <= allowed
+        if pose_stays != focal_stays:
+            return AuditVerdict.WRONG_POSE if focal_stays else AuditVerdict.WRONG_INTRINSICS
+        if not pose_stays and min(self.excess(Free.POSE), self.excess(Free.FOCAL)) > options.both_excess:
+            return AuditVerdict.WRONG_POSE_AND_INTRINSICS
+        return AuditVerdict.WRONG_INTRINSICS if focal_could_be else AuditVerdict.WRONG_POSE
+
+    def severity(
+        self, noise_m: float = 0.0, noise_deg: float = 0.0, world_from_camera: RigidTransform | None = None
+    ) -> float:
+        """Distance of a pose, by default the fitted one, from the given one, divided by what is tolerated."""
+        options = self.options
+        sigma, noise = options.significance_sigma, options.neighbour_noise
+        allowed_m = max(options.position_tolerance_m, sigma * self.sigma_m, noise * noise_m)
+        allowed_deg = max(options.rotation_tolerance_deg, sigma * self.sigma_deg, noise * noise_deg)
+        off_m, off_deg = self.distance(world_from_camera or self.world_from_camera)
+        return max(off_m / allowed_m, off_deg / allowed_deg)
+
+    @cached_property
+    def _covariance(self) -> Array:
+        information = self.fits[Free.POSE].information[:6, :6]
+        return _INFLATION**2 * world_covariance(information, self.world_from_camera)
+
+
+def compare(
+    subject: PosedView, neighbours: Sequence[PosedView], pairs: PairMatches, options: AuditOptions
+) -> Comparison:
+    """Compares a reference with neighbours, whose poses are trusted as far as they agree with one another."""
+    neighbourhood = build_neighbourhood(neighbours, pairs, options.epipolar_px, options.structure)
+    points = match_points(subject, neighbourhood, pairs)
+    fits = {}
+    if len(points) >= _RANSAC.min_matches:
+        camera, given = subject.view.camera, subject.world_from_camera
+        found = ransac(camera, points.x_in_world, points.pixel, None, _RANSAC)
+        starts = (given,) if found is None else (given, found)
+        fits = {free: fit_camera(points, camera, starts, free, options.resection) for free in Free}
+    return Comparison(subject, neighbourhood, points, fits, options)
+
+
+def pose_difference(first: RigidTransform, second: RigidTransform) -> tuple[float, float]:
+    """Distance of the centres in metres, and angle between the rotations in degrees."""
+    apart_m = float(np.linalg.norm(first.translation - second.translation))
+    return apart_m, rotation_angle_deg(first.rotation @ second.rotation.T)

@@ -1,0 +1,194 @@
+"""Audit and coverage of a stored scene, whose references may be deleted or damaged meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from mapless.geometry import Camera, RigidTransform
+from mapless.names import parse_reference_name, reference_name
+from mapless_server.errors import DataLoss, NotFound, RequestError, Unavailable
+from mapless_server.method.context import StageContext
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.views import PosedView
+from mapless_server.security.tenancy import SceneKey, scene_id_of
+
+from ..indexes import SceneIndexes
+from ..library import Loaded, ReferenceLibrary, load_usable
+from ..retrieval.descriptor import GlobalDescriptor
+from ..retrieval.index import Entries, Rows
+from ..retrieval.ranking import RankOptions, Selection, rank_references
+from .auditor import Auditor
+from .coverage import Coverage, check_coverage
+from .finder import ReferenceFinder, ReferenceGone
+from .neighbourhood import PairMatches
+from .options import AuditOptions
+from .verdict import AuditVerdict, ReferenceAudit
+
+ResultT = TypeVar("ResultT")
+
+CACHED_VIEWS = 200
+"""Loaded references that a call keeps, about 1.2 MB each."""
+
+UNTHINNED = RankOptions(apart_m=0.0)
+"""Neighbours at one place see the same, which is what an audit needs."""
+
+MAX_READINGS = 3
+"""If a reference is deleted while it is used, the scene is read again; more often than this it is being emptied."""
+
+DAMAGED = "is damaged in the store: delete it and add it again"
+
+COVERAGE_CANDIDATES = 500
+"""References nearest to a pose, among which its neighbours are chosen."""
+
+PROCESSED_SIDE_PX = 1024
+"""Longer side of the image that features are found in."""
+
+
+@dataclass(frozen=True, eq=False)
+class AuditTools:
+    """What auditing needs, for all scenes.
+
+    Attributes:
+        library: loads references.
+        indexes: of all scenes.
+        descriptor: in the indexes.
+        extractor: of the first tier, whose features every reference has.
+        pairs: caches matches, for all calls together.
+    """
+
+    library: ReferenceLibrary
+    indexes: SceneIndexes
+    descriptor: GlobalDescriptor
+    extractor: FeatureExtractor
+    pairs: PairMatches
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A camera and its pose: world_from_camera, metric."""
+
+    camera: Camera
+    world_from_camera: RigidTransform
+
+
+class SceneAuditor:
+    """Audits references of a scene as it was when first used; of one thread at a time.
+
+    If a reference that it uses is deleted meanwhile, it reads the scene again.
+    """
+
+    def __init__(self, tools: AuditTools, scene_key: SceneKey, named: Sequence[str] = ()) -> None:
+        """`named` are ids of references that the caller named, so that it is an error if one of them is missing."""
+        self._tools = tools
+        self._scene_key = scene_key
+        self._named = named
+        self._entries: Entries | None = None
+        self._auditor: Auditor | None = None
+        self._check: Callable[[], None] = lambda: None
+
+    @property
+    def generation(self) -> int:
+        """Of the scene as it was read; 0 before that."""
+        return self._entries.generation if self._entries else 0
+
+    def audit(self, reference_id: str, check: Callable[[], None]) -> ReferenceAudit | None:
+        """The result for a reference; None if it is missing and was not named.
+
+        Raises:
+            NotFound: there is no such scene (field "scene") or reference that was named (field "references[i]").
+            Unavailable: the scene is being emptied.
+        """
+        self._check = check
+        return self._retried(lambda: self._audit(reference_id))
+
+    def check_coverage(self, view: Viewpoint, check: Callable[[], None]) -> Coverage:
+        """Whether a photograph taken there would be localized.
+
+        Raises:
+            NotFound: there is no such scene (field "scene").
+            Unavailable: the scene is being emptied.
+        """
+        self._check = check
+        return self._retried(lambda: self._check_coverage(view))
+
+    def _retried(self, compute: Callable[[], ResultT]) -> ResultT:
+        for _ in range(MAX_READINGS):
+            with suppress(ReferenceGone):
+                return compute()
+            self._entries = self._auditor = None
+        raise Unavailable("the scene's references are being deleted", reason="SCENE_CHANGED", retry_after_s=1.0)
+
+    def _audit(self, reference_id: str) -> ReferenceAudit | None:
+        entries = self._read()
+        name = self._name(reference_id)
+        try:
+            self._load_exactly([reference_id])
+        except DataLoss:
+            return ReferenceAudit(name, AuditVerdict.UNVERIFIABLE, DAMAGED)
+        except NotFound as error:
+            if error.field == "scene":
+                raise
+            if reference_id in self._named:
+                raise NotFound(str(error), field=f"references[{self._named.index(reference_id)}]") from error
+            return None
+        if reference_id not in entries:
+            if self._tools.indexes.is_damaged(self._scene_key, reference_id):
+                return ReferenceAudit(name, AuditVerdict.UNVERIFIABLE, DAMAGED)
+            raise ReferenceGone(name)  # added since the scene was read
+        if self._auditor is None:
+            finder = self._finder(entries.rows())
+            self._auditor = Auditor(finder, AuditOptions(), self._tools.pairs, lambda: self._check())
+        return self._auditor.audit(name)
+
+    def _check_coverage(self, view: Viewpoint) -> Coverage:
+        entries = self._read()
+        rows = entries.rows()
+        away_m = np.linalg.norm(entries.centres(rows) - view.world_from_camera.translation, axis=1)
+        nearest = np.sort(rows[np.argsort(away_m, kind="stable")[:COVERAGE_CANDIDATES]])
+        scale = min(1.0, PROCESSED_SIDE_PX / max(view.camera.width_px, view.camera.height_px))
+        width_px, height_px = round(scale * view.camera.width_px), round(scale * view.camera.height_px)
+        camera = view.camera.resized(width_px, height_px).pinhole()
+        return check_coverage(camera, view.world_from_camera, self._finder(nearest), self._tools.pairs)
+
+    def _read(self) -> Entries:
+        if self._entries is None:
+            self._entries = self._tools.indexes.entries(self._scene_key, StageContext(self._check))
+        return self._entries
+
+    def _finder(self, rows: Rows) -> ReferenceFinder:
+        scene_id = scene_id_of(self._scene_key)
+        return ReferenceFinder(scene_id, self._read(), rows, self._load, self._similar, CACHED_VIEWS)
+
+    def _name(self, reference_id: str) -> str:
+        return reference_name(scene_id_of(self._scene_key), reference_id)
+
+    def _load_exactly(self, reference_ids: Sequence[str]) -> Loaded:
+        tools = self._tools
+        return tools.library.load(self._scene_key, reference_ids, tools.extractor, StageContext(self._check))
+
+    def _load(self, names: Sequence[str]) -> Sequence[PosedView]:
+        """The references of these names that exist and are not damaged."""
+        reference_ids = [parse_reference_name(name)[1] for name in names]
+        try:
+            return load_usable(self._load_exactly, reference_ids, (DataLoss, NotFound), self._report)[1]
+        except NotFound as error:  # another one was deleted between the two readings
+            if error.field == "scene":
+                raise
+            raise ReferenceGone(str(error)) from error
+
+    def _report(self, reference_id: str, error: RequestError) -> None:
+        if isinstance(error, DataLoss):
+            self._tools.indexes.report_damaged(self._scene_key, reference_id, error)
+
+    def _similar(self, name: str, count: int) -> Sequence[str]:
+        references = self._load([name])
+        if not references:
+            raise ReferenceGone(name)
+        vector = self._tools.descriptor.describe(references[0].view)
+        ranked = rank_references(self._read(), vector, Selection(count, options=UNTHINNED))
+        return [self._name(it.reference_id) for it in ranked]
