@@ -534,23 +534,19 @@ class Heard:
         self.beats += 1
 
 
-def test_a_blocked_loop_is_measured_and_logged(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_blocked_loop_is_measured_and_logged(caplog: pytest.LogCaptureFixture) -> None:
     heard = Heard()
-
-    async def run() -> None:
-        watching = asyncio.create_task(watch_event_loop(heard))
-        while not heard.lags_s:
-            await asyncio.sleep(0.001)
-        time.sleep(0.3)
-        count = len(heard.lags_s)
-        while len(heard.lags_s) == count:
-            await asyncio.sleep(0.001)
-        watching.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await watching
-
     caplog.set_level(logging.WARNING)
-    asyncio.run(run())
+    watching = asyncio.create_task(watch_event_loop(heard))
+    while not heard.lags_s:
+        await asyncio.sleep(0.001)
+    time.sleep(0.3)
+    count = len(heard.lags_s)
+    while len(heard.lags_s) == count:
+        await asyncio.sleep(0.001)
+    watching.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await watching
     assert max(heard.lags_s) >= 0.28
     assert min(heard.lags_s) >= 0
     assert heard.beats == len(heard.lags_s)
@@ -558,14 +554,10 @@ def test_a_blocked_loop_is_measured_and_logged(caplog: pytest.LogCaptureFixture)
     assert vars(record)["lag_ms"] >= 280
 
 
-def test_a_dead_scheduler_does_not_beat() -> None:
+async def test_a_dead_scheduler_does_not_beat() -> None:
     heard = Heard()
-
-    async def run() -> None:
-        watching = asyncio.create_task(watch_event_loop(heard, is_alive=lambda: len(heard.lags_s) <= 2))
-        while len(heard.lags_s) < 5:
-            await asyncio.sleep(0.001)
-        watching.cancel()
-
-    asyncio.run(run())
+    watching = asyncio.create_task(watch_event_loop(heard, is_alive=lambda: len(heard.lags_s) <= 2))
+    while len(heard.lags_s) < 5:
+        await asyncio.sleep(0.001)
+    watching.cancel()
     assert heard.beats == 2

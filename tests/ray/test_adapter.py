@@ -120,7 +120,7 @@ def test_a_replicas_handlers_are_those_of_the_plain_server(settings: Settings) -
     assert error.request_id
 
 
-def test_a_server_that_serve_stops_is_drained_first(settings: Settings) -> None:
+async def test_a_server_that_serve_stops_is_drained_first(settings: Settings) -> None:
     told: list[Any] = []
 
     class Stopped:
@@ -130,19 +130,13 @@ def test_a_server_that_serve_stops_is_drained_first(settings: Settings) -> None:
     async def stop(grace_s: float | None) -> None:
         told.append("stopped")
 
-    async def run() -> None:
-        await Ingress(settings, Stopped(), None).drained(stop)(7.0)  # type: ignore[arg-type]
-
-    asyncio.run(run())
+    await Ingress(settings, Stopped(), None).drained(stop)(7.0)  # type: ignore[arg-type]
     assert told == [("drained", 0.0, 7.0), "stopped"]
 
 
-def test_tls_is_the_gateways(settings: Settings) -> None:
-    async def run() -> None:
-        Ingress(settings, None, grpc.ssl_server_credentials([(b"", b"")]))  # type: ignore[arg-type]
-
+async def test_tls_is_the_gateways(settings: Settings) -> None:
     with pytest.raises(StartupError, match="tls_certificate"):
-        asyncio.run(run())
+        Ingress(settings, None, grpc.ssl_server_credentials([(b"", b"")]))  # type: ignore[arg-type]
 
 
 # The environment

@@ -157,50 +157,43 @@ def counted(caplog: pytest.LogCaptureFixture) -> Counted:
         (raising(asyncio.TimeoutError()), "INTERNAL", "TimeoutError"),
     ],
 )
-def test_a_call_ends_once_whatever_comes_of_it(
+async def test_a_call_ends_once_whatever_comes_of_it(
     counted: Counted, caplog: pytest.LogCaptureFixture, answer: Answer, code: str, reason: str | None
 ) -> None:
-    async def run() -> None:
-        async with serving(answer, counted) as channel:
-            if code == "OK":
-                await ask(channel)
-            else:
-                error = await failure(channel)
-                assert error.code == code
-                assert "secret" not in error.message
-            await until(lambda: len(counted.ended) == 1)
-
-    asyncio.run(run())
+    async with serving(answer, counted) as channel:
+        if code == "OK":
+            await ask(channel)
+        else:
+            error = await failure(channel)
+            assert error.code == code
+            assert "secret" not in error.message
+        await until(lambda: len(counted.ended) == 1)
     assert counted.codes == [code]
     assert counted.started == [METHOD]
     (line,) = lines_of(caplog)
     assert (line["code"], line.get("reason"), line["method"]) == (code, reason, METHOD)
 
 
-def test_bytes_that_are_no_message_are_counted_and_logged(counted: Counted, caplog: pytest.LogCaptureFixture) -> None:
-    async def run() -> None:
-        async with serving(echo, counted) as channel:
-            assert (await failure(channel, b"\xff" * 40)).reason == "MALFORMED_MESSAGE"
-
-    asyncio.run(run())
+async def test_bytes_that_are_no_message_are_counted_and_logged(
+    counted: Counted, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with serving(echo, counted) as channel:
+        assert (await failure(channel, b"\xff" * 40)).reason == "MALFORMED_MESSAGE"
     assert counted.codes == ["INVALID_ARGUMENT"]
     assert lines_of(caplog)[0]["bytes_in"] == 40
 
 
-def test_an_answer_that_cannot_be_written_is_internal(counted: Counted) -> None:
+async def test_an_answer_that_cannot_be_written_is_internal(counted: Counted) -> None:
     async def nonsense(request: Any, call: Call) -> Any:
         return "not a message"
 
-    async def run() -> None:
-        async with serving(nonsense, counted) as channel:
-            assert (await failure(channel)).code == "INTERNAL"
-
-    asyncio.run(run())
+    async with serving(nonsense, counted) as channel:
+        assert (await failure(channel)).code == "INTERNAL"
     assert counted.codes == ["INTERNAL"]
 
 
 @pytest.mark.parametrize("stubborn", [False, True])
-def test_a_leaving_caller_cancels_the_servicer(counted: Counted, stubborn: bool) -> None:
+async def test_a_leaving_caller_cancels_the_servicer(counted: Counted, stubborn: bool) -> None:
     begun, ended = asyncio.Event(), asyncio.Event()
 
     async def slow(request: Any, call: Call) -> Any:
@@ -212,22 +205,19 @@ def test_a_leaving_caller_cancels_the_servicer(counted: Counted, stubborn: bool)
                 await asyncio.sleep(0.1)
             ended.set()
 
-    async def run() -> None:
-        async with serving(slow, counted) as channel:
-            call = channel.unary_unary(METHOD)(b"", timeout=LIMIT_S)
-            answered = asyncio.ensure_future(call)  # what is not waited for is not sent
-            await asyncio.wait_for(begun.wait(), LIMIT_S)
-            call.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await answered
-            await until(lambda: len(counted.ended) == 1)
-            await asyncio.wait_for(ended.wait(), LIMIT_S)
-
-    asyncio.run(run())
+    async with serving(slow, counted) as channel:
+        call = channel.unary_unary(METHOD)(b"", timeout=LIMIT_S)
+        answered = asyncio.ensure_future(call)  # what is not waited for is not sent
+        await asyncio.wait_for(begun.wait(), LIMIT_S)
+        call.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await answered
+        await until(lambda: len(counted.ended) == 1)
+        await asyncio.wait_for(ended.wait(), LIMIT_S)
     assert counted.codes == ["CANCELLED"]
 
 
-def test_a_passed_deadline_is_answered_before_the_servicer_ends(
+async def test_a_passed_deadline_is_answered_before_the_servicer_ends(
     counted: Counted, caplog: pytest.LogCaptureFixture
 ) -> None:
     answered = asyncio.Event()
@@ -239,14 +229,11 @@ def test_a_passed_deadline_is_answered_before_the_servicer_ends(
             await answered.wait()
             raise RuntimeError("after the end") from None
 
-    async def run() -> None:
-        async with serving(stubborn, counted, default_deadline_s=0.3) as channel:
-            error = await failure(channel, timeout=None)
-            assert (error.code, error.reason) == ("DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED")
-            answered.set()
-            await until(lambda: "after the end" in caplog.text)
-
-    asyncio.run(run())
+    async with serving(stubborn, counted, default_deadline_s=0.3) as channel:
+        error = await failure(channel, timeout=None)
+        assert (error.code, error.reason) == ("DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED")
+        answered.set()
+        await until(lambda: "after the end" in caplog.text)
     assert counted.codes == ["DEADLINE_EXCEEDED"]
     assert "abandoned" in caplog.text
 
@@ -272,24 +259,21 @@ def test_the_caller_hears_of_its_deadline_from_the_server(counted: Counted) -> N
 @pytest.mark.parametrize(
     ("asked_s", "given_s"), [(None, 20.0), (5.0, 5.0), (50.0, 50.0), (500.0, 100.0), (10**9, 100.0)]
 )
-def test_deadlines_have_a_default_and_an_end(counted: Counted, asked_s: float | None, given_s: float) -> None:
+async def test_deadlines_have_a_default_and_an_end(counted: Counted, asked_s: float | None, given_s: float) -> None:
     calls: list[Call] = []
 
     async def answer(request: Any, call: Call) -> Any:
         calls.append(call)
         return pb.LocalizeResponse()
 
-    async def run() -> None:
-        async with serving(answer, counted, default_deadline_s=20.0, max_deadline_s=100.0) as channel:
-            await ask(channel, timeout=asked_s)
-
-    asyncio.run(run())
+    async with serving(answer, counted, default_deadline_s=20.0, max_deadline_s=100.0) as channel:
+        await ask(channel, timeout=asked_s)
     (call,) = calls
     assert call.deadline_s - call.arrived_s == pytest.approx(given_s * (1 - ANSWER_MARGIN_SHARE), abs=1.0)
     assert call.deadline_s - call.arrived_s < given_s
 
 
-def test_who_calls_is_known_before_anything_is_read(counted: Counted, caplog: pytest.LogCaptureFixture) -> None:
+async def test_who_calls_is_known_before_anything_is_read(counted: Counted, caplog: pytest.LogCaptureFixture) -> None:
     seen: list[Call] = []
     asked: list[tuple[str, Any]] = []
 
@@ -306,15 +290,12 @@ def test_who_calls_is_known_before_anything_is_read(counted: Counted, caplog: py
         seen.append(call)
         return pb.LocalizeResponse()
 
-    async def run() -> None:
-        async with serving(answer, counted, authenticate=authenticate) as channel:
-            assert (await failure(channel, b"\xff" * 9)).reason == "TOKEN_MISSING"
-            assert (await failure(channel, authorization="Bearer reader")).code == "PERMISSION_DENIED"
-            await ask(channel, authorization="Bearer good-secret", x_client_id="headset-3")
-            stub = health_pb2_grpc.HealthStub(channel)
-            assert (await stub.Check(health_pb2.HealthCheckRequest())).status == health_pb2.HealthCheckResponse.SERVING
-
-    asyncio.run(run())
+    async with serving(answer, counted, authenticate=authenticate) as channel:
+        assert (await failure(channel, b"\xff" * 9)).reason == "TOKEN_MISSING"
+        assert (await failure(channel, authorization="Bearer reader")).code == "PERMISSION_DENIED"
+        await ask(channel, authorization="Bearer good-secret", x_client_id="headset-3")
+        stub = health_pb2_grpc.HealthStub(channel)
+        assert (await stub.Check(health_pb2.HealthCheckRequest())).status == health_pb2.HealthCheckResponse.SERVING
     assert counted.codes == ["UNAUTHENTICATED", "PERMISSION_DENIED", "OK"]  # and health is not ours to count
     (call,) = seen
     assert call.principal == Principal("acme", Role.LOCALIZE, "robot-7")
@@ -335,51 +316,39 @@ class TestCallsOfWhichOnlyTheHeadersCome:
         await asyncio.wait_for(raw_http2.until_ended(reader, stream), LIMIT_S)
         writer.close()
 
-    def test_what_is_refused_is_refused_without_its_message(self, counted: Counted) -> None:
+    async def test_what_is_refused_is_refused_without_its_message(self, counted: Counted) -> None:
         def authenticate(*_: Any) -> Principal:
             raise Unauthenticated("a token is needed", reason="TOKEN_MISSING")
 
-        async def run() -> None:
-            async with listening(echo, counted, authenticate=authenticate) as port:
-                await self.ended(port, raw_http2.begin(1, METHOD))
-
-        asyncio.run(run())
+        async with listening(echo, counted, authenticate=authenticate) as port:
+            await self.ended(port, raw_http2.begin(1, METHOD))
         assert counted.codes == ["UNAUTHENTICATED"]
 
-    def test_the_message_has_to_come_before_the_deadline(
+    async def test_the_message_has_to_come_before_the_deadline(
         self, counted: Counted, caplog: pytest.LogCaptureFixture
     ) -> None:
-        async def run() -> None:
-            async with listening(echo, counted, default_deadline_s=0.2) as port:
-                await self.ended(port, raw_http2.begin(1, METHOD))
-
-        asyncio.run(run())
+        async with listening(echo, counted, default_deadline_s=0.2) as port:
+            await self.ended(port, raw_http2.begin(1, METHOD))
         assert counted.codes == ["DEADLINE_EXCEEDED"]
         assert lines_of(caplog)[0]["reason"] == "MESSAGE_LATE"
 
     @pytest.mark.parametrize("method", [CHECK, WATCH])
-    def test_the_message_of_an_open_method_has_little_time(
+    async def test_the_message_of_an_open_method_has_little_time(
         self, counted: Counted, monkeypatch: pytest.MonkeyPatch, method: str
     ) -> None:
         monkeypatch.setattr(receiving, "OPEN_MESSAGE_LIMIT_S", 0.2)
+        async with listening(echo, counted) as port:
+            await self.ended(port, raw_http2.begin(1, method))
 
-        async def run() -> None:
-            async with listening(echo, counted) as port:
-                await self.ended(port, raw_http2.begin(1, method))
-
-        asyncio.run(run())
-
-    def test_of_many_that_wait_the_oldest_gives_way(self, counted: Counted, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test_of_many_that_wait_the_oldest_gives_way(
+        self, counted: Counted, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         monkeypatch.setattr(receiving, "OPEN_MESSAGE_LIMIT_S", 1000.0)
         monkeypatch.setattr(receiving, "MAX_OPEN_WAITING", 2)
-
-        async def run() -> None:
-            async with listening(echo, counted) as port:
-                await self.ended(port, *(raw_http2.begin(stream, CHECK) for stream in (1, 3, 5)), stream=1)
-                async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
-                    await check_health(channel)
-
-        asyncio.run(run())
+        async with listening(echo, counted) as port:
+            await self.ended(port, *(raw_http2.begin(stream, CHECK) for stream in (1, 3, 5)), stream=1)
+            async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
+                await check_health(channel)
 
 
 async def check_health(channel: Channel) -> None:
@@ -387,38 +356,34 @@ async def check_health(channel: Channel) -> None:
     assert answer.status == health_pb2.HealthCheckResponse.SERVING
 
 
-def test_public_streams_are_few_and_keep_no_probe_out(counted: Counted, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_public_streams_are_few_and_keep_no_probe_out(counted: Counted, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(receiving, "MAX_OPEN_STREAMS", 2)
+    async with serving(echo, counted) as channel:
+        stub = health_pb2_grpc.HealthStub(channel)
 
-    async def run() -> None:
-        async with serving(echo, counted) as channel:
-            stub = health_pb2_grpc.HealthStub(channel)
+        async def watch() -> Any:
+            """One that has begun."""
+            watching = stub.Watch(health_pb2.HealthCheckRequest(), timeout=LIMIT_S)
+            assert (await watching.read()).status == health_pb2.HealthCheckResponse.SERVING
+            return watching
 
-            async def watch() -> Any:
-                """One that has begun."""
-                watching = stub.Watch(health_pb2.HealthCheckRequest(), timeout=LIMIT_S)
-                assert (await watching.read()).status == health_pb2.HealthCheckResponse.SERVING
-                return watching
+        async def is_let_in() -> bool:
+            try:
+                await watch()
+            except grpc.RpcError as error:
+                codes.add(from_rpc_error(error).code)
+                return False
+            return True
 
-            async def is_let_in() -> bool:
-                try:
-                    await watch()
-                except grpc.RpcError as error:
-                    codes.add(from_rpc_error(error).code)
-                    return False
-                return True
-
-            codes: set[str] = set()
-            first, _ = await watch(), await watch()
-            assert not await is_let_in()
-            await check_health(channel)
-            first.cancel()
-            while not await is_let_in():
-                await asyncio.sleep(0.01)
-            assert not await is_let_in()
-            assert codes == {"RESOURCE_EXHAUSTED"}
-
-    asyncio.run(run())
+        codes: set[str] = set()
+        first, _ = await watch(), await watch()
+        assert not await is_let_in()
+        await check_health(channel)
+        first.cancel()
+        while not await is_let_in():
+            await asyncio.sleep(0.01)
+        assert not await is_let_in()
+        assert codes == {"RESOURCE_EXHAUSTED"}
 
 
 class Unread:
@@ -437,85 +402,69 @@ class Unread:
         self.seen.append(message.status)
 
 
-def test_a_health_watcher_that_reads_nothing_blocks_no_change() -> None:
+async def test_a_health_watcher_that_reads_nothing_blocks_no_change() -> None:
     """Health's servicer holds a lock while it writes; a server that stops says so first."""
     status = health_pb2.HealthCheckResponse
-
-    async def run() -> None:
-        healthy = health.aio.HealthServicer()  # type: ignore[attr-defined]
-        method = grpc.unary_stream_rpc_method_handler(
-            healthy.Watch, health_pb2.HealthCheckRequest.FromString, status.SerializeToString
-        )
-        call = Unread()
-        watching = asyncio.ensure_future(OpenMethods(Receiver()).guarded(method).stream_stream(None, call))
-        for now in (status.SERVING, status.NOT_SERVING, status.UNKNOWN, status.NOT_SERVING):
-            await asyncio.wait_for(healthy.set("", now), LIMIT_S)
-            await until(lambda: call.begun == 1)
-            await asyncio.sleep(0)
-        call.may_read.set()
-        await until(lambda: call.seen[-1:] == [status.NOT_SERVING])
-        assert len(call.seen) == 2  # the first, and how it is now
-        watching.cancel()
-
-    asyncio.run(run())
+    healthy = health.aio.HealthServicer()  # type: ignore[attr-defined]
+    method = grpc.unary_stream_rpc_method_handler(
+        healthy.Watch, health_pb2.HealthCheckRequest.FromString, status.SerializeToString
+    )
+    call = Unread()
+    watching = asyncio.ensure_future(OpenMethods(Receiver()).guarded(method).stream_stream(None, call))
+    for now in (status.SERVING, status.NOT_SERVING, status.UNKNOWN, status.NOT_SERVING):
+        await asyncio.wait_for(healthy.set("", now), LIMIT_S)
+        await until(lambda: call.begun == 1)
+        await asyncio.sleep(0)
+    call.may_read.set()
+    await until(lambda: call.seen[-1:] == [status.NOT_SERVING])
+    assert len(call.seen) == 2  # the first, and how it is now
+    watching.cancel()
 
 
-def test_a_call_that_ends_without_a_message_is_told_so(counted: Counted) -> None:
-    async def run() -> None:
-        async with serving(echo, counted) as channel:
-            with pytest.raises(grpc.RpcError) as caught:
-                await channel.stream_unary(METHOD)(iter(()), timeout=LIMIT_S)
-            assert from_rpc_error(caught.value).reason == "MALFORMED_MESSAGE"
-
-    asyncio.run(run())
+async def test_a_call_that_ends_without_a_message_is_told_so(counted: Counted) -> None:
+    async with serving(echo, counted) as channel:
+        with pytest.raises(grpc.RpcError) as caught:
+            await channel.stream_unary(METHOD)(iter(()), timeout=LIMIT_S)
+        assert from_rpc_error(caught.value).reason == "MALFORMED_MESSAGE"
     assert counted.codes == ["INVALID_ARGUMENT"]
 
 
-def test_a_message_that_is_too_large_is_counted_once(counted: Counted) -> None:
-    async def run() -> None:
-        async with serving(echo, counted) as channel:
-            assert (await failure(channel, bytes(2**20 + 1))).code == "RESOURCE_EXHAUSTED"
-            await until(lambda: len(counted.ended) == 1)
-
-    asyncio.run(run())
+async def test_a_message_that_is_too_large_is_counted_once(counted: Counted) -> None:
+    async with serving(echo, counted) as channel:
+        assert (await failure(channel, bytes(2**20 + 1))).code == "RESOURCE_EXHAUSTED"
+        await until(lambda: len(counted.ended) == 1)
     # grpc tells the caller itself, and lets the call go at the same moment: either may be seen first.
     assert counted.codes in (["CANCELLED"], ["INVALID_ARGUMENT"])
 
 
-def test_a_fault_in_authentication_admits_nobody(counted: Counted) -> None:
+async def test_a_fault_in_authentication_admits_nobody(counted: Counted) -> None:
     def broken(*_: Any) -> Principal:
         raise OSError("the file of tokens is gone")
 
-    async def run() -> None:
-        async with serving(echo, counted, authenticate=broken) as channel:
-            error = await failure(channel)
-            assert error.code == "INTERNAL"
-            assert "tokens" not in error.message
-
-    asyncio.run(run())
+    async with serving(echo, counted, authenticate=broken) as channel:
+        error = await failure(channel)
+        assert error.code == "INTERNAL"
+        assert "tokens" not in error.message
     assert counted.codes == ["INTERNAL"]
 
 
 @pytest.mark.parametrize("given", ["a b", "x" * 65, "", "a%0a", 'id="1"'])
-def test_every_caller_is_admitted_by_default_by_address(counted: Counted, given: str) -> None:
+async def test_every_caller_is_admitted_by_default_by_address(counted: Counted, given: str) -> None:
     seen: list[Call] = []
 
     async def answer(request: Any, call: Call) -> Any:
         seen.append(call)
         return pb.LocalizeResponse()
 
-    async def run() -> None:
-        async with serving(answer, counted) as channel:
-            await ask(channel, x_client_id=given, x_request_id=given)
-
-    asyncio.run(run())
+    async with serving(answer, counted) as channel:
+        await ask(channel, x_client_id=given, x_request_id=given)
     (call,) = seen
     assert call.principal == Principal()
     assert re.fullmatch(r"ipv4:127\.0\.0\.1:\d+", call.client)
     assert len(call.request_id) == 32
 
 
-def test_what_a_servicer_tells_is_in_the_line_and_in_the_trace(
+async def test_what_a_servicer_tells_is_in_the_line_and_in_the_trace(
     counted: Counted, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def answer(request: Any, call: Call) -> Any:
@@ -527,12 +476,9 @@ def test_what_a_servicer_tells_is_in_the_line_and_in_the_trace(
         call.computed("coarse", start_s + 0.045, start_s + 0.145, batch_id="b-1", batch_size=3)
         return pb.LocalizeResponse()
 
-    async def run() -> None:
-        async with serving(answer, counted) as channel:
-            await ask(channel, b"\x0a\x01s", x_request_id="logged")
-
     counted.trace_id = "0af7651916cd43dd8448eb211c80319c"
-    asyncio.run(run())
+    async with serving(answer, counted) as channel:
+        await ask(channel, b"\x0a\x01s", x_request_id="logged")
     (line,) = lines_of(caplog)
     assert line["queue_ms"] == pytest.approx(15)
     assert line["stages_ms"] == {"decode": 10.0, "features": 20.0, "coarse": 100.0}
@@ -554,21 +500,18 @@ def test_a_call_of_many_steps_adds_them_up_and_keeps_the_first() -> None:
     assert len(call.history.steps) == MAX_STEPS
 
 
-def test_cancellation_inside_a_servicer_is_no_cancelled_call(counted: Counted) -> None:
+async def test_cancellation_inside_a_servicer_is_no_cancelled_call(counted: Counted) -> None:
     async def answer(request: Any, call: Call) -> Any:
         dropped: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         dropped.cancel()
         await dropped
 
-    async def run() -> None:
-        async with serving(answer, counted) as channel:
-            assert (await failure(channel)).reason == "GIVEN_UP"
-
-    asyncio.run(run())
+    async with serving(answer, counted) as channel:
+        assert (await failure(channel)).reason == "GIVEN_UP"
     assert counted.codes == ["UNAVAILABLE"]
 
 
-def test_a_thousand_calls_that_end_in_any_way_are_counted_once(counted: Counted) -> None:
+async def test_a_thousand_calls_that_end_in_any_way_are_counted_once(counted: Counted) -> None:
     arrived: set[str] = set()
 
     async def answer(request: Any, call: Call) -> Any:
@@ -594,15 +537,12 @@ def test_a_thousand_calls_that_end_in_any_way_are_counted_once(counted: Counted)
         except (grpc.RpcError, asyncio.CancelledError):
             assert kind != "good"
 
-    async def run() -> None:
-        kinds = ["good", "missing", "broken", "malformed", "late", "cancelled"]
-        async with serving(answer, counted) as channel:
-            for turn in range(20):
-                await asyncio.gather(*(one(channel, kinds[i % 6], f"{turn}-{i}") for i in range(48)))
-            await until(lambda: len(counted.ended) == len(counted.started))
-
     logging.getLogger("mapless_server.rpc.guard").setLevel(logging.CRITICAL)
-    asyncio.run(run())
+    kinds = ["good", "missing", "broken", "malformed", "late", "cancelled"]
+    async with serving(answer, counted) as channel:
+        for turn in range(20):
+            await asyncio.gather(*(one(channel, kinds[i % 6], f"{turn}-{i}") for i in range(48)))
+        await until(lambda: len(counted.ended) == len(counted.started))
     codes = counted.codes
     for code in ("OK", "NOT_FOUND", "INTERNAL", "INVALID_ARGUMENT"):
         assert codes.count(code) == 160, code

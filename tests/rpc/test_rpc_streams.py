@@ -123,16 +123,13 @@ async def until(condition: Callable[[], bool]) -> None:
     await asyncio.wait_for(wait(), LIMIT_S)
 
 
-def test_a_stream_that_ends_by_itself() -> None:
-    async def run() -> None:
-        counted, numbers = Counted(), Numbers(5)
-        async with serving(numbers, counted) as (channel, _):
-            call = watching(channel)
-            assert await read(call) == [1, 2, 3, 4, 5]
-            assert "x-request-id" in dict(await call.trailing_metadata())
-        assert (counted.started, counted.handled, numbers.is_closed) == (1, ["OK"], True)
-
-    asyncio.run(run())
+async def test_a_stream_that_ends_by_itself() -> None:
+    counted, numbers = Counted(), Numbers(5)
+    async with serving(numbers, counted) as (channel, _):
+        call = watching(channel)
+        assert await read(call) == [1, 2, 3, 4, 5]
+        assert "x-request-id" in dict(await call.trailing_metadata())
+    assert (counted.started, counted.handled, numbers.is_closed) == (1, ["OK"], True)
 
 
 @pytest.mark.parametrize(
@@ -144,47 +141,38 @@ def test_a_stream_that_ends_by_itself() -> None:
     ],
 )
 @pytest.mark.parametrize("when", ["at once", "later"])
-def test_a_stream_that_fails(error: Exception, code: str, when: str) -> None:
-    async def run() -> None:
-        counted, numbers = Counted(), Numbers(2, error)
-        async with serving(error if when == "at once" else numbers, counted) as (channel, _):
-            with pytest.raises(grpc.RpcError) as caught:
-                await read(watching(channel))
-            failure = from_rpc_error(caught.value)
-        assert failure.code == code
-        assert failure.request_id
-        assert "secret" not in str(failure)
-        assert counted.handled == [code]
-        assert numbers.is_closed == (when == "later")
-
-    asyncio.run(run())
+async def test_a_stream_that_fails(error: Exception, code: str, when: str) -> None:
+    counted, numbers = Counted(), Numbers(2, error)
+    async with serving(error if when == "at once" else numbers, counted) as (channel, _):
+        with pytest.raises(grpc.RpcError) as caught:
+            await read(watching(channel))
+        failure = from_rpc_error(caught.value)
+    assert failure.code == code
+    assert failure.request_id
+    assert "secret" not in str(failure)
+    assert counted.handled == [code]
+    assert numbers.is_closed == (when == "later")
 
 
-def test_a_caller_who_goes_ends_it() -> None:
-    async def run() -> None:
-        counted, numbers = Counted(), Numbers(1, "wait")
-        async with serving(numbers, counted) as (channel, _):
-            call = watching(channel)
-            await call.initial_metadata()
-            await call.read()
-            call.cancel()
-            await until(lambda: numbers.is_closed)
-            await until(lambda: counted.handled == ["CANCELLED"])
-
-    asyncio.run(run())
+async def test_a_caller_who_goes_ends_it() -> None:
+    counted, numbers = Counted(), Numbers(1, "wait")
+    async with serving(numbers, counted) as (channel, _):
+        call = watching(channel)
+        await call.initial_metadata()
+        await call.read()
+        call.cancel()
+        await until(lambda: numbers.is_closed)
+        await until(lambda: counted.handled == ["CANCELLED"])
 
 
-def test_a_caller_who_reads_nothing_and_goes_ends_it() -> None:
-    async def run() -> None:
-        counted, numbers = Counted(), Numbers(10**9, "wait")
-        async with serving(numbers, counted) as (channel, _):
-            call = watching(channel)
-            await call.initial_metadata()
-            await asyncio.sleep(0.1)  # until what is under way fills all there is room for
-            call.cancel()
-            await until(lambda: numbers.is_closed)
-
-    asyncio.run(run())
+async def test_a_caller_who_reads_nothing_and_goes_ends_it() -> None:
+    counted, numbers = Counted(), Numbers(10**9, "wait")
+    async with serving(numbers, counted) as (channel, _):
+        call = watching(channel)
+        await call.initial_metadata()
+        await asyncio.sleep(0.1)  # until what is under way fills all there is room for
+        call.cancel()
+        await until(lambda: numbers.is_closed)
 
 
 class Photographs(Numbers):
@@ -198,8 +186,8 @@ class Photographs(Numbers):
 
 
 @pytest.mark.parametrize("how", ["cancels", "closes its channel", "reaches its deadline"])
-def test_a_watcher_leaving_during_a_photo_is_no_server_fault(how: str, caplog: pytest.LogCaptureFixture) -> None:
-    async def run() -> None:
+async def test_a_watcher_leaving_during_a_photo_is_no_server_fault(how: str, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("WARNING"):
         counted, numbers = Counted(), Photographs(10**9)
         async with serving(numbers, counted) as (channel, _):
             call = watching(channel, 1.0 if how == "reaches its deadline" else LIMIT_S)
@@ -212,57 +200,45 @@ def test_a_watcher_leaving_during_a_photo_is_no_server_fault(how: str, caplog: p
             await until(lambda: len(counted.handled) == 1)
         assert numbers.is_closed
         assert counted.handled == ["DEADLINE_EXCEEDED" if how == "reaches its deadline" else "CANCELLED"]
-
-    with caplog.at_level("WARNING"):
-        asyncio.run(run())
     assert not caplog.records
 
 
-def test_it_outlasts_other_deadlines_and_ends_at_its_own() -> None:
-    async def run() -> None:
-        counted, numbers = Counted(), Numbers(0, "wait")
-        async with serving(numbers, counted, default_deadline_s=0.2, max_deadline_s=0.3) as (channel, _):
-            call = watching(channel, timeout=None)
-            await call.initial_metadata()
-            await asyncio.sleep(0.5)
-            assert not numbers.is_closed
-            call.cancel()
-            await until(lambda: numbers.is_closed)
-            with pytest.raises(grpc.RpcError) as caught:
-                await read(watching(channel, timeout=0.4))
-            assert from_rpc_error(caught.value).code == "DEADLINE_EXCEEDED"
-            await until(lambda: len(counted.handled) == 2)
-
-    asyncio.run(run())
+async def test_it_outlasts_other_deadlines_and_ends_at_its_own() -> None:
+    counted, numbers = Counted(), Numbers(0, "wait")
+    async with serving(numbers, counted, default_deadline_s=0.2, max_deadline_s=0.3) as (channel, _):
+        call = watching(channel, timeout=None)
+        await call.initial_metadata()
+        await asyncio.sleep(0.5)
+        assert not numbers.is_closed
+        call.cancel()
+        await until(lambda: numbers.is_closed)
+        with pytest.raises(grpc.RpcError) as caught:
+            await read(watching(channel, timeout=0.4))
+        assert from_rpc_error(caught.value).code == "DEADLINE_EXCEEDED"
+        await until(lambda: len(counted.handled) == 2)
 
 
-def test_a_missing_message_is_reported_without_a_deadline_too() -> None:
-    async def run() -> None:
-        counted = Counted()
-        async with serving(Numbers(0), counted, default_deadline_s=0.2) as (channel, _):
-            call = channel.stream_stream(METHOD)()
-            with pytest.raises(grpc.RpcError) as caught:
-                await call.read()
-            assert from_rpc_error(caught.value).reason == "MESSAGE_LATE"
-        assert counted.handled == ["DEADLINE_EXCEEDED"]
-
-    asyncio.run(run())
+async def test_a_missing_message_is_reported_without_a_deadline_too() -> None:
+    counted = Counted()
+    async with serving(Numbers(0), counted, default_deadline_s=0.2) as (channel, _):
+        call = channel.stream_stream(METHOD)()
+        with pytest.raises(grpc.RpcError) as caught:
+            await call.read()
+        assert from_rpc_error(caught.value).reason == "MESSAGE_LATE"
+    assert counted.handled == ["DEADLINE_EXCEEDED"]
 
 
-def test_nobody_waits_for_its_end() -> None:
-    async def run() -> None:
-        async with serving(Numbers(0, "wait"), Counted()) as (channel, guard):
-            call = watching(channel)
-            await call.initial_metadata()
-            start_s = time.monotonic()
-            await guard.wait_until_idle(LIMIT_S)
-            assert time.monotonic() - start_s < LIMIT_S / 2
-            call.cancel()
-
-    asyncio.run(run())
+async def test_nobody_waits_for_its_end() -> None:
+    async with serving(Numbers(0, "wait"), Counted()) as (channel, guard):
+        call = watching(channel)
+        await call.initial_metadata()
+        start_s = time.monotonic()
+        await guard.wait_until_idle(LIMIT_S)
+        assert time.monotonic() - start_s < LIMIT_S / 2
+        call.cancel()
 
 
-def test_a_caller_who_may_not_any_more_sees_nothing_more() -> None:
+async def test_a_caller_who_may_not_any_more_sees_nothing_more() -> None:
     allowed = [True, True, True, True, False]  # at the door, with the message, and before each that is sent
 
     def authenticate(*_: Any) -> Principal:
@@ -270,16 +246,13 @@ def test_a_caller_who_may_not_any_more_sees_nothing_more() -> None:
             raise Unauthenticated("it has been revoked", reason="TOKEN_INVALID")
         return Principal()
 
-    async def run() -> None:
-        counted, numbers, seen = Counted(), Numbers(9), list[int]()
-        async with serving(numbers, counted, authenticate=authenticate) as (channel, _):
-            with pytest.raises(grpc.RpcError) as caught:
-                await read(watching(channel), seen)
-            assert from_rpc_error(caught.value).reason == "TOKEN_INVALID"
-        assert seen == [1, 2]
-        assert (counted.handled, numbers.is_closed) == (["UNAUTHENTICATED"], True)
-
-    asyncio.run(run())
+    counted, numbers, seen = Counted(), Numbers(9), list[int]()
+    async with serving(numbers, counted, authenticate=authenticate) as (channel, _):
+        with pytest.raises(grpc.RpcError) as caught:
+            await read(watching(channel), seen)
+        assert from_rpc_error(caught.value).reason == "TOKEN_INVALID"
+    assert seen == [1, 2]
+    assert (counted.handled, numbers.is_closed) == (["UNAUTHENTICATED"], True)
 
 
 class Large(Numbers):
@@ -298,61 +271,48 @@ class Asked:
 
 
 class TestStreamsThatComeToAnEnd:
-    def test_all_that_is_sent_comes_and_they_are_counted(self) -> None:
-        async def run() -> None:
-            counted, numbers = Counted(), Numbers(2)
-            async with serving(numbers, counted) as (channel, _):
-                call = watching(channel, method=FINITE)
-                assert await read(call) == [1, 2]
-                assert "x-request-id" in dict(await call.trailing_metadata())
-            assert (counted.started, counted.handled, numbers.is_closed) == (1, ["OK"], True)
-
-        asyncio.run(run())
+    async def test_all_that_is_sent_comes_and_they_are_counted(self) -> None:
+        counted, numbers = Counted(), Numbers(2)
+        async with serving(numbers, counted) as (channel, _):
+            call = watching(channel, method=FINITE)
+            assert await read(call) == [1, 2]
+            assert "x-request-id" in dict(await call.trailing_metadata())
+        assert (counted.started, counted.handled, numbers.is_closed) == (1, ["OK"], True)
 
     @pytest.mark.parametrize("options", [{"default_deadline_s": 0.3}, {"max_deadline_s": 0.3}])
-    def test_their_deadline_is_that_of_unary_calls(self, options: dict[str, Any]) -> None:
-        async def run() -> None:
-            counted, numbers, seen = Counted(), Numbers(1, "wait"), list[int]()
-            async with serving(numbers, counted, **options) as (channel, _):
-                with pytest.raises(grpc.RpcError) as caught:
-                    await read(watching(channel, LIMIT_S if "max_deadline_s" in options else None, FINITE), seen)
-                failure = from_rpc_error(caught.value)
-                await until(lambda: numbers.is_closed)
-            assert (failure.code, failure.reason, seen) == ("DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED", [1])
-            assert failure.request_id
-            assert counted.handled == ["DEADLINE_EXCEEDED"]
+    async def test_their_deadline_is_that_of_unary_calls(self, options: dict[str, Any]) -> None:
+        counted, numbers, seen = Counted(), Numbers(1, "wait"), list[int]()
+        async with serving(numbers, counted, **options) as (channel, _):
+            with pytest.raises(grpc.RpcError) as caught:
+                await read(watching(channel, LIMIT_S if "max_deadline_s" in options else None, FINITE), seen)
+            failure = from_rpc_error(caught.value)
+            await until(lambda: numbers.is_closed)
+        assert (failure.code, failure.reason, seen) == ("DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED", [1])
+        assert failure.request_id
+        assert counted.handled == ["DEADLINE_EXCEEDED"]
 
-        asyncio.run(run())
+    async def test_the_server_waits_for_their_end(self) -> None:
+        numbers = Numbers(1, "wait")
+        async with serving(numbers, Counted()) as (channel, guard):
+            call = watching(channel, method=FINITE)
+            await call.read()
+            idle = asyncio.ensure_future(guard.wait_until_idle(LIMIT_S))
+            await asyncio.sleep(0.05)
+            assert not idle.done()
+            call.cancel()
+            await asyncio.wait_for(idle, LIMIT_S)
+            assert numbers.is_closed
 
-    def test_the_server_waits_for_their_end(self) -> None:
-        async def run() -> None:
-            numbers = Numbers(1, "wait")
-            async with serving(numbers, Counted()) as (channel, guard):
-                call = watching(channel, method=FINITE)
-                await call.read()
-                idle = asyncio.ensure_future(guard.wait_until_idle(LIMIT_S))
-                await asyncio.sleep(0.05)
-                assert not idle.done()
-                call.cancel()
-                await asyncio.wait_for(idle, LIMIT_S)
-                assert numbers.is_closed
+    async def test_an_error_after_a_message_is_told_with_details(self) -> None:
+        counted, seen = Counted(), list[int]()
+        async with serving(Numbers(1, FailedPrecondition("not now")), counted) as (channel, _):
+            with pytest.raises(grpc.RpcError) as caught:
+                await read(watching(channel, method=FINITE), seen)
+        assert (from_rpc_error(caught.value).reason, seen) == ("FAILED_PRECONDITION", [1])
 
-        asyncio.run(run())
-
-    def test_an_error_after_a_message_is_told_with_details(self) -> None:
-        async def run() -> None:
-            counted, seen = Counted(), list[int]()
-            async with serving(Numbers(1, FailedPrecondition("not now")), counted) as (channel, _):
-                with pytest.raises(grpc.RpcError) as caught:
-                    await read(watching(channel, method=FINITE), seen)
-            assert (from_rpc_error(caught.value).reason, seen) == ("FAILED_PRECONDITION", [1])
-
-        asyncio.run(run())
-
-    def test_what_was_made_in_time_waits_for_a_slow_reader(self, caplog: pytest.LogCaptureFixture) -> None:
+    async def test_what_was_made_in_time_waits_for_a_slow_reader(self, caplog: pytest.LogCaptureFixture) -> None:
         """The servicer is through with it long before, and the caller is told no other end later."""
-
-        async def run() -> None:
+        with caplog.at_level("WARNING"):
             counted, numbers = Counted(), Large(8)
             async with serving(numbers, counted, default_deadline_s=0.2) as (channel, _):
                 call = watching(channel, None, FINITE)
@@ -362,12 +322,9 @@ class TestStreamsThatComeToAnEnd:
                 assert not counted.handled
                 assert await read(call) == [*range(1, 9)]
             assert counted.handled == ["OK"]
-
-        with caplog.at_level("WARNING"):
-            asyncio.run(run())
         assert not caplog.records
 
-    def test_the_request_does_not_wait_for_who_reads_slowly(self) -> None:
+    async def test_the_request_does_not_wait_for_who_reads_slowly(self) -> None:
         """It is a photograph."""
         requests: list[weakref.ref[Asked]] = []
 
@@ -376,48 +333,39 @@ class TestStreamsThatComeToAnEnd:
             requests.append(weakref.ref(asked))
             return asked
 
-        async def run() -> None:
-            counted, numbers = Counted(), Large(8)
-            async with serving(numbers, counted, understand) as (channel, _):
-                call = watching(channel, method=FINITE)
-                await until(lambda: numbers.is_closed)
-                assert [it() for it in requests] == [None]
-                assert not counted.handled
-                assert await read(call) == [*range(1, 9)]
+        counted, numbers = Counted(), Large(8)
+        async with serving(numbers, counted, understand) as (channel, _):
+            call = watching(channel, method=FINITE)
+            await until(lambda: numbers.is_closed)
+            assert [it() for it in requests] == [None]
+            assert not counted.handled
+            assert await read(call) == [*range(1, 9)]
 
-        asyncio.run(run())
-
-    def test_one_that_expired_before_it_began_leaves_nothing(self) -> None:
+    async def test_one_that_expired_before_it_began_leaves_nothing(self) -> None:
         def authenticate(*_: Any) -> Principal:
             time.sleep(0.15)  # at the door, and with the message
             return Principal()
 
-        async def run() -> None:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
             late = serving(Numbers(1), Counted(), default_deadline_s=0.2, authenticate=authenticate)
             async with late as (channel, _):
                 with pytest.raises(grpc.RpcError) as caught:
                     await read(watching(channel, None, FINITE))
             assert from_rpc_error(caught.value).reason == "DEADLINE_EXCEEDED"
-
-        with warnings.catch_warnings(record=True) as told:
-            warnings.simplefilter("always")
-            asyncio.run(run())
             gc.collect()
         assert not told
 
-    def test_who_was_let_in_is_answered(self) -> None:
+    async def test_who_was_let_in_is_answered(self) -> None:
         asked = []
 
         def authenticate(*_: Any) -> Principal:
             asked.append(1)
             return Principal()
 
-        async def run() -> None:
-            async with serving(Numbers(2), Counted(), authenticate=authenticate) as (channel, _):
-                assert await read(watching(channel, method=FINITE)) == [1, 2]
-            assert len(asked) == 2  # at the door, and with the message
-
-        asyncio.run(run())
+        async with serving(Numbers(2), Counted(), authenticate=authenticate) as (channel, _):
+            assert await read(watching(channel, method=FINITE)) == [1, 2]
+        assert len(asked) == 2  # at the door, and with the message
 
 
 @pytest.fixture
@@ -437,37 +385,31 @@ class TestWhoReadsTooSlowly:
     """No deadline ends it: its messages were made in time, and the caller gave none."""
 
     @pytest.mark.parametrize("read_before", [0, 1])
-    def test_is_told_when_it_reads_again_and_holds_no_call(self, method: str, read_before: int) -> None:
-        async def run() -> None:
-            counted, numbers = Counted(), Large(8)
-            async with serving(numbers, counted) as (channel, guard):
-                before = len(asyncio.all_tasks())
-                call, seen = watching(channel, None, method), list[int]()
-                for _ in range(read_before):
-                    await anext(aiter(call))
-                await until(lambda: len(counted.handled) == 1)
-                await guard.wait_until_idle(LIMIT_S)
-                assert numbers.is_closed
-                with pytest.raises(grpc.RpcError) as caught:
-                    await asyncio.wait_for(read(call, seen), LIMIT_S)
-                failure = from_rpc_error(caught.value)
-                await until(lambda: len(asyncio.all_tasks()) == before + 1)  # the one that asks
-            assert (failure.code, failure.reason) == ("DEADLINE_EXCEEDED", "READ_LATE")
-            assert failure.request_id
-            assert seen == [read_before + 1]
-            assert counted.handled == ["DEADLINE_EXCEEDED"]
+    async def test_is_told_when_it_reads_again_and_holds_no_call(self, method: str, read_before: int) -> None:
+        counted, numbers = Counted(), Large(8)
+        async with serving(numbers, counted) as (channel, guard):
+            before = len(asyncio.all_tasks())
+            call, seen = watching(channel, None, method), list[int]()
+            for _ in range(read_before):
+                await anext(aiter(call))
+            await until(lambda: len(counted.handled) == 1)
+            await guard.wait_until_idle(LIMIT_S)
+            assert numbers.is_closed
+            with pytest.raises(grpc.RpcError) as caught:
+                await asyncio.wait_for(read(call, seen), LIMIT_S)
+            failure = from_rpc_error(caught.value)
+            await until(lambda: len(asyncio.all_tasks()) == before + 1)  # the one that asks
+        assert (failure.code, failure.reason) == ("DEADLINE_EXCEEDED", "READ_LATE")
+        assert failure.request_id
+        assert seen == [read_before + 1]
+        assert counted.handled == ["DEADLINE_EXCEEDED"]
 
-        asyncio.run(run())
-
-    def test_leaves_nothing_behind_when_it_never_reads_and_goes(self, method: str) -> None:
-        async def run() -> None:
-            counted = Counted()
-            async with serving(Large(8), counted) as (channel, _):
-                before = len(asyncio.all_tasks())
-                call = watching(channel, None, method)
-                await until(lambda: len(counted.handled) == 1)
-                call.cancel()
-                await until(lambda: len(asyncio.all_tasks()) == before + 1)  # the one that asks
-            assert counted.handled == ["DEADLINE_EXCEEDED"]
-
-        asyncio.run(run())
+    async def test_leaves_nothing_behind_when_it_never_reads_and_goes(self, method: str) -> None:
+        counted = Counted()
+        async with serving(Large(8), counted) as (channel, _):
+            before = len(asyncio.all_tasks())
+            call = watching(channel, None, method)
+            await until(lambda: len(counted.handled) == 1)
+            call.cancel()
+            await until(lambda: len(asyncio.all_tasks()) == before + 1)  # the one that asks
+        assert counted.handled == ["DEADLINE_EXCEEDED"]
