@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+from mapless_server.extras import install_hint
 
 from .catalogue import Weights, WheelMember
 from .errors import CheckpointError, FolderError
-from .fit import compare_names, try_loading
 from .folder import find_weights, place_of, put_in_place, record, recorded, workplace
-from .safetensors_header import opened, read_header, sha256_of
+from .safetensors_header import Header, check_fit, opened, read_header, sha256_of
 from .sources import convert, download, is_original
 
 Progress = Callable[[int], object]
-"""Told how many more bytes were done."""
+"""Called with how many more bytes were done."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +55,9 @@ def fetch(weights: Weights, weights_dir: Path, folder: Path) -> Installed:
     with _writing(weights_dir):
         ready = download(weights, folder)
         what = f"the file that came for {weights.name}"
-        sha256, is_official, not_compared = _read_through(ready, weights, called=what)
-        _require_official(what, weights, sha256, is_official)
-        return Installed(put_in_place(ready, weights, weights_dir, sha256), sha256, is_official, not_compared)
+        found = _read_through(ready, weights, called=what)
+        _require_official(found, weights, what)
+        return replace(found, path=put_in_place(ready, weights, weights_dir, found.sha256))
 
 
 def add(
@@ -90,16 +92,16 @@ def add(
         ready = folder / weights.file_name
         if original:
             convert(file.read_bytes(), original, ready)
-            sha256, is_official, not_compared = _read_through(ready, weights, called=str(file))
+            found = _read_through(ready, weights, called=str(file))
         elif link:
             ready.symlink_to(file.resolve())
-            sha256, is_official, not_compared = _read_through(file, weights, progress)
+            found = _read_through(file, weights, progress)
         else:
             with ready.open("wb") as copy:
-                sha256, is_official, not_compared = _read_through(file, weights, progress, _writer(copy.write))
+                found = _read_through(file, weights, progress, _writer(copy.write))
         if not unofficial:
-            _require_official(str(file), weights, sha256, is_official, "; --unofficial takes it all the same")
-        return Installed(put_in_place(ready, weights, weights_dir, sha256), sha256, is_official, not_compared)
+            _require_official(found, weights, str(file), "; --unofficial takes it all the same")
+        return replace(found, path=put_in_place(ready, weights, weights_dir, found.sha256))
 
 
 def check(weights: Weights, weights_dir: Path, progress: Progress = lambda _: None) -> Installed:
@@ -110,15 +112,15 @@ def check(weights: Weights, weights_dir: Path, progress: Progress = lambda _: No
         CheckpointError: it cannot be read or used, or its digest is neither the official nor the recorded one.
     """
     path = find_weights(weights.name, weights_dir)
-    sha256, is_official, not_compared = _read_through(path, weights, progress)
+    found = _read_through(path, weights, progress)
     known = recorded(path)
-    if sha256 != known:
-        _require_official(str(path), weights, sha256, is_official)
-        if known is not None and is_official is None:
-            raise CheckpointError(f"{path} has changed since it came: its SHA-256 is {sha256}, not {known}")
+    if found.sha256 != known:
+        _require_official(found, weights, str(path))
+        if known is not None and found.is_official is None:
+            raise CheckpointError(f"{path} has changed since it came: its SHA-256 is {found.sha256}, not {known}")
     with contextlib.suppress(OSError):  # a folder mounted read-only can be checked too
-        record(path, sha256)
-    return Installed(path, sha256, is_official, not_compared)
+        record(path, found.sha256)
+    return found
 
 
 def _original(file: Path, weights: Weights) -> WheelMember | None:
@@ -142,14 +144,14 @@ def _read_through(
     progress: Progress = lambda _: None,
     write: Callable[[bytes], object] = lambda _: None,
     called: str = "",
-) -> tuple[str, bool | None, str | None]:
-    """Digest, whether it is the official one, and why the tensors were not compared with the network's, if so.
+) -> Installed:
+    """Reads a file from end to end and compares it with what it should be.
 
     Args:
         file: to read.
         weights: what it should be.
-        progress: told of every block.
-        write: handed every block.
+        progress: called with the size of every block.
+        write: called with every block.
         called: the file's name in messages, if it is not its own.
     """
     called = called or str(file)
@@ -161,21 +163,77 @@ def _read_through(
 
     header = read_header(file, called)
     if weights.network:  # gigabytes: before they are read
-        not_compared = compare_names(header, weights, called)
+        not_compared = _compare_names(header, weights, called)
     with opened(file) as stream:
         sha256 = sha256_of(stream, to)
     is_official = None if weights.sha256 is None else sha256 == weights.sha256
     if is_official:
-        return sha256, True, None
-    return sha256, is_official, not_compared if weights.network else try_loading(weights, file)
+        not_compared = None
+    elif not weights.network:
+        not_compared = _try_loading(weights, file)
+    return Installed(file, sha256, is_official, not_compared)
 
 
-def _require_official(called: str, weights: Weights, sha256: str, is_official: bool | None, way_out: str = "") -> None:
-    if is_official is False:
+def _require_official(found: Installed, weights: Weights, called: str, way_out: str = "") -> None:
+    if found.is_official is False:
         raise CheckpointError(
-            f"{called} is not the official file of {weights.name}: its SHA-256 is {sha256}, "
+            f"{called} is not the official file of {weights.name}: its SHA-256 is {found.sha256}, "
             f"not {weights.sha256}{way_out}"
         )
+
+
+def _compare_names(header: Header, weights: Weights, called: str) -> str | None:
+    """Compares names and shapes with those of the class that the catalogue names, which must not be empty.
+
+    Args:
+        header: of the file.
+        weights: what it should be.
+        called: the file's name in messages.
+
+    Returns:
+        Why they could not be compared; None if they could.
+
+    Raises:
+        CheckpointError: they differ.
+    """
+    module_name, class_name = weights.network.split(":")
+    try:
+        import torch
+
+        from ..checkpoint import IMAGE_NORMALIZATION, UNUSED, expected_tensors
+
+        network = getattr(importlib.import_module(module_name), class_name)
+    except ImportError as error:
+        return install_hint(error)
+    with torch.device("meta"):
+        expected = expected_tensors(network())
+    check_fit(header, expected, IMAGE_NORMALIZATION.keys(), UNUSED, f"{called} does not fit {class_name}")
+    return None
+
+
+def _try_loading(weights: Weights, file: Path) -> str | None:
+    """Loads features or matching as the server does, which also finds numbers that are not finite.
+
+    Returns:
+        Why it could not be tried; None if it went well.
+
+    Raises:
+        CheckpointError: the file does not fit.
+    """
+    try:
+        if weights.purpose == "features":
+            from mapless_server.networks.local_features import LOADERS
+
+            LOADERS[weights.name](file)
+        elif weights.purpose == "matching":
+            from mapless_server.networks.lightglue import load_lightglue
+
+            load_lightglue(weights.name.removesuffix("-lightglue"), file)
+        else:
+            return f"no network takes {weights.name}"
+    except ImportError as error:
+        return install_hint(error)
+    return None
 
 
 def _writer(write: Callable[[bytes], object]) -> Callable[[bytes], object]:
