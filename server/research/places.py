@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import OPTIONS, make_matcher

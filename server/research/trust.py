@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Localization
 from mapless_server.method.features import make_extractor
 from mapless_server.method.options import LocalizeOptions

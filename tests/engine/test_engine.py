@@ -22,7 +22,7 @@ from mapless_server.engine.query import Caller, Description, Photo, Query, Resul
 from mapless_server.engine.stages import MAX_LISTINGS, QueryStages
 from mapless_server.engine.tiers import EscalationOptions
 from mapless_server.errors import DeadlineExceeded, InvalidArgument, Unavailable
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline

@@ -21,7 +21,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES
 from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Query
-from mapless_server.images.decode import image_size
+from mapless_server.images import image_size
 from mapless_server.method.priors.known import DirectionPrior, PosePrior, PositionPrior, Prior
 from mapless_server.security.tenancy import scene_id_of, tenant_of
 from mapless_server.services.messages.answers import (

@@ -17,8 +17,7 @@ from fuzz import benchmarks, captures, colmap
 from fuzz.importing import Layout
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.errors import InvalidArgument
-from mapless_server.images import png_chunks
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image, png_chunks
 from mapless_server.images.png_chunks import essential_png
 from mapless_server.security.errors import SecurityError
 from mapless_server.security.tokens import read_tokens

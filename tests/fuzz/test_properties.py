@@ -27,7 +27,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.wire import MAX_SIDE_PX, MIN_SIDE_PX, FieldError
 from mapless_server.errors import InvalidArgument
-from mapless_server.images.decode import ImageLimits, decode_image, image_size
+from mapless_server.images import ImageLimits, decode_image, image_size
 from mapless_server.images.png_chunks import essential_png
 from mapless_server.services.messages.answers import answer_frames_of
 from mapless_server.services.messages.queries import query_from_message

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.images import cmyk_jpeg, encode, png_claiming, textured, with_exif_orientation
 
 from mapless_server.errors import InvalidArgument
-from mapless_server.images.decode import ImageLimits, decode_image, image_size
+from mapless_server.images import ImageLimits, decode_image, image_size
 
 LIMITS = ImageLimits()
 RGB = textured()

@@ -12,7 +12,7 @@ from support.compare import assert_pose_close
 from support.scenes import make_scene, random_for
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import make_extractor

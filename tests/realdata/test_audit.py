@@ -15,7 +15,7 @@ import pytest
 from support.audits import audit_references, finder_of
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features import make_extractor
 from mapless_server.method.views import PosedView
 from mapless_server.scenes import AuditVerdict, CoverageVerdict, PairMatches, ReferenceAudit

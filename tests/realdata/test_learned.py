@@ -11,7 +11,7 @@ import pytest
 
 from mapless_server.engine.query import Tier
 from mapless_server.engine.tiers import EscalationOptions, is_doubtful
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features import SiftExtractor
 from mapless_server.scenes import RankedReference, RankOptions, Selection, Vector, VladDescriptor, rank_references
 from mapless_server.scenes.retrieval.index import SceneIndex

@@ -20,7 +20,7 @@ from support.servers import CAMERA, StandInExtractor, pose
 
 from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, RequestError
-from mapless_server.images.decode import ImageLimits
+from mapless_server.images import ImageLimits
 from mapless_server.method.context import StageContext
 from mapless_server.method.views import View
 from mapless_server.scenes import FeaturesMissing, Loaded, ReferenceLibrary, load_usable

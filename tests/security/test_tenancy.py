@@ -24,7 +24,7 @@ from mapless.v1.geometry_pb2 import Vector3
 from mapless.wire import FieldError
 from mapless_server.engine.query import Description
 from mapless_server.errors import NotFound, RequestError
-from mapless_server.images.decode import ImageLimits
+from mapless_server.images import ImageLimits
 from mapless_server.method.views import Features, View
 from mapless_server.rpc.call import Call
 from mapless_server.scenes import Choice, Coverage, CoverageVerdict

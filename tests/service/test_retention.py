@@ -48,7 +48,7 @@ from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features import make_extractor
 from mapless_server.services.capture.files import blobs_of, calls_of
 

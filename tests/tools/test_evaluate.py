@@ -16,7 +16,7 @@ from rich.console import Console
 from support.images import encode, textured
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
-from mapless_server.images.decode import ImageLimits
+from mapless_server.images import ImageLimits
 from mapless_tools.bench.latency import Latency
 from mapless_tools.bench.report import BenchResult, as_json, markdown
 from mapless_tools.bench.scenes import BenchScene, Figures, met

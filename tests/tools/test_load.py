@@ -24,7 +24,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 from mapless_tools.charts import write_figure
 from mapless_tools.load.arrivals import Kind, Mix, PlannedCall, Requests, plan_calls, poisson_times
 from mapless_tools.load.charts import LATENCIES, RATES, draw_load

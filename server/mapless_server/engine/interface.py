@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
-from mapless_server.images.decode import ImageLimits
+from mapless_server.images import ImageLimits
 from mapless_server.scheduling import Job, WorkQueueOptions
 
 from .tiers import EscalationOptions

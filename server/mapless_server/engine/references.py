@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Protocol
 
 from mapless_server.errors import DataLoss, NotFound
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import Photograph, View

@@ -1,4 +1,8 @@
-"""From the bytes of a stranger's photograph to pixels: `decode`.
+"""Encoded photographs of strangers to pixels; one is rejected by its header, before memory is allocated for it.
 
-Imports nothing of the other rooms but scheduling's; a photograph is refused by its header, before memory is allocated.
+Imports only `mapless_server.errors`. Begin with `decode`.
 """
+
+from .decode import ImageLimits, decode_image, image_size
+
+__all__ = ["ImageLimits", "decode_image", "image_size"]

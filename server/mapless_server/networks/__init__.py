@@ -1,15 +1,15 @@
 """The feed-forward 3D networks pi^3 (Wang et al. 2025) and its successor Pi3X, written from a description of them.
 
 A network takes images of one scene and gives, up to one similarity, each view's pose and the point seen at each of its
-pixels. The modules' names are those of the official checkpoints' entries. Nothing here knows the rest of mapless but
-the header of weights' files.
+pixels. The modules' names are those of the official checkpoints' entries. Imports only `errors` and `extras`, and
+nothing at all at import: torch takes seconds. Begin with `network`.
 
     blocks.py      attention, normalization, rotary positions
     encoder.py     each image to patch tokens
     decoder.py     blocks within views and over the scene in turn
     heads.py       poses, points and confidence from decoded tokens
     rotation.py    the nearest rotation
-    conditions.py  what Pi3X may be told: rays, depths, poses
+    conditions.py  what Pi3X takes besides images: rays, poses
     network.py     what both have in common, in order
     pi3.py, pi3x.py
     checkpoint.py  weights from a file, all of them and nothing else
@@ -24,4 +24,6 @@ And those of local features and of their matching:
 
     local_features.py   ALIKED, XFeat, SuperPoint: other packages' networks, with weights of ours
     lightglue.py        LightGlue (Lindenberger et al. 2023), of kornia's layers
+
+    weights/       which weights there are, where they lie, how they get there; without torch
 """

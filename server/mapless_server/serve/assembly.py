@@ -15,7 +15,7 @@ from mapless_server.engine.queue_engine import QueueEngine, check_tiers
 from mapless_server.engine.references import References
 from mapless_server.engine.stages import Method
 from mapless_server.extras import install_hint
-from mapless_server.images.decode import ImageLimits
+from mapless_server.images import ImageLimits
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import Matcher, make_matcher
 from mapless_server.method.features import FEATURES, FeatureExtractor, make_extractor

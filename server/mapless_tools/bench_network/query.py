@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from mapless_server.engine.query import Tier
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.features import FeatureExtractor

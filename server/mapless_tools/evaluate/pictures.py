@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, cross_matrix
-from mapless_server.images.decode import decode_image
+from mapless_server.images import decode_image
 from mapless_server.method.correspond import mutual_matches
 from mapless_server.method.views import View
 from mapless_tools.dataset import Frame

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from mapless_server.errors import InvalidArgument
-from mapless_server.images.decode import ImageLimits, decode_image, image_size
+from mapless_server.images import ImageLimits, decode_image, image_size
 from mapless_server.method.correspond import OPTIONS
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.retrieve import choose_references

@@ -13,7 +13,7 @@ from rich.console import Console
 from mapless import AlreadyExists, Client, MaplessError, Reference
 from mapless.names import check_id
 from mapless_server.errors import InvalidArgument
-from mapless_server.images.decode import ImageLimits, image_size
+from mapless_server.images import ImageLimits, image_size
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import Settings
 from mapless_tools.child import ServerFailed

@@ -28,7 +28,7 @@ from mapless import (
     Unavailable,
 )
 from mapless_server.errors import InvalidArgument as BadImage
-from mapless_server.images.decode import image_size
+from mapless_server.images import image_size
 from mapless_tools.dataset import Frame, Refusal
 from mapless_tools.progress import Progress
 

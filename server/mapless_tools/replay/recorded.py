@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapless.names import reference_name
 from mapless_server.engine.references import QueryViews
 from mapless_server.errors import DataLoss
-from mapless_server.images.decode import decode_image
+from mapless_server.images import decode_image
 from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import Photograph, PosedView, View

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform, resized_pixel
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 
 from .queries import Query
 

@@ -11,7 +11,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError, camera_from_message, joined
 from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query
-from mapless_server.images.decode import ImageLimits, image_size
+from mapless_server.images import ImageLimits, image_size
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.security.tenancy import SceneKey, key_of
 from mapless_server.store import SceneAttributes

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from mapless_server.errors import InvalidArgument
-from mapless_server.images.decode import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.epipolar import consistent_matches
 from mapless_server.method.features import FeatureExtractor, SiftExtractor
 from mapless_server.method.views import PosedView

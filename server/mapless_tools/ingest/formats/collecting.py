@@ -16,7 +16,7 @@ import numpy as np
 
 from mapless.geometry import MAX_COORDINATE_M, Array, Camera, Quaternion, RigidTransform
 from mapless_server.errors import InvalidArgument
-from mapless_server.images.decode import ImageLimits, image_size
+from mapless_server.images import ImageLimits, image_size
 from mapless_tools.dataset import MAX_SIDE_PX, Dataset, Frame, Refusal, image_file, legal_id
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
