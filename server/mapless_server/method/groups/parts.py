@@ -18,6 +18,7 @@ from mapless.geometry import Array, RigidTransform
 from ..pnp import reprojection_errors_px
 from ..results import PointMatches
 from ..tracks import Tracks
+from ..uncertainty.linearization import tracks_with_query
 from .freedom import Freedom
 from .images import MatchedImage
 
@@ -48,15 +49,8 @@ def part_of(
     errors_px = reprojection_errors_px(source.query.camera, pose, structure.x_in_world[matches.point], pixels)
     used = np.flatnonzero(errors_px < max_error_px)
     used = used[:: max(1, -(-len(used) // max_matches))]
-    chosen = np.unique(matches.point[used])
-    is_chosen = np.zeros(len(structure.x_in_world), bool)
-    is_chosen[chosen] = True
-    seen = structure.tracks.select(is_chosen)
-    point = np.concatenate([seen.point, np.searchsorted(chosen, matches.point[used])])
-    view = np.concatenate([seen.view, np.full(len(used), len(source.references))])
-    keypoint = np.concatenate([seen.keypoint, matches.keypoint[used]])
-    order = np.lexsort((view, point))
-    return Part(source, pose, chosen, Tracks(point[order], view[order], keypoint[order]))
+    tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(source.references))
+    return Part(source, pose, np.flatnonzero(chosen), tracks)
 
 
 class Shared:
