@@ -36,7 +36,7 @@ from mapless_server.scheduling import (
     compute_items,
 )
 from mapless_server.security.tenancy import SceneKey
-from mapless_server.services.groups import _localize_each
+from mapless_server.services.localization import localize_photographs
 
 LIMIT_S = 30.0
 MAX_BYTES = 1000
@@ -229,7 +229,7 @@ def test_the_stages_of_a_group_that_fails_are_told_too() -> None:
         engine.fails_at = next(engine._numbers) + 3
         call = Call("id", time.monotonic(), time.monotonic() + LIMIT_S)
         with pytest.raises(RuntimeError, match="planted"):
-            await _localize_each(engine, [PART] * 4, call, "images")
+            await localize_photographs(engine, [PART] * 4, call, "images")
         assert call.history.queue_s is not None
         assert call.history.stage_seconds[PREPARE] >= engine.seconds
 

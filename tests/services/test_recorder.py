@@ -165,7 +165,7 @@ def answer(recorder: Recorder, tenant: str = "default", *references: PosedView) 
     result = SimpleNamespace(choice=None, references=references, generation=1, attributes=SceneAttributes())
     part = cast(Any, (query, result))
     response = pb.LocalizeResponse()
-    recorder.answered("Localize", localize_request("s"), response, call, [part], ())
+    recorder.record(localize_request("s"), response, call, [part], ())
     return response
 
 

@@ -1,28 +1,39 @@
-"""LocalizationService: message to values, engine, values to message. No maths here."""
+"""LocalizationService: a request becomes queries, the engine answers them, and the results become a response."""
 # ruff: noqa: N802  methods carry the names of their RPCs
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Callable, Sequence
 from functools import partial
 
 from mapless import wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
+from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES, GroupResult, localize_each
 from mapless_server.engine.interface import Engine
 from mapless_server.engine.query import Query, Result
 from mapless_server.method.answer import Localization
+from mapless_server.method.rejection import Rejection
+from mapless_server.method.results import MetricScale
 from mapless_server.observability.metrics import LOCALIZED, Metrics
 from mapless_server.rpc.call import Call
 from mapless_server.security.tenancy import key_of
 from mapless_server.store import SceneAttributes, Store
 
+from .capture.calls import Request, Response
 from .capture.recorder import Recorder
-from .groups import answer_rig, answer_sequence
 from .messages.answers import AnswerFrames, answer_frames_of, diagnostics_to_message, outcome_to_message
 from .messages.debug import debug_to_message
+from .messages.groups import (
+    poses_from_message,
+    queries_from_message,
+    rig_to_message,
+    sequence_to_message,
+    session_from_rig_from_message,
+    session_poses_from_message,
+)
 from .messages.priors import needs_attributes
 from .messages.queries import query_from_message
 from .progressive import coarse_then_final
@@ -30,7 +41,7 @@ from .watching import Watch, Watchers
 
 
 class LocalizationService(rpcs.LocalizationServiceServicer):
-    """Says where a photograph was taken."""
+    """Localizes photographs: single ones, rigs and sequences."""
 
     def __init__(
         self,
@@ -40,7 +51,15 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         watchers: Watchers,
         recorder: Recorder | None = None,
     ) -> None:
-        """`engine` gives it, or raises Unavailable as long as there is none; a recorder captures the calls."""
+        """Computes nothing yet.
+
+        Args:
+            engine: returns the engine; raises Unavailable while the server starts.
+            metrics: count answers and their quality.
+            store: of the scenes' attributes.
+            watchers: receive each answer of a single photograph.
+            recorder: captures answered calls; None to capture none.
+        """
         self._engine = engine
         self._metrics = metrics
         self._store = store
@@ -76,7 +95,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         call: Call,
         coarse: asyncio.Future[pb.LocalizeResponse] | None = None,
     ) -> pb.LocalizeResponse:
-        """The final answer; before it, `coarse` gets the first answer that is known without refining."""
+        """The final answer; before it, `coarse` is set to the coarse pose if there is one."""
         engine = self._engine()
 
         def to_message(result: Result) -> pb.LocalizeResponse:
@@ -102,25 +121,47 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             result = await engine.run(job)
         finally:
             call.record(job.records)
-        response = to_message(result)
-        self._count(result, response, call)
-        debug, support = None, result.answer.support
-        if support is not None and (request.options.include_debug or self._watchers.is_watched(query.scene_key)):
-            debug = await asyncio.to_thread(debug_to_message, support)
+        response, answer = to_message(result), result.answer
+        parts_ms = {stage: round(1000 * seconds, 1) for stage, seconds in result.stage_seconds.items()}
+        call.note(parts_ms=parts_ms, used_references=len(result.references))
+        if isinstance(answer.outcome, Localization):
+            call.note(pose_stage=answer.outcome.pose_stage.value)
+        self._report(answer.outcome, response.localization, [result], call, answer.scale)
+        debug = None
+        if answer.support is not None and (request.options.include_debug or self._watchers.is_watched(query.scene_key)):
+            debug = await asyncio.to_thread(debug_to_message, answer.support)
         if request.options.include_debug and debug is not None:
             response.debug.CopyFrom(debug)
-        if self._recorder is not None:
-            self._recorder.answered("Localize", request, response, call, [(query, result)], engine.tiers)
+        self._capture(request, response, call, [(query, result)])
         self._watchers.publish(query.scene_key, request, response, debug)
         return response
 
     async def LocalizeRig(self, request: pb.LocalizeRigRequest, call: Call) -> pb.LocalizeRigResponse:
         """Implements LocalizationService.LocalizeRig."""
-        return await answer_rig(request, call, self._engine(), self._metrics, self._recorder)
+        engine = self._engine()
+        queries = queries_from_message(request, "images", (1, MAX_RIG_IMAGES), call.principal.tenant, engine.options)
+        rig_from_camera = poses_from_message(request.images, "images", "rig_from_camera")
+        session_from_rig = session_from_rig_from_message(request)
+        with engine.hold(queries, call.caller):
+            group = await localize_photographs(engine, queries, call, "images")
+            outcome = await engine.pose_rig(group.results, rig_from_camera, call.caller)
+        response = rig_to_message(outcome, group, queries, request, session_from_rig)
+        self._finish_group(request, response, outcome, queries, group.results, call)
+        return response
 
     async def LocalizeSequence(self, request: pb.LocalizeSequenceRequest, call: Call) -> pb.LocalizeSequenceResponse:
         """Implements LocalizationService.LocalizeSequence."""
-        return await answer_sequence(request, call, self._engine(), self._metrics, self._recorder)
+        engine = self._engine()
+        bounds = (MIN_FRAMES, MAX_FRAMES)
+        queries = queries_from_message(request, "frames", bounds, call.principal.tenant, engine.options)
+        axes, session_from_camera = session_poses_from_message(request)
+        scale_is_free = request.estimate_session_scale
+        with engine.hold(queries, call.caller):
+            group = await localize_photographs(engine, queries, call, "frames")
+            outcome = await engine.pose_sequence(group.results, session_from_camera, scale_is_free, call.caller)
+        response = sequence_to_message(outcome, group, queries, request, axes)
+        self._finish_group(request, response, outcome, queries, group.results, call)
+        return response
 
     async def WatchQueries(self, request: pb.WatchQueriesRequest, call: Call) -> Watch:
         """Implements LocalizationService.WatchQueries."""
@@ -131,30 +172,74 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         return self._watchers.watch(scene_key)
 
     async def _attributes(self, request: pb.LocalizeRequest, tenant: str) -> SceneAttributes:
-        """What is known of the request's scene, if what it says of the camera cannot be understood without."""
+        """The scene's attributes, read only if the request's priors need them."""
         if not needs_attributes(request):
             return SceneAttributes()
         scene_key = key_of(tenant, wire.scene_id_from_name(request.scene, "scene"))
         return await asyncio.to_thread(self._store.get_attributes, scene_key)
 
-    def _count(self, result: Result, response: pb.LocalizeResponse, call: Call) -> None:
-        """Reports how good the answer is to the log and the metrics."""
-        answer = result.answer
-        outcome = answer.outcome
-        self._metrics.stages(result.stage_seconds)
-        parts_ms = {stage: round(1000 * seconds, 1) for stage, seconds in result.stage_seconds.items()}
-        call.note(parts_ms=parts_ms, used_references=len(result.references))
-        if not isinstance(outcome, Localization):
+    def _finish_group(
+        self,
+        request: pb.LocalizeRigRequest | pb.LocalizeSequenceRequest,
+        response: pb.LocalizeRigResponse | pb.LocalizeSequenceResponse,
+        outcome: object,
+        queries: Sequence[Query],
+        results: Sequence[Result],
+        call: Call,
+    ) -> None:
+        for report in response.images:
+            report.diagnostics.request_id = call.request_id
+        call.note(localized_alone=sum(not report.HasField("alone") for report in response.images))
+        self._report(outcome, response.localization, results, call)
+        self._capture(request, response, call, list(zip(queries, results, strict=True)))
+
+    def _report(
+        self,
+        outcome: object,
+        localization: pb.Localization | pb.RigLocalization | pb.SequenceLocalization,
+        results: Sequence[Result],
+        call: Call,
+        scale: MetricScale | None = None,
+    ) -> None:
+        """Reports an answer to the log and the metrics: a rejection, or a localization with its message."""
+        for result in results:
+            self._metrics.stages(result.stage_seconds)
+        if isinstance(outcome, Rejection):
             self._metrics.answered(outcome.reason.value)
             call.note(outcome=outcome.reason.value)
             return
-        call.note(outcome="localized", pose_stage=outcome.pose_stage.value, inliers=outcome.inlier_count)
-        measured = response.localization.HasField("accuracy")
+        call.note(outcome=LOCALIZED, inliers=localization.inlier_count)
+        is_measured = localization.HasField("accuracy")
         self._metrics.answered(
             LOCALIZED,
-            inlier_count=outcome.inlier_count if measured else None,
-            match_count=outcome.match_count if measured else None,
-            reprojection_error_px=outcome.reprojection_error_px if measured else None,
-            scale_deviation=answer.scale.deviation if answer.scale else None,
-            accuracy_radius_m=response.localization.accuracy.position_68_m if measured else None,
+            inlier_count=localization.inlier_count if is_measured else None,
+            match_count=localization.match_count if is_measured else None,
+            reprojection_error_px=localization.reprojection_error_px if is_measured else None,
+            scale_deviation=scale.deviation if scale else None,
+            accuracy_radius_m=localization.accuracy.position_68_m if is_measured else None,
         )
+
+    def _capture(self, request: Request, response: Response, call: Call, parts: Sequence[tuple[Query, Result]]) -> None:
+        if self._recorder is not None:
+            self._recorder.record(request, response, call, parts, self._engine().tiers)
+
+
+async def localize_photographs(engine: Engine, queries: Sequence[Query], call: Call, list_name: str) -> GroupResult:
+    """Localizes each photograph of a rig or a sequence, and records their stages even if one of them fails.
+
+    Args:
+        engine: which computes.
+        queries: the photographs, of one scene.
+        call: to which they belong.
+        list_name: the field of the request that holds them.
+
+    Raises:
+        RequestError: as of `localize_each`.
+    """
+    call.note(scene=queries[0].scene_key, images=len(queries))
+    jobs = [engine.query_job(query, call.caller) for query in queries]
+    try:
+        return await localize_each(engine, jobs, call.caller, list_name)
+    finally:
+        for job in jobs:
+            call.record(job.records)

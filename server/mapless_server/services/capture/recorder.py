@@ -121,9 +121,8 @@ class Recorder:
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
         self._thread.start()
 
-    def answered(
+    def record(
         self,
-        method: str,
         request: Request,
         response: Response,
         call: Call,
@@ -133,7 +132,6 @@ class Recorder:
         """A call has been answered; the answer says so if it is to be kept.
 
         Args:
-            method: "Localize", ...
             request: as it came.
             response: as it goes; neither is to be changed afterwards.
             call: whose they are.
@@ -150,6 +148,7 @@ class Recorder:
         if self._has_room(size_bytes):
             for diagnostics in diagnostics_of(response):
                 diagnostics.captured = True
+            method = request.DESCRIPTOR.name.removesuffix("Request")
             self._put(Waiting(call, scene_id, now_s, method, *messages, size_bytes, used, attributes, tiers))
 
     @property
