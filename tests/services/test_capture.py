@@ -22,12 +22,10 @@ from mapless.geodesy import Datum
 from mapless.geometry import Camera, RadialTangential, RigidTransform, rotation_from_vector
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes import Choice, RankedReference
-from mapless_server.services.capture import files as blobs_module
 from mapless_server.services.capture import files as files_module
 from mapless_server.services.capture import folder as folder_module
-from mapless_server.services.capture import held as held_module
 from mapless_server.services.capture.calls import (
-    BlobGone,
+    BlobDeleted,
     CapturedCall,
     CapturedPart,
     CapturedReference,
@@ -125,9 +123,9 @@ def test_references_are_kept_once_until_no_call_needs_them(tmp_path: Path) -> No
         assert folder.add(call, missing)
     assert len(files(tmp_path / "c")) == 3 + 3
     for count, left in ((5, 2), (3, 1), (0, 0)):
-        folder.remove_all(folder.held()[:1])
-        assert (len(files(tmp_path / "c")), len(folder)) == ((2 + 2, 1 + 2, 0)[2 - left], left), count
-    assert folder.space_bytes == 0
+        folder.remove_all(folder.entries()[:1])
+        assert (len(files(tmp_path / "c")), len(folder.entries())) == ((2 + 2, 1 + 2, 0)[2 - left], left), count
+    assert folder.disk_bytes == 0
     folder.close()
 
 
@@ -149,7 +147,7 @@ def test_the_limit_of_size_holds_at_every_moment(tmp_path: Path, monkeypatch: py
         write_whole(path, data)
         most.append(sum(-(-it.stat().st_size // 4096) * 4096 for it in files(tmp_path / "c")))
 
-    for module in (folder_module, blobs_module):
+    for module in (folder_module, files_module):
         monkeypatch.setattr(module, "write_whole", watched)
     folder = opened(tmp_path / "c", Retention(3600.0, limit))
     random = np.random.default_rng(1)
@@ -158,9 +156,9 @@ def test_the_limit_of_size_holds_at_every_moment(tmp_path: Path, monkeypatch: py
         call = a_call(number, references, size=int(random.integers(100, 60_000)))
         missing = {name: data for name, data in blobs_of(call).items() if not folder.has_blob("acme", name)}
         assert folder.add(call, missing)
-        assert folder.space_bytes == most[-1]
+        assert folder.disk_bytes == most[-1]
     assert max(most) <= limit
-    kept = [decode_call(it.path.read_bytes()).request_id for it in folder.held()]
+    kept = [decode_call(it.path.read_bytes()).request_id for it in folder.entries()]
     assert kept == [f"id-{number}" for number in range(60 - len(kept), 60)]
     assert 2 <= len(kept) < 60
     before = files(tmp_path / "c")
@@ -177,13 +175,13 @@ def test_what_is_too_old_goes_at_the_start_and_while_idle(tmp_path: Path) -> Non
         call = a_call(number, (number,), now_s[0])
         folder.add(call, blobs_of(call))
         now_s[0] += 40
-    assert len(folder) == 3
+    assert len(folder.entries()) == 3
     assert folder.expire() == pytest.approx(20, abs=1)  # the first is 120 s old, the second 80
-    assert len(folder) == 2
+    assert len(folder.entries()) == 2
     folder.close()
     now_s[0] += 30
     folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
-    assert [it.references for it in folder.held()] == [{("r2", "key-2")}]
+    assert [it.references for it in folder.entries()] == [{("r2", "key-2")}]
     assert len(files(tmp_path / "c")) == 2
     folder.close()
     now_s[0] -= 10_000  # the clock is set back: nobody knows how old it is
@@ -197,21 +195,20 @@ def test_what_is_too_old_goes_though_the_clock_is_set_meanwhile(
 ) -> None:
     """Back: what has passed counts. Ahead: the clock does. And a call that was ahead of the clock stays no longer."""
     now_s, passed_s = [NOW_S], [0.0]
-    for module in (folder_module, held_module):
-        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: passed_s[0]))
+    monkeypatch.setattr(folder_module, "time", SimpleNamespace(monotonic=lambda: passed_s[0]))
     folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
     folder.add(a_call(0, ()), {})
     folder.add(a_call(1, (), NOW_S + 50), {})
     now_s[0] -= 10_000
     passed_s[0] = 99.0
-    assert (folder.expire(), len(folder)) == (1.0, 2)
+    assert (folder.expire(), len(folder.entries())) == (1.0, 2)
     passed_s[0] = 100.0
-    assert (folder.expire(), len(folder), files(tmp_path / "c")) == (100.0, 0, [])
+    assert (folder.expire(), len(folder.entries()), files(tmp_path / "c")) == (100.0, 0, [])
     folder.add(a_call(2, (), now_s[0]), {})
     now_s[0] += 60
-    assert (folder.expire(), len(folder)) == (40.0, 1)
+    assert (folder.expire(), len(folder.entries())) == (40.0, 1)
     now_s[0] += 40
-    assert (folder.expire(), len(folder)) == (100.0, 0)
+    assert (folder.expire(), len(folder.entries())) == (100.0, 0)
     folder.close()
 
 
@@ -221,7 +218,7 @@ def test_leftovers_of_a_crash_and_damage_go_at_the_start(tmp_path: Path) -> None
     for number in range(3):
         call = a_call(number, (number,))
         folder.add(call, blobs_of(call))
-    first, second, third = folder.held()
+    first, second, third = folder.entries()
     folder.close()
     first.path.write_bytes(first.path.read_bytes()[:-1])
     next(iter(second.blobs)).unlink()
@@ -229,7 +226,7 @@ def test_leftovers_of_a_crash_and_damage_go_at_the_start(tmp_path: Path) -> None
     (next(iter(third.blobs)).parent / f"{77:064x}").write_bytes(b"orphan")
     (tmp_path / "c" / "notes.txt").write_text("of the operator")
     folder = opened(tmp_path / "c")
-    assert [it.path for it in folder.held()] == [third.path]
+    assert [it.path for it in folder.entries()] == [third.path]
     assert set(files(tmp_path / "c")) == {third.path, *third.blobs, tmp_path / "c" / "notes.txt"}
     folder.close()
 
@@ -239,10 +236,10 @@ def test_what_somebody_deleted_by_hand_is_forgotten(tmp_path: Path) -> None:
     for number in range(2):
         call = a_call(number, (number,))
         folder.add(call, blobs_of(call))
-    folder.held()[0].path.unlink()
-    next(iter(folder.held()[1].blobs)).unlink()
+    folder.entries()[0].path.unlink()
+    next(iter(folder.entries()[1].blobs)).unlink()
     folder.forget_deleted()
-    assert (len(folder), folder.space_bytes, files(tmp_path / "c")) == (0, 0, [])
+    assert (len(folder.entries()), folder.disk_bytes, files(tmp_path / "c")) == (0, 0, [])
     assert folder.add(call, blobs_of(call))
     folder.close()
 
@@ -254,18 +251,18 @@ def test_one_file_that_cannot_be_deleted_keeps_no_other(tmp_path: Path, monkeypa
     for number in range(4):
         call = a_call(number, (number,))
         folder.add(call, blobs_of(call))
-    held = folder.held()
-    stuck = {held[0].path, next(iter(held[2].blobs))}
+    entries = folder.entries()
+    stuck = {entries[0].path, next(iter(entries[2].blobs))}
     refuse_to_delete(stuck, monkeypatch)
     now_s[0] += 101
     for _ in range(2):
         with pytest.raises(PermissionError):
             folder.expire()
-        assert set(files(tmp_path / "c")) == {*stuck, *held[0].blobs}
-        assert folder.space_bytes == sum(-(-it.stat().st_size // 4096) * 4096 for it in files(tmp_path / "c"))
+        assert set(files(tmp_path / "c")) == {*stuck, *entries[0].blobs}
+        assert folder.disk_bytes == sum(-(-it.stat().st_size // 4096) * 4096 for it in files(tmp_path / "c"))
     monkeypatch.undo()
     folder.expire()
-    assert (files(tmp_path / "c"), folder.space_bytes, len(folder)) == ([], 0, 0)
+    assert (files(tmp_path / "c"), folder.disk_bytes, len(folder.entries())) == ([], 0, 0)
     folder.close()
 
 
@@ -278,27 +275,27 @@ def test_a_blob_that_was_cut_is_written_anew(tmp_path: Path, content: bytes) -> 
     first, second = (replace(a_call(number), parts=(part,)) for number in range(2))
     folder = opened(tmp_path / "c")
     folder.add(first, {name: data})
-    (path,) = folder.held()[0].blobs
+    (path,) = folder.entries()[0].blobs
     folder.close()
     path.write_bytes(content)
     folder = opened(tmp_path / "c")
     assert not folder.has_blob("acme", name)
-    assert len(folder) == 0
+    assert len(folder.entries()) == 0
     folder.add(second, {name: data})
     assert path.read_bytes() == data
     folder.close()
     folder = opened(tmp_path / "c")
     assert folder.has_blob("acme", name)
-    assert len(folder) == 1
+    assert len(folder.entries()) == 1
     folder.close()
 
 
 def test_a_blob_that_went_meanwhile_is_asked_for_again(tmp_path: Path) -> None:
     folder = opened(tmp_path / "c")
     call = a_call()
-    with pytest.raises(BlobGone):
+    with pytest.raises(BlobDeleted):
         folder.add(call, {})
-    assert (files(tmp_path / "c"), folder.space_bytes) == ([], 0)
+    assert (files(tmp_path / "c"), folder.disk_bytes) == ([], 0)
     assert folder.add(call, blobs_of(call))
     folder.close()
 
@@ -327,11 +324,11 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.M
             raise OSError(28, "No space left on device")
         write_whole(path, data)
 
-    for module in (folder_module, blobs_module):
+    for module in (folder_module, files_module):
         monkeypatch.setattr(module, "write_whole", full)
     with pytest.raises(OSError, match="No space"):
         folder.add(a_call(), blobs_of(a_call()))
-    assert (files(tmp_path / "c"), folder.space_bytes, len(folder)) == ([], 0, 0)
+    assert (files(tmp_path / "c"), folder.disk_bytes, len(folder.entries())) == ([], 0, 0)
     folder.close()
 
 
@@ -343,16 +340,16 @@ def test_undeletable_entries_never_exceed_the_limit(tmp_path: Path, monkeypatch:
     refuse_to_delete(stuck, monkeypatch)
     for number in range(3):
         folder.add(a_call(number, (number,), size=1000), blobs_of(a_call(number, (number,))))
-    first = folder.held()[0]
+    first = folder.entries()[0]
     stuck.add(first.path)
     assert folder.add(a_call(3, (3,), size=20_000), blobs_of(a_call(3, (3,))))
-    assert folder.held()[0].path == first.path
+    assert folder.entries()[0].path == first.path
     stuck.update(files(tmp_path / "c"))
     for number in range(4, 8):
         call = a_call(number, (number,), size=int(random.integers(30_000, 60_000)))
         with pytest.raises(OSError, match="leaves no room"):
             folder.add(call, blobs_of(call))
-        assert sum(-(-it.stat().st_size // 4096) * 4096 for it in files(tmp_path / "c")) == folder.space_bytes <= limit
+        assert sum(-(-it.stat().st_size // 4096) * 4096 for it in files(tmp_path / "c")) == folder.disk_bytes <= limit
     folder.close()
 
 
@@ -393,10 +390,10 @@ def test_a_folder_deleted_by_hand_is_made_by_its_server_alone(tmp_path: Path) ->
     folder = opened(path)
     folder.add(a_call(), blobs_of(a_call()))
     shutil.rmtree(path)
-    with pytest.raises(BlobGone):
+    with pytest.raises(BlobDeleted):
         folder.add(a_call(1), {})
     assert folder.add(a_call(1), blobs_of(a_call(1)))
-    assert len(folder) == 1
+    assert len(folder.entries()) == 1
     assert stat.S_IMODE(path.stat().st_mode) == 0o700
     with pytest.raises(CaptureError, match="in use by another server"):
         opened(path)
@@ -448,9 +445,9 @@ def test_no_header_keeps_a_call_beyond_its_time(tmp_path: Path) -> None:
         a_call(size=10), parts=(CapturedPart("image", 7, (replace(reference(0), views={"a": f"{1:064x}"}),)),)
     )
     folder.add(call, blobs_of(call))
-    (held,) = folder.held()
+    (entry,) = folder.entries()
     folder.close()
-    data = held.path.read_bytes()
+    data = entry.path.read_bytes()
     places = list(places_in(json.loads(data[32:].partition(b"\n")[0])))
     random = np.random.default_rng(0)
     for place in places:
@@ -458,18 +455,18 @@ def test_no_header_keeps_a_call_beyond_its_time(tmp_path: Path) -> None:
         for index in range(len(ODD_VALUES)) if is_vital else random.choice(len(ODD_VALUES), 1).tolist():
             now_s[0] = NOW_S
             changed = with_header(data, partial(set_at, place, ODD_VALUES[index]))
-            write_whole(held.path, changed)
-            for blob in held.blobs:
+            write_whole(entry.path, changed)
+            for blob in entry.blobs:
                 write_whole(blob, IMAGES[blob.name])
             try:
                 folder = opened(path, clock=lambda: now_s[0])
             except CaptureError as error:  # of a format to come
                 assert "its format" in str(error)  # noqa: PT017
                 continue
-            kept += len(folder)
+            kept += len(folder.entries())
             now_s[0] += ROOM.keep_s + 60
             assert 0 < folder.expire() <= ROOM.keep_s
-            assert (files(path), len(folder), folder.space_bytes) == ([], 0, 0)
+            assert (files(path), len(folder.entries()), folder.disk_bytes) == ([], 0, 0)
             folder.close()
     assert kept > 10
 
@@ -478,9 +475,9 @@ def test_a_call_of_another_scene_than_its_place_says_is_deleted(tmp_path: Path) 
     """Who deletes that scene would not know of it."""
     folder = opened(tmp_path / "c")
     folder.add(a_call(), blobs_of(a_call()))
-    (held,) = folder.held()
+    (entry,) = folder.entries()
     folder.close()
-    write_whole(held.path, with_header(held.path.read_bytes(), lambda header: header.update(scene_id="other")))
+    write_whole(entry.path, with_header(entry.path.read_bytes(), lambda header: header.update(scene_id="other")))
     folder = opened(tmp_path / "c")
     assert files(tmp_path / "c") == []
     folder.close()
@@ -491,7 +488,7 @@ def test_calls_of_the_same_moment_do_not_replace_each_other(tmp_path: Path) -> N
     for count in (1, 2, 3):
         folder = opened(tmp_path / "c")
         folder.add(a_call(count, ()), {})
-        assert len(folder) == len(files(tmp_path / "c")) == count
+        assert len(folder.entries()) == len(files(tmp_path / "c")) == count
         folder.close()
 
 
@@ -499,11 +496,11 @@ def test_what_is_larger_than_all_may_be_is_deleted_unread(tmp_path: Path, monkey
     """It may be larger than the memory."""
     folder = opened(tmp_path / "c")
     folder.add(a_call(), blobs_of(a_call()))
-    (held,) = folder.held()
+    (entry,) = folder.entries()
     folder.close()
-    with held.path.open("r+b") as file:
+    with entry.path.open("r+b") as file:
         file.truncate(ROOM.max_bytes + 1)
-    monkeypatch.setattr(held_module, "decode_call", lambda _: pytest.fail("read"))
+    monkeypatch.setattr(folder_module, "decode_call", lambda _: pytest.fail("read"))
     folder = opened(tmp_path / "c")
     assert files(tmp_path / "c") == []
     folder.close()

@@ -33,8 +33,14 @@ from mapless_server.security.principal import Principal
 from mapless_server.security.tenancy import SceneKey, key_of
 from mapless_server.services.capture import deletion as deletion_module
 from mapless_server.services.capture import recorder as recorder_module
-from mapless_server.services.capture.calls import BlobGone, CapturedCall, CapturedPart, CapturedReference, decode_call
-from mapless_server.services.capture.deletion import Staleness
+from mapless_server.services.capture.calls import (
+    BlobDeleted,
+    CapturedCall,
+    CapturedPart,
+    CapturedReference,
+    decode_call,
+)
+from mapless_server.services.capture.deletion import StaleCalls
 from mapless_server.services.capture.files import calls_of
 from mapless_server.services.capture.folder import CaptureFolder, Retention
 from mapless_server.services.capture.recorder import Recorder
@@ -178,7 +184,7 @@ def test_a_slow_disk_holds_up_nobody(tmp_path: Path, store: Store, monkeypatch: 
     counts = Counts()
     with recording(tmp_path, store, counts) as recorder:
         monkeypatch.setattr(recorder.folder, "add", lambda *_: time.sleep(0.2))
-        for _ in range(recorder_module.MAX_WAITING + 10):
+        for _ in range(recorder_module.MAX_QUEUED + 10):
             answer(recorder)
         assert counts.dropped["queue"] >= 9
         monkeypatch.undo()
@@ -186,7 +192,7 @@ def test_a_slow_disk_holds_up_nobody(tmp_path: Path, store: Store, monkeypatch: 
 
 def test_the_queue_is_bounded_in_bytes(tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """But for one call that waits alone."""
-    monkeypatch.setattr(recorder_module, "MAX_WAITING_BYTES", 100)
+    monkeypatch.setattr(recorder_module, "MAX_QUEUED_BYTES", 100)
     counts, began, let_go = Counts(), threading.Event(), threading.Event()
 
     def slow(*_: object) -> bool:
@@ -275,7 +281,7 @@ def test_a_call_whose_blobs_go_meanwhile_is_gathered_again(
         def meanwhile(*args: Any) -> bool:
             left[0] -= 1
             if left[0] >= 0:
-                raise BlobGone
+                raise BlobDeleted
             return add(*args)
 
         monkeypatch.setattr(recorder.folder, "add", meanwhile)
@@ -336,7 +342,7 @@ def test_an_undeletable_file_keeps_nothing_of_other_scenes(
         part = CapturedPart("image", 1, (reference,) if tenant == "acme" else ())
         call = CapturedCall(tenant, time.time(), "Localize", tenant, "s", created_us, parts=(part,))
         folder.add(call, {"0" * 64: b"x"} if tenant == "acme" else {})
-    first = folder.held()[0]
+    first = folder.entries()[0]
     path = first.path if stuck == "call" else next(iter(first.blobs))
     path.unlink()
     path.mkdir()
@@ -346,7 +352,7 @@ def test_an_undeletable_file_keeps_nothing_of_other_scenes(
     for tenant in ("acme", "other"):
         store.delete_scene(key_of(tenant, "s"))
     recorder = Recorder(folder, store, Counts())
-    wait_until(lambda: [it.scene_key for it in folder.held()] == [first.scene_key][stuck == "blob" :])
+    wait_until(lambda: [it.scene_key for it in folder.entries()] == [first.scene_key][stuck == "blob" :])
     assert captured_in(tmp_path / "captured") == []
     recorder.close()
 
@@ -377,7 +383,7 @@ def test_the_time_limit_holds_whatever_the_store_does(
         monkeypatch.setattr(StoreReader, "get_scene", broken)
         answer(recorder)
         wait_until(lambda: checks[0] == 1)
-        wait_until(lambda: len(recorder.folder) == 0)
+        wait_until(lambda: len(recorder.folder.entries()) == 0)
         assert captured_in(tmp_path / "captured") == []
         let_go.set()
         wait_until(lambda: counts.dropped["fault"] == 1)
@@ -404,7 +410,7 @@ def test_a_fault_of_the_store_ends_no_check(
             patch.setattr(StoreReader, "get_scene", broken)
             wait_until(lambda: checks[0] >= 5)
         store.delete_scene(key_of("default", "s"))
-        wait_until(lambda: len(recorder.folder) == 0)
+        wait_until(lambda: len(recorder.folder.entries()) == 0)
     assert caplog.text.count("captured calls cannot be compared with the store: no such table") == 1
 
 
@@ -425,7 +431,7 @@ def test_the_start_waits_for_no_store_and_retries_each_round(
     monkeypatch.setattr(StoreReader, "get_scene", away)
     with recording(tmp_path, store, Counts()) as recorder:  # returns, although nobody lets the store go
         wait_until(lambda: asked[0] == 1)
-        assert len(recorder.folder) == 3
+        assert len(recorder.folder.entries()) == 3
         let_go.set()
     assert asked[0] == 1
 
@@ -448,7 +454,7 @@ class CountingStore:
 def test_an_unchanged_scene_is_asked_for_references_once(tmp_path: Path) -> None:
     """However many calls come and go; and what is not there is found out all the same."""
     folder, counting = CaptureFolder(tmp_path / "c", Retention(3600.0, 2**24)), CountingStore({"r0": "k0", "r1": "k1"})
-    staleness = Staleness(cast(Store, counting))
+    stale_calls = StaleCalls(cast(Store, counting))
 
     def add(number: int, key: str) -> None:
         reference = CapturedReference(f"r{number % 2}", key, CAMERA, pose(0), "0" * 64, {})
@@ -457,12 +463,12 @@ def test_an_unchanged_scene_is_asked_for_references_once(tmp_path: Path) -> None
 
     for number in range(20):
         add(number, f"k{number % 2}")
-        assert staleness.delete_stale(folder) == 0
+        assert stale_calls.delete(folder) == 0
         if number > 10:
-            folder.remove_all(folder.held()[:1])
+            folder.remove_all(folder.entries()[:1])
     assert counting.asked == {"get_scene": 20, "find_keys": 2}
     add(20, "another key")
-    assert staleness.delete_stale(folder) == 1
+    assert stale_calls.delete(folder) == 1
     folder.close()
 
 
@@ -479,7 +485,7 @@ def test_what_is_wrong_with_one_scene_keeps_nothing_of_another(tmp_path: Path, f
         raise NotFound("there is none")
 
     with nullcontext() if isinstance(fault, DataLoss) else pytest.raises(type(fault)):
-        assert Staleness(cast(Store, SimpleNamespace(get_scene=get_scene))).delete_stale(folder) == 2
+        assert StaleCalls(cast(Store, SimpleNamespace(get_scene=get_scene))).delete(folder) == 2
     left = ["b", "c"] if isinstance(fault, Unavailable) else ["b"]
     assert [it.parent.name for it in captured_in(tmp_path / "c")] == left
     folder.close()

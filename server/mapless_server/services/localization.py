@@ -7,6 +7,7 @@ import asyncio
 import time
 from collections.abc import AsyncGenerator, Callable, Sequence
 from functools import partial
+from typing import Any
 
 from mapless import wire
 from mapless.v1 import localization_service_pb2 as pb
@@ -196,12 +197,12 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     def _report(
         self,
         outcome: object,
-        localization: pb.Localization | pb.RigLocalization | pb.SequenceLocalization,
+        localization: Any,
         results: Sequence[Result],
         call: Call,
         scale: MetricScale | None = None,
     ) -> None:
-        """Reports an answer to the log and the metrics: a rejection, or a localization with its message."""
+        """Reports an answer to the log and the metrics: a Rejection, or the message of a localization of any kind."""
         for result in results:
             self._metrics.stages(result.stage_seconds)
         if isinstance(outcome, Rejection):

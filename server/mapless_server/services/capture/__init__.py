@@ -1,5 +1,7 @@
-"""Keeping calls for a time, where the operator asks for it, so that they can be replayed.
+"""Capture: answered calls on disk for a limited time, where the operator asks for it, so that they can be replayed.
 
-`calls` is the record of one, `folder` where they lie, under a limit of time and one of size; `recorder` takes calls
-from the services and writes them in a thread of its own, and `deletion` deletes them in time.
+May import what `services` may. Begin with `recorder`, which takes answered calls from the services and writes them in
+its own thread. `calls` is the file of one call and `folder` the folder with its limits of time and size; `collecting`
+reads a call's references from the store; `deletion` deletes calls when their time or their scene is over; `opening`
+builds all this from the settings.
 """

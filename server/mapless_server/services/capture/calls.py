@@ -1,11 +1,11 @@
-"""What is kept of a call, as one file: all that decided the answer, but for the references' photographs and features.
+"""The file of a captured call: all that decided the answer, except the references' photographs and features.
 
     first 32   SHA-256 of everything after
     header     one line of JSON; floats as the shortest decimal that reads back as the same float64
     request    the message
     response   the message
 
-Photographs and features of references are blobs beside it, named by their SHA-256: many calls have them in common.
+Photographs and features of references are blobs beside it, named by their SHA-256, since many calls share them.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class CaptureError(Exception):
 
 
 class DamagedCapture(CaptureError):
-    """What is kept of a call is not what was written: cut, changed, or a part of it is gone."""
+    """A captured call is not what was written: it was cut or changed, or a part of it is missing."""
 
 
-class BlobGone(Exception):
-    """A blob that the folder had when it was asked has been deleted since."""
+class BlobDeleted(Exception):
+    """A blob that the folder had when the call was collected has been deleted since."""
 
 
 Request = pb.LocalizeRequest | pb.LocalizeRigRequest | pb.LocalizeSequenceRequest
@@ -44,7 +44,7 @@ Response = pb.LocalizeResponse | pb.LocalizeRigResponse | pb.LocalizeSequenceRes
 
 
 def diagnostics_of(response: Response) -> list[pb.Diagnostics]:
-    """Of each photograph, in order."""
+    """The diagnostics of each photograph, in order."""
     if isinstance(response, pb.LocalizeResponse):
         return [response.diagnostics]
     return [image.diagnostics for image in response.images]
@@ -60,7 +60,7 @@ class CapturedReference:
 
     Attributes:
         reference_id: unique within its scene.
-        key: identifies this very reference for good.
+        key: unique for all time; a reference that replaces it has another.
         camera: in pixels of its photograph.
         world_from_camera: its pose, metric.
         image_sha256: its photograph's blob.
@@ -82,8 +82,8 @@ class CapturedPart:
     Attributes:
         field: path of the photograph in the request, "image" or "images[2].image".
         generation: of the scene when its references were read.
-        references: all that it was compared with, those that were named or come into the choice.
-        choice: how they were chosen; None if they were used as they were named.
+        references: those that were named or ranked.
+        choice: how they were chosen; None if they were used as named.
     """
 
     field: str
@@ -102,12 +102,12 @@ class CapturedCall:
         method: "Localize", "LocalizeRig" or "LocalizeSequence".
         tenant: whose call.
         scene_id: of the scene, as its tenant knows it.
-        scene_created_us: when the scene was made, Unix microseconds: another one of the same name is not this one.
+        scene_created_us: when the scene was created, Unix microseconds; tells scenes of one name apart.
         circumstances: what else decides an answer, by name: versions, settings, weights.
         attributes: of the scene.
         parts: one for each photograph.
-        request: the message, as it was sent.
-        response: likewise.
+        request: the message as it was received.
+        response: the message as it was sent.
     """
 
     request_id: str
@@ -156,11 +156,11 @@ def encode_call(call: CapturedCall) -> bytes:
 def decode_call(data: bytes) -> CapturedCall:
     """The call of a file.
 
-    Whoever can write the file can make its digest, too: names, times and blobs are what they should be, whoever did.
+    All names, times and blobs are checked: a digest shows damage, not who wrote the file.
 
     Raises:
         DamagedCapture: it is cut or changed.
-        CaptureError: its format is newer than this program.
+        CaptureError: its format is that of another version.
     """
     digest, body = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
     if hashlib.sha256(body).digest() != digest:
@@ -170,7 +170,7 @@ def decode_call(data: bytes) -> CapturedCall:
         header = json.loads(text)
         if header["format"] != FORMAT_VERSION:
             raise CaptureError(f"its format {header['format']} is another than this program's, {FORMAT_VERSION}")
-        datetime.fromtimestamp(header["time_s"], timezone.utc)  # or it is no time: NaN would be kept for ever
+        datetime.fromtimestamp(header["time_s"], timezone.utc)  # raises if it is no time: NaN would never expire
         check_id(header["scene_id"])
         check_tenant(header["tenant"])
         names = ("request_id", "time_s", "method", "tenant", "scene_id", "scene_created_us", "circumstances")

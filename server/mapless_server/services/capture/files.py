@@ -1,11 +1,11 @@
-"""The files of a capture folder: where each lies, written whole or not at all, readable by their owner alone.
+"""The files of a capture folder: their paths, the folder's lock, writing and deleting; readable by their owner alone.
 
-    mapless-capture.json            says that the folder is one of ours, and its format
+    mapless-capture.json            marks the folder as a capture folder, with its format
     lock                            held by the server that writes
     tenants/{tenant}/calls/{scene}/{time}-{number}.call
     tenants/{tenant}/blobs/{sha256}
 
-A tenant's calls are a folder of their own and share nothing with another's, so that they can be deleted by hand.
+A tenant's files share nothing with another's, so that an operator can delete its folder.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ CALL_SUFFIX = ".call"
 UNFINISHED_SUFFIX = ".tmp"
 
 _BLOCK_BYTES = 4096
-"""File systems give space in such pieces."""
+"""File systems allocate in blocks of this size."""
 
 
-def space_of(size_bytes: int) -> int:
-    """What a file of so many bytes takes on the disk."""
+def disk_bytes(size_bytes: int) -> int:
+    """The size of a file on the disk, in whole blocks."""
     return -(-size_bytes // _BLOCK_BYTES) * _BLOCK_BYTES
 
 
 def open_folder(folder: Path) -> int:
-    """Makes the folder, or sees that it is one of ours, and locks it; the lock holds until the descriptor is closed.
+    """Creates the folder, or checks that it is a capture folder, and locks it until the descriptor is closed.
 
     Raises:
-        CaptureError: it cannot be written, holds something else, is in use, or is of a newer program.
+        CaptureError: it cannot be written, holds other files, is in use, or has the format of another version.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # Files of ours without the marker are what a server left that was killed, or whose folder was deleted by hand.
+        # Our own files without the marker were left by a server that was killed, or whose folder was deleted by hand.
         if not _is_marked(folder) and any(foreign_in(folder)):
             raise CaptureError(f"capture folder {folder} holds something else; name an empty or a new one")
         if stat.S_IMODE(folder.stat().st_mode) & 0o077:
@@ -61,7 +61,7 @@ def open_folder(folder: Path) -> int:
 
 
 def is_locked_by(folder: Path, lock: int) -> bool:
-    """Whether a descriptor is that of the folder's lock, and not of one that somebody deleted with the folder."""
+    """Whether a descriptor is that of the folder's lock, and not of one that was deleted with the folder."""
     try:
         return os.path.samestat(os.fstat(lock), os.lstat(folder / LOCK_FILE))
     except FileNotFoundError:
@@ -69,10 +69,10 @@ def is_locked_by(folder: Path, lock: int) -> bool:
 
 
 def check_format(folder: Path) -> None:
-    """Whether a folder is one that this program can read.
+    """Checks that a folder is a capture folder that this version can read.
 
     Raises:
-        CaptureError: it is not there, none of ours, or of a newer program.
+        CaptureError: it does not exist, is no capture folder, or has the format of another version.
     """
     try:
         found = json.loads((folder / MARKER_FILE).read_bytes())["format"]
@@ -85,7 +85,7 @@ def check_format(folder: Path) -> None:
 
 
 def calls_of(folder: Path) -> Iterator[Path]:
-    """Files of calls, whatever is in them."""
+    """Files of calls, not yet checked."""
     return (it for it in _files(folder) if _is_call(*_parts(folder, it)))
 
 
@@ -95,30 +95,30 @@ def blobs_of(folder: Path) -> Iterator[Path]:
 
 
 def unfinished_in(folder: Path) -> Iterator[Path]:
-    """What a server that was killed had begun to write."""
+    """Unfinished files of a server that was killed."""
     return (it for it in _files(folder) if _is_unfinished(*_parts(folder, it)))
 
 
 def foreign_in(folder: Path) -> Iterator[Path]:
-    """Files that are none of ours; nobody but their owner deletes them."""
+    """Files that are not part of a capture folder; the server never deletes them."""
     kinds = (_is_call, _is_blob, _is_unfinished, _is_about_the_folder)
     return (it for it in _all(folder) if not (_is_regular(it) and any(kind(*_parts(folder, it)) for kind in kinds)))
 
 
 def call_path(folder: Path, tenant: str, scene_id: str, name: str) -> Path:
-    """Where a call lies; the names must have been checked."""
+    """The file of a call; the names must be valid."""
     return folder / TENANTS / tenant / CALLS / scene_id / f"{name}{CALL_SUFFIX}"
 
 
 def blob_path(folder: Path, tenant: str, sha256: str) -> Path:
-    """Where a blob lies."""
+    """The file of a blob."""
     return folder / TENANTS / tenant / BLOBS / sha256
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Writes a file so that nobody ever sees a part of it.
+    """Writes a file so that no reader ever sees a part of it.
 
-    Not forced to the disk: after a power failure a file may be empty or cut, which its reader finds out.
+    It is not forced to the disk: after a power failure a file may be empty or cut, which its checksum reveals.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     unfinished = path.with_name(path.name + UNFINISHED_SUFFIX)
@@ -133,7 +133,7 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def do_each(actions: Iterable[Callable[[], object]]) -> None:
-    """Does all of it; then OSError, if some of it failed: one file that cannot be deleted keeps no other."""
+    """Does all of the actions; then raises the first OSError, if some failed."""
     faults = [fault for it in actions if (fault := _fault_of(it)) is not None]
     if faults:
         raise faults[0]
@@ -156,8 +156,8 @@ def _is_regular(path: Path) -> bool:
 
 
 def _all(folder: Path) -> Iterator[Path]:
-    """All that is in the folder but folders, in order; OSError if one cannot be looked into, or lies elsewhere."""
-    for place, folders, files in os.walk(folder, onerror=_unless_gone):
+    """All files in the folder, in order; OSError if a folder in it cannot be read, or is a link to elsewhere."""
+    for place, folders, files in os.walk(folder, onerror=_raise_unless_missing):
         folders.sort()
         for name in folders:
             path = Path(place, name)
@@ -166,7 +166,7 @@ def _all(folder: Path) -> Iterator[Path]:
         yield from (Path(place, name) for name in sorted(files))
 
 
-def _unless_gone(error: OSError) -> None:
+def _raise_unless_missing(error: OSError) -> None:
     if not isinstance(error, FileNotFoundError):
         raise error
 
@@ -194,13 +194,13 @@ def _is_about_the_folder(*parts: str) -> bool:
 
 
 def _is_marked(folder: Path) -> bool:
-    """Whether it is said to be one of ours; a power failure may leave the marker empty."""
+    """Whether it has the marker of a capture folder; a power failure may leave the marker empty."""
     marker = folder / MARKER_FILE
     return marker.exists() and marker.stat().st_size > 0
 
 
 def _lock(folder: Path) -> int:
-    """Locks it, and sees that it is one of ours: nobody else makes it so meanwhile."""
+    """Locks the folder, and then marks it, so that no other server does at the same time."""
     lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -217,74 +217,74 @@ def _lock(folder: Path) -> int:
 
 
 class BlobLedger:
-    """The blobs of a folder, by their paths; for one thread at a time.
+    """The blobs of a folder by path, and how many calls need each; for one thread at a time.
 
     Attributes:
-        space_bytes: what they take on the disk.
+        disk_bytes: their size on the disk.
     """
 
     def __init__(self) -> None:
-        self.space_bytes = 0
-        self._space: dict[Path, int] = {}
+        self.disk_bytes = 0
+        self._sizes: dict[Path, int] = {}
         self._uses: Counter[Path] = Counter()
         self._unused: set[Path] = set()  # to be deleted
-        self._unverified: set[Path] = set()  # of before: a power failure may have cut them
+        self._unverified: set[Path] = set()  # found at the start: a power failure may have cut them
 
     def __contains__(self, path: Path) -> bool:
-        return path in self._space
+        return path in self._sizes
 
-    def take_stock(self, folder: Path) -> None:
-        """Enters all that are there; those that no call will need by then go with the first `sweep`."""
+    def load(self, folder: Path) -> None:
+        """Enters all that are there; the first `sweep` deletes those that no call needs by then."""
         for path in blobs_of(folder):
             self._enter(path, path.stat().st_size)
-        self._unverified.update(self._space)
-        self._unused.update(self._space)
+        self._unverified.update(self._sizes)
+        self._unused.update(self._sizes)
 
-    def space_of(self, path: Path) -> int:
-        """What one takes; 0 if it is not there."""
-        return self._space.get(path, 0)
+    def disk_bytes_of(self, path: Path) -> int:
+        """The size of one on the disk; 0 if it is not there."""
+        return self._sizes.get(path, 0)
 
     def write(self, path: Path, data: bytes) -> None:
-        """Writes one that is needed; OSError as `write_whole`."""
+        """Writes one; OSError as `write_whole`."""
         write_whole(path, data)
         self._enter(path, len(data))
 
     def is_intact(self, path: Path) -> bool:
-        """Whether what lies there is what was written, as far as that is not known; not if it cannot be read."""
+        """Whether the file has the content of its name; one of an earlier server is read once to find out."""
         if path in self._unverified:
             with suppress(OSError):
                 if hashlib.sha256(path.read_bytes()).hexdigest() == path.name:
                     self._unverified.discard(path)
         return path not in self._unverified
 
-    def deleted_by_hand(self) -> set[Path]:
-        """Those that are there no more, although nobody asked for it."""
-        return {path for path in self._space if not os.path.lexists(path)}
+    def missing(self) -> set[Path]:
+        """Those whose files were deleted by hand."""
+        return {path for path in self._sizes if not os.path.lexists(path)}
 
     def use(self, paths: Collection[Path]) -> None:
-        """One more call needs them."""
+        """Counts one more call that needs them."""
         self._uses.update(list(paths))
         self._unused.difference_update(paths)
 
     def release(self, paths: Collection[Path]) -> None:
-        """One call less needs them."""
+        """Counts one call less that needs them."""
         for path in paths:
             self._uses[path] -= 1
             if self._uses[path] <= 0:
                 del self._uses[path]
-                if path in self._space:
+                if path in self._sizes:
                     self._unused.add(path)
 
     def sweep(self) -> None:
-        """Deletes those that no call needs, each that can be; OSError if there are some that cannot be."""
+        """Deletes those that no call needs; OSError after the last if one could not be deleted."""
         do_each([partial(self._delete, it) for it in self._unused])
 
     def _enter(self, path: Path, size_bytes: int) -> None:
-        self._space[path] = space_of(size_bytes)
-        self.space_bytes += self._space[path]
+        self._sizes[path] = disk_bytes(size_bytes)
+        self.disk_bytes += self._sizes[path]
 
     def _delete(self, path: Path) -> None:
         path.unlink(missing_ok=True)
         self._unused.discard(path)
         self._unverified.discard(path)
-        self.space_bytes -= self._space.pop(path)
+        self.disk_bytes -= self._sizes.pop(path)

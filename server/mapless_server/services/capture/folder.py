@@ -1,9 +1,9 @@
-"""Captured calls under a limit of time and one of size, both kept at every moment that the server runs.
+"""Captured calls in a folder, with a limit of time and one of size that hold at every moment while the server runs.
 
-The limit of time is that of `held`, and `expire` keeps it; `_make_room` keeps that of size: what is to be written is
-made room for first, and the oldest calls go. What cannot be deleted stays counted, and is tried again. When a folder is
-opened anything may be in it: a call that is not as it was written, or not within the limits, is deleted. Methods may be
-called from any thread.
+A call expires when the clock says so, or when its time has passed since it was written or found, whichever is sooner:
+setting the clock cannot prolong it. `expire` deletes expired calls; `_make_room` deletes the oldest before a file is
+written. A file that cannot be deleted stays counted, and is tried again. Opening a folder deletes every call that is
+damaged, incomplete or outside the limits. Methods may be called from any thread.
 """
 
 from __future__ import annotations
@@ -20,66 +20,100 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from .calls import BlobGone, CapturedCall, CaptureError, DamagedCapture, encode_call
+from mapless_server.security.tenancy import SceneKey, key_of
+
+from .calls import BlobDeleted, CapturedCall, CaptureError, DamagedCapture, decode_call, encode_call
 from .files import (
     BlobLedger,
     blob_path,
     call_path,
     calls_of,
+    disk_bytes,
     do_each,
     foreign_in,
     is_locked_by,
     open_folder,
-    space_of,
     unfinished_in,
     write_whole,
 )
-from .held import Held, held_of, read_held
 
 log = logging.getLogger(__name__)
+
+_FUTURE_S = 60.0
+"""A call that is further ahead of the clock than this was captured while the clock was wrong."""
 
 
 @dataclass(frozen=True)
 class Retention:
-    """What is kept.
+    """Limits of a folder.
 
     Attributes:
-        keep_s: how long, seconds.
-        max_bytes: of all files, each counted as the whole blocks that it takes.
+        keep_s: age at which a call is deleted, seconds.
+        max_bytes: of all files together, in whole blocks of the disk.
     """
 
     keep_s: float
     max_bytes: int
 
     def __post_init__(self) -> None:
-        if not (self.keep_s > 0 and self.max_bytes > 0):
-            raise ValueError(f"senseless limits: {self}")
+        for name in ("keep_s", "max_bytes"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be above 0, is {getattr(self, name)}")
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedEntry:
+    """A captured call in the folder.
+
+    Attributes:
+        path: its file.
+        scene_key: its scene.
+        scene_created_us: when the scene was created, Unix microseconds; tells scenes of one name apart.
+        references: id and key of each.
+        blobs: files that it needs.
+        disk_bytes: of its own file.
+        expiry_s: when it is deleted, Unix seconds.
+        expiry_monotonic_s: the same by `time.monotonic`.
+    """
+
+    path: Path
+    scene_key: SceneKey
+    scene_created_us: int
+    references: frozenset[tuple[str, str]]
+    blobs: frozenset[Path]
+    disk_bytes: int
+    expiry_s: float
+    expiry_monotonic_s: float
+
+    def remaining_s(self, now_s: float, monotonic_s: float) -> float:
+        """Time until it expires; 0 or less if it has."""
+        return min(self.expiry_s - now_s, self.expiry_monotonic_s - monotonic_s)
 
 
 class CaptureFolder:
-    """The calls of one server. Opening deletes what is too old, cut, or too much.
+    """The captured calls of one server.
 
     Attributes:
         path: of the folder.
     """
 
     def __init__(self, path: Path, retention: Retention, clock: Callable[[], float] = time.time) -> None:
-        """Opens the folder and locks it; makes it where there is none.
+        """Opens and locks the folder, creates it if it does not exist, and applies the limits to what is in it.
 
         Raises:
-            CaptureError: see `files.open_folder`; or something in it cannot be read or deleted.
+            CaptureError: see `files.open_folder`; or a file in it cannot be read or deleted.
         """
         self.path = path
         self._retention = retention
         self._clock = clock
         self._guard = threading.RLock()
         self._lock = open_folder(path)
-        self._calls: OrderedDict[Path, Held] = OrderedDict()  # the oldest first
+        self._calls: OrderedDict[Path, CapturedEntry] = OrderedDict()  # the oldest first
         self._calls_bytes = 0
         self._blobs = BlobLedger()
         self._number = 0
         try:
-            self._take_stock()
+            self._load()
         except OSError as error:
             self.close()
             what = f"{error.filename or path}: {error.strerror or error}"
@@ -88,27 +122,24 @@ class CaptureFolder:
             self.close()
             raise
 
-    def __len__(self) -> int:
-        return len(self._calls)
-
     @property
-    def space_bytes(self) -> int:
-        """What its calls and blobs take on the disk."""
-        return self._calls_bytes + self._blobs.space_bytes
+    def disk_bytes(self) -> int:
+        """Size of its calls and blobs on the disk."""
+        return self._calls_bytes + self._blobs.disk_bytes
 
     def close(self) -> None:
-        """Lets other servers in."""
+        """Releases the lock."""
         if self._lock >= 0:
             os.close(self._lock)
             self._lock = -1
 
-    def held(self) -> list[Held]:
+    def entries(self) -> list[CapturedEntry]:
         """All calls, the oldest first."""
         with self._guard:
             return list(self._calls.values())
 
     def has_blob(self, tenant: str, sha256: str) -> bool:
-        """Whether a blob need not be given again; one that is not what was written goes, and what needs it."""
+        """Whether an intact blob is there; a damaged one is deleted, with the calls that need it."""
         path = blob_path(self.path, tenant, sha256)
         with self._guard:
             if not self._blobs.is_intact(path):
@@ -117,31 +148,31 @@ class CaptureFolder:
             return path in self._blobs
 
     def add(self, call: CapturedCall, blobs: Mapping[str, bytes]) -> bool:
-        """Keeps a call, and deletes the oldest ones for it where there is no room.
+        """Writes a call, after deleting the oldest ones as far as it needs their room.
 
         Args:
-            call: with names that have been checked.
-            blobs: by SHA-256, those of its that the folder lacks.
+            call: its tenant and scene must be valid names.
+            blobs: those of its blobs that the folder lacks, by SHA-256.
 
         Returns:
-            Whether it is kept: one that is larger than the limit alone is not, and deletes nothing.
+            Whether it was written: a call that exceeds the limit alone is not, and nothing is deleted for it.
 
         Raises:
-            OSError: the disk is full, or the like; what was written of it is gone.
-            BlobGone: one that the folder had went meanwhile; gather the call again.
-            CaptureError: somebody deleted the folder by hand, and another server has it now.
+            OSError: the disk is full, or the like; nothing of the call is left in the folder.
+            BlobDeleted: a blob that the folder had was deleted meanwhile; collect the call's blobs again.
+            CaptureError: the folder was deleted by hand, and another server uses it now.
         """
         data = encode_call(call)
         with self._guard:
-            self._see_that_it_is_ours()
+            self._reopen_if_deleted()
             needed = {blob_path(self.path, call.tenant, name): name for name in call.blobs}
             missing = [path for path in needed if path not in self._blobs]
             if any(needed[path] not in blobs for path in missing):
-                raise BlobGone
-            new_bytes = space_of(len(data)) + sum(space_of(len(blobs[needed[path]])) for path in missing)
-            if new_bytes + sum(map(self._blobs.space_of, needed)) > self._retention.max_bytes:
+                raise BlobDeleted
+            new_bytes = disk_bytes(len(data)) + sum(disk_bytes(len(blobs[needed[path]])) for path in missing)
+            if new_bytes + sum(map(self._blobs.disk_bytes_of, needed)) > self._retention.max_bytes:
                 return False
-            self._blobs.use(needed)  # before room is made, so that none of them goes
+            self._blobs.use(needed)  # before room is made, so that none of them is deleted
             try:
                 self._make_room(new_bytes)
                 for path in missing:
@@ -150,61 +181,69 @@ class CaptureFolder:
                 write_whole(path, data)
             except BaseException:
                 self._blobs.release(needed)
-                with suppress(OSError):  # what stays is tried again
+                with suppress(OSError):  # what is left is tried again
                     self._blobs.sweep()
                 raise
-            self._enter(held_of(self.path, path, call, len(data), self._retention.keep_s, self._clock()))
+            self._enter(self._entry(path, call, len(data)))
             return True
 
     def expire(self) -> float:
-        """Deletes what is too old.
+        """Deletes expired calls.
 
         Returns:
-            Seconds until the next one is too old; those of the limit if there is none.
+            Seconds until the next call expires; the limit of time if there is none.
 
         Raises:
-            OSError: the first of the files that cannot be deleted; all others are. It is tried again next time.
+            OSError: the first file that cannot be deleted; all others are deleted, and it is tried again next time.
         """
         with self._guard:
             now_s, monotonic_s = self._clock(), time.monotonic()
-            self.remove_all([it for it in self._calls.values() if it.left_s(now_s, monotonic_s) <= 0])
-            rest = (it.left_s(now_s, monotonic_s) for it in self._calls.values())
-            return min(rest, default=self._retention.keep_s)
+            self.remove_all([it for it in self._calls.values() if it.remaining_s(now_s, monotonic_s) <= 0])
+            remaining_s = (it.remaining_s(now_s, monotonic_s) for it in self._calls.values())
+            return min(remaining_s, default=self._retention.keep_s)
 
     def forget_deleted(self) -> None:
-        """Forgets what somebody deleted by hand, and deletes what is of no use without it; OSError as `remove_all`."""
+        """Drops calls of which a file was deleted by hand, with their other files; OSError as `remove_all`."""
         with self._guard:
-            gone = self._blobs.deleted_by_hand()
-            held = self._calls.values()
-            self.remove_all([it for it in held if it.blobs & gone or not os.path.lexists(it.path)])
+            missing = self._blobs.missing()
+            entries = self._calls.values()
+            self.remove_all([it for it in entries if it.blobs & missing or not os.path.lexists(it.path)])
 
-    def remove_all(self, gone: Collection[Held]) -> None:
-        """Deletes calls, and what no other call needs, each that can be; OSError if there are some that cannot be."""
+    def remove_all(self, entries: Collection[CapturedEntry]) -> None:
+        """Deletes calls and the blobs that no other call needs; OSError after the last if one could not be deleted."""
         with self._guard:
-            do_each([*(partial(self._remove, it) for it in gone), self._blobs.sweep])
+            do_each([*(partial(self._remove, it) for it in entries), self._blobs.sweep])
 
-    def _take_stock(self) -> None:
+    def _load(self) -> None:
         foreign = sum(1 for _ in foreign_in(self.path))
         if foreign:
             log.warning("capture folder %s: %d files are not ours, and left alone", self.path, foreign)
         for path in list(unfinished_in(self.path)):
             path.unlink()
-        self._blobs.take_stock(self.path)
+        self._blobs.load(self.path)
         found = [it for path in list(calls_of(self.path)) if (it := self._read(path)) is not None]
-        for held in sorted(found, key=lambda it: (it.expiry_s, it.path.name)):
-            self._blobs.use(held.blobs)
-            self._enter(held)
+        for entry in sorted(found, key=lambda it: (it.expiry_s, it.path.name)):
+            self._blobs.use(entry.blobs)
+            self._enter(entry)
         self._blobs.sweep()
         self.expire()
         self._make_room(0)
 
-    def _read(self, path: Path) -> Held | None:
-        """The call of a file; None if it had to be deleted, see `read_held`."""
+    def _read(self, path: Path) -> CapturedEntry | None:
+        """The call of a file; None if it was damaged, and is deleted."""
         try:
-            held = read_held(self.path, path, self._retention.keep_s, self._retention.max_bytes, self._clock())
-            if not all(it in self._blobs for it in held.blobs):
-                raise DamagedCapture("a part of it is gone")
-            return held
+            if path.stat().st_size > self._retention.max_bytes:
+                raise DamagedCapture("it is larger than all calls may be")
+            data = path.read_bytes()
+            call = decode_call(data)
+            if path.parent != call_path(self.path, call.tenant, call.scene_id, "").parent:
+                raise DamagedCapture("it belongs to another tenant or scene than its folder")
+            if call.time_s > self._clock() + _FUTURE_S:
+                raise DamagedCapture("it was captured later than now")  # so nothing would limit its time
+            entry = self._entry(path, call, len(data))
+            if not all(it in self._blobs for it in entry.blobs):
+                raise DamagedCapture("one of its blobs is missing")
+            return entry
         except DamagedCapture as error:
             log.warning("captured call %s is deleted: %s", path.name, error)
             path.unlink()
@@ -212,8 +251,22 @@ class CaptureFolder:
         except CaptureError as error:
             raise CaptureError(f"captured call {path} cannot be used: {error}") from error
 
-    def _see_that_it_is_ours(self) -> None:
-        """Makes and locks the folder anew if somebody deleted it by hand."""
+    def _entry(self, path: Path, call: CapturedCall, size_bytes: int) -> CapturedEntry:
+        keep_s = self._retention.keep_s
+        expiry_s = call.time_s + keep_s
+        return CapturedEntry(
+            path,
+            key_of(call.tenant, call.scene_id),
+            call.scene_created_us,
+            call.keys,
+            frozenset(blob_path(self.path, call.tenant, name) for name in call.blobs),
+            disk_bytes(size_bytes),
+            expiry_s,
+            time.monotonic() + min(expiry_s - self._clock(), keep_s),
+        )
+
+    def _reopen_if_deleted(self) -> None:
+        """Creates and locks the folder again if it was deleted by hand."""
         if not is_locked_by(self.path, self._lock):
             lock = open_folder(self.path)
             os.close(self._lock)
@@ -221,7 +274,7 @@ class CaptureFolder:
             self.forget_deleted()
 
     def _new_path(self, call: CapturedCall) -> Path:
-        """Where a call is to lie; a server before this one, with the clock set back since, may have had the name."""
+        """A free path for a call; an earlier server may have used the name, if the clock was set back since."""
         while True:
             self._number += 1
             name = f"{round(1e3 * call.time_s):014d}-{os.getpid()}-{self._number}"
@@ -229,27 +282,27 @@ class CaptureFolder:
             if path not in self._calls and not os.path.lexists(path):
                 return path
 
-    def _enter(self, held: Held) -> None:
-        self._calls[held.path] = held
-        self._calls_bytes += held.space_bytes
+    def _enter(self, entry: CapturedEntry) -> None:
+        self._calls[entry.path] = entry
+        self._calls_bytes += entry.disk_bytes
 
     def _make_room(self, wanted_bytes: int) -> None:
-        """Deletes the oldest calls until so much more fits; OSError if it does not, since some cannot be deleted."""
-        for held in self.held():
+        """Deletes the oldest calls until so much more fits; OSError if files that cannot be deleted prevent it."""
+        for entry in self.entries():
             if self._fits(wanted_bytes):
                 return
-            with suppress(OSError):  # others may do
-                self.remove_all([held])
+            with suppress(OSError):  # the next ones may suffice
+                self.remove_all([entry])
         if not self._fits(wanted_bytes):
             raise OSError(errno.ENOSPC, "what cannot be deleted leaves no room within the limit", str(self.path))
 
     def _fits(self, wanted_bytes: int) -> bool:
-        return self.space_bytes + wanted_bytes <= self._retention.max_bytes
+        return self.disk_bytes + wanted_bytes <= self._retention.max_bytes
 
-    def _remove(self, held: Held) -> None:
-        held.path.unlink(missing_ok=True)
-        if self._calls.pop(held.path, None) is not None:
-            self._calls_bytes -= held.space_bytes
-            self._blobs.release(held.blobs)
-        with suppress(OSError):  # other calls are in it, or somebody was faster
-            held.path.parent.rmdir()
+    def _remove(self, entry: CapturedEntry) -> None:
+        entry.path.unlink(missing_ok=True)
+        if self._calls.pop(entry.path, None) is not None:
+            self._calls_bytes -= entry.disk_bytes
+            self._blobs.release(entry.blobs)
+        with suppress(OSError):  # other calls are in it, or it is gone already
+            entry.path.parent.rmdir()

@@ -1,4 +1,4 @@
-"""What captures a server's calls, put together from its settings."""
+"""Builds the recorder from a server's settings, and names the circumstances that decide its answers."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from .folder import CaptureFolder, Retention
 from .recorder import Recorder
 
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "poselib", "torch", "kornia")
-"""Whose arithmetic answers are made of."""
+"""Packages whose arithmetic decides answers."""
 
 DECISIVE_SETTINGS = ("device", "coverage", "retrieval", "max_batch", "compiled_views")
-"""Those of which another value may mean another answer; features, backend and weights are told by name."""
+"""Settings of which another value may change an answer, beside features, backend and weights."""
 
 
 def circumstances_of(settings: Settings, tiers: Sequence[Tier]) -> dict[str, str]:
-    """Of a server with these settings and tiers, here and now, by name."""
+    """What decides the answers of a server with these settings and tiers on this machine, by name."""
     found = {
         "mapless": __version__,
         "commit": commit_of(ROOT),
@@ -48,7 +48,7 @@ def circumstances_of(settings: Settings, tiers: Sequence[Tier]) -> dict[str, str
 
 def _version_of(package: str) -> str:
     if package in ("torch", "kornia") and package not in sys.modules:
-        return ""  # it may be installed, and nothing of this server asks it
+        return ""  # it may be installed, but this server does not use it
     try:
         return version(package)
     except PackageNotFoundError:
@@ -59,10 +59,10 @@ log = logging.getLogger(__name__)
 
 
 def open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorder | None:
-    """What captures calls, if the settings ask for it; the log says so, since photographs are then kept.
+    """The recorder, if the settings ask for one; with a warning in the log, since photographs are stored then.
 
     Raises:
-        CaptureError: the folder cannot be used, or a tenant's name is none.
+        CaptureError: the folder cannot be used, or capture_tenants has an invalid name.
     """
     if settings.capture_dir is None:
         return None
@@ -77,5 +77,5 @@ def open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorde
         settings.capture_hours,
         settings.capture_mib,
     )
-    metrics.watch_captures(lambda: folder.space_bytes)
+    metrics.watch_captures(lambda: folder.disk_bytes)
     return Recorder(folder, store, metrics, partial(circumstances_of, settings), tenants)

@@ -1,14 +1,15 @@
-"""Takes calls from the services, and keeps them, in a thread of its own: it never delays a call and never fails one.
+"""Takes answered calls from the services and writes them to the folder, without delaying or failing any call.
 
-What it cannot keep it counts. Calls wait for the disk in a queue that is bounded in number and bytes. `deletion` sees
-to it that what is kept goes when it is to go.
+Calls wait for the disk in a queue that is bounded in number and bytes, and one thread writes them. What is not written
+is counted. `deletion` deletes them on time.
 """
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -22,66 +23,104 @@ from mapless_server.rpc.call import Call
 from mapless_server.security.tenancy import key_of
 from mapless_server.store import SceneAttributes, Store, time_us
 
-from .calls import BlobGone, CapturedCall, Request, Response, diagnostics_of
+from .calls import BlobDeleted, CapturedCall, Request, Response, diagnostics_of
+from .collecting import Collector, ReferencesDeleted, UsedReferences, used_references
 from .deletion import Deletion
 from .folder import CaptureFolder
-from .gathering import Gatherer, Gone, Used, used_of
-from .telling import Telling
 
-MAX_WAITING = 32
+log = logging.getLogger(__name__)
+
+MAX_QUEUED = 32
 """Calls that wait for the disk."""
-MAX_WAITING_BYTES = 64 * 2**20
-"""Of their messages."""
+MAX_QUEUED_BYTES = 64 * 2**20
+"""Size of their messages together."""
 FAULT_PAUSE_S = 60.0
-"""After the disk has failed nothing is captured for so long, not what waits already either."""
+"""After a fault of the disk, the time in which nothing is captured, queued calls neither."""
 CLOSING_LIMIT_S = 5.0
-"""For what waits to be written when the server stops."""
+"""For writing the queued calls when the server stops."""
+LOG_PERIOD_S = 60.0
+"""Time in which the log has one line at most of each kind of fault: a fault may occur at every call."""
 
 
 class CaptureObserver(Protocol):
     """Counts what is captured; called from any thread, so it must return at once and never raise."""
 
     def captured(self) -> None:
-        """A call is kept."""
+        """A call is written."""
 
     def capture_dropped(self, reason: str) -> None:
         """A call that was to be captured is not: "queue", "size", "disk", "deleted", "store" or "fault".
 
-        "queue" if too many waited, or if it still did when the server stopped.
+        "queue" if too many were queued, or if it still was when the server stopped.
         """
 
 
 @dataclass(frozen=True, eq=False)
-class Waiting:
-    """A call that waits to be kept: its messages, and by name what its photographs were compared with.
+class QueuedCall:
+    """A call that waits for the disk.
 
     Attributes:
-        call: whose it is.
-        scene_id: where.
+        call: the call.
+        scene_id: its scene.
         time_s: when it was answered, Unix seconds.
-        method: "Localize", ...
-        request: as it came.
-        response: as it went.
-        size_bytes: of both.
-        parts: of each photograph.
+        request: as it was received.
+        response: as it was sent.
+        size_bytes: of both messages.
+        parts: the references of each photograph.
         attributes: of the scene.
-        tiers: what computed the answer.
+        tiers: all that the server has.
     """
 
     call: Call
     scene_id: str
     time_s: float
-    method: str
     request: Message
     response: Message
     size_bytes: int
-    parts: tuple[Used, ...]
+    parts: tuple[UsedReferences, ...]
     attributes: SceneAttributes
     tiers: Sequence[Tier]
 
 
+class RateLimitedLog:
+    """Logs faults, of each kind one line in `LOG_PERIOD_S`; from any thread."""
+
+    def __init__(self) -> None:
+        self._guard = threading.Lock()
+        self._logged_s: dict[str, float] = {}
+        self._dropped: Counter[str] = Counter()
+
+    def fault(self, what: str, error: Exception, request_id: str = "") -> None:
+        """Logs that something failed, for the call of this id if any; an unexpected error with its traceback."""
+        if self._is_due(what):
+            origin = None if isinstance(error, OSError) else error
+            log.error("%s: %s", what, error, exc_info=origin, extra={"request_id": request_id} if request_id else None)
+
+    def dropped(self, reason: str) -> None:
+        """Counts a call that was not captured, for the next line about such calls."""
+        with self._guard:
+            self._dropped[reason] += 1
+        if self._is_due("dropped"):
+            self.flush()
+
+    def flush(self) -> None:
+        """Logs how many calls were not captured since the last line about them."""
+        with self._guard:
+            counts, self._dropped = self._dropped, Counter()
+        if counts:
+            log.warning("calls were not captured: %s", ", ".join(f"{name} {count}" for name, count in counts.items()))
+
+    def _is_due(self, what: str) -> bool:
+        with self._guard:
+            now_s = time.monotonic()
+            is_due = now_s - self._logged_s.get(what, -LOG_PERIOD_S) >= LOG_PERIOD_S
+            if is_due:
+                self._logged_s[what] = now_s
+            return is_due
+
+
 class Recorder:
-    """Captures the calls of one server. `answered` is for the event loop.
+    """Captures the calls of one server.
 
     Attributes:
         folder: of the calls.
@@ -95,29 +134,29 @@ class Recorder:
         circumstances: Callable[[Sequence[Tier]], Mapping[str, str]] = lambda _: {},
         tenants: frozenset[str] = frozenset(),
     ) -> None:
-        """Begins to watch over the folder; asks the store nothing yet.
+        """Starts the threads that write and delete; does not wait for the store.
 
         Args:
-            folder: of the calls; closed at the end.
-            store: of the references; must not be closed before.
-            observer: counts.
+            folder: of the calls; closed with the recorder.
+            store: of the references; to be closed after the recorder.
+            observer: counts calls.
             circumstances: what else decides the answers of these tiers, see `circumstances_of`.
-            tenants: whose calls; none for those of all.
+            tenants: whose calls are captured; empty for those of all.
         """
         self.folder = folder
         self._observer = observer
         self._tenants = tenants
         self._store = store.uncached()
-        self._gatherer = Gatherer(self._store, folder)
+        self._collector = Collector(self._store, folder)
         self._circumstances = circumstances
-        self._found: Mapping[str, str] | None = None
-        self._waiting: deque[Waiting] = deque()
-        self._waiting_bytes = 0
+        self._known_circumstances: Mapping[str, str] | None = None
+        self._queue: deque[QueuedCall] = deque()
+        self._queued_bytes = 0
         self._paused_until_s = 0.0
         self._closing_s: float | None = None
-        self._news = threading.Condition()
-        self._telling = Telling()
-        self._deletion = Deletion(folder, self._store, self._telling)
+        self._changed = threading.Condition()
+        self._log = RateLimitedLog()
+        self._deletion = Deletion(folder, self._store, self._log.fault)
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
         self._thread.start()
 
@@ -129,130 +168,127 @@ class Recorder:
         parts: Sequence[tuple[Query, Result]],
         tiers: Sequence[Tier],
     ) -> None:
-        """A call has been answered; the answer says so if it is to be kept.
+        """Queues an answered call; to be called on the event loop.
 
         Args:
-            request: as it came.
-            response: as it goes; neither is to be changed afterwards.
-            call: whose they are.
-            parts: its photographs, in order, and what was made of each.
+            request: as it was received.
+            response: its diagnostics say from now on if it is captured. Neither message may change afterwards.
+            call: the call.
+            parts: its photographs, in order, with their results.
             tiers: all that the server has.
         """
         if self._tenants and call.principal.tenant not in self._tenants:
             return
         messages: tuple[Message, Message] = request, response
         size_bytes = sum(it.ByteSize() for it in messages)
-        used = tuple(used_of(*part) for part in parts)
+        used = tuple(used_references(*part) for part in parts)
         attributes = parts[0][1].attributes
         scene_id, now_s = parse_scene_name(request.scene), time.time()
         if self._has_room(size_bytes):
             for diagnostics in diagnostics_of(response):
                 diagnostics.captured = True
-            method = request.DESCRIPTOR.name.removesuffix("Request")
-            self._put(Waiting(call, scene_id, now_s, method, *messages, size_bytes, used, attributes, tiers))
+            queued = QueuedCall(call, scene_id, now_s, *messages, size_bytes, used, attributes, tiers)
+            with self._changed:
+                self._queue.append(queued)
+                self._queued_bytes += size_bytes
+                self._changed.notify()
 
     @property
     def is_closing(self) -> bool:
-        """Whether no more than what waits is written."""
+        """Whether only queued calls are still written."""
         return self._closing_s is not None
 
     def close(self) -> None:
-        """Writes what waits, for as long as there is time, and lets the folder go; from any thread."""
-        with self._news:
+        """Writes queued calls within `CLOSING_LIMIT_S`, and closes the folder; from any thread."""
+        with self._changed:
             self._closing_s = time.monotonic() + CLOSING_LIMIT_S
-            self._news.notify()
+            self._changed.notify()
         self._thread.join()
-        self._telling.tell_dropped()
+        self._log.flush()
         self._deletion.close()
         self.folder.close()
 
     def _has_room(self, size_bytes: int) -> bool:
-        """Whether another call may wait; only the event loop adds any."""
+        """Whether another call may be queued; only the event loop adds any."""
         if self._is_paused():
             self._drop("disk")
             return False
-        with self._news:
-            fits = not self._waiting or self._waiting_bytes + size_bytes <= MAX_WAITING_BYTES
-            has_room = fits and len(self._waiting) < MAX_WAITING
+        with self._changed:
+            fits = not self._queue or self._queued_bytes + size_bytes <= MAX_QUEUED_BYTES
+            has_room = fits and len(self._queue) < MAX_QUEUED
         if not has_room:
             self._drop("queue")
         return has_room
 
-    def _put(self, waiting: Waiting) -> None:
-        with self._news:
-            self._waiting.append(waiting)
-            self._waiting_bytes += waiting.size_bytes
-            self._news.notify()
-
     def _run(self) -> None:
         while True:
-            with self._news:
-                self._news.wait_for(lambda: self._waiting or self.is_closing)
-                if not self._waiting:
+            with self._changed:
+                self._changed.wait_for(lambda: self._queue or self.is_closing)
+                if not self._queue:
                     return
-                waiting = self._waiting.popleft()
-                self._waiting_bytes -= waiting.size_bytes
+                queued = self._queue.popleft()
+                self._queued_bytes -= queued.size_bytes
                 is_late = self._closing_s is not None and time.monotonic() >= self._closing_s
             if is_late:
                 self._drop("queue")
             else:
-                self._keep(waiting)
+                self._write(queued)
 
     def _is_paused(self) -> bool:
         return time.monotonic() < self._paused_until_s
 
-    def _keep(self, waiting: Waiting) -> None:
+    def _write(self, queued: QueuedCall) -> None:
         if self._is_paused():
             self._drop("disk")
             return
         try:
-            if self._add(waiting):
+            if self._add(queued):
                 self._observer.captured()
             else:
                 self._drop("size")
         except OSError as error:
             self._paused_until_s = time.monotonic() + FAULT_PAUSE_S
             self._drop("disk")
-            self._telling.complain(f"nothing is captured for {FAULT_PAUSE_S:g} s", error)
-        except (Gone, NotFound):
+            self._log.fault(f"nothing is captured for {FAULT_PAUSE_S:g} s", error)
+        except (ReferencesDeleted, NotFound):
             self._drop("deleted")
         except (DataLoss, Unavailable):
             self._drop("store")
         except Exception as error:
             self._drop("fault")
-            self._telling.complain("a call was not captured", error, waiting.call.request_id)
+            self._log.fault("a call was not captured", error, queued.call.request_id)
 
-    def _add(self, waiting: Waiting, more_tries: int = 2) -> bool:
+    def _add(self, queued: QueuedCall, more_tries: int = 2) -> bool:
         try:
-            return self.folder.add(*self._gather(waiting))
-        except BlobGone:
+            return self.folder.add(*self._collect(queued))
+        except BlobDeleted:
             if not more_tries:
                 raise
-            return self._add(waiting, more_tries - 1)
+            return self._add(queued, more_tries - 1)
 
-    def _gather(self, waiting: Waiting) -> tuple[CapturedCall, dict[str, bytes]]:
-        if self._found is None:
-            self._found = self._circumstances(waiting.tiers)
-        tenant, scene_id = waiting.call.principal.tenant, waiting.scene_id
-        extractors, blobs = tuple(tier.features for tier in waiting.tiers), dict[str, bytes]()
-        # First: a scene that is made anew while its references are read has others, which is then found out.
-        scene = self._store.get_scene(key_of(tenant, scene_id))
-        parts = tuple(self._gatherer.part(scene, used, extractors, blobs) for used in waiting.parts)
+    def _collect(self, queued: QueuedCall) -> tuple[CapturedCall, dict[str, bytes]]:
+        if self._known_circumstances is None:
+            self._known_circumstances = self._circumstances(queued.tiers)
+        tenant = queued.call.principal.tenant
+        extractors, blobs = tuple(tier.features for tier in queued.tiers), dict[str, bytes]()
+        # First, so that a scene that is created anew while its references are read is found to have others.
+        scene = self._store.get_scene(key_of(tenant, queued.scene_id))
+        parts = tuple(self._collector.part(scene, used, extractors, blobs) for used in queued.parts)
         call = CapturedCall(
-            waiting.call.request_id,
-            waiting.time_s,
-            waiting.method,
+            queued.call.request_id,
+            queued.time_s,
+            type(queued.request).__name__.removesuffix("Request"),
             tenant,
-            scene_id,
+            queued.scene_id,
             time_us(scene.create_time),
-            self._found,
-            waiting.attributes,
+            self._known_circumstances,
+            queued.attributes,
             parts,
-            waiting.request.SerializeToString(),
-            waiting.response.SerializeToString(),
+            queued.request.SerializeToString(),
+            queued.response.SerializeToString(),
         )
         return call, blobs
 
     def _drop(self, reason: str) -> None:
         self._observer.capture_dropped(reason)
-        self._telling.dropped(reason)
+        self._log.dropped(reason)

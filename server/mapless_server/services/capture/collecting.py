@@ -1,4 +1,4 @@
-"""What a photograph was compared with, gathered from the store when its call has been answered."""
+"""Reads the references that a photograph was compared with from the store, after its call has been answered."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from .folder import CaptureFolder
 _REMEMBERED = 100_000
 
 
-class Gone(Exception):
-    """What was used has been deleted since, so what was made of it is not to be kept either."""
+class ReferencesDeleted(Exception):
+    """A reference that was used has been deleted since, so its call must not be captured."""
 
 
 @dataclass(frozen=True, eq=False)
-class Used:
-    """What a photograph was compared with, by name: nothing large is held on to while it waits to be gathered.
+class UsedReferences:
+    """What a photograph was compared with, by key, so that a queued call holds nothing large in memory.
 
     Attributes:
         field: path of the photograph in the request.
         generation: of the scene when its references were read.
-        used: keys of those that the answer rests on.
-        wanted: keys by id of those that were named, or that come into the choice.
-        choice: how they were chosen; None if they were used as they were named.
+        used: keys of those that the answer was computed from.
+        wanted: keys by id of those that were named or ranked.
+        choice: how they were chosen; None if they were used as named.
     """
 
     field: str
@@ -42,49 +42,51 @@ class Used:
     choice: Choice | None
 
 
-def used_of(query: Query, result: Result) -> Used:
-    """What is to be gathered of an answered photograph."""
+def used_references(query: Query, result: Result) -> UsedReferences:
+    """What an answered photograph was compared with."""
     choice = result.choice
     if choice is not None:
         wanted = {it.reference_id: it.key for it in choice.references}
     else:
         wanted = {parse_reference_name(it.name)[1]: it.key for it in result.references}
     used = frozenset(it.key for it in result.references)
-    return Used(query.photo.field, result.generation, used, wanted, choice)
+    return UsedReferences(query.photo.field, result.generation, used, wanted, choice)
 
 
-class Gatherer:
-    """Reads references from the store; what the folder has already is not read again. For one thread."""
+class Collector:
+    """Reads references from the store, except what the folder has already. For one thread."""
 
     def __init__(self, store: Store, folder: CaptureFolder) -> None:
-        """A store that is `uncached`, since queries want to remember other references than captures."""
+        """`store` is `uncached`, since the cache is for the references of queries."""
         self._store = store
         self._folder = folder
         self._records: dict[str, ReferenceRecord] = {}  # by key; references never change
         self._views: dict[tuple[str, str], str] = {}  # blobs by the reference's key and the extractor's name
 
-    def part(self, scene: SceneRecord, used: Used, extractors: Sequence[str], blobs: dict[str, bytes]) -> CapturedPart:
+    def part(
+        self, scene: SceneRecord, used: UsedReferences, extractors: Sequence[str], blobs: dict[str, bytes]
+    ) -> CapturedPart:
         """What a photograph was compared with.
 
         Args:
             scene: as it is now.
-            used: the photograph's.
-            extractors: names of all that the server has: a replay may try each of them.
-            blobs: gets those that the folder lacks.
+            used: the photograph's references.
+            extractors: names of all that the server has, since a replay may try each of them.
+            blobs: receives those that the folder lacks.
 
         Raises:
-            Gone: a reference that was used was deleted meanwhile, or is another one by now; or none was used, so that
-                nothing says whether a scene that has changed is still the one that was asked.
-            DataLoss: it is damaged.
-            Unavailable: the store is not there.
+            ReferencesDeleted: a reference that was used was deleted or replaced meanwhile; or none was used and the
+                scene has changed, so that it may be another scene of the same name.
+            DataLoss: a reference is damaged.
+            Unavailable: the store cannot be read.
         """
         if not used.used and used.generation != scene.generation:
-            raise Gone
+            raise ReferencesDeleted
         wanted = dict(used.wanted)
         read_at = {used.generation, used.generation if used.choice is None else used.choice.generation}
         if read_at != {scene.generation}:
-            there = self._store.find_keys(scene.scene_key, list(wanted))
-            wanted = {it: key for it, key in wanted.items() if there.get(it) == key}
+            current = self._store.find_keys(scene.scene_key, list(wanted))
+            wanted = {it: key for it, key in wanted.items() if current.get(it) == key}
         if max(len(self._records), len(self._views)) > _REMEMBERED:
             self._records.clear()
             self._views.clear()
@@ -92,7 +94,7 @@ class Gatherer:
             self._read(scene.scene_key, wanted, extractor, blobs)
         known = {key: self._records[key] for key in wanted.values() if key in self._records}
         if not used.used <= known.keys():
-            raise Gone
+            raise ReferencesDeleted
         for record in known.values():
             self._image(record, blobs)
         references = [
@@ -109,20 +111,20 @@ class Gatherer:
         return CapturedPart(used.field, used.generation, tuple(references), used.choice)
 
     def _read(self, scene_key: SceneKey, wanted: Mapping[str, str], extractor: str, blobs: dict[str, bytes]) -> None:
-        """Features of an extractor, of those references that have them and whose blob is not there yet."""
+        """Reads the features of an extractor, as far as they exist and their blobs are not there yet."""
         tenant = tenant_of(scene_key)
 
-        def is_there(key: str) -> bool:
+        def has_blob(key: str) -> bool:
             name = self._views.get((key, extractor))
             return name is not None and (name in blobs or self._folder.has_blob(tenant, name))
 
-        missing = [reference_id for reference_id, key in wanted.items() if not is_there(key)]
+        missing = [reference_id for reference_id, key in wanted.items() if not has_blob(key)]
         for reference_id in missing:
             self._views.pop((wanted[reference_id], extractor), None)
         self._load(scene_key, missing, extractor, blobs)
 
     def _load(self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: str, blobs: dict[str, bytes]) -> None:
-        """All at once, or, where one of them is damaged or gone, each that is there."""
+        """Reads all at once; where one is damaged or deleted, one by one."""
         if not reference_ids:
             return
         try:
@@ -148,4 +150,4 @@ class Gatherer:
         try:
             blobs[name] = self._store.read_image_of(record.key)
         except NotFound:
-            raise Gone from None
+            raise ReferencesDeleted from None
