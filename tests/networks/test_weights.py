@@ -318,7 +318,9 @@ def test_a_check_of_ones_own_file_compares_with_its_record(
         path = add(weights, file, folder, unofficial=True).path
         assert check(weights, folder).sha256 == sha256(CONTENT)
         path.write_bytes(CONTENT[:-1] + b"\x7b")
-        with pytest.raises(CheckpointError, match="not the official file" if official else "has changed since it came"):
+        with pytest.raises(
+            CheckpointError, match="not the official file" if official else "has changed since it was added"
+        ):
             check(weights, folder)
 
 

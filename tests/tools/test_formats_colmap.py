@@ -225,7 +225,7 @@ def test_an_unknown_camera_model_number_is_named(tmp_path: Path) -> None:
         ("cameras.txt", "1 PINHOLE 96 64 80 81 47", r"cameras\.txt:1: PINHOLE has parameters fx fy cx cy, found 3"),
         ("cameras.txt", "1 BOX 96 64 80", r"cameras\.txt:1: expected CAMERA_ID"),
         ("cameras.txt", "1 PINHOLE 96 x 80 81 47 31", r"cameras\.txt:1: "),
-        ("cameras.txt", "1 PINHOLE 96 64 80 81 47 31\n" * 2, r"cameras\.txt: camera 1 stands twice"),
+        ("cameras.txt", "1 PINHOLE 96 64 80 81 47 31\n" * 2, r"cameras\.txt: camera 1 occurs twice"),
         ("images.txt", "1 1 0 0 0 0 0 1 0000.png\n\n", r"images\.txt:1: expected IMAGE_ID"),
         ("images.txt", "1 1 0 0 0 0 y 0 1 0000.png\n\n", r"images\.txt:1: "),
     ],
@@ -258,7 +258,7 @@ def test_single_images_are_refused_and_the_rest_is_read(tmp_path: Path) -> None:
     assert "there is no file" in why["0001.png"]
     assert "leads out" in why["../0000.png"]
     assert "leads out" in why[f"{tmp_path}/images/0000.png"]
-    assert "stands twice" in why["0000.png"]
+    assert "occurs twice" in why["0000.png"]
     assert "image 11: its pose" in why["zero.png"]
     assert "image 12: its pose" in why["nan.png"]
     assert "no camera 5" in why["camera.png"]

@@ -1,4 +1,4 @@
-"""Encoded photographs of strangers to pixels; one is rejected by its header, before memory is allocated for it.
+"""Encoded photographs of untrusted callers to pixels; rejected by their headers, before memory is allocated for them.
 
 Imports only `mapless_server.errors`. Begin with `decode`.
 """

@@ -1,7 +1,7 @@
-"""What of a PNG is handed to the decoder: the chunks that its pixels are made of, and nothing else.
+"""The part of a PNG that the decoder gets: the chunks of its pixels, and nothing else.
 
 The decoder allocates for whatever length a chunk of text claims, gigabytes for a file of a kilobyte, and inflates every
-compressed text and profile, megabytes for kilobytes each; so it does not get to see them. Colour profiles, gamma and
+compressed text and profile, megabytes for kilobytes each; so it does not get them. Colour profiles, gamma and
 transparency are not applied, so that nothing is lost.
 """
 
@@ -85,7 +85,7 @@ def _inflates_beyond(most_bytes: int, compressed: Iterable[memoryview]) -> bool:
 
 
 def _most_data_bytes(data: bytes) -> int:
-    """What the pixels of an honest file take at most, however badly they are compressed."""
+    """What the pixels of a valid file take at most, however badly they are compressed."""
     width, height, depth, colour = struct.unpack_from(">IIBB", data, 16)
     row_bytes = (width * depth * _CHANNELS.get(colour, 4) + 7) // 8
     # Interlaced rows come in seven parts, each with its own filter byte and padding, and stored blocks have headers.

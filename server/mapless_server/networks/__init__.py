@@ -1,7 +1,7 @@
 """The feed-forward 3D networks pi^3 (Wang et al. 2025) and its successor Pi3X, written from a description of them.
 
 A network takes images of one scene and gives, up to one similarity, each view's pose and the point seen at each of its
-pixels. The modules' names are those of the official checkpoints' entries. Imports only `errors` and `extras`, and
+pixels. The modules' names are those of the official checkpoints' entries. Imports only `mapless_server.extras`, and
 nothing at all at import: torch takes seconds. Begin with `network`.
 
     blocks.py      attention, normalization, rotary positions

@@ -49,7 +49,7 @@ def invert_poses(poses: Tensor) -> Tensor:
 
 
 def normalize_poses(poses: Tensor) -> Tensor:
-    """Poses of each scene's views relative to its first, at a scale that the network knows.
+    """Poses of each scene's views relative to its first, at the scale of the network's training.
 
     The mean distance of the other views from the first is 1: of all of them, also of those whose pose is then not used
     (so what stands in for an unknown pose matters).

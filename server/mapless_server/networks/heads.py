@@ -1,4 +1,4 @@
-"""The heads: what is read off the decoded tokens of a view. Their decoders see one view at a time.
+"""The heads, which read values off the decoded tokens of a view. Their decoders see one view at a time.
 
 `HeadDecoder` prepares tokens for a head; `CameraHead` gives a pose; `LinearHead` (Pi3) and `ConvHead` (Pi3X, as in
 MoGe, Wang et al. 2024) give a value for each pixel; `MetricDecoder` (Pi3X) gives one for the scene. Heads compute in

@@ -2,7 +2,7 @@
 
 All layers run, nothing stops early and no keypoint is pruned on the way, so that several pairs of photographs can go
 through together: those with fewer keypoints are padded, and masks keep the padding out of every sum. A pair's matches
-then do not depend on the others', and the device is asked for results once.
+then do not depend on the others', and the host waits for the device once.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ class Sizes:
 
 @dataclass(frozen=True, eq=False)
 class NetworkOutput:
-    """What a network says of B scenes with N views each, up to a similarity for each scene.
+    """A network's output for B scenes with N views each, up to a similarity for each scene.
 
     Attributes:
         local_points: (B, M, H, W, 3) float32, the point at each pixel of the first M views, in the view's camera frame.

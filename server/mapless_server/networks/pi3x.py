@@ -1,4 +1,4 @@
-"""Pi3X, the successor of pi^3: takes intrinsics and poses as conditions, and knows roughly how long a metre is.
+"""Pi3X, the successor of pi^3: takes intrinsics and poses as conditions, and its output is roughly metric.
 
 Given poses fix neither the frame nor the scale of what it answers: align it with them afterwards, as with Pi3. What the
 official network has for given depths, a fifth of its weights, is not here: no query comes with depths.

@@ -112,7 +112,7 @@ class NetworkRunner:
         return compiled(self.network.encode), compiled(self.network.reconstruct)
 
     def _check_kernels(self, name: str) -> None:
-        """One tiny attention now tells what would otherwise fail every query."""
+        """One tiny attention now, instead of a failure in every query."""
         token = torch.ones(1, 1, 1, 64, device=self.device, dtype=self.dtype)
         try:
             Attention.attend(token, token, token)
@@ -138,7 +138,7 @@ class NetworkRunner:
 
         Returns:
             (V, T, C) on the device, in the compute type. Rounding here, and not only where tokens are kept, makes no
-            difference between those that were and those that were not. Nor does the company: views are encoded one by
+            difference between those that were and those that were not. Nor do the other views: they are encoded one by
             one, because kernels round differently for batches of another size, and a thousand tokens fill a device.
         """
         return self._run(self._encode_views, images, intrinsics)

@@ -1,6 +1,6 @@
-"""SALAD (Izquierdo and Civera 2024): what an image's tokens say together, by optimal transport to learned clusters.
+"""SALAD (Izquierdo and Civera 2024): one vector from an image's tokens, by optimal transport to learned clusters.
 
-Every patch has mass one to give: to clusters, or to a dustbin where what tells nothing of a place ends (sky, people).
+Every patch has mass one to give: to clusters, or to a dustbin for what does not identify a place (sky, people).
 Every cluster takes mass one, the dustbin the rest. What a cluster is given, features weighted by mass, is one part of
 the descriptor; the class token's features are another.
 """

@@ -17,7 +17,7 @@ from mapless_tools.dataset import Frame, read_folder
 
 ROOM = Path(__file__).with_name("room")
 MAX_FRAMES = 60
-"""Of a longer real sequence so many frames are used, evenly spread: enough to judge, and a minute to run."""
+"""Of a longer real sequence so many frames are used, evenly spread: enough to judge, in a minute."""
 QUERY_EVERY = 3
 
 
@@ -49,7 +49,7 @@ class Place:
     """References and queries of one place.
 
     Attributes:
-        title: for the person who watches.
+        title: shown to the user.
         references, queries: apart from one another.
         metric: whether lengths are metres.
         outline: None if it is not known.

@@ -25,7 +25,7 @@ SCENE = "demo"
 DRAWN_PX = 960
 """Longer side of the photographs that are drawn."""
 DRAWN_REFERENCES = 3
-"""What is drawn is what these, the most agreeing ones, see: more would be hidden things that shine through."""
+"""So many, those with the most inliers, give the points that are drawn: more would add points that are hidden."""
 MAX_MEDIAN_ERROR_M = 0.03
 MAX_MEDIAN_ERROR_DEG = 1.0
 """What the rendered room must reach for the demo to succeed."""
@@ -50,7 +50,7 @@ def run_demo(data: Path | None, output: Path, console: Console | None = None) ->
         console: where to write; None for the standard output.
 
     Returns:
-        whether it went well: the rendered room's queries are all localized with small median errors; of a real folder's
+        whether it succeeded: the rendered room's queries are all localized with small median errors; of a real folder's
         more than half are localized.
 
     Raises:
@@ -123,7 +123,7 @@ def table_of(outcomes: Sequence[Outcome], metric: bool) -> Table:
 
 
 def summarize(console: Console, place: Place, outcomes: Sequence[Outcome]) -> bool:
-    """Print the medians and the verdict; whether the demo went well."""
+    """Print the medians and the verdict; whether the demo succeeded."""
     localized = [outcome for outcome in outcomes if isinstance(outcome.answer, LocalizationResult)]
     translation = float(np.median([outcome.translation_error for outcome in outcomes]))
     rotation_deg = float(np.median([outcome.rotation_error_deg for outcome in outcomes]))

@@ -1,7 +1,7 @@
 """Points to draw: matched between photographs with known poses and triangulated, apart from the server's own work.
 
-An answer carries a pose and no points. A person who is to believe the pose wants to see that known structure falls
-where the photograph shows it, so the demo makes a little structure itself, from the references alone.
+An answer has a pose and no points. Known structure that falls where the photograph shows it makes a pose credible, so
+the demo computes a little structure itself, from the references alone.
 """
 
 from __future__ import annotations

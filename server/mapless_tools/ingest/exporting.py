@@ -27,7 +27,7 @@ class Export:
 
     Attributes:
         written: how many lie in the folder.
-        damaged: of the others what the server said, by their ids, in their order.
+        damaged: the server's messages about the others, by their ids, in their order.
     """
 
     written: int
@@ -52,10 +52,10 @@ def check_target(folder: Path, layout: str) -> None:
 def export_scene(client: Client, scene: str, folder: Path, layout: str, progress: Progress) -> Export:
     """Writes a scene's references into a folder, but for those that are damaged.
 
-    The layout `cameras` says the scene's datum and down, too. A calibration is of these references on a server of this
+    The layout `cameras` has the scene's datum and down, too. A calibration is of these references on a server of this
     version, and is measured anew elsewhere; a backup keeps it.
 
-    The description comes last, so that a folder without it is an export that was cut off. Where every reference is
+    The description is written last, so that a folder without it is an interrupted export. Where every reference is
     damaged, nothing is left in the folder.
 
     Raises:
@@ -96,7 +96,7 @@ def _reference_ids(client: Client, scene: str) -> list[str]:
     """Of all references, damaged ones too."""
     with suppress(DataLoss):
         return [reference.reference_id for reference in client.list_references(scene, page_size=1000)]
-    # A list ends at a reference whose pose is damaged; an audit names it and goes on, but has to look at each of them.
+    # A list ends at a reference whose pose is damaged; an audit names it and continues, but examines each reference.
     return [audit.name.rpartition("/")[2] for audit in client.audit_scene(scene)]
 
 
@@ -108,7 +108,7 @@ def _write_image(client: Client, folder: Path, scene: str, reference_id: str) ->
         return error.message
     image = reference.image or b""
     if hashlib.sha256(image).hexdigest() != reference.image_sha256:
-        return f"reference {reference_id!r}: the image that came is not the one that was stored"
+        return f"reference {reference_id!r}: the image received is not the one that was stored"
     name = image_name(reference_id, image)
     write_file(folder / IMAGES / name, image)
     return PosedImage(name, reference.camera, reference.world_from_camera)

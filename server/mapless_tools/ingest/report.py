@@ -49,7 +49,7 @@ class ImportReport:
 
     @property
     def untried_count(self) -> int:
-        """Frames that the import did not come to."""
+        """Frames that the import did not reach."""
         tried = len(self.added) + len(self.skipped) + len(self.refused) - len(self.dataset.refused)
         return 0 if self.is_dry else len(self.chosen) - tried
 

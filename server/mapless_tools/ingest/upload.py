@@ -2,7 +2,7 @@
 
 As many messages are read ahead as there are threads, and no more. What the server refuses is taken out of its message,
 and the rest is sent again; when it is busy or away it is waited for. A message whose answer was lost may have been
-stored all the same, so an id that is taken is looked at before it is called a duplicate.
+stored nevertheless, so a reference that exists is compared before it is reported as a duplicate.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class UploadOptions:
 
     Attributes:
         parallel: messages in flight. The server describes their photographs side by side; more only wait.
-        busy_patience_s: how long a server may say that it is too busy before the import gives up.
+        busy_patience_s: how long a server may be too busy before the import gives up.
         away_patience_s: how long it may be unreachable; a restart takes seconds.
     """
 
@@ -68,7 +68,7 @@ class UploadOptions:
 
 
 class _Stopped(Exception):
-    """The import ends; the report says why."""
+    """The import ends; the reason is in the report."""
 
 
 class Uploader:
@@ -91,7 +91,7 @@ class Uploader:
         self._lock = threading.Lock()
 
     def run(self) -> None:
-        """Stores the report's chosen frames. An interruption stops it soon, and goes through."""
+        """Stores the report's chosen frames. An interruption stops it soon, and is raised."""
         batches = batches_of(self._report.chosen)
         total = len(self._report.chosen)
         self._progress("storing references", 0, total)
@@ -130,7 +130,7 @@ class Uploader:
             raise
 
     def _load(self, frame: Frame) -> Item | None:
-        """The frame with its image's bytes; None if it is not to be sent, which the report then says."""
+        """The frame with its image's bytes; None if it is not to be sent, for a reason in the report."""
         try:
             item = read_item(frame)
         except ValueError as error:
@@ -189,7 +189,7 @@ class Uploader:
                 self._add([item])
             else:
                 self._duplicate(item.frame, there, item.stored)
-        if len(left) == len(items):  # it was there, and is not any longer: somebody else is at work
+        if len(left) == len(items):  # it existed, and does not any longer: another client is at work
             if waiting.for_return():
                 return left
             self._end(str(error))
@@ -236,7 +236,7 @@ class Uploader:
             self._report.added += [item.frame.name for item in items]
 
     def _end(self, reason: str) -> None:
-        """Ends the import; whoever stops first says why."""
+        """Ends the import; the first reason is the one that is reported."""
         with self._lock:
             if not self._stop.is_set():
                 self._report.stopped = reason
@@ -280,7 +280,7 @@ def batches_of(frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
     for frame in frames:
         try:
             size_bytes = frame.image_path.stat().st_size
-        except OSError:  # whoever reads it says so
+        except OSError:  # reading it will report that
             size_bytes = 0
         if batch and (len(batch) == BATCH_COUNT or batch_bytes + size_bytes > BATCH_BYTES):
             yield batch
@@ -302,7 +302,7 @@ class Waiting:
         self._away_s = 0.0
 
     def for_busy(self, retry_after_s: float) -> bool:
-        """Waits as the server asks; False when that has been going on for too long."""
+        """Waits as long as the server requests; False when it has been busy for too long."""
         if time.monotonic() - self._start_s > self._options.busy_patience_s:
             return False
         self._stop.wait(min(max(retry_after_s, 0.05), 30.0))

@@ -1,4 +1,4 @@
-"""The weights that mapless can use: what for, under which licence, from where, and how to know the right file."""
+"""The weights that mapless can use: their purpose, licence, source, and digest."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class Licence:
     """Terms that weights come under.
 
     Attributes:
-        name: as people know it.
+        name: the usual one.
         url: where it stands.
         restriction: what it forbids that a user could stumble over; empty for permissive ones.
     """

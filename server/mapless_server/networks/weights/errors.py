@@ -20,11 +20,11 @@ class CheckpointError(WeightsError):
 
 
 class FetchError(WeightsError):
-    """Weights could not be fetched; the message says how to get them by hand."""
+    """Weights could not be fetched; the message has the way to get them by hand."""
 
 
 class LicenceNotAccepted(WeightsError):
-    """A person did not accept the terms, or was not there to be asked."""
+    """The terms were not accepted, or there was no terminal to accept them."""
 
 
 class FolderError(WeightsError):

@@ -24,13 +24,13 @@ class Status(Enum):
 
     ABSENT = "absent"
     OFFICIAL = "official"
-    """Its recorded digest is the one that the catalogue knows."""
+    """Its recorded digest is the one of the catalogue."""
     UNOFFICIAL = "not official"
     """Its recorded digest is another."""
     RECORDED = "present"
-    """It has a recorded digest, and the catalogue knows none."""
+    """It has a recorded digest, and the catalogue has none."""
     UNCHECKED = "not checked"
-    """Somebody put it there, or changed it since its digest was recorded."""
+    """It was put there by hand, or changed since its digest was recorded."""
     NO_FILE = "not a file"
     """Something else lies there, a folder most likely."""
 
@@ -99,7 +99,7 @@ def look_up(weights: Weights, weights_dir: Path) -> Stored:
 def workplace(weights_dir: Path) -> Iterator[Path]:
     """A temporary folder inside the weights folder, which is made if need be.
 
-    What is ready there is renamed into place. However the block is left, the folder goes: nothing half stays.
+    A file that is ready is renamed into place. However the block is left, the folder is removed.
 
     Raises:
         FolderError: the weights folder cannot be made or written.

@@ -27,9 +27,9 @@ class Installed:
     Attributes:
         path: of the file.
         sha256: of it.
-        is_official: whether that is the digest that the catalogue knows; None if it knows none.
+        is_official: whether that is the digest of the catalogue; None if it has none.
         not_compared: why its tensors were not compared with those of the network that takes them; None if they were,
-            or if the digest says enough.
+            or if the digest is the official one.
     """
 
     path: Path
@@ -48,13 +48,13 @@ def fetch(weights: Weights, weights_dir: Path, folder: Path) -> Installed:
 
     Raises:
         FetchError: they could not be had.
-        CheckpointError: what came is not what the catalogue knows.
+        CheckpointError: the file received is not the one of the catalogue.
         FolderError: the folder cannot be written, or is full.
     """
     place_of(weights, weights_dir)
     with _writing(weights_dir):
         ready = download(weights, folder)
-        what = f"the file that came for {weights.name}"
+        what = f"the file received for {weights.name}"
         found = _read_through(ready, weights, called=what)
         _require_official(found, weights, what)
         return replace(found, path=put_in_place(ready, weights, weights_dir, found.sha256))
@@ -73,7 +73,7 @@ def add(
 
     Args:
         weights: what it is.
-        file: safetensors; or the authors' PyTorch file where the catalogue knows its digest.
+        file: safetensors; or the authors' PyTorch file where the catalogue has its digest.
         weights_dir: where to.
         link: make a symbolic link instead of a copy.
         unofficial: take a file that differs from the official one: of lower precision, trained further.
@@ -117,7 +117,7 @@ def check(weights: Weights, weights_dir: Path, progress: Progress = lambda _: No
     if found.sha256 != known:
         _require_official(found, weights, str(path))
         if known is not None and found.is_official is None:
-            raise CheckpointError(f"{path} has changed since it came: its SHA-256 is {found.sha256}, not {known}")
+            raise CheckpointError(f"{path} has changed since it was added: its SHA-256 is {found.sha256}, not {known}")
     with contextlib.suppress(OSError):  # a folder mounted read-only can be checked too
         record(path, found.sha256)
     return found
@@ -215,7 +215,7 @@ def _try_loading(weights: Weights, file: Path) -> str | None:
     """Loads features or matching as the server does, which also finds numbers that are not finite.
 
     Returns:
-        Why it could not be tried; None if it went well.
+        Why it could not be tried; None if it loaded.
 
     Raises:
         CheckpointError: the file does not fit.

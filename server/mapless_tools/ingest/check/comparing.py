@@ -29,7 +29,7 @@ MAX_SUSPECTED = 12
 MORE_PAIRS = 3
 
 LIMITS = ImageLimits(max_bytes=2**28, max_pixels=200_000_000)
-"""Of photographs that are looked at here; what a server accepts is the server's business."""
+"""Of photographs that are compared here; the server has limits of its own."""
 
 
 def check_frames(frames: Sequence[Frame], progress: Progress, extractor: FeatureExtractor | None = None) -> Verdict:

@@ -1,7 +1,7 @@
 """Which usual mistake in poses or intrinsics, corrected, makes poses fit that do not.
 
 A correction turns a pose as it was given into what was meant. A pose with mirrored axes stays a rotation when both the
-world and the camera are mirrored, which is how left-handed engines come through unnoticed.
+world and the camera are mirrored, so those of left-handed engines pass all other checks.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _GAIN = 0.4  # an explanation must reduce the error to this share, or it explain
 _BAD_SHARE = 0.5  # of the pairs, that may stay bad
 _MIXED_BAD_SHARE = 0.2  # stricter, because each pair is given the choice of which of its two to correct
 _REFINEMENTS = 3
-_ENOUGH_MATCHES = 64  # for a median that tells mistakes apart
+_ENOUGH_MATCHES = 64  # for a median that distinguishes mistakes
 
 
 def _turned_camera(rotation: Array) -> Correction:

@@ -1,4 +1,4 @@
-"""What the epipolar errors of pairs say of a scene's poses: fine, wrong as a whole and how, or wrong here and there."""
+"""The verdict on a scene's poses by the epipolar errors of pairs: right, wrong as a whole and how, or single ones."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Layouts in which photographs with poses lie on disks, read into `dataset.Dataset`, and two that are written.
 
-Each layout is a module with one public function `read(path, options) -> Dataset`; its docstring says what it looks for.
-What is foreign about a layout ends there: cameras and poses that come out follow our conventions.
+Each layout is a module with one public function `read(path, options) -> Dataset`; its docstring describes the files.
+Conventions of a layout end there: the cameras and poses that it returns follow ours. Begin with `reading`.
 """
 
 from .options import FORMATS, Intrinsics, ReadOptions

@@ -1,7 +1,7 @@
 """Cambridge Landmarks (Kendall et al. 2015): dataset_train.txt, dataset_test.txt, reconstruction.nvm and seq1/*.png.
 
 A line of the first two is an image's path, the camera's centre X Y Z and a quaternion W P Q R, which is the rotation of
-camera_from_world; three lines go before. VisualSFM's reconstruction.nvm, which the poses come from, has the focal
+camera_from_world, after three lines of header. VisualSFM's reconstruction.nvm, which the poses come from, has the focal
 length and radial distortion of each image; its paths end in .jpg, the files in .png. The principal point is the
 image's centre.
 """

@@ -1,7 +1,7 @@
-"""What all readers share: a frame that is wrong is set aside with the reason, the rest goes on.
+"""What all readers share: a frame that is wrong is refused with the reason, and the others are read.
 
-Only what concerns a layout as a whole ends its reading. Checks that no layout may forget are made here: the image lies
-in the folder, is there and is named once; the pose can be one.
+Only what concerns a layout as a whole ends its reading. Checks that every layout needs are made here: the image lies in
+the folder, exists and is named once; the pose is possible.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 """Camera axes x right, y up, z back to x right, y down, z forward; its own inverse."""
 
 ANY_SIZE = ImageLimits(max_bytes=2**40, max_pixels=2**40, min_side_px=1, max_side_px=2**30)
-"""Headers are read to learn sizes, not to judge them: what a server accepts is the server's business."""
+"""Headers are read for the sizes alone; the server has limits of its own."""
 
 _HEAD_BYTES = 2**16
 

@@ -1,4 +1,4 @@
-"""What a reader is told beyond the folder."""
+"""Options of the readers."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class ReadOptions:
     """Options of reading.
 
     Attributes:
-        images: folder of the images where that of the layout is not the usual one; `colmap` alone asks.
+        images: folder of the images where that of the layout is not the usual one; only for `colmap`.
         ground_truth: poses to take instead of the layout's own: a file or folder of SfM pseudo ground truth, for
             `7scenes` and `12scenes`.
-        intrinsics: for layouts that come without (`7scenes`, `tum`); None for the layout's usual ones.
+        intrinsics: for layouts without them (`7scenes`, `tum`); None for the layout's usual ones.
     """
 
     images: Path | None = None

@@ -1,4 +1,4 @@
-"""SfM pseudo ground truth of 7-Scenes and 12-Scenes (Brachmann et al. 2021), in the two forms in which it goes round.
+"""SfM pseudo ground truth of 7-Scenes and 12-Scenes (Brachmann et al. 2021), in both forms in which it is distributed.
 
 Text files, one a split (`redkitchen_train.txt`, `apt1_kitchen_test.txt`): lines of the image's path, qw qx qy qz tx ty
 tz of camera_from_world, and the focal length. The principal point is the image's centre, as COLMAP's models of these
@@ -97,6 +97,6 @@ def _read_lines(files: list[Path]) -> dict[str, tuple[str, ...]]:
                     "words"
                 )
             if words[0] in lines:
-                raise ValueError(f"{file}:{number}: {words[0]} stands twice")
+                raise ValueError(f"{file}:{number}: {words[0]} occurs twice")
             lines[words[0]] = tuple(words[1:])
     return lines

@@ -37,7 +37,7 @@ def read_dataset(path: Path, format: str = "auto", options: ReadOptions | None =
 
     Args:
         path: the folder (`7scenes`: a scene; `12scenes`: a room; `colmap`: a model, or what holds one).
-        format: one of FORMATS, or "auto" to see what is there; `Dataset.format` then says what it was.
+        format: one of FORMATS, or "auto" to recognize it; `Dataset.format` is then its name.
         options: see ReadOptions.
 
     Returns:

@@ -3,8 +3,8 @@
 Lines of rgb.txt are a time in seconds and an image's path; of groundtruth.txt a time and tx ty tz qx qy qz qw of
 world_from_camera, from motion capture at 100 Hz. A frame's pose is interpolated between the two before and after it.
 
-The layout has no intrinsics: they are those published for the camera of freiburg1, 2 or 3, which the folder's name
-tells, or given. Images of freiburg3 are undistorted already.
+The layout has no intrinsics: they are those published for the camera of freiburg1, 2 or 3, by the folder's
+name, or given. Images of freiburg3 are undistorted already.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .collecting import Collector, read_text, size_of
 from .options import ReadOptions
 
 MAX_GAP_S = 0.02
-"""A frame without a pose this near, before and after, is refused: a hand moves centimetres meanwhile."""
+"""A frame without a pose this near, before and after, is refused: a hand-held camera moves centimetres in that time."""
 
 _LENSES = {
     "1": ((517.306408, 516.469215, 318.643040, 255.313989), (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)),

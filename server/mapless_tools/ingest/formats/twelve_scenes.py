@@ -40,7 +40,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
             if number is None:
                 raise ValueError("image: its name has no frame number")
             if truth is not None:
-                # Sizes differ where somebody reduced the images; the focal length is that of the original's.
+                # Sizes differ where the images were reduced; the focal length is the original's.
                 camera, pose = truth.camera_and_pose(relative, size, options.intrinsics)
             else:
                 camera = (options.intrinsics or found).camera(*size)

@@ -1,4 +1,4 @@
-"""A scene's references as a folder of files: images, and what says their cameras and poses."""
+"""A scene's references as a folder of files: images, and a description of their cameras and poses."""
 
 from __future__ import annotations
 

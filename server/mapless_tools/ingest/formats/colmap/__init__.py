@@ -1,7 +1,7 @@
 """COLMAP models: cameras and images, in text or binary; points are not needed.
 
 `images` gives camera_from_world for every image, also in the models of COLMAP 3.12 and later, which have rigs and
-frames beside it; so those two are not looked at. Principal points count from the corner of the top-left pixel: half a
+frames beside it; so those two are not read. Principal points count from the corner of the top-left pixel: half a
 pixel is taken off here, and put back by `writing`.
 """
 

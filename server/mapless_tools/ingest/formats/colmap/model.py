@@ -22,7 +22,7 @@ class Model:
         file: of the images, for messages.
         cameras: by COLMAP's id.
         images: by name.
-        refused: names that stand twice, each with the reason.
+        refused: names that occur twice, each with the reason.
     """
 
     file: Path
@@ -66,13 +66,13 @@ def read_model(folder: Path) -> Model:
     cameras: dict[int, ColmapCamera] = {}
     for camera in read_cameras(cameras_file):
         if camera.camera_id in cameras:
-            raise ValueError(f"{cameras_file}: camera {camera.camera_id} stands twice")
+            raise ValueError(f"{cameras_file}: camera {camera.camera_id} occurs twice")
         cameras[camera.camera_id] = camera
     images: dict[str, ImageRecord] = {}
     refused: list[tuple[str, str]] = []
     for record in read_images(images_file):
         if record.name in images:
-            refused.append((record.name, f"{images_file}: image {record.image_id}: its name stands twice"))
+            refused.append((record.name, f"{images_file}: image {record.image_id}: its name occurs twice"))
         else:
             images[record.name] = record
     return Model(images_file, cameras, images, refused)
