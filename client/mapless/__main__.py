@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from .cli.arguments import connect_options, make_parser
-from .cli.exits import EXIT_FAILED, EXIT_USAGE
+from .cli.folder import EXIT_FAILED, EXIT_USAGE
 from .client import Client
 from .errors import MaplessError
 

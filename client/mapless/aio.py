@@ -1,4 +1,4 @@
-"""The client for asyncio: the methods of `mapless.Client`, to be awaited.
+"""The client for asyncio: the methods of `mapless.Client` as coroutines.
 
 >>> async with mapless.aio.Client("localhost:50051") as client:
 ...     answer = await client.localize("photo.jpg", camera, scene="kitchen")
@@ -17,10 +17,10 @@ import grpc
 import grpc.aio
 from google.protobuf.message import Message
 
-from .calls import asking, groups, health, localization
+from .calls import health, localization
 from .calls import references as reference_calls
 from .errors import MaplessError, from_rpc_error
-from .exchange import Attempt, Exchange, Heard, Methods, Pages, Pause, attempts
+from .exchange import Attempt, Exchange, Methods, Pages, Pause, StreamReader, attempts
 from .options import ConnectOptions
 from .requests import NewReference
 from .results import Reference
@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 
 def _awaited(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P], Coroutine[Any, Any, T]]:
-    """The method that makes a call: its parameters, what it returns, its docstring."""
+    """The coroutine that executes a call, with the call's parameters, result and docstring."""
 
     @wraps(call)
     async def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> T:
@@ -40,7 +40,7 @@ def _awaited(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P],
 
 
 def _paged(call: Callable[P, Pages[T]]) -> Callable[Concatenate[Client, P], AsyncIterator[T]]:
-    """The method that fetches a list as it is read."""
+    """The method that iterates over a list and fetches its pages when needed."""
 
     @wraps(call)
     async def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> AsyncIterator[T]:
@@ -56,7 +56,7 @@ def _paged(call: Callable[P, Pages[T]]) -> Callable[Concatenate[Client, P], Asyn
 
 
 def _followed(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P], AsyncIterator[T]]:
-    """The method that yields what a call tells early, and its answer."""
+    """The method that yields a call's early answers and its final answer."""
 
     @wraps(call)
     def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> AsyncIterator[T]:
@@ -66,14 +66,14 @@ def _followed(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P]
 
 
 class Client:
-    """A connection to a mapless server for the event loop it is made in; close it or use it as a context manager.
+    """A connection to a mapless server within the running event loop; close it or use it as a context manager.
 
-    What is said of `mapless.Client` holds here, but that lists are read with `async for`. A call whose task is
-    cancelled is cancelled on the server, too.
+    As `mapless.Client`, except that lists are read with `async for`. Cancelling a task also cancels its call on the
+    server.
     """
 
     def __init__(self, address: str, options: ConnectOptions | None = None) -> None:
-        """Does not connect yet: a server that cannot be reached is noticed by the first call.
+        """Connects with the first call, which reports a server that cannot be reached.
 
         Args:
             address: "host:port".
@@ -104,8 +104,8 @@ class Client:
 
     localize = _awaited(localization.localize)
     localize_progressively = _followed(localization.localize_progressively)
-    localize_rig = _awaited(groups.localize_rig)
-    localize_sequence = _awaited(groups.localize_sequence)
+    localize_rig = _awaited(localization.localize_rig)
+    localize_sequence = _awaited(localization.localize_sequence)
 
     create_scene = _awaited(reference_calls.create_scene)
     get_scene = _awaited(reference_calls.get_scene)
@@ -118,9 +118,9 @@ class Client:
     list_references = _paged(reference_calls.list_references)
     delete_reference = _awaited(reference_calls.delete_reference)
 
-    retrieve_references = _awaited(asking.retrieve_references)
-    audit_scene = _paged(asking.audit_scene)
-    check_coverage = _awaited(asking.check_coverage)
+    retrieve_references = _awaited(reference_calls.retrieve_references)
+    audit_scene = _paged(reference_calls.audit_scene)
+    check_coverage = _awaited(reference_calls.check_coverage)
 
     async def add_references(
         self,
@@ -140,7 +140,7 @@ class Client:
         return stored
 
     async def run(self, exchange: Exchange[T]) -> T:
-        """Makes the calls of an exchange; what all methods do."""
+        """Executes the calls of an exchange; used by all methods."""
         steps = attempts(exchange, self.options)
         # The first step builds the request, which may read a file: not in the event loop.
         step = await asyncio.to_thread(next, steps)
@@ -156,8 +156,8 @@ class Client:
             return value
 
     async def _follow(self, exchange: Exchange[T]) -> AsyncIterator[T]:
-        """The same for calls that are answered by streams; what they tell early comes first."""
-        steps, heard = attempts(exchange, self.options), Heard()
+        """`run` for calls that are answered by a stream; early answers are yielded first."""
+        steps, reader = attempts(exchange, self.options), StreamReader()
         step = await asyncio.to_thread(next, steps)
         try:
             while True:
@@ -165,12 +165,12 @@ class Client:
                     await asyncio.sleep(step.duration_s)
                     step = next(steps)
                 else:
-                    async with aclosing(self._messages(step, heard)) as messages:
+                    async with aclosing(self._messages(step, reader)) as messages:
                         async for message in messages:
-                            early: T | None = heard.hear(message)
+                            early: T | None = reader.read(message)
                             if early is not None:
                                 yield early
-                    step = steps.send(heard.outcome)
+                    step = steps.send(reader.outcome)
         except StopIteration as end:
             yield end.value
 
@@ -180,23 +180,19 @@ class Client:
         try:
             response: Message = await method(attempt.call.request, timeout=attempt.timeout_s, metadata=metadata)
         except grpc.RpcError as error:
-            failure = from_rpc_error(error)
-            failure.__cause__ = error
-            return failure
+            return from_rpc_error(error)
         return response
 
-    async def _messages(self, attempt: Attempt, heard: Heard) -> AsyncGenerator[Message, None]:
-        """What a stream says; whoever reads no further ends the call."""
+    async def _messages(self, attempt: Attempt, reader: StreamReader) -> AsyncGenerator[Message, None]:
+        """The messages of a stream; the call is cancelled when the caller stops reading."""
         method = self._methods.of(attempt.call)
-        heard.begin(attempt.call)
+        reader.begin(attempt.call)
         metadata = self._metadata + attempt.call.metadata
         stream = method(attempt.call.request, timeout=attempt.timeout_s, metadata=metadata)
         try:
             async for message in stream:
                 yield message
         except grpc.RpcError as error:
-            failure = from_rpc_error(error)
-            failure.__cause__ = error
-            heard.fail(failure)
+            reader.fail(from_rpc_error(error))
         finally:
             stream.cancel()

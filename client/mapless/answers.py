@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from . import wire
 from .geodesy import GeoPose
 from .geometry import Array, Quaternion, RigidTransform
-from .v1 import localization_service_pb2 as localization_pb
+from .v1 import localization_service_pb2 as pb
+from .wire import optional
 
 
 @dataclass(frozen=True)
@@ -245,45 +246,42 @@ class Rejected:
     is_final: bool = field(default=True, init=False)
 
 
-def answer_from_message(message: localization_pb.LocalizeResponse) -> LocalizationResult | Rejected:
+def answer_from_message(message: pb.LocalizeResponse) -> LocalizationResult | Rejected:
     """Answer of a message."""
-    diagnostics = diagnostics_from_message(message.diagnostics)
-    capture_time = message.capture_time.ToDatetime(timezone.utc) if message.HasField("capture_time") else None
-    session_from_camera = (
-        wire.transform_from_message(message.session_from_camera, "session_from_camera")
-        if message.HasField("session_from_camera")
-        else None
-    )
-    debug = _debug_from_message(message.debug) if message.HasField("debug") else None
+    common: dict[str, Any] = {
+        "diagnostics": diagnostics_from_message(message.diagnostics),
+        "capture_time": optional(message, "capture_time", wire.time_from_message),
+        "session_from_camera": _optional_transform(message, "session_from_camera"),
+        "debug": optional(message, "debug", _debug_from_message),
+    }
     if message.WhichOneof("outcome") == "rejection":
-        return Rejected(
-            reason=wire.value_name(localization_pb.RejectionReason, message.rejection.reason),
-            message=message.rejection.message,
-            diagnostics=diagnostics,
-            capture_time=capture_time,
-            session_from_camera=session_from_camera,
-            hint=hint_from_message(message.rejection.hint) if message.rejection.HasField("hint") else None,
-            hypotheses=tuple(map(hypothesis_from_message, message.rejection.hypotheses)),
-            debug=debug,
-        )
+        return wire.filled(Rejected, message.rejection, **rejection_fields(message.rejection), **common)
     found = message.localization
-    return LocalizationResult(
+    return wire.filled(
+        LocalizationResult,
+        found,
         world_from_camera=wire.transform_from_message(found.world_from_camera, "localization.world_from_camera"),
         covariance=covariance_from_message(found),
-        accuracy=accuracy_from_message(found.accuracy) if found.HasField("accuracy") else None,
-        pose_stage=wire.value_name(localization_pb.PoseStage, found.pose_stage),
-        inlier_count=found.inlier_count,
-        match_count=found.match_count,
-        reprojection_error_px=found.reprojection_error_px,
-        diagnostics=diagnostics,
-        capture_time=capture_time,
-        session_from_camera=session_from_camera,
+        accuracy=optional(found, "accuracy", accuracy_from_message),
+        pose_stage=wire.value_name(pb.PoseStage, found.pose_stage),
         trust=found.trust if found.HasField("trust") else None,
-        in_axes=_framed_from_message(found.in_axes) if found.HasField("in_axes") else None,
-        geo_pose=geo_pose_from_message(found.geo_pose) if found.HasField("geo_pose") else None,
-        prior_checks=tuple(map(_check_from_message, found.prior_checks)),
-        debug=debug,
+        in_axes=optional(found, "in_axes", _framed_from_message),
+        geo_pose=optional(found, "geo_pose", geo_pose_from_message),
+        prior_checks=tuple(
+            wire.filled(PriorCheck, check, kind=wire.value_name(pb.PriorKind, check.kind))
+            for check in found.prior_checks
+        ),
+        **common,
     )
+
+
+def rejection_fields(message: pb.Rejection) -> dict[str, Any]:
+    """Reason, hint and hypotheses of a rejection, as `Rejected` and `GroupRejected` have them."""
+    return {
+        "reason": wire.value_name(pb.RejectionReason, message.reason),
+        "hint": optional(message, "hint", _hint_from_message),
+        "hypotheses": tuple(map(_hypothesis_from_message, message.hypotheses)),
+    }
 
 
 def covariance_from_message(message: Any) -> Array | None:
@@ -291,58 +289,40 @@ def covariance_from_message(message: Any) -> Array | None:
     return np.array(message.covariance.row_major).reshape(6, 6) if message.HasField("covariance") else None
 
 
-def accuracy_from_message(message: localization_pb.Accuracy) -> Accuracy:
+def accuracy_from_message(message: pb.Accuracy) -> Accuracy:
     """Radii of a message."""
-    return Accuracy(
-        position_68_m=message.position_68_m,
-        position_95_m=message.position_95_m,
-        rotation_68_deg=message.rotation_68_deg,
-        rotation_95_deg=message.rotation_95_deg,
-        calibrated=message.calibrated,
-    )
+    return wire.filled(Accuracy, message)
 
 
-def geo_pose_from_message(message: localization_pb.GeoPose) -> GeoPose:
+def geo_pose_from_message(message: pb.GeoPose) -> GeoPose:
     """GeoPose of a message."""
     position, q = message.position, message.quaternion
     return GeoPose(position.lat, position.lon, position.h, Quaternion(q.x, q.y, q.z, q.w))
 
 
-def _framed_from_message(message: localization_pb.FramedPose) -> FramedPose:
-    has_session = message.HasField("world_from_session")
+def _optional_transform(message: Any, field: str, path: str = "") -> RigidTransform | None:
+    return optional(message, field, wire.transform_from_message, path + field)
+
+
+def _framed_from_message(message: pb.FramedPose) -> FramedPose:
     return FramedPose(
-        axes=wire.value_name(localization_pb.Axes, message.axes),
+        axes=wire.value_name(pb.Axes, message.axes),
         world_from_camera=wire.transform_from_message(message.world_from_camera, "in_axes.world_from_camera"),
         covariance=covariance_from_message(message),
-        world_from_session=wire.transform_from_message(message.world_from_session, "in_axes.world_from_session")
-        if has_session
-        else None,
+        world_from_session=_optional_transform(message, "world_from_session", "in_axes."),
     )
 
 
-def _check_from_message(message: localization_pb.PriorCheck) -> PriorCheck:
-    return PriorCheck(
-        kind=wire.value_name(localization_pb.PriorKind, message.kind),
-        mahalanobis=message.mahalanobis,
-        degrees_of_freedom=message.degrees_of_freedom,
-        conflict=message.conflict,
-        used=message.used,
-    )
+def _hint_from_message(message: pb.Hint) -> Hint:
+    return wire.filled(Hint, message, advice=wire.value_name(pb.Advice, message.advice))
 
 
-def hint_from_message(message: localization_pb.Hint) -> Hint:
-    """Hint of a message."""
-    advice = wire.value_name(localization_pb.Advice, message.advice)
-    return Hint(message.stage, advice, message.message, message.best_reference)
-
-
-def hypothesis_from_message(message: localization_pb.Hypothesis) -> Hypothesis:
-    """Hypothesis of a message."""
+def _hypothesis_from_message(message: pb.Hypothesis) -> Hypothesis:
     pose = wire.transform_from_message(message.world_from_camera, "hypotheses.world_from_camera")
-    return Hypothesis(pose, message.inlier_count, tuple(message.references))
+    return wire.filled(Hypothesis, message, world_from_camera=pose, references=tuple(message.references))
 
 
-def _debug_from_message(message: localization_pb.Debug) -> Debug:
+def _debug_from_message(message: pb.Debug) -> Debug:
     def columns(*fields: str) -> Array:
         return np.stack([np.array(getattr(message, field), float) for field in fields], axis=1)
 
@@ -356,34 +336,23 @@ def _debug_from_message(message: localization_pb.Debug) -> Debug:
     )
 
 
-def diagnostics_from_message(message: localization_pb.Diagnostics) -> Diagnostics:
+def diagnostics_from_message(message: pb.Diagnostics) -> Diagnostics:
     """Diagnostics of a message."""
-    scale = message.scale
-    return Diagnostics(
-        request_id=message.request_id,
-        backend=message.backend,
-        weights_sha256=message.weights_sha256,
-        features=message.features,
-        variant=wire.value_name(localization_pb.Variant, message.variant),
-        store_generation=message.store_generation,
-        references=tuple(
-            ReferenceUse(use.name, use.match_count, use.inlier_count, use.similarity) for use in message.references
-        ),
-        scale=ScaleEstimate(
-            scale.metres_per_unit, wire.value_name(localization_pb.ScaleStage, scale.stage), scale.deviation
-        )
-        if message.HasField("scale")
-        else None,
+    return wire.filled(
+        Diagnostics,
+        message,
+        variant=wire.value_name(pb.Variant, message.variant),
+        references=tuple(wire.filled(ReferenceUse, use) for use in message.references),
+        scale=optional(message, "scale", _scale_from_message),
         stage_s={timing.stage: _seconds(timing.duration) for timing in message.stages},
         queue_s=_seconds(message.queue_duration),
         total_s=_seconds(message.total_duration),
-        processed_width_px=message.processed_width_px,
-        processed_height_px=message.processed_height_px,
-        server_version=message.server_version,
-        retrieval=message.retrieval,
-        captured=message.captured,
     )
 
 
+def _scale_from_message(message: pb.ScaleEstimate) -> ScaleEstimate:
+    return wire.filled(ScaleEstimate, message, stage=wire.value_name(pb.ScaleStage, message.stage))
+
+
 def _seconds(duration: Any) -> float:
-    return float(duration.ToNanoseconds()) / 1e9
+    return float(duration.ToNanoseconds() / 1e9)

@@ -1,4 +1,4 @@
-"""The blocking client: the calls of `mapless.calls`, each made and waited for in the caller's thread."""
+"""The blocking client: a method for each call of `mapless.calls`, executed in the caller's thread."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Concatenate, ParamSpec, TypeVar
 import grpc
 from google.protobuf.message import Message
 
-from .calls import asking, groups, health, localization
+from .calls import health, localization
 from .calls import references as reference_calls
 from .errors import MaplessError, from_rpc_error
-from .exchange import Attempt, Exchange, Heard, Methods, Pages, Pause, attempts
+from .exchange import Attempt, Exchange, Methods, Pages, Pause, StreamReader, attempts
 from .options import ConnectOptions
 from .requests import NewReference
 from .results import Reference
@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 
 def _blocking(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P], T]:
-    """The method that makes a call and waits for it: its parameters, what it returns, its docstring."""
+    """The method that executes a call, with the call's parameters, result and docstring."""
 
     @wraps(call)
     def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> T:
@@ -34,7 +34,7 @@ def _blocking(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P]
 
 
 def _paged(call: Callable[P, Pages[T]]) -> Callable[Concatenate[Client, P], Iterator[T]]:
-    """The method that fetches a list as it is read."""
+    """The method that iterates over a list and fetches its pages when needed."""
 
     @wraps(call)
     def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> Iterator[T]:
@@ -49,7 +49,7 @@ def _paged(call: Callable[P, Pages[T]]) -> Callable[Concatenate[Client, P], Iter
 
 
 def _followed(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P], Iterator[T]]:
-    """The method that yields what a call tells early, and its answer."""
+    """The method that yields a call's early answers and its final answer."""
 
     @wraps(call)
     def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> Iterator[T]:
@@ -61,13 +61,13 @@ def _followed(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P]
 class Client:
     """A connection to a mapless server; use it from any thread, close it or use it as a context manager.
 
-    Scenes and references are given by id or by name ("scenes/{scene}"). Every method raises `MaplessError`, and takes
-    `timeout_s`, which stands for the options' own: a deadline for a call with all its attempts. `mapless.aio.Client`
+    Scenes and references are given by id or by name ("scenes/{scene}"). Every method raises `MaplessError` and takes
+    `timeout_s`, the deadline of a call with all its attempts, which replaces the options' default. `mapless.aio.Client`
     has the same methods for asyncio.
     """
 
     def __init__(self, address: str, options: ConnectOptions | None = None) -> None:
-        """Does not connect yet: a server that cannot be reached is noticed by the first call.
+        """Connects with the first call, which reports a server that cannot be reached.
 
         Args:
             address: "host:port".
@@ -96,8 +96,8 @@ class Client:
 
     localize = _blocking(localization.localize)
     localize_progressively = _followed(localization.localize_progressively)
-    localize_rig = _blocking(groups.localize_rig)
-    localize_sequence = _blocking(groups.localize_sequence)
+    localize_rig = _blocking(localization.localize_rig)
+    localize_sequence = _blocking(localization.localize_sequence)
 
     create_scene = _blocking(reference_calls.create_scene)
     get_scene = _blocking(reference_calls.get_scene)
@@ -110,9 +110,9 @@ class Client:
     list_references = _paged(reference_calls.list_references)
     delete_reference = _blocking(reference_calls.delete_reference)
 
-    retrieve_references = _blocking(asking.retrieve_references)
-    audit_scene = _paged(asking.audit_scene)
-    check_coverage = _blocking(asking.check_coverage)
+    retrieve_references = _blocking(reference_calls.retrieve_references)
+    audit_scene = _paged(reference_calls.audit_scene)
+    check_coverage = _blocking(reference_calls.check_coverage)
 
     def add_references(
         self,
@@ -124,13 +124,13 @@ class Client:
     ) -> list[Reference]:
         """Stores many references, in as many messages as needed.
 
-        A message is stored whole or not at all. When one fails, those before it stay: list the scene to see how far
-        it came.
+        A message is stored whole or not at all. When one fails, the references of earlier messages remain stored:
+        list the scene to see which.
 
         Args:
-            scene: where to.
-            references: what to store; files are read as they are sent.
-            on_progress: told the number stored so far, after each message.
+            scene: the scene.
+            references: the references; files are read when they are sent.
+            on_progress: called with the number stored so far after each message.
             timeout_s: deadline of each message; None for `upload_timeout_s`.
         """
         stored: list[Reference] = []
@@ -141,7 +141,7 @@ class Client:
         return stored
 
     def run(self, exchange: Exchange[T]) -> T:
-        """Makes the calls of an exchange, and waits; what all methods do."""
+        """Executes the calls of an exchange; used by all methods."""
         steps = attempts(exchange, self.options)
         try:
             step = next(steps)
@@ -156,8 +156,8 @@ class Client:
             return value
 
     def _follow(self, exchange: Exchange[T]) -> Iterator[T]:
-        """The same for calls that are answered by streams; what they tell early comes first."""
-        steps, heard = attempts(exchange, self.options), Heard()
+        """`run` for calls that are answered by a stream; early answers are yielded first."""
+        steps, reader = attempts(exchange, self.options), StreamReader()
         try:
             step = next(steps)
             while True:
@@ -165,11 +165,11 @@ class Client:
                     self._pause(step)
                     step = next(steps)
                 else:
-                    for message in self._messages(step, heard):
-                        early: T | None = heard.hear(message)
+                    for message in self._messages(step, reader):
+                        early: T | None = reader.read(message)
                         if early is not None:
                             yield early
-                    step = steps.send(heard.outcome)
+                    step = steps.send(reader.outcome)
         except StopIteration as end:
             yield end.value
 
@@ -183,22 +183,18 @@ class Client:
         try:
             response: Message = method(attempt.call.request, timeout=attempt.timeout_s, metadata=metadata)
         except grpc.RpcError as error:
-            failure = from_rpc_error(error)
-            failure.__cause__ = error
-            return failure
+            return from_rpc_error(error)
         return response
 
-    def _messages(self, attempt: Attempt, heard: Heard) -> Iterator[Message]:
-        """What a stream says; whoever reads no further ends the call."""
+    def _messages(self, attempt: Attempt, reader: StreamReader) -> Iterator[Message]:
+        """The messages of a stream; the call is cancelled when the caller stops reading."""
         method = self._methods.of(attempt.call)
-        heard.begin(attempt.call)
+        reader.begin(attempt.call)
         metadata = self._metadata + attempt.call.metadata
         stream = method(attempt.call.request, timeout=attempt.timeout_s, metadata=metadata)
         try:
             yield from stream
         except grpc.RpcError as error:
-            failure = from_rpc_error(error)
-            failure.__cause__ = error
-            heard.fail(failure)
+            reader.fail(from_rpc_error(error))
         finally:
             stream.cancel()

@@ -1,4 +1,4 @@
-"""What a call can fail with. A photograph that was not localized is not among them: it is an answer, `Rejected`."""
+"""Errors of calls. A photograph that could not be localized is not an error but an answer, `Rejected`."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ _DETAILS_KEY = "grpc-status-details-bin"
 _NO_TIME = "Deadline Exceeded"
 _NOT_CONNECTED = "connections to all backends failing"
 _NOT_CONNECTED_BECAUSE = {
-    "Socket closed": "the server hangs up at once; does it speak TLS? Then say so, --tls or --ca FILE (Python: tls, "
-    "root_certificates), and --cert if it asks for a certificate",
-    "WRONG_VERSION_NUMBER": "the server does not speak TLS",
-    "unable to get local issuer certificate": "the server's certificate is not signed by a known one; --ca FILE "
-    "(Python: root_certificates) names another",
-    "Failed to create security handshaker": "what was given as certificates is unusable; is it PEM?",
-    "Connection refused": "nobody listens there (connection refused)",
+    "Socket closed": "the server closes the connection at once; if it uses TLS, give --tls or --ca FILE (Python: tls, "
+    "root_certificates), and --cert if it requires a client certificate",
+    "WRONG_VERSION_NUMBER": "the server does not use TLS",
+    "unable to get local issuer certificate": "the server's certificate is not signed by a known authority; give its "
+    "certificate with --ca FILE (Python: root_certificates)",
+    "Failed to create security handshaker": "the given certificates are unusable; they must be PEM",
+    "Connection refused": "no server listens there (connection refused)",
 }
 _ADDRESS = re.compile(r"ipv[46]:(\S+): ")
 Detail = TypeVar("Detail", bound=Message)
@@ -30,10 +30,10 @@ class MaplessError(Exception):
 
     Attributes:
         code: name of the gRPC status, "INVALID_ARGUMENT".
-        reason: UPPER_SNAKE_CASE, stable, for programs; the code again where the server gave none.
+        reason: UPPER_SNAKE_CASE, stable, for programs; the code where the server gave no reason.
         message: one sentence for a person.
-        field: path of the guilty field in the request, "intrinsics.focal_x_px", or None.
-        retry_after_s: when the server asks to be tried again, seconds, or None.
+        field: path of the wrong field in the request, "intrinsics.focal_x_px", or None.
+        retry_after_s: seconds after which the server requests a retry, or None.
         request_id: identifies the call in the server's log; empty if the call did not reach it.
     """
 
@@ -61,15 +61,15 @@ class InvalidArgument(MaplessError):
 
 
 class Unauthenticated(MaplessError):
-    """The server asks for a token, and none was shown, or one that is wrong or has expired."""
+    """The server requires a token, and it is missing, wrong or expired."""
 
 
 class PermissionDenied(MaplessError):
-    """The token does not allow this."""
+    """The token's role does not include the call."""
 
 
 class NotFound(MaplessError):
-    """There is no such scene or reference."""
+    """The scene or the reference does not exist."""
 
 
 class AlreadyExists(MaplessError):
@@ -77,19 +77,19 @@ class AlreadyExists(MaplessError):
 
 
 class FailedPrecondition(MaplessError):
-    """The server is not set up for this."""
+    """The server's configuration or state does not permit the call."""
 
 
 class ResourceExhausted(MaplessError):
-    """Too many calls wait (`retry_after_s` says when to come back), or the message is larger than the limit."""
+    """Too many calls wait (`retry_after_s` is set), or the message is larger than the server's limit."""
 
 
 class DeadlineExceeded(MaplessError):
-    """No answer in time."""
+    """No answer arrived before the deadline."""
 
 
 class Unavailable(MaplessError):
-    """The server cannot be reached, starts or drains; retries did not help."""
+    """The server cannot be reached, starts or drains; all retries failed."""
 
 
 class DataLoss(MaplessError):
@@ -97,49 +97,42 @@ class DataLoss(MaplessError):
 
 
 class Internal(MaplessError):
-    """A fault of the server; its log has the rest under `request_id`.
+    """A fault of the server; its log has the details under `request_id`.
 
-    The reason MALFORMED_ANSWER is the client's: what the server sent breaks the contract.
+    The client itself raises it, with the reason MALFORMED_ANSWER, for an answer that violates the interface.
     """
 
 
 _BY_CODE: dict[str, type[MaplessError]] = {
-    "INVALID_ARGUMENT": InvalidArgument,
-    "UNAUTHENTICATED": Unauthenticated,
-    "PERMISSION_DENIED": PermissionDenied,
-    "NOT_FOUND": NotFound,
-    "ALREADY_EXISTS": AlreadyExists,
-    "FAILED_PRECONDITION": FailedPrecondition,
-    "RESOURCE_EXHAUSTED": ResourceExhausted,
-    "DEADLINE_EXCEEDED": DeadlineExceeded,
-    "UNAVAILABLE": Unavailable,
-    "DATA_LOSS": DataLoss,
-    "INTERNAL": Internal,
+    re.sub("(?<=.)(?=[A-Z])", "_", kind.__name__).upper(): kind for kind in MaplessError.__subclasses__()
 }
+"""Error classes by the name of their gRPC status: InvalidArgument by INVALID_ARGUMENT."""
 
 
 def from_rpc_error(error: Any) -> MaplessError:
-    """Our error of a grpc.RpcError that a blocking call raised."""
+    """The MaplessError of a grpc.RpcError, which is its cause."""
     metadata = dict(error.trailing_metadata() or ())
     try:
         status = status_pb2.Status.FromString(metadata.get(_DETAILS_KEY, b""))
-    except DecodeError:  # some proxy's own; the plain status remains
+    except DecodeError:  # details in a proxy's own format; the plain status remains
         status = status_pb2.Status()
     info = _detail(status, error_details_pb2.ErrorInfo())
     retry = _detail(status, error_details_pb2.RetryInfo())
     code: grpc.StatusCode = error.code()
-    return _BY_CODE.get(code.name, MaplessError)(
+    failure = _BY_CODE.get(code.name, MaplessError)(
         code.name,
-        _in_words(error.details() or ""),
+        _message(error.details() or ""),
         reason=info.reason if info else "",
         field=(info.metadata.get("field") if info else None),
         retry_after_s=retry.retry_delay.ToNanoseconds() / 1e9 if retry else None,
         request_id=metadata.get("x-request-id", ""),
     )
+    failure.__cause__ = error
+    return failure
 
 
-def _in_words(details: str) -> str:
-    """What kept a connection from being made, in other words than gRPC's where it is known; else as it is said."""
+def _message(details: str) -> str:
+    """The message of an error: why a connection failed, in plain words where the cause is known, else gRPC's text."""
     if details == _NO_TIME:
         return "no answer in time"
     if not details.startswith(_NOT_CONNECTED):
@@ -151,5 +144,5 @@ def _in_words(details: str) -> str:
 
 
 def _detail(status: status_pb2.Status, empty: Detail) -> Detail | None:
-    """The status's detail of the type of `empty`, which is filled, or None."""
+    """The status's detail of the type of `empty`, unpacked into it; None if there is none."""
     return next((empty for packed in status.details if packed.Unpack(empty)), None)

@@ -1,12 +1,11 @@
-"""Calls as data: what is asked and how the answer is read, apart from who waits for it.
+"""Calls as data, independent of how they are executed.
 
-An exchange is a generator that yields calls, is sent their responses and returns what the caller wanted. The blocking
-and the asynchronous client drive the same exchanges, so each request is built and each answer read in one place.
-`attempts` puts retries and deadlines around an exchange; what is left to a client are two things: make an attempt, and
-pause.
+An exchange is a generator that yields calls, is sent their responses and returns the caller's result. The blocking and
+the asynchronous client execute the same exchanges, so each request is built and each answer read in one place.
+`attempts` adds retries and deadlines to an exchange and leaves two actions to the client: make an attempt, and pause.
 
-gRPC's own retries are not used. They know no RetryInfo, so they would take a server at its limit (come back in 3 s) for
-a message over the limit (never come back), and they repeat a creation without being able to tell whose it then was.
+gRPC's own retries are not used. They ignore RetryInfo, so they cannot distinguish a server at its limit (retry in 3 s)
+from a message over the limit (never retry), and they repeat a creation without checking who created what then exists.
 """
 
 from __future__ import annotations
@@ -29,13 +28,13 @@ from .wire import FieldError
 T = TypeVar("T")
 
 MALFORMED_ANSWER = "MALFORMED_ANSWER"
-"""The reason of the error that an answer is which breaks its contract."""
+"""Reason of the error for an answer that violates the interface."""
 
-_JITTER = 0.2  # of a pause of ours, either way, as gRPC has it
+_JITTER = 0.2  # relative, of our own pauses, as in gRPC
 _LOST = frozenset({"UNAVAILABLE", "CANCELLED"})
-"""The server, or what is between, is gone. Nobody here cancels a call and waits for it: if it is said to be, then by a
-load balancer, whose server went in the middle of the answer."""
-_LATENESS = 0.25  # at most so much longer than the server asked for, never earlier: it refused many, and all will come
+"""Codes of a lost server or connection. The client does not wait for calls that it cancels, so CANCELLED comes from a
+load balancer whose server disappeared during the answer."""
+_LATENESS = 0.25  # relative, added to the server's RetryInfo at random: many refused clients retry, but none earlier
 
 
 @dataclass(frozen=True)
@@ -45,15 +44,15 @@ class Call:
     Attributes:
         method: "package.Service/Method".
         request: the message.
-        response_type: of which the answer is.
-        timeout_s: deadline, above 0, with all retries and pauses, and with what `on_repeat` asks; None for the
-            options' own.
-        is_upload: whether that is then `upload_timeout_s`.
-        on_repeat: for calls that change something: an earlier try may have succeeded though its answer was lost, and
-            then the next one fails as if somebody else had done it. Given the error, it raises it, or yields the calls
-            that find out, and returns what the lost answer would have been. All of them have the deadline of this one.
-        early: for calls that are answered by a stream, whose last message is the response: what a message tells before
-            that; None if it is the last.
+        response_type: type of the answer.
+        timeout_s: deadline in seconds, above 0, for all attempts, pauses and calls of `on_repeat`; None for the
+            default.
+        is_upload: whether the default is `upload_timeout_s`.
+        on_repeat: for calls that change something. An earlier attempt may have succeeded although its answer was lost;
+            then a retry fails with ALREADY_EXISTS or NOT_FOUND. Given that error, `on_repeat` yields the calls that
+            determine who made the change, and returns the lost answer or raises the error.
+        early: for calls that are answered by a stream whose last message is the response: the early answer that a
+            message contains, or None for the last one.
     """
 
     method: str
@@ -66,12 +65,12 @@ class Call:
 
     @property
     def metadata(self) -> tuple[tuple[str, str], ...]:
-        """What it carries besides what all calls do: which scene it concerns, for load balancers."""
+        """The call's own metadata: its scene, for load balancers."""
         return scene_metadata(self.request)
 
 
 Exchange = Generator[Call, Any, T]
-"""Yields calls, is sent their responses (or thrown their errors), returns what the caller wanted."""
+"""Yields calls, is sent their responses (or thrown their errors), returns the caller's result."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class Pages(Generic[T]):
 
 @dataclass(frozen=True)
 class Attempt:
-    """Make this call once, within `timeout_s`; send back the response, or the error."""
+    """Execute this call once, within `timeout_s`; send back the response or the error."""
 
     call: Call
     timeout_s: float
@@ -91,21 +90,21 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Pause:
-    """Wait; if there is to be no further attempt, `error` is how the call ended."""
+    """Wait before the next attempt; if there is none, the call ends with `error`."""
 
     duration_s: float
     error: MaplessError
 
 
 class Methods:
-    """The methods of a channel, of either kind, by the calls that need them."""
+    """The methods of a channel, blocking or asynchronous, made when a call first needs them."""
 
     def __init__(self, channel: Any) -> None:
         self._channel = channel
         self._by_name: dict[str, Callable[..., Any]] = {}
 
     def of(self, call: Call) -> Callable[..., Any]:
-        """What makes the call: takes the request, `timeout` in seconds and `metadata`."""
+        """The function that executes the call: takes the request, `timeout` in seconds and `metadata`."""
         if call.method not in self._by_name:
             make = self._channel.unary_unary if call.early is None else self._channel.unary_stream
             self._by_name[call.method] = make(
@@ -118,7 +117,7 @@ class Methods:
 
 @dataclass
 class _Clock:
-    """What time it is and what the dice say; tests have their own."""
+    """Time and random numbers; tests replace them."""
 
     now_s: Callable[[], float] = time.monotonic
     uniform: Callable[[float, float], float] = field(default=random.uniform)
@@ -127,17 +126,17 @@ class _Clock:
 def attempts(
     exchange: Exchange[T], options: ConnectOptions, clock: _Clock | None = None, deadline_s: float = math.inf
 ) -> Generator[Attempt | Pause, Any, T]:
-    """The exchange with retries: yields what is to be done, returns what the exchange does.
+    """The exchange with retries: yields actions, returns the exchange's result.
 
-    A call is tried again if the server is UNAVAILABLE or lost, or RESOURCE_EXHAUSTED and says when to come back; never
-    if the pause before would outlast its deadline. A server that says when to come back is taken at its word until
-    then; other attempts are counted. An answer that the exchange cannot read is an error of the server, `Internal`.
+    A call is retried if the server is UNAVAILABLE or lost, or RESOURCE_EXHAUSTED with RetryInfo; never if the pause
+    would exceed the deadline. Attempts are counted, except those that the server's RetryInfo requests. An answer that
+    the exchange cannot read is an error of the server, `Internal`.
 
     Args:
         exchange: the calls.
-        options: how often to try, and for how long.
-        clock: another than the computer's.
-        deadline_s: of all calls together, by that clock, beside each call's own.
+        options: limits of attempts and time.
+        clock: replaces the computer's clock.
+        deadline_s: deadline of all calls together, in the clock's time, in addition to each call's own.
 
     Raises:
         ValueError: a call's `timeout_s` is not above 0.
@@ -147,7 +146,11 @@ def attempts(
         call = next(exchange)
         while True:
             outcome = yield from _with_retries(call, options, clock, deadline_s)
-            call = exchange.throw(outcome) if isinstance(outcome, MaplessError) else _answered(exchange, call, outcome)
+            if isinstance(outcome, MaplessError):
+                call = exchange.throw(outcome)
+            else:
+                with _reading(call, outcome):
+                    call = exchange.send(outcome)
     except StopIteration as end:
         value: T = end.value
         return value
@@ -155,62 +158,52 @@ def attempts(
         exchange.close()
 
 
-def _answered(exchange: Exchange[Any], call: Call, response: Message) -> Call:
-    """The exchange's next call; what it cannot read in the response breaks the contract."""
-    with _reading(call, response):
-        return exchange.send(response)
-
-
 @contextmanager
 def _reading(call: Call, response: Message) -> Iterator[None]:
-    """What cannot be read in a response is an error of the server.
-
-    `wire` calls that a FieldError, which in a request is the caller's fault and here the server's.
-    """
+    """Turns errors of reading a response, such as FieldError, into an error of the server."""
     try:
         yield
     except (ValueError, OverflowError) as error:
         field_path = error.field if isinstance(error, FieldError) else None
-        message = f"the answer of {call.method} breaks its contract: {error}"
+        message = f"the answer of {call.method} violates the interface: {error}"
         request_id = getattr(getattr(response, "diagnostics", None), "request_id", "")
         raise Internal("INTERNAL", message, reason=MALFORMED_ANSWER, field=field_path, request_id=request_id) from error
 
 
-class Heard:
-    """What the streams of a call's attempts say: what is told early, once, and how each of them ends.
+class StreamReader:
+    """Reads the streams of a call's attempts: the early answer, once, and the outcome of each attempt.
 
-    An attempt that breaks after it has told something is followed by another like any other, and that tells nothing but
-    the answer.
+    An attempt that fails after its early answer is retried like any other; the retry yields the final answer only.
 
     Attributes:
-        outcome: of the attempt at hand, for `attempts`.
+        outcome: outcome of the current attempt, for `attempts`.
     """
 
     outcome: Message | MaplessError
 
     def __init__(self) -> None:
-        self._has_told = False
+        self._had_early = False
 
     def begin(self, call: Call) -> None:
-        """Another attempt."""
+        """Starts an attempt."""
         self._call = call
         message = f"the stream of {call.method} ended before the answer"
         self.outcome = Internal("INTERNAL", message, reason=MALFORMED_ANSWER)
 
-    def hear(self, message: Message) -> Any | None:
-        """What a message tells early; None if it is the answer, or if so much has been told."""
+    def read(self, message: Message) -> Any | None:
+        """The early answer of a message; None if it is the final answer, or if an early one was returned before."""
         assert self._call.early is not None
         with _reading(self._call, message):
             early = self._call.early(message)
         if early is None:
             self.outcome = message
-        elif not self._has_told:
-            self._has_told = True
+        elif not self._had_early:
+            self._had_early = True
             return early
         return None
 
     def fail(self, error: MaplessError) -> None:
-        """The stream broke; after the answer that does not matter."""
+        """Ends the attempt with an error, unless the answer was already received."""
         if not isinstance(self.outcome, Message):
             self.outcome = error
 
@@ -218,11 +211,11 @@ class Heard:
 def _with_retries(
     call: Call, options: ConnectOptions, clock: _Clock, deadline_s: float
 ) -> Generator[Attempt | Pause, Any, Any]:
-    """One call until it succeeds, fails for good, or has no attempts or no time left; its response, or its error."""
+    """One call until it succeeds, fails permanently, or has no attempts or time left; its response or error."""
     deadline_s = min(clock.now_s() + _timeout_s(call, options), deadline_s)
     if clock.now_s() >= deadline_s:
-        return DeadlineExceeded("DEADLINE_EXCEEDED", f"no time was left for {call.method}")
-    may_be_done = False  # by a try whose answer never came
+        return DeadlineExceeded("DEADLINE_EXCEEDED", f"no time left for {call.method}")
+    may_be_done = False  # by an attempt whose answer was lost
     attempt = 0
     while True:
         outcome = yield Attempt(call, max(deadline_s - clock.now_s(), 0.0))
@@ -230,7 +223,7 @@ def _with_retries(
         if not isinstance(outcome, MaplessError):
             return outcome
         if may_be_done and call.on_repeat is not None and outcome.code in {"ALREADY_EXISTS", "NOT_FOUND"}:
-            return (yield from _found_out(call.on_repeat(outcome), options, clock, deadline_s))
+            return (yield from _resolved(call.on_repeat(outcome), options, clock, deadline_s))
         pause_s = _pause_s(outcome, attempt, options, clock)
         is_last = attempt >= options.max_attempts and (outcome.retry_after_s is None or options.max_attempts == 1)
         if pause_s is None or is_last or clock.now_s() + pause_s >= deadline_s:
@@ -247,7 +240,7 @@ def _timeout_s(call: Call, options: ConnectOptions) -> float:
     return call.timeout_s
 
 
-def _found_out(
+def _resolved(
     exchange: Exchange[Any], options: ConnectOptions, clock: _Clock, deadline_s: float
 ) -> Generator[Attempt | Pause, Any, Any]:
     try:
@@ -257,12 +250,12 @@ def _found_out(
 
 
 def _pause_s(error: MaplessError, attempt: int, options: ConnectOptions, clock: _Clock) -> float | None:
-    """How long to wait after so many attempts, seconds; None if another would be of no use."""
-    asked_s = error.retry_after_s
+    """Seconds to wait after this many attempts; None if a retry would not help."""
+    requested_s = error.retry_after_s
     backoff_s = min(options.initial_backoff_s * 2.0 ** min(attempt - 1, 30), options.max_backoff_s)
     backoff_s *= clock.uniform(1 - _JITTER, 1 + _JITTER)
-    if error.code in _LOST and (asked_s is None or attempt == 1):
-        return backoff_s  # the first time soon: behind one name there may be another server, which is not unavailable
-    if error.code in {"UNAVAILABLE", "RESOURCE_EXHAUSTED"} and asked_s is not None:
-        return max(options.initial_backoff_s, asked_s * clock.uniform(1, 1 + _LATENESS))
+    if error.code in _LOST and (requested_s is None or attempt == 1):
+        return backoff_s  # the first retry is early: another server of the same name may be available
+    if error.code in {"UNAVAILABLE", "RESOURCE_EXHAUSTED"} and requested_s is not None:
+        return max(options.initial_backoff_s, requested_s * clock.uniform(1, 1 + _LATENESS))
     return None

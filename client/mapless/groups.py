@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -18,13 +18,13 @@ from .answers import (
     covariance_from_message,
     diagnostics_from_message,
     geo_pose_from_message,
-    hint_from_message,
-    hypothesis_from_message,
+    rejection_fields,
 )
 from .geodesy import GeoPose
 from .geometry import Array, Camera, RigidTransform, Similarity
 from .requests import ImageSource
 from .v1 import localization_service_pb2 as pb
+from .wire import optional
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,70 +160,67 @@ class GroupRejected:
 
 def rig_from_message(message: pb.LocalizeRigResponse) -> RigLocalization | GroupRejected:
     """Answer of a message."""
-    images = tuple(map(_report_from_message, message.images))
-    capture_time = message.capture_time.ToDatetime(timezone.utc) if message.HasField("capture_time") else None
+    capture_time = optional(message, "capture_time", wire.time_from_message)
     if message.WhichOneof("outcome") == "rejection":
-        return _rejected_from_message(message.rejection, images, capture_time)
-    found, has_session = message.localization, message.localization.HasField("world_from_session")
-    return RigLocalization(
-        world_from_rig=wire.transform_from_message(found.world_from_rig, "localization.world_from_rig"),
-        images=images,
-        world_from_session=wire.transform_from_message(found.world_from_session, "localization.world_from_session")
-        if has_session
-        else None,
-        geo_pose=geo_pose_from_message(found.geo_pose) if found.HasField("geo_pose") else None,
+        return _rejected(message, capture_time)
+    found = message.localization
+    path = "localization.world_from_"
+    return wire.filled(
+        RigLocalization,
+        found,
+        world_from_rig=wire.transform_from_message(found.world_from_rig, path + "rig"),
+        world_from_session=optional(found, "world_from_session", wire.transform_from_message, path + "session"),
+        geo_pose=optional(found, "geo_pose", geo_pose_from_message),
         capture_time=capture_time,
-        **_support_from_message(found),
+        **_common(message),
     )
 
 
 def sequence_from_message(message: pb.LocalizeSequenceResponse) -> SequenceLocalization | GroupRejected:
     """Answer of a message."""
-    images = tuple(map(_report_from_message, message.images))
     if message.WhichOneof("outcome") == "rejection":
-        return _rejected_from_message(message.rejection, images, None)
+        return _rejected(message, None)
     found = message.localization
     rigid = wire.transform_from_message(found.world_from_session, "localization.world_from_session")
-    return SequenceLocalization(
+    return wire.filled(
+        SequenceLocalization,
+        found,
         world_from_session=Similarity(found.session_scale, rigid.rotation, rigid.translation),
         scale_sigma=found.session_scale_sigma,
         world_from_camera=tuple(
             wire.transform_from_message(pose.world_from_camera, "localization.poses") for pose in found.poses
         ),
-        images=images,
         axes=wire.value_name(pb.Axes, found.axes),
-        **_support_from_message(found),
+        **_common(message),
     )
 
 
-def _support_from_message(message: pb.RigLocalization | pb.SequenceLocalization) -> dict[str, Any]:
-    covariance = covariance_from_message(message)
+def _common(message: pb.LocalizeRigResponse | pb.LocalizeSequenceResponse) -> dict[str, Any]:
+    covariance = covariance_from_message(message.localization)
     return {
         "covariance": np.full((6, 6), np.nan) if covariance is None else covariance,
-        "accuracy": accuracy_from_message(message.accuracy),
-        "inlier_count": message.inlier_count,
-        "match_count": message.match_count,
-        "reprojection_error_px": message.reprojection_error_px,
+        "accuracy": accuracy_from_message(message.localization.accuracy),
+        "images": _reports(message),
     }
 
 
-def _rejected_from_message(
-    message: pb.Rejection, images: tuple[ImageReport, ...], capture_time: datetime | None
+def _rejected(
+    message: pb.LocalizeRigResponse | pb.LocalizeSequenceResponse, capture_time: datetime | None
 ) -> GroupRejected:
-    return GroupRejected(
-        reason=wire.value_name(pb.RejectionReason, message.reason),
-        message=message.message,
-        images=images,
-        hint=hint_from_message(message.hint) if message.HasField("hint") else None,
-        hypotheses=tuple(map(hypothesis_from_message, message.hypotheses)),
-        capture_time=capture_time,
+    rejection = message.rejection
+    images = _reports(message)
+    return wire.filled(
+        GroupRejected, rejection, images=images, capture_time=capture_time, **rejection_fields(rejection)
     )
 
 
-def _report_from_message(message: pb.ImageReport) -> ImageReport:
-    return ImageReport(
-        inlier_count=message.inlier_count,
-        match_count=message.match_count,
-        rejected_alone=wire.value_name(pb.RejectionReason, message.alone.reason) if message.HasField("alone") else None,
-        diagnostics=diagnostics_from_message(message.diagnostics),
+def _reports(message: pb.LocalizeRigResponse | pb.LocalizeSequenceResponse) -> tuple[ImageReport, ...]:
+    return tuple(
+        wire.filled(
+            ImageReport,
+            image,
+            rejected_alone=wire.value_name(pb.RejectionReason, image.alone.reason) if image.HasField("alone") else None,
+            diagnostics=diagnostics_from_message(image.diagnostics),
+        )
+        for image in message.images
     )

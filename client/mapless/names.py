@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 
 _ID = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,126}[A-Za-z0-9_])?", re.ASCII)
-_SHOWN_CHARACTERS = 60  # of a bad value in a message: callers send ids of 10,000
+_SHOWN_CHARACTERS = 60  # of a wrong value in an error message: ids of 10,000 have been sent
 
 
 def check_id(value: str) -> str:
     """The id of a scene or a reference, unchanged.
 
     Raises:
-        ValueError: not an id.
+        ValueError: the value is not an id.
     """
     if not _ID.fullmatch(value) or ".." in value:
         raise ValueError(
@@ -22,14 +22,14 @@ def check_id(value: str) -> str:
     return value
 
 
-def scene_name(scene_id: str) -> str:
-    """The name of a scene."""
-    return f"scenes/{scene_id}"
+def scene_name(scene: str) -> str:
+    """The name of a scene given by id or by name."""
+    return scene if scene.startswith("scenes/") else f"scenes/{scene}"
 
 
-def reference_name(scene_id: str, reference_id: str) -> str:
-    """The name of a reference."""
-    return f"scenes/{scene_id}/references/{reference_id}"
+def reference_name(scene: str, reference: str) -> str:
+    """The name of a reference given by id or by name, in a scene given by id or by name."""
+    return reference if reference.startswith("scenes/") else f"{scene_name(scene)}/references/{reference}"
 
 
 def parse_scene_name(name: str) -> str:
@@ -57,7 +57,7 @@ def parse_reference_name(name: str) -> tuple[str, str]:
 
 
 def shown(value: str) -> str:
-    """A value as messages quote it: escaped and cut to a readable length."""
+    """A value as error messages quote it: escaped and truncated."""
     if len(value) > _SHOWN_CHARACTERS:
         return f"{value[:_SHOWN_CHARACTERS]!a}... ({len(value)} characters)"
     return ascii(value)

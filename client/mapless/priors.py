@@ -1,12 +1,11 @@
-"""What is known of a camera before the server has looked at its photograph.
+"""Priors: what is known of a camera's pose before its photograph is used.
 
-Hard limits turn down a pose beyond them. Soft priors say a value and how far it may be off: they help to find the pose,
-and how well they fit is answered (`PriorCheck`); one that contradicts the photograph is not used.
+A hard prior is a limit: a pose beyond it is rejected. A soft prior has a value and a covariance: it helps to find the
+pose and is compared with it (`PriorCheck`); a soft prior that contradicts the photograph is not used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -14,17 +13,16 @@ import numpy as np
 
 from . import wire
 from .geometry import Array, RigidTransform
-from .v1 import geometry_pb2
 
 
 @dataclass(frozen=True, eq=False)
 class PositionPrior:
-    """Where the camera is, world frame, metres.
+    """Position of the camera, world frame, metres.
 
     Attributes:
         position_m: (3,).
-        radius_m: hard: a pose further away is rejected; 0 for no limit.
-        covariance_m2: soft: (3, 3); None for no such knowledge.
+        radius_m: hard limit of the distance from `position_m`; 0 for no limit.
+        covariance_m2: soft, (3, 3); None for no soft prior.
     """
 
     position_m: Array
@@ -34,14 +32,14 @@ class PositionPrior:
 
 @dataclass(frozen=True)
 class GeoPositionPrior:
-    """What a satellite receiver says, soft; only for scenes with a datum.
+    """Position from a satellite receiver, soft; only for scenes with a datum.
 
     Attributes:
         latitude_deg, longitude_deg: WGS84.
         horizontal_sigma_m: standard deviation of north and of east. Phones' "horizontal accuracy" is a 68 % radius:
             divide it by 1.5.
-        height_m: above the ellipsoid; None where it is unknown.
-        vertical_sigma_m: standard deviation of the height, where there is one.
+        height_m: above the ellipsoid; None if unknown.
+        vertical_sigma_m: standard deviation of the height, if given.
     """
 
     latitude_deg: float
@@ -53,12 +51,11 @@ class GeoPositionPrior:
 
 @dataclass(frozen=True, eq=False)
 class GravityPrior:
-    """Which way is down, soft.
+    """Direction of gravity, soft.
 
     Attributes:
-        down_in_camera: (3,) the way things fall, in OpenCV's axes: (0, 1, 0) for a camera held upright and level.
-        sigma_deg: standard deviation about each of two axes.
-        down_in_world: (3,); None: the scene's.
+        down_in_camera: (3,) direction of gravity in OpenCV's camera axes: (0, 1, 0) for a camera held upright and
+        level. sigma_deg: standard deviation about each of two axes. down_in_world: (3,); None for the scene's.
     """
 
     down_in_camera: Array
@@ -68,12 +65,12 @@ class GravityPrior:
 
 @dataclass(frozen=True, eq=False)
 class HeadingPrior:
-    """Which way the camera looks, world frame.
+    """Viewing direction of the camera, world frame.
 
     Attributes:
-        direction: (3,) of the optical axis, of any length but 0.
-        max_angle_deg: hard: a pose that looks elsewhere is rejected; 0 for no limit.
-        sigma_deg: soft: standard deviation about each of two axes; 0 for no such knowledge.
+        direction: (3,) of the optical axis, any length above 0.
+        max_angle_deg: hard limit of the angle to `direction`; 0 for no limit.
+        sigma_deg: soft, standard deviation about each of two axes; 0 for no soft prior.
     """
 
     direction: Array
@@ -83,7 +80,7 @@ class HeadingPrior:
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """The whole pose, soft: the previous answer, moved on by what the device tracked since.
+    """The full pose, soft: for example the previous answer, moved by the device's own tracking since.
 
     Attributes:
         world_from_camera: at capture time.
@@ -96,7 +93,7 @@ class PosePrior:
 
 @dataclass(frozen=True, eq=False)
 class Priors:
-    """All that is known beforehand; what is None is not known. At most one of `position` and `geo_position`."""
+    """The priors of a request; None for none of its kind. At most one of `position` and `geo_position`."""
 
     position: PositionPrior | None = None
     geo_position: GeoPositionPrior | None = None
@@ -106,10 +103,10 @@ class Priors:
 
 
 def set_priors(request: Any, priors: Priors) -> None:
-    """Puts what is known into a request.
+    """Sets the priors of a request; the fields of a prior and of its message have the same names.
 
     Raises:
-        ValueError: the request has no field for it.
+        ValueError: the request has no field for a prior.
     """
     for field in fields(priors):
         prior, name = getattr(priors, field.name), f"{field.name}_prior"
@@ -117,49 +114,21 @@ def set_priors(request: Any, priors: Priors) -> None:
             continue
         if name not in request.DESCRIPTOR.fields_by_name:
             raise ValueError(f"{request.DESCRIPTOR.name} takes no {name}")
-        _FILLERS[field.name](getattr(request, name), prior)
+        message = getattr(request, name)
+        for part in fields(prior):
+            value = getattr(prior, part.name)
+            if value is not None:
+                _set(message, part.name, value)
 
 
-def _fill_position(message: Any, prior: PositionPrior) -> None:
-    message.position_m.CopyFrom(_vector(prior.position_m))
-    message.radius_m = prior.radius_m
-    if prior.covariance_m2 is not None:
-        message.covariance_m2.extend(np.asarray(prior.covariance_m2, float).ravel().tolist())
-
-
-def _fill_geo_position(message: Any, prior: GeoPositionPrior) -> None:
-    message.latitude_deg, message.longitude_deg = prior.latitude_deg, prior.longitude_deg
-    message.horizontal_sigma_m, message.vertical_sigma_m = prior.horizontal_sigma_m, prior.vertical_sigma_m
-    if prior.height_m is not None:
-        message.height_m = prior.height_m
-
-
-def _fill_gravity(message: Any, prior: GravityPrior) -> None:
-    message.down_in_camera.CopyFrom(_vector(prior.down_in_camera))
-    message.sigma_deg = prior.sigma_deg
-    if prior.down_in_world is not None:
-        message.down_in_world.CopyFrom(_vector(prior.down_in_world))
-
-
-def _fill_heading(message: Any, prior: HeadingPrior) -> None:
-    message.direction.CopyFrom(_vector(prior.direction))
-    message.max_angle_deg, message.sigma_deg = prior.max_angle_deg, prior.sigma_deg
-
-
-def _fill_pose(message: Any, prior: PosePrior) -> None:
-    message.world_from_camera.CopyFrom(wire.transform_to_message(prior.world_from_camera))
-    message.covariance.row_major.extend(np.asarray(prior.covariance, float).ravel().tolist())
-
-
-_FILLERS: dict[str, Callable[[Any, Any], None]] = {
-    "position": _fill_position,
-    "geo_position": _fill_geo_position,
-    "gravity": _fill_gravity,
-    "heading": _fill_heading,
-    "pose": _fill_pose,
-}
-
-
-def _vector(xyz: Array) -> geometry_pb2.Vector3:
-    x, y, z = map(float, xyz)
-    return geometry_pb2.Vector3(x=x, y=y, z=z)
+def _set(message: Any, name: str, value: Any) -> None:
+    if name == "covariance":
+        message.covariance.row_major.extend(np.asarray(value, float).ravel().tolist())
+    elif name == "covariance_m2":
+        message.covariance_m2.extend(np.asarray(value, float).ravel().tolist())
+    elif isinstance(value, RigidTransform):
+        getattr(message, name).CopyFrom(wire.transform_to_message(value))
+    elif np.ndim(value):
+        getattr(message, name).CopyFrom(wire.vector_to_message(value))
+    else:
+        setattr(message, name, value)

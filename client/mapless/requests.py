@@ -1,4 +1,4 @@
-"""What is sent to the server, as values, and the messages they become."""
+"""A new reference, and the bytes of a photograph."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class NewReference:
 
 
 def create_request(scene_name: str, reference: NewReference) -> reference_pb.CreateReferenceRequest:
-    """The message that asks to store a reference; reads its file."""
+    """The request that stores a reference; reads the photograph's file."""
     return reference_pb.CreateReferenceRequest(
         scene=scene_name,
         reference_id=reference.reference_id,

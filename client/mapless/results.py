@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import datetime
 
 from . import names, wire
 from .geodesy import Datum
 from .geometry import Camera, RigidTransform
-from .scene_messages import calibration_from_message, datum_from_message, direction_from_message
-from .scenes import Calibration, Vector
-from .v1 import reference_service_pb2 as reference_pb
+from .scenes import Calibration, Vector, calibration_from_message, datum_from_message, direction_from_message
+from .v1 import reference_service_pb2 as pb
 
 
 @dataclass(frozen=True)
@@ -105,65 +104,51 @@ class Coverage:
     references: tuple[str, ...]
 
 
-def scene_from_message(message: reference_pb.Scene) -> Scene:
+def scene_from_message(message: pb.Scene) -> Scene:
     """Scene of a message."""
-    datum, down, calibration = message.datum, message.down_in_world, message.calibration
-    return Scene(
+    return wire.filled(
+        Scene,
+        message,
         scene_id=names.parse_scene_name(message.name),
-        generation=message.generation,
-        reference_count=message.reference_count,
-        create_time=message.create_time.ToDatetime(timezone.utc),
-        datum=datum_from_message(datum, "datum") if message.HasField("datum") else None,
-        down_in_world=direction_from_message(down, "down_in_world") if message.HasField("down_in_world") else None,
-        calibration=calibration_from_message(calibration, "calibration") if message.HasField("calibration") else None,
+        create_time=wire.time_from_message(message.create_time),
+        datum=wire.optional(message, "datum", datum_from_message, "datum"),
+        down_in_world=wire.optional(message, "down_in_world", direction_from_message, "down_in_world"),
+        calibration=wire.optional(message, "calibration", calibration_from_message, "calibration"),
     )
 
 
-def reference_from_message(message: reference_pb.Reference) -> Reference:
+def reference_from_message(message: pb.Reference) -> Reference:
     """Reference of a message."""
     scene_id, reference_id = names.parse_reference_name(message.name)
-    return Reference(
+    return wire.filled(
+        Reference,
+        message,
         scene_id=scene_id,
         reference_id=reference_id,
         camera=wire.camera_from_message(message.intrinsics, "intrinsics"),
         world_from_camera=wire.transform_from_message(message.world_from_camera, "world_from_camera"),
-        image_sha256=message.image_sha256,
-        feature_count=message.feature_count,
-        create_time=message.create_time.ToDatetime(timezone.utc),
+        create_time=wire.time_from_message(message.create_time),
         image=message.image or None,
     )
 
 
-def retrieved_from_message(message: reference_pb.RetrievedReference) -> RetrievedReference:
+def retrieved_from_message(message: pb.RetrievedReference) -> RetrievedReference:
     """Retrieved reference of a message."""
     pose = wire.transform_from_message(message.world_from_camera, "world_from_camera")
-    return RetrievedReference(message.name, message.similarity, pose)
+    return wire.filled(RetrievedReference, message, world_from_camera=pose)
 
 
-def audit_from_message(message: reference_pb.ReferenceAudit) -> ReferenceAudit:
+def audit_from_message(message: pb.ReferenceAudit) -> ReferenceAudit:
     """Audit of a message."""
-    return ReferenceAudit(
-        name=message.name,
-        verdict=wire.value_name(reference_pb.AuditVerdict, message.verdict),
-        message=message.message,
-        neighbour_count=message.neighbour_count,
-        match_count=message.match_count,
-        inlier_count=message.inlier_count,
-        reprojection_error_px=message.reprojection_error_px,
-        position_offset_m=message.position_offset_m,
-        rotation_offset_deg=message.rotation_offset_deg,
-        focal_ratio=message.focal_ratio,
-        other=message.other,
-    )
+    return wire.filled(ReferenceAudit, message, verdict=wire.value_name(pb.AuditVerdict, message.verdict))
 
 
-def coverage_from_message(message: reference_pb.CheckCoverageResponse) -> Coverage:
+def coverage_from_message(message: pb.CheckCoverageResponse) -> Coverage:
     """Coverage of a message."""
-    return Coverage(
-        verdict=wire.value_name(reference_pb.CoverageVerdict, message.verdict),
-        message=message.message,
-        expected_match_count=message.expected_match_count,
-        image_share=message.image_share,
+    return wire.filled(
+        Coverage,
+        message,
+        verdict=wire.value_name(pb.CoverageVerdict, message.verdict),
         position_68_m=message.position_68_m or None,
         references=tuple(message.references),
     )

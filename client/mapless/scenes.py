@@ -1,4 +1,4 @@
-"""What is known of a scene as a whole, beside its references."""
+"""Properties of a scene: calibration, directions, datum, and their messages, which client and server share."""
 
 from __future__ import annotations
 
@@ -8,11 +8,23 @@ from datetime import datetime
 from enum import Enum
 from typing import Final, Literal
 
+from . import wire
+from .geodesy import MAX_HEIGHT_M, MIN_HEIGHT_M, Datum
+from .geometry import Quaternion
+from .v1 import geometry_pb2
+from .v1 import localization_service_pb2 as localization_pb
+from .v1 import reference_service_pb2 as pb
+from .wire import FieldError, joined
+
 MIN_FACTOR, MAX_FACTOR = 0.01, 1000.0
 """Of radii: what lies beyond is no calibration, but something else that went wrong."""
 
 MAX_TEXT = 128
 """Characters of each text of a calibration."""
+
+FACTORS = ("position_factor_68", "position_factor_95", "rotation_factor_68", "rotation_factor_95")
+TEXTS = ("features", "backend", "server_version")
+_VARIANT: wire.ProtoEnum = localization_pb.Variant
 
 Vector = tuple[float, float, float]
 
@@ -85,3 +97,89 @@ def unit_vector(x: float, y: float, z: float) -> Vector:
     x, y, z = x / longest, y / longest, z / longest  # squares of what is very small or large would be none
     length = math.sqrt(x * x + y * y + z * z)
     return x / length, y / length, z / length
+
+
+def datum_to_message(datum: Datum) -> pb.Datum:
+    """Message of a datum."""
+    q = datum.enu_from_world
+    return pb.Datum(
+        latitude_deg=datum.latitude_deg,
+        longitude_deg=datum.longitude_deg,
+        height_m=datum.height_m,
+        enu_from_world=geometry_pb2.Quaternion(x=q.x, y=q.y, z=q.z, w=q.w),
+    )
+
+
+def datum_from_message(message: pb.Datum, field: str) -> Datum:
+    """Datum of a message, its quaternion normalized.
+
+    Raises:
+        FieldError: a number is out of range, or the quaternion's norm is not one.
+    """
+    ranges = (
+        ("latitude_deg", -90.0, 90.0),
+        ("longitude_deg", -180.0, 180.0),
+        ("height_m", MIN_HEIGHT_M, MAX_HEIGHT_M),
+    )
+    for name, least, most in ranges:
+        value = getattr(message, name)
+        if not least <= value <= most:
+            raise FieldError(joined(field, name), f"must be {least:g} to {most:g}, is {value:g}")
+    if not message.HasField("enu_from_world"):
+        return Datum(message.latitude_deg, message.longitude_deg, message.height_m)
+    q = message.enu_from_world
+    try:
+        rotation = Quaternion(q.x, q.y, q.z, q.w).normalized()
+    except ValueError as error:
+        raise FieldError(joined(field, "enu_from_world"), str(error)) from None
+    return Datum(message.latitude_deg, message.longitude_deg, message.height_m, rotation)
+
+
+def direction_to_message(direction: Vector) -> geometry_pb2.Vector3:
+    """Message of a direction."""
+    x, y, z = direction
+    return geometry_pb2.Vector3(x=x, y=y, z=z)
+
+
+def direction_from_message(message: geometry_pb2.Vector3, field: str) -> Vector:
+    """The direction, of unit length; FieldError if it has none."""
+    try:
+        return unit_vector(message.x, message.y, message.z)
+    except ValueError as error:
+        raise FieldError(field, str(error)) from None
+
+
+def calibration_to_message(calibration: Calibration) -> pb.SceneCalibration:
+    """Message of a calibration; its variant is unspecified if this program does not know it."""
+    numbers = dict(_VARIANT.items())
+    message = pb.SceneCalibration(
+        **{name: getattr(calibration, name) for name in FACTORS + TEXTS},
+        query_count=calibration.query_count,
+        variant=numbers.get(wire.enum_prefix(_VARIANT) + calibration.variant, 0),
+    )
+    if calibration.create_time is not None:
+        message.create_time.FromDatetime(calibration.create_time)
+    return message
+
+
+def calibration_from_message(message: pb.SceneCalibration, field: str) -> Calibration:
+    """Calibration of a message, with the time that it says; a variant newer than this program is its number as text.
+
+    Raises:
+        FieldError: a number is out of range, or a text too long.
+    """
+    for name in FACTORS:
+        factor = getattr(message, name)
+        if not MIN_FACTOR <= factor <= MAX_FACTOR:
+            raise FieldError(joined(field, name), f"must be {MIN_FACTOR:g} to {MAX_FACTOR:g}, is {factor:g}")
+    if message.query_count < 1:
+        raise FieldError(joined(field, "query_count"), f"must be at least 1, is {message.query_count}")
+    for name in TEXTS:
+        length = len(getattr(message, name))
+        if length > MAX_TEXT:
+            raise FieldError(joined(field, name), f"must have at most {MAX_TEXT} characters, has {length}")
+    return Calibration(
+        **{name: getattr(message, name) for name in (*FACTORS, *TEXTS, "query_count")},
+        variant=wire.value_name(_VARIANT, message.variant),
+        create_time=wire.optional(message, "create_time", wire.time_from_message),
+    )

@@ -1,20 +1,26 @@
 """Geometry types to messages and back; client and server share it.
 
-Reading a message checks everything the proto's comments promise. What is wrong is a `FieldError` that names the field
-by its path in the request, "requests[3].reference.intrinsics.focal_x_px".
+Reading a message checks all bounds that the proto's comments state. A violation raises `FieldError`, which names the
+field by its path in the request, "requests[3].reference.intrinsics.focal_x_px".
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from typing import Any
+from collections.abc import Callable
+from datetime import datetime, timezone
+from enum import Enum
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from . import names
 from .geometry import Array, Camera, Distortion, Fisheye, Quaternion, RadialTangential, RigidTransform
 from .v1 import geometry_pb2 as pb
 
+T = TypeVar("T")
 ProtoEnum = Any
 """A generated enum: the wrapper that has `Name`, `Value` and `values`."""
 
@@ -24,7 +30,7 @@ MAX_FOCAL_PER_SIDE = 100.0
 
 
 class FieldError(ValueError):
-    """A field of a message breaks its contract.
+    """A field of a message violates its contract.
 
     Attributes:
         field: its path in the request.
@@ -41,7 +47,7 @@ def joined(path: str, field: str) -> str:
 
 
 def scene_id_from_name(name: str, field: str) -> str:
-    """The id in "scenes/{scene}"; FieldError if it is not that."""
+    """The id in "scenes/{scene}"; FieldError if it has another form."""
     try:
         return names.parse_scene_name(name)
     except ValueError as error:
@@ -49,7 +55,7 @@ def scene_id_from_name(name: str, field: str) -> str:
 
 
 def reference_ids_from_name(name: str, field: str) -> tuple[str, str]:
-    """The ids in "scenes/{scene}/references/{reference}"; FieldError if it is not that."""
+    """The ids in "scenes/{scene}/references/{reference}"; FieldError if it has another form."""
     try:
         return names.parse_reference_name(name)
     except ValueError as error:
@@ -57,30 +63,41 @@ def reference_ids_from_name(name: str, field: str) -> tuple[str, str]:
 
 
 def checked_id(value: str, field: str) -> str:
-    """The id, unchanged; FieldError if it is not one."""
+    """The id, unchanged; FieldError if it is invalid."""
     try:
         return names.check_id(value)
     except ValueError as error:
         raise FieldError(field, str(error)) from None
 
 
+def filled(kind: type[T], message: Any, /, **values: Any) -> T:
+    """A dataclass with the given values; each other field has the message's value of the same name, or its default."""
+    given: Any = kind
+    names_of = {it.name for it in dataclasses.fields(given)} - set(values)
+    same = names_of.intersection(message.DESCRIPTOR.fields_by_name)
+    return kind(**{name: getattr(message, name) for name in same}, **values)
+
+
+def optional(message: Any, field: str, read: Callable[..., T], *arguments: Any) -> T | None:
+    """`read(part, *arguments)` of a message's part; None if the message has no such part."""
+    return read(getattr(message, field), *arguments) if message.HasField(field) else None
+
+
+def time_from_message(message: Any) -> datetime:
+    """A time in UTC of a google.protobuf.Timestamp."""
+    time: datetime = message.ToDatetime(timezone.utc)
+    return time
+
+
 def camera_to_message(camera: Camera) -> pb.CameraIntrinsics:
     """Message of a camera."""
-    message = pb.CameraIntrinsics(
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-        focal_x_px=camera.focal_x_px,
-        focal_y_px=camera.focal_y_px,
-        principal_x_px=camera.principal_x_px,
-        principal_y_px=camera.principal_y_px,
-    )
+    intrinsics = {name: value for name, value in vars(camera).items() if name != "distortion"}
+    message = pb.CameraIntrinsics(**intrinsics)
     lens = camera.distortion
     if isinstance(lens, RadialTangential):
-        message.radial_tangential.CopyFrom(
-            pb.RadialTangentialDistortion(k1=lens.k1, k2=lens.k2, p1=lens.p1, p2=lens.p2, k3=lens.k3)
-        )
+        message.radial_tangential.CopyFrom(pb.RadialTangentialDistortion(**vars(lens)))
     elif isinstance(lens, Fisheye):
-        message.fisheye.CopyFrom(pb.FisheyeDistortion(k1=lens.k1, k2=lens.k2, k3=lens.k3, k4=lens.k4))
+        message.fisheye.CopyFrom(pb.FisheyeDistortion(**vars(lens)))
     return message
 
 
@@ -103,15 +120,7 @@ def camera_from_message(message: pb.CameraIntrinsics, field: str) -> Camera:
         value = getattr(message, principal)
         if not -side_px <= value <= 2 * side_px:
             raise FieldError(joined(field, principal), f"must be {-side_px} to {2 * side_px}, is {value:g}")
-    return Camera(
-        message.width_px,
-        message.height_px,
-        message.focal_x_px,
-        message.focal_y_px,
-        message.principal_x_px,
-        message.principal_y_px,
-        _distortion_from_message(message, field),
-    )
+    return filled(Camera, message, distortion=_distortion_from_message(message, field))
 
 
 def _distortion_from_message(message: pb.CameraIntrinsics, field: str) -> Distortion | None:
@@ -130,9 +139,9 @@ def _distortion_from_message(message: pb.CameraIntrinsics, field: str) -> Distor
 
 def transform_to_message(target_from_source: RigidTransform) -> pb.RigidTransform:
     """Message of a rigid transform, its quaternion with w >= 0."""
-    q, (x, y, z) = target_from_source.quaternion(), target_from_source.translation.tolist()
+    q = target_from_source.quaternion()
     return pb.RigidTransform(
-        rotation=pb.Quaternion(x=q.x, y=q.y, z=q.z, w=q.w), translation_m=pb.Vector3(x=x, y=y, z=z)
+        rotation=pb.Quaternion(**vars(q)), translation_m=vector_to_message(target_from_source.translation)
     )
 
 
@@ -156,6 +165,12 @@ def transform_from_message(
     return RigidTransform(rotation, translation)
 
 
+def vector_to_message(xyz: ArrayLike) -> pb.Vector3:
+    """Message of a vector (3,)."""
+    x, y, z = map(float, np.asarray(xyz, float))
+    return pb.Vector3(x=x, y=y, z=z)
+
+
 def vector_from_message(message: pb.Vector3, field: str, max_coordinate_m: float = math.inf) -> Array:
     """Coordinates (3,) in metres; FieldError if one is not finite or exceeds the maximum in magnitude."""
     for axis in ("x", "y", "z"):
@@ -168,12 +183,28 @@ def vector_from_message(message: pb.Vector3, field: str, max_coordinate_m: float
 
 
 def enum_prefix(enum: ProtoEnum) -> str:
-    """What the names of an enum's values begin with on the wire, "SCALE_STAGE_"."""
+    """The common prefix of an enum's value names, "SCALE_STAGE_"."""
     return str(enum.Name(0)).removesuffix("UNSPECIFIED")
 
 
 def value_name(enum: ProtoEnum, number: int) -> str:
-    """REJECTION_REASON_LOW_OVERLAP becomes "LOW_OVERLAP"; a value newer than this client, its number as text."""
+    """REJECTION_REASON_LOW_OVERLAP becomes "LOW_OVERLAP"; an unknown value, from a newer server, its number as text."""
     if number not in enum.values():
         return str(number)
     return str(enum.Name(number)).removeprefix(enum_prefix(enum))
+
+
+def enum_value(enum: ProtoEnum, value: str | Enum) -> Any:
+    """The number of a value of an enum, given without prefix in small or capital letters; 0 for "".
+
+    Raises:
+        ValueError: the enum has no such value; the message lists those it has.
+    """
+    prefix = enum_prefix(enum)
+    written = str(value.value if isinstance(value, Enum) else value)
+    if not written:
+        return 0
+    known = [name.removeprefix(prefix).lower() for name in enum.keys()[1:]]
+    if written.lower() not in known:
+        raise ValueError(f"{enum.DESCRIPTOR.name} must be one of {', '.join(known)}, is {written!r}")
+    return enum.Value(prefix + written.upper())

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from support.planted_answers import diagnostics, localized, rejected
 
+from mapless import wire
 from mapless.answers import PriorCheck
 from mapless.axes import Axes
-from mapless.calls.naming import enum_value
 from mapless.cameras import read_camera
+from mapless.cli.folder import Tally
 from mapless.cli.output import lines
-from mapless.cli.progress import Progress
+from mapless.errors import Internal
 from mapless.requests import read_image
 from mapless.v1 import localization_service_pb2 as pb
 
@@ -69,22 +70,21 @@ def test_what_the_server_is_to_keep_is_said_and_of_nothing_else() -> None:
 
 
 def test_progress_counts_each_kind_by_its_name() -> None:
-    with Progress(5) as progress:
-        for without in ("", "failed", "not localized", "not localized"):
-            progress.step(without)
-        assert "] 4/5, 2 not localized, 1 failed, " in progress.text()
-    assert progress.without() == ", 2 not localized, 1 failed"
+    tally = Tally(5)
+    for outcome in (localized(), Internal("INTERNAL", "broken"), rejected(), rejected()):
+        tally.count(outcome)
+    assert "] 4/5, 2 not localized, 1 failed, " in tally.progress()
 
 
 @pytest.mark.parametrize("axes", ["arkit", "ARKit", "ARKIT", Axes.ARKIT])
 def test_axes_are_taken_in_any_case_and_as_values(axes: str | Axes) -> None:
-    assert enum_value(pb.Axes, axes) == pb.AXES_ARKIT
+    assert wire.enum_value(pb.Axes, axes) == pb.AXES_ARKIT
 
 
 def test_axes_that_are_none_are_named_among_those_there_are() -> None:
-    with pytest.raises(ValueError, match=r"Axes is one of opencv, .* not 'Blender'"):
-        enum_value(pb.Axes, "Blender")
-    assert enum_value(pb.Axes, "") == 0
+    with pytest.raises(ValueError, match=r"Axes must be one of opencv, .* is 'Blender'"):
+        wire.enum_value(pb.Axes, "Blender")
+    assert wire.enum_value(pb.Axes, "") == 0
 
 
 def test_pixels_are_to_be_encoded_first() -> None:

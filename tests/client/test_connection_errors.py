@@ -18,7 +18,7 @@ CERTIFICATE = signed(OURS, "server")
 
 @pytest.fixture(scope="module")
 def addresses() -> Iterator[dict[str, str]]:
-    """Servers that answer nothing, one with TLS, one without; and a port at which nobody listens."""
+    """Servers that answer nothing, one with TLS, one without; and a port without a listener."""
     plain, tls = (grpc.server(ThreadPoolExecutor(1)) for _ in range(2))
     credentials = grpc.ssl_server_credentials([(CERTIFICATE.key_pem, CERTIFICATE.certificate_pem)])
     ports = {
@@ -38,11 +38,11 @@ def addresses() -> Iterator[dict[str, str]]:
 @pytest.mark.parametrize(
     ("kind", "certificates", "told"),
     [
-        ("tls", None, "does it speak TLS?"),
-        ("tls", ANOTHER.certificate_pem, "is not signed by a known one"),
-        ("tls", b"no certificate", "is it PEM?"),
-        ("plain", OURS.certificate_pem, "does not speak TLS"),
-        ("nobody", None, "nobody listens there"),
+        ("tls", None, "if it uses TLS"),
+        ("tls", ANOTHER.certificate_pem, "is not signed by a known authority"),
+        ("tls", b"no certificate", "must be PEM"),
+        ("plain", OURS.certificate_pem, "does not use TLS"),
+        ("nobody", None, "no server listens there"),
     ],
 )
 def test_a_connection_that_cannot_be_made_is_told_in_words(

@@ -18,8 +18,7 @@ from support.planted_answers import diagnostics, localized, rejected
 from mapless import wire
 from mapless.__main__ import main
 from mapless.cli import localize
-from mapless.cli.pace import Pace
-from mapless.cli.tally import Tally
+from mapless.cli.folder import Concurrency, Tally
 from mapless.errors import InvalidArgument, ResourceExhausted
 from mapless.geometry import RigidTransform
 from mapless.v1 import localization_service_pb2 as pb
@@ -196,14 +195,14 @@ def test_what_is_captured_is_counted() -> None:
     ):
         tally.count(outcome)
     told = "2 of 4 localized, 1 not localized (1 LOW_OVERLAP), 1 failed (1 INVALID_IMAGE); 2 captured by the server"
-    assert (tally.text(), tally.exit_code) == (told, 1)
+    assert (tally.summary(), tally.exit_code) == (told, 1)
 
 
 def test_refusals_lower_concurrency_and_answers_raise_it() -> None:
-    pace = Pace(2)
+    concurrency = Concurrency(2)
     for _ in range(5):
-        pace.failed(ResourceExhausted("RESOURCE_EXHAUSTED", "full"))
-    with pace.turn():
+        concurrency.failed(ResourceExhausted("RESOURCE_EXHAUSTED", "full"))
+    with concurrency.call():
         pass
-    with pace.turn(), pace.turn():  # which would wait for ever if there were one alone
+    with concurrency.call(), concurrency.call():  # would block for ever at a limit of one
         pass

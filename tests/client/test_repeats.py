@@ -16,7 +16,7 @@ from google.protobuf.message import Message
 from support.played import Played
 
 from mapless import wire
-from mapless.calls import asking, groups, localization, references
+from mapless.calls import localization, references
 from mapless.errors import AlreadyExists, DeadlineExceeded, Internal, NotFound, Unavailable
 from mapless.exchange import Exchange
 from mapless.geodesy import Datum
@@ -196,9 +196,9 @@ def localize() -> Exchange[Any]:
         (localize, of_35_covariances),
         (localize, of_unequal_columns),
         (localize, before_the_calendar),
-        (lambda: groups.localize_rig([], "a"), of_a_rig),
+        (lambda: localization.localize_rig([], "a"), of_a_rig),
         (
-            lambda: asking.retrieve_references(b"photo", CAMERA, "a"),
+            lambda: references.retrieve_references(b"photo", CAMERA, "a"),
             lambda: pb.RetrieveReferencesResponse(references=[pb.RetrievedReference()]),
         ),
         (lambda: references.get_scene("a"), pb.GetSceneResponse),

@@ -102,7 +102,7 @@ def test_the_life_of_a_scene(server: RunningServer, connect: Connect, tmp_path: 
         assert isinstance(caught.value.__cause__, grpc.RpcError)
         with pytest.raises(FileNotFoundError):
             client.localize(tmp_path / "absent.jpg", CAMERA, name)
-        with pytest.raises(ValueError, match="Variant is one of"):
+        with pytest.raises(ValueError, match="Variant must be one of"):
             client.localize(PHOTO, CAMERA, name, variant="worst")
 
 

@@ -157,10 +157,10 @@ def test_a_photograph_beside_a_cameras_json_needs_no_camera(
     code, answer, told = run(server, capsys, "localize", scene, str(folder / "images" / "0.png"))
     assert (code, answer["inlier_count"], told) == (0, 90, "")
     code, _, complaint = run(server, capsys, "localize", scene, str(folder / "images" / "1.png"))
-    assert (code, "knows no" in complaint) == (2, True)
+    assert (code, "does not list" in complaint) == (2, True)
     (folder / "cameras.json").unlink()
     code, _, complaint = run(server, capsys, "localize", scene, str(folder / "images" / "0.png"))
-    assert (code, "say --camera" in complaint) == (2, True)
+    assert (code, "give --camera" in complaint) == (2, True)
 
 
 def test_what_would_fail_for_all_ends_at_once(
@@ -260,9 +260,9 @@ def test_a_scene_has_its_place_on_the_earth(server: RunningServer, capsys: pytes
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["--parallel", "0"], "--parallel is the number of calls at a time, at least 1, not 0"),
-        (["--rerank"], "--rerank chooses among references"),
-        ([], "has no cameras.json: say --camera"),
+        (["--parallel", "0"], "--parallel must be at least 1, is 0"),
+        (["--rerank"], "--rerank needs --reference"),
+        ([], "has no cameras.json: give --camera"),
         (["--camera", FOUR_NUMBERS], "1.png"),
         (["--camera", "1,2,3"], "1,2,3: a camera in numbers is four of them"),
         (["--camera", "1,2,3,4,5"], "four of them"),

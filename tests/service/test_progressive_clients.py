@@ -290,4 +290,4 @@ def test_what_fails_leaves_no_file_and_a_folder_is_refused(
         assert not (tmp_path / "answers.json").exists()
         exit_code, _, complaint = command(capsys, address, str(tmp_path))
     assert exit_code == 2
-    assert "--progressive shows how one photograph is localized" in complaint
+    assert "--progressive takes one photograph, not a folder" in complaint

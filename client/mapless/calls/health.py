@@ -8,21 +8,21 @@ from google.protobuf import wrappers_pb2
 
 from ..exchange import Call, Exchange
 
-# grpc.health.v1 in messages that every protobuf has, which spares robots a package: the request is the service's name
-# in field 1, empty for the whole server, and the answer an enum in field 1.
+# grpc.health.v1 in protobuf's own messages, which saves a dependency: the request has the service's name in field 1,
+# empty for the whole server, and the answer an enum in field 1.
 _WRAPPERS: Any = wrappers_pb2  # the module is not annotated
 _METHOD = "grpc.health.v1.Health/Check"
 _SERVING = 1
 
 SERVICES = ("mapless.v1.LocalizationService", "mapless.v1.ReferenceService")
-"""What can be asked for by itself: a server whose store cannot be written answers queries all the same."""
+"""Services with a state of their own: a server whose store cannot be written still answers queries."""
 
 
 def is_serving(service: str = "", *, timeout_s: float | None = None) -> Exchange[bool]:
     """Whether the server takes calls; False while it starts or drains, an error if it cannot be reached.
 
     Args:
-        service: one of `SERVICES`, "mapless.v1.ReferenceService", that alone is meant; empty for the whole server.
+        service: one of `SERVICES`; empty for the whole server.
         timeout_s: deadline of the call.
     """
     response = yield Call(_METHOD, _WRAPPERS.StringValue(value=service), _WRAPPERS.UInt32Value, timeout_s)

@@ -1,4 +1,4 @@
-"""Where photographs were taken."""
+"""Localization of one photograph, of a rig's photographs, and of a sequence."""
 
 from __future__ import annotations
 
@@ -13,10 +13,19 @@ from ..answers import LocalizationResult, Rejected, answer_from_message
 from ..axes import Axes
 from ..exchange import Call, Exchange
 from ..geometry import Camera, RigidTransform
+from ..groups import (
+    GroupRejected,
+    RigImage,
+    RigLocalization,
+    SequenceFrame,
+    SequenceLocalization,
+    rig_from_message,
+    sequence_from_message,
+)
+from ..names import reference_name, scene_name
 from ..priors import Priors, set_priors
 from ..requests import ImageSource, read_image
 from ..v1 import localization_service_pb2 as pb
-from .naming import enum_value, reference_name, scene_name
 
 SERVICE = "mapless.v1.LocalizationService"
 
@@ -43,26 +52,26 @@ def localize(
     session_from_camera: RigidTransform | None = None,
     timeout_s: float | None = None,
 ) -> Exchange[LocalizationResult | Rejected]:
-    """Where a photograph was taken.
+    """Localizes a photograph: estimates the pose of its camera.
 
     Args:
         image: the photograph.
         camera: the camera that took it, in pixels of the file as it is stored, before any EXIF rotation.
-        scene: where to look.
-        references: what to compare with, most similar first, at most 64; none: the server chooses.
-        priors: what is known of the camera beforehand.
+        scene: the scene to localize in.
+        references: the references to use, most similar first, at most 64; empty: the server chooses.
+        priors: what is known of the pose before the photograph is used.
         variant: "best" (default), "full", "no_structure" or "coarse".
         scale_strategy: "two_stage" (default), "triangulation" or "trajectory".
-        reference_count: how many references the server chooses if it does; 0 is its default.
-        rerank_references: whether it chooses among those that are named, of which there may then be 1000.
-        allow_coarse: whether a pose that could not be refined before the deadline is answered all the same, with
+        reference_count: number of references that the server chooses; 0 for its default.
+        rerank_references: whether the server chooses among `references`, which may then be 1000.
+        allow_coarse: whether to return a pose that could not be refined before the deadline, with
             `LocalizationResult.pose_stage` "COARSE" and no covariance, instead of raising `DeadlineExceeded`.
-        coverage: share of the right answers that are to be accepted, above 0 and below 1; 0 is the server's default.
+        coverage: share of right answers to accept, above 0 and below 1; 0 for the server's default.
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of `session_from_camera` and of
             `LocalizationResult.in_axes`.
-        include_debug: whether the answer is to carry the matches it rests on.
-        capture_time: when it was taken, with time zone; echoed.
-        session_from_camera: where the device believed its camera to be then; echoed, and what makes
+        include_debug: whether the answer includes the matches that support it.
+        capture_time: time of the photograph, with time zone; returned with the answer.
+        session_from_camera: the device's own pose at that time; returned with the answer, and used for
             `LocalizationResult.world_from_session`.
         timeout_s: deadline of the call.
     """
@@ -73,12 +82,12 @@ def localize(
         image=read_image(image),
         intrinsics=wire.camera_to_message(camera),
         options=pb.LocalizeOptions(
-            variant=enum_value(pb.Variant, variant),
-            scale_strategy=enum_value(pb.ScaleStrategy, scale_strategy),
+            variant=wire.enum_value(pb.Variant, variant),
+            scale_strategy=wire.enum_value(pb.ScaleStrategy, scale_strategy),
             reference_count=reference_count,
             allow_coarse=allow_coarse,
             rerank_references=rerank_references,
-            axes=enum_value(pb.Axes, axes),
+            axes=wire.enum_value(pb.Axes, axes),
             include_debug=include_debug,
             coverage=coverage,
         ),
@@ -103,16 +112,16 @@ def _asked_like(model: Callable[P, Any]) -> Callable[[Callable[..., T]], Callabl
 
 @_asked_like(localize)
 def localize_progressively(*asked: Any, **named: Any) -> Exchange[LocalizationResult | Rejected]:
-    """Where a photograph was taken, coarsely as soon as that is known, and then as `localize` answers it.
+    """Localizes a photograph, with a coarse pose as soon as there is one and the answer of `localize` after it.
 
-    Yields at most two answers. The first, if there is one, is a `LocalizationResult` with `pose_stage` "COARSE": a pose
-    that nothing has checked, without covariance, accuracy and trust. The last, with `is_final`, is what `localize`
-    would have answered, perhaps another pose altogether, or `Rejected`; errors are raised in its place.
+    Yields at most two answers. The first, if there is one, is a `LocalizationResult` with `pose_stage` "COARSE": an
+    unverified pose without covariance, accuracy and trust. The last, with `is_final`, is the answer of `localize`,
+    possibly a very different pose or `Rejected`; an error is raised in its place.
 
-    Whoever stops reading before ends the call. If the connection breaks after the first answer, the call is made again
-    like any other, and only the last is yielded.
+    The call is cancelled when the caller stops reading. If the connection breaks after the first answer, the call is
+    retried like any other, and only the last answer is yielded.
 
-    Args and deadline are those of `localize`, for both answers together.
+    Args and deadline are those of `localize`; the deadline holds for both answers together.
     """
     unary = localize(*asked, **named)
     call = replace(
@@ -127,10 +136,101 @@ def localize_progressively(*asked: Any, **named: Any) -> Exchange[LocalizationRe
 
 
 def _early_answer(message: pb.LocalizeProgressivelyResponse) -> LocalizationResult | None:
-    """A coarse answer; None if it is the final one."""
+    """The coarse answer of a message; None if its answer is final."""
     if message.is_final:
         return None
     answer = answer_from_message(message.answer)
     if isinstance(answer, Rejected):
         raise ValueError("a rejection that is not final")
     return replace(answer, is_final=False)
+
+
+def localize_rig(
+    images: Sequence[RigImage],
+    scene: str,
+    *,
+    reference_count: int = 0,
+    coverage: float = 0.0,
+    capture_time: datetime | None = None,
+    session_from_rig: RigidTransform | None = None,
+    timeout_s: float | None = None,
+) -> Exchange[RigLocalization | GroupRejected]:
+    """Localizes a rig by photographs that its cameras took at one moment.
+
+    One pose is estimated from all photographs together: together they can suffice where each alone does not.
+
+    Args:
+        images: the photographs, 1 to 8.
+        scene: the scene to localize in.
+        reference_count: number of references that the server chooses for each photograph; 0 for its default.
+        coverage: see `localize`; holds for each photograph alone.
+        capture_time: time of the photographs, with time zone; returned with the answer.
+        session_from_rig: the device's own pose of the rig at that time, OpenCV's axes; used for
+            `RigLocalization.world_from_session`.
+        timeout_s: deadline of the call.
+    """
+    request = pb.LocalizeRigRequest(
+        scene=scene_name(scene),
+        images=[
+            pb.RigImage(
+                image=read_image(image.image),
+                intrinsics=wire.camera_to_message(image.camera),
+                rig_from_camera=wire.transform_to_message(image.rig_from_camera),
+                references=[reference_name(scene, reference) for reference in image.references],
+            )
+            for image in images
+        ],
+        options=pb.LocalizeOptions(reference_count=reference_count, coverage=coverage),
+    )
+    if capture_time is not None:
+        request.capture_time.FromDatetime(capture_time)
+    if session_from_rig is not None:
+        request.session_from_rig.CopyFrom(wire.transform_to_message(session_from_rig))
+    response = yield Call(f"{SERVICE}/LocalizeRig", request, pb.LocalizeRigResponse, timeout_s)
+    return rig_from_message(response)
+
+
+def localize_sequence(
+    frames: Sequence[SequenceFrame],
+    scene: str,
+    *,
+    estimate_session_scale: bool = False,
+    reference_count: int = 0,
+    coverage: float = 0.0,
+    axes: Axes | str = "",
+    timeout_s: float | None = None,
+) -> Exchange[SequenceLocalization | GroupRejected]:
+    """Localizes a device by a few photographs and the poses that it tracked meanwhile, which may drift.
+
+    Args:
+        frames: 2 to 16 photographs with the device's poses, the oldest first.
+        scene: the scene to localize in.
+        estimate_session_scale: whether the scale of the device's poses is unknown; the device must have moved.
+        reference_count: number of references that the server chooses for each photograph; 0 for its default.
+        coverage: see `localize`; holds for each photograph alone.
+        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of the device's poses and of
+            `SequenceLocalization.world_from_session`.
+        timeout_s: deadline of the call.
+    """
+    request = pb.LocalizeSequenceRequest(
+        scene=scene_name(scene),
+        frames=[_frame_to_message(frame, scene) for frame in frames],
+        estimate_session_scale=estimate_session_scale,
+        options=pb.LocalizeOptions(
+            reference_count=reference_count, coverage=coverage, axes=wire.enum_value(pb.Axes, axes)
+        ),
+    )
+    response = yield Call(f"{SERVICE}/LocalizeSequence", request, pb.LocalizeSequenceResponse, timeout_s)
+    return sequence_from_message(response)
+
+
+def _frame_to_message(frame: SequenceFrame, scene: str) -> pb.SequenceFrame:
+    message = pb.SequenceFrame(
+        image=read_image(frame.image),
+        intrinsics=wire.camera_to_message(frame.camera),
+        session_from_camera=wire.transform_to_message(frame.session_from_camera),
+        references=[reference_name(scene, reference) for reference in frame.references],
+    )
+    if frame.capture_time is not None:
+        message.capture_time.FromDatetime(frame.capture_time)
+    return message

@@ -1,24 +1,35 @@
-"""Scenes and references: create, get, change, list, delete."""
+"""Scenes and references: create, get, update, list, delete; retrieval, audit and coverage."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-import numpy as np
 from numpy.typing import ArrayLike
 
+from .. import wire
 from ..errors import MaplessError
 from ..exchange import Call, Exchange, Pages
 from ..geodesy import Datum
+from ..geometry import Camera, RigidTransform
+from ..names import reference_name, scene_name
 from ..options import ConnectOptions
-from ..requests import NewReference, create_request
-from ..results import Reference, Scene, reference_from_message, scene_from_message
-from ..scene_messages import calibration_to_message, datum_to_message
-from ..scenes import UNCHANGED, Calibration, UnchangedType
-from ..v1 import geometry_pb2
+from ..priors import Priors, set_priors
+from ..requests import ImageSource, NewReference, create_request, read_image
+from ..results import (
+    Coverage,
+    Reference,
+    ReferenceAudit,
+    RetrievedReference,
+    Scene,
+    audit_from_message,
+    coverage_from_message,
+    reference_from_message,
+    retrieved_from_message,
+    scene_from_message,
+)
+from ..scenes import UNCHANGED, Calibration, UnchangedType, calibration_to_message, datum_to_message
 from ..v1 import reference_service_pb2 as pb
 from . import repeats
-from .naming import reference_name, scene_name
 from .repeats import SERVICE
 
 
@@ -29,12 +40,12 @@ def create_scene(
     down_in_world: ArrayLike | None = None,
     timeout_s: float | None = None,
 ) -> Exchange[Scene]:
-    """A new scene, without references.
+    """Creates a scene without references.
 
     Args:
-        scene_id: its id.
-        datum: where its world is on the Earth, if that is known.
-        down_in_world: (3,) to where things fall, of any length; None: what the datum says, if there is one.
+        scene_id: id of the scene.
+        datum: position of its world on the Earth, if known.
+        down_in_world: (3,) direction of gravity, any length; None for the datum's, if there is one.
         timeout_s: deadline of the call.
     """
 
@@ -44,14 +55,14 @@ def create_scene(
     request = pb.CreateSceneRequest(
         scene_id=scene_id,
         datum=None if datum is None else datum_to_message(datum),
-        down_in_world=None if down_in_world is None else _direction(down_in_world),
+        down_in_world=None if down_in_world is None else wire.vector_to_message(down_in_world),
     )
     response = yield Call(f"{SERVICE}/CreateScene", request, pb.CreateSceneResponse, timeout_s, on_repeat=found)
     return scene_from_message(response.scene)
 
 
 def get_scene(scene: str, *, timeout_s: float | None = None) -> Exchange[Scene]:
-    """A scene."""
+    """Gets a scene."""
     request = pb.GetSceneRequest(name=scene_name(scene))
     response = yield Call(f"{SERVICE}/GetScene", request, pb.GetSceneResponse, timeout_s)
     return scene_from_message(response.scene)
@@ -65,13 +76,13 @@ def update_scene(
     calibration: Calibration | UnchangedType | None = UNCHANGED,
     timeout_s: float | None = None,
 ) -> Exchange[Scene]:
-    """Changes what is known of a scene as a whole; what is not given stays as it is, and None forgets it.
+    """Changes properties of a scene; a property that is not given keeps its value, None deletes it.
 
     Args:
         scene: the scene.
-        datum: where its world is on the Earth.
-        down_in_world: (3,) to where things fall, of any length; without it, what the datum says, if there is one.
-        calibration: how far off answers were found to be.
+        datum: position of its world on the Earth.
+        down_in_world: (3,) direction of gravity, any length; without it the datum's, if there is one.
+        calibration: measured factors of the radii of answers.
         timeout_s: deadline of the call.
     """
     request = pb.UpdateSceneRequest(scene=pb.Scene(name=scene_name(scene)))
@@ -80,7 +91,7 @@ def update_scene(
     if datum is not None and datum is not UNCHANGED:
         request.scene.datum.CopyFrom(datum_to_message(datum))
     if down_in_world is not None and down_in_world is not UNCHANGED:
-        request.scene.down_in_world.CopyFrom(_direction(down_in_world))
+        request.scene.down_in_world.CopyFrom(wire.vector_to_message(down_in_world))
     if calibration is not None and calibration is not UNCHANGED:
         request.scene.calibration.CopyFrom(calibration_to_message(calibration))
     response = yield Call(f"{SERVICE}/UpdateScene", request, pb.UpdateSceneResponse, timeout_s)
@@ -88,7 +99,7 @@ def update_scene(
 
 
 def list_scenes(*, page_size: int = 0, timeout_s: float | None = None) -> Pages[Scene]:
-    """All scenes by id, fetched page by page; the deadline is each page's."""
+    """All scenes by id, fetched page by page; the deadline holds for each page."""
 
     def fetch(token: str) -> Exchange[tuple[list[Scene], str]]:
         request = pb.ListScenesRequest(page_size=page_size, page_token=token)
@@ -118,7 +129,7 @@ def add_reference(scene: str, reference: NewReference, *, timeout_s: float | Non
 def add_batch(
     scene: str, requests: Sequence[pb.CreateReferenceRequest], timeout_s: float | None
 ) -> Exchange[list[Reference]]:
-    """Stores the references of one message, all or none."""
+    """Stores the references of one message: all of them, or none."""
 
     def found(error: MaplessError) -> Exchange[pb.BatchCreateReferencesResponse]:
         stored = yield from repeats.stored_references(request, error)
@@ -139,7 +150,7 @@ def add_batch(
 def batches(
     scene: str, references: Iterable[NewReference], options: ConnectOptions
 ) -> Iterator[list[pb.CreateReferenceRequest]]:
-    """Requests in the references' order, as many together as fit a message; one that is too large goes alone."""
+    """Requests in the references' order, in batches that fit a message; a request too large for that is sent alone."""
     batch: list[pb.CreateReferenceRequest] = []
     batch_bytes = 0
     for reference in references:
@@ -158,14 +169,14 @@ def batches(
 def get_reference(
     scene: str, reference: str, *, include_image: bool = False, timeout_s: float | None = None
 ) -> Exchange[Reference]:
-    """A reference, with its photograph if asked for."""
+    """Gets a reference, with its photograph if requested."""
     request = pb.GetReferenceRequest(name=reference_name(scene, reference), include_image=include_image)
     response = yield Call(f"{SERVICE}/GetReference", request, pb.GetReferenceResponse, timeout_s)
     return reference_from_message(response.reference)
 
 
 def list_references(scene: str, *, page_size: int = 0, timeout_s: float | None = None) -> Pages[Reference]:
-    """A scene's references by id, without photographs, fetched page by page; the deadline is each page's."""
+    """A scene's references by id, without photographs, fetched page by page; the deadline holds for each page."""
 
     def fetch(token: str) -> Exchange[tuple[list[Reference], str]]:
         request = pb.ListReferencesRequest(scene=scene_name(scene), page_size=page_size, page_token=token)
@@ -181,6 +192,62 @@ def delete_reference(scene: str, reference: str, *, timeout_s: float | None = No
     yield Call(f"{SERVICE}/DeleteReference", request, pb.DeleteReferenceResponse, timeout_s, on_repeat=repeats.gone)
 
 
-def _direction(direction: ArrayLike) -> geometry_pb2.Vector3:
-    x, y, z = map(float, np.asarray(direction, float))
-    return geometry_pb2.Vector3(x=x, y=y, z=z)
+def retrieve_references(
+    image: ImageSource,
+    camera: Camera,
+    scene: str,
+    count: int = 0,
+    *,
+    priors: Priors | None = None,
+    timeout_s: float | None = None,
+) -> Exchange[list[RetrievedReference]]:
+    """Finds the references most similar to a photograph; `localize` chooses among twice as many by feature matches.
+
+    Args:
+        image: the photograph.
+        camera: the camera that took it.
+        scene: the scene to search.
+        count: number of references, at most 1000; 0 for the server's default.
+        priors: only references near the camera's prior position and heading are considered.
+        timeout_s: deadline of the call.
+    """
+    request = pb.RetrieveReferencesRequest(
+        scene=scene_name(scene), image=read_image(image), intrinsics=wire.camera_to_message(camera), count=count
+    )
+    set_priors(request, priors or Priors())
+    response = yield Call(f"{SERVICE}/RetrieveReferences", request, pb.RetrieveReferencesResponse, timeout_s)
+    return list(map(retrieved_from_message, response.references))
+
+
+def audit_scene(
+    scene: str, references: Sequence[str] = (), *, page_size: int = 0, timeout_s: float | None = None
+) -> Pages[ReferenceAudit]:
+    """Examines references of a scene against their neighbours, by id; results are yielded as they arrive.
+
+    Args:
+        scene: the scene.
+        references: which references, at most 100; empty for all.
+        page_size: references per call, about half a second of computation each; 0 for the server's default.
+        timeout_s: deadline of each call.
+    """
+    named = [reference_name(scene, reference) for reference in references]
+
+    def fetch(token: str) -> Exchange[tuple[list[ReferenceAudit], str]]:
+        request = pb.AuditSceneRequest(scene=scene_name(scene), references=named, page_size=page_size, page_token=token)
+        page = yield Call(f"{SERVICE}/AuditScene", request, pb.AuditSceneResponse, timeout_s)
+        return list(map(audit_from_message, page.audits)), page.next_page_token
+
+    return Pages(fetch)
+
+
+def check_coverage(
+    scene: str, world_from_camera: RigidTransform, camera: Camera, *, timeout_s: float | None = None
+) -> Exchange[Coverage]:
+    """Predicts whether a photograph taken at a pose would be localized."""
+    request = pb.CheckCoverageRequest(
+        scene=scene_name(scene),
+        world_from_camera=wire.transform_to_message(world_from_camera),
+        intrinsics=wire.camera_to_message(camera),
+    )
+    response = yield Call(f"{SERVICE}/CheckCoverage", request, pb.CheckCoverageResponse, timeout_s)
+    return coverage_from_message(response)

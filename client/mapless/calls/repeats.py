@@ -1,6 +1,6 @@
-"""What becomes of a change that was made before, though its answer was lost: found, or somebody else's.
+"""Retries of changes whose first answer was lost: determines whether the existing state is the result of that change.
 
-The calls that ask have no deadline of their own: theirs is that of the change.
+The calls made here share the deadline of the change.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from .. import wire
 from ..errors import MaplessError, NotFound
 from ..exchange import Call, Exchange
 from ..geometry import Array
-from ..scene_messages import datum_from_message, direction_from_message
+from ..names import scene_name
+from ..scenes import datum_from_message, direction_from_message
 from ..v1 import reference_service_pb2 as pb
-from .naming import scene_name
 
 SERVICE = "mapless.v1.ReferenceService"
-_SAME = 1e-9  # metres, degrees, entries of a rotation or direction: what rounding leaves of one that is normalized
-_PAGE_SIZE = 1000  # the most that a server lists at once
+_SAME = 1e-9  # metres, degrees, entries of a rotation or direction: rounding errors of normalization
+_PAGE_SIZE = 1000  # the server's maximum
 
 
 def gone(error: MaplessError) -> Exchange[None]:
-    """Nothing to find out: what an earlier try deleted, the next does not find."""
+    """Success: what an earlier attempt deleted is NOT_FOUND for the next; any other error is raised."""
     if error.code != "NOT_FOUND":
         raise error
     yield from ()
 
 
 def created_scene(wanted: pb.CreateSceneRequest, error: MaplessError) -> Exchange[pb.Scene]:
-    """The scene, if nobody has done anything with it and the same is known of its world as of ours; else the error."""
+    """The existing scene if it is unchanged since its creation and its world equals the wanted one; else the error."""
     if error.code != "ALREADY_EXISTS":
         raise error
     get = pb.GetSceneRequest(name=scene_name(wanted.scene_id))
@@ -43,13 +43,13 @@ def created_scene(wanted: pb.CreateSceneRequest, error: MaplessError) -> Exchang
 
 
 def stored_reference(wanted: pb.CreateReferenceRequest, error: MaplessError) -> Exchange[pb.Reference]:
-    """The stored reference, if it is the one that was to be stored; else the error."""
+    """The stored reference if it equals the wanted one; else the error."""
     if error.code != "ALREADY_EXISTS":
         raise error
     get = pb.GetReferenceRequest(name=_name(wanted))
     try:
         there: pb.Reference = (yield Call(f"{SERVICE}/GetReference", get, pb.GetReferenceResponse)).reference
-    except NotFound:  # of a batch, another one is there
+    except NotFound:  # of a batch, another reference exists
         raise error from None
     if not _is_same(wanted.reference, there):
         raise error
@@ -57,9 +57,9 @@ def stored_reference(wanted: pb.CreateReferenceRequest, error: MaplessError) -> 
 
 
 def stored_references(wanted: pb.BatchCreateReferencesRequest, error: MaplessError) -> Exchange[list[pb.Reference]]:
-    """The stored references in the request's order, if all are those that were to be stored; else the error.
+    """The stored references in the request's order if all equal the wanted ones; else the error.
 
-    Most scenes are listed by one call. Of a larger one, those that stand on later pages are asked for one by one.
+    One call lists most scenes. In a larger scene, references on later pages are fetched one by one.
     """
     if error.code != "ALREADY_EXISTS":
         raise error
@@ -91,7 +91,7 @@ def _is_same(wanted: pb.Reference, stored: pb.Reference) -> bool:
 
 
 def _of_world(message: Any) -> Array:
-    """What a message says of a scene's world: 12 numbers of its datum, if it has one, and 3 of its down."""
+    """World properties of a message: 12 numbers of its datum, if it has one, and 3 of its direction of gravity."""
     numbers: list[float] = []
     if message.HasField("datum"):
         datum = datum_from_message(message.datum, "datum")

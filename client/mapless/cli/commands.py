@@ -13,7 +13,7 @@ from ..errors import NotFound
 from ..geodesy import Datum
 from ..geometry import Quaternion
 from ..requests import NewReference
-from .exits import EXIT_FAILED, EXIT_REJECTED
+from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import priors
 from .output import print_json
 

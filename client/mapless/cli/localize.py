@@ -25,10 +25,7 @@ from ..report import write_report
 from ..requests import ImageSource
 from ..results import Reference
 from . import output
-from .exits import EXIT_REJECTED
-from .pace import Pace, PacedClient
-from .progress import Progress
-from .tally import LOCALIZED, Outcome, Tally
+from .folder import EXIT_REJECTED, Concurrency, LimitedClient, Outcome, Tally
 
 ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 _FIELDS_OF_PHOTOS = ("image", "intrinsics")
@@ -37,7 +34,7 @@ _DRAWN_REFERENCES, _SHOWN_REFERENCES = 16, 4
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph to localize, and what to call it."""
+    """A photograph to localize, its name in the output, and its camera."""
 
     path: Path
     name: str
@@ -47,35 +44,35 @@ class Photo:
 def run(client: Client, arguments: argparse.Namespace) -> int:
     """The command."""
     if arguments.rerank and not arguments.reference:
-        raise ValueError("--rerank chooses among references that --reference names")
+        raise ValueError("--rerank needs --reference: it chooses among the references given")
     if arguments.parallel < 1:
-        raise ValueError(f"--parallel is the number of calls at a time, at least 1, not {arguments.parallel}")
+        raise ValueError(f"--parallel must be at least 1, is {arguments.parallel}")
     if arguments.draw is not None:
         arguments.draw.mkdir(parents=True, exist_ok=True)
     if not arguments.photo.is_dir():
         return _one(client, arguments)
     if arguments.progressive:
-        raise ValueError("--progressive shows how one photograph is localized, not a folder of them")
+        raise ValueError("--progressive takes one photograph, not a folder")
     return _folder(client, arguments)
 
 
 def _one(client: Client, arguments: argparse.Namespace) -> int:
     photo = Photo(arguments.photo, arguments.photo.name, _camera_of(arguments.photo, arguments.camera))
     answers = _answers(client, photo, photo.path, arguments)
-    first = next(answers)  # before there is a file that nothing is written to
+    first = next(answers)  # before the output file is created, which an error would leave empty
     indent = None if arguments.progressive else 2  # of several answers each is a line
     with _opened(arguments.output) as file:
         for answer in itertools.chain([first], answers):
             if arguments.json or arguments.output or not sys.stdout.isatty():
-                print(json.dumps(output.plain(_told(answer, arguments)), indent=indent), file=file, flush=True)
+                print(json.dumps(output.plain(_printed(answer, arguments)), indent=indent), file=file, flush=True)
             else:
                 print("\n".join(output.lines(answer)), file=file, flush=True)
-    _tell_where(arguments)
+    _print_paths(arguments)
     return EXIT_REJECTED if isinstance(answer, Rejected) else 0
 
 
 def _folder(client: Client, arguments: argparse.Namespace) -> int:
-    """One line for each photograph, in their order, as they come; one that fails by itself does not end the others."""
+    """One line for each photograph, in order, as answers arrive; an error of one photograph does not end the others."""
     photos = photos_of(arguments.photo, arguments.camera)
     names = [photo.name for photo in photos]
     width = max(map(len, names))
@@ -84,25 +81,25 @@ def _folder(client: Client, arguments: argparse.Namespace) -> int:
     try:
         with (
             _opened(arguments.output) as file,
-            Progress(len(photos)) as progress,
             contextlib.closing(_all(client, photos, arguments)) as outcomes,
         ):
             if not as_json:
                 print(output.heading(width), file=file)
+            tally.draw()
             for name, outcome in zip(names, outcomes, strict=True):
-                progress.clear()
+                tally.clear()
                 print(_row(name, width, outcome, as_json, arguments), file=file, flush=True)
-                kind = tally.count(outcome)
-                progress.step("" if kind == LOCALIZED else kind)
+                tally.count(outcome)
     finally:
-        if tally.done:  # also of a run that ends early: by Ctrl-C, or because the server is gone
-            print(tally.text(), file=sys.stderr)
-            _tell_where(arguments)
+        tally.clear()
+        if tally.done:  # also where the command ends early: by Ctrl-C, or because the server is gone
+            print(tally.summary(), file=sys.stderr)
+            _print_paths(arguments)
     return tally.exit_code
 
 
-def _tell_where(arguments: argparse.Namespace) -> None:
-    """Which files there are now."""
+def _print_paths(arguments: argparse.Namespace) -> None:
+    """Names the files that were written."""
     if arguments.output is not None:
         print(f"answers are in {arguments.output}", file=sys.stderr)
     if arguments.draw is not None:
@@ -117,7 +114,7 @@ def photos_of(folder: Path, camera: str | None) -> list[Photo]:
     """
     if camera is None:
         if not (folder / FOLDER_FILE).is_file():
-            raise ValueError(f"{folder} has no {FOLDER_FILE}: say --camera, which then took all its photographs")
+            raise ValueError(f"{folder} has no {FOLDER_FILE}: give --camera, the camera of all its photographs")
         cameras = read_cameras(folder / FOLDER_FILE)
         if not cameras:
             raise ValueError(f"{folder / FOLDER_FILE} lists no photographs")
@@ -135,7 +132,7 @@ def _camera_of(path: Path, camera: str | None) -> Camera:
         return read_camera(camera, path)
     cameras = {known.resolve(): its for known, its in read_cameras(camera).items()}
     if path.resolve() not in cameras:
-        raise ValueError(f"{camera} knows no {path}")
+        raise ValueError(f"{camera} does not list {path}")
     return cameras[path.resolve()]
 
 
@@ -144,43 +141,43 @@ def _camera_beside(path: Path) -> Camera:
     for folder in path.resolve().parents[:2]:
         if (folder / FOLDER_FILE).is_file():
             return _camera_of(path, str(folder / FOLDER_FILE))
-    raise ValueError(f"say --camera: which camera took the photograph; there is no {FOLDER_FILE} beside it")
+    raise ValueError(f"give --camera, the camera of the photograph: there is no {FOLDER_FILE} beside it")
 
 
 def _all(client: Client, photos: list[Photo], arguments: argparse.Namespace) -> Generator[Outcome, None, None]:
-    """An outcome for each photograph, in their order; `parallel` calls at a time, or as many as there is room for."""
-    pace = Pace(arguments.parallel)
+    """An outcome for each photograph, in order; at most `parallel` concurrent calls, fewer if the server is full."""
+    concurrency = Concurrency(arguments.parallel)
 
     def outcome(photo: Photo) -> Outcome:
         try:
-            with pace.turn():
-                return _ask(paced, photo, arguments)
+            with concurrency.call():
+                return _localize(limited, photo, arguments)
         except MaplessError as error:
-            if _is_everybodys(error):
+            if _concerns_all(error):
                 raise
             return error
 
     with (
-        PacedClient(arguments.address, client.options, pace) as paced,
+        LimitedClient(arguments.address, client.options, concurrency) as limited,
         ThreadPoolExecutor(arguments.parallel, "localize") as threads,
     ):
         try:
             yield from threads.map(outcome, photos)
         except BaseException:
             threads.shutdown(wait=False, cancel_futures=True)
-            paced.close()  # ends the calls in flight
+            limited.close()  # ends the calls in flight
             raise
 
 
-def _is_everybodys(error: MaplessError) -> bool:
-    """Whether all other photographs would be answered the same."""
+def _concerns_all(error: MaplessError) -> bool:
+    """Whether the calls of all other photographs would fail in the same way."""
     if error.code == "INVALID_ARGUMENT":
         return not (error.field or "").startswith(_FIELDS_OF_PHOTOS)
     return error.code in {"NOT_FOUND", "UNAUTHENTICATED", "PERMISSION_DENIED", "UNAVAILABLE", "UNIMPLEMENTED"}
 
 
-def _ask(client: Client, photo: Photo, arguments: argparse.Namespace) -> LocalizationResult | Rejected:
-    """The answer alone; a file that cannot be read is its own call's fault."""
+def _localize(client: Client, photo: Photo, arguments: argparse.Namespace) -> LocalizationResult | Rejected:
+    """The final answer; a file that cannot be read is an error of this photograph alone."""
     try:
         image = photo.path.read_bytes()
     except OSError as error:
@@ -193,8 +190,8 @@ def _ask(client: Client, photo: Photo, arguments: argparse.Namespace) -> Localiz
 def _answers(
     client: Client, photo: Photo, image: ImageSource, arguments: argparse.Namespace
 ) -> Iterator[LocalizationResult | Rejected]:
-    """The answer; with --progressive, what is known before it comes first."""
-    asked: dict[str, Any] = {
+    """The answer; with --progressive, a coarse pose may come first."""
+    options: dict[str, Any] = {
         "priors": priors(arguments),
         "variant": arguments.variant,
         "allow_coarse": arguments.allow_coarse,
@@ -205,12 +202,12 @@ def _answers(
         "axes": arguments.axes,
         "include_debug": arguments.debug or arguments.draw is not None,
     }
-    about = image, photo.camera, arguments.scene, arguments.reference
+    photograph = image, photo.camera, arguments.scene, arguments.reference
     if arguments.progressive:
-        for answer in client.localize_progressively(*about, **asked):
+        for answer in client.localize_progressively(*photograph, **options):
             yield answer
     else:
-        answer = client.localize(*about, **asked)
+        answer = client.localize(*photograph, **options)
         yield answer
     if arguments.draw is not None:
         page = arguments.draw / f"{photo.name.replace('/', '_')}.html"
@@ -219,7 +216,7 @@ def _answers(
 
 
 def _references(client: Client, scene: str, answer: LocalizationResult | Rejected) -> list[Reference]:
-    """Those that matched, as far as they are still there; the best with their photographs, the hint's first."""
+    """References with matches that still exist, the hint's first; the best with their photographs."""
     uses = sorted(answer.diagnostics.references, key=lambda use: (-use.inlier_count, -use.match_count))
     names = [use.name for use in uses if use.match_count > 0]
     hint = answer.hint if isinstance(answer, Rejected) else None
@@ -234,20 +231,20 @@ def _references(client: Client, scene: str, answer: LocalizationResult | Rejecte
 
 def _row(name: str, width: int, outcome: Outcome, as_json: bool, arguments: argparse.Namespace) -> str:
     if isinstance(outcome, MaplessError):
-        told = {"code": outcome.code, "reason": outcome.reason, "message": outcome.message, "field": outcome.field}
-        return json.dumps({"photo": name, "error": told}) if as_json else f"{name:{width}}  failed: {outcome}"
+        fields = {"code": outcome.code, "reason": outcome.reason, "message": outcome.message, "field": outcome.field}
+        return json.dumps({"photo": name, "error": fields}) if as_json else f"{name:{width}}  failed: {outcome}"
     if as_json:
-        return json.dumps({"photo": name} | output.plain(_told(outcome, arguments)))
+        return json.dumps({"photo": name} | output.plain(_printed(outcome, arguments)))
     return output.line(f"{name:{width}}", outcome)
 
 
-def _told(answer: LocalizationResult | Rejected, arguments: argparse.Namespace) -> Any:
-    """What is printed of an answer: its matches only for those who asked for them by name."""
+def _printed(answer: LocalizationResult | Rejected, arguments: argparse.Namespace) -> Any:
+    """The answer as it is printed: with its matches only if --debug was given."""
     return answer if arguments.debug else replace(answer, debug=None)
 
 
 def priors(arguments: argparse.Namespace) -> Priors:
-    """What the command line knows of the camera."""
+    """The priors that the command line gives."""
     near, looking = arguments.near, arguments.looking
     gravity = getattr(arguments, "gravity", None)
     return Priors(

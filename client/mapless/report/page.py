@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +18,6 @@ from .overlay import define, histogram, image_of, overlay
 from .pairs import best_references, pairs
 from .pictures import Picture, picture
 from .plan import plan_view
-from .style import STYLE
 
 PHOTOGRAPH_BYTES = 1_800_000
 REFERENCE_BYTES = 450_000
@@ -76,9 +76,13 @@ def report_html(
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{text(_POLICY)}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{text(_verdict(answer))}{': ' + text(title) if title else ''}</title><style>{STYLE}</style></head>"
+        f"<title>{text(_verdict(answer))}{': ' + text(title) if title else ''}</title><style>{_style()}</style></head>"
         f"<body>{''.join(body)}</body></html>\n"
     )
+
+
+def _style() -> str:
+    return Path(__file__).with_name("style.css").read_text(encoding="utf-8")
 
 
 def _verdict(answer: LocalizationResult | Rejected) -> str:

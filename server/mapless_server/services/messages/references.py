@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
 
 from mapless import names, wire
-from mapless.scene_messages import (
+from mapless.scenes import (
+    Calibration,
     calibration_from_message,
     calibration_to_message,
     datum_from_message,
@@ -16,7 +17,6 @@ from mapless.scene_messages import (
     direction_from_message,
     direction_to_message,
 )
-from mapless.scenes import Calibration
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.wire import FieldError, joined
