@@ -1,4 +1,4 @@
-"""Metrics have the names that dashboards know, count each event once, and never grow with what callers send."""
+"""Metrics have the dashboards' names, count each event once, and do not grow with what callers send."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import pytest
 from prometheus_client import generate_latest
@@ -21,11 +22,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from mapless_server.method.coarse.token_cache import TokenCacheCounters
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability import exporter
-from mapless_server.observability.event_loop import LoopObserver, watch_event_loop
+from mapless_server.observability.event_loop import watch_event_loop
 from mapless_server.observability.exporter import MAX_CONNECTIONS, MetricsServer
 from mapless_server.observability.metrics import LOCALIZED, STAGES, Metrics
-from mapless_server.rpc.guard import CallObserver
-from mapless_server.scheduling import Ending, Observer, Refusal
+from mapless_server.scheduling import Ending, Refusal
 from mapless_server.store.cache import LruCache
 
 LOCALIZE = "/mapless.v1.LocalizationService/Localize"
@@ -85,6 +85,8 @@ HISTOGRAMS = {
     "mapless_store_op_seconds": {"op"},
 }
 
+OUTCOMES = (LOCALIZED, *(reason.value for reason in RejectionReason))
+
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
 
@@ -120,7 +122,7 @@ def changed(before: Samples, after: Samples) -> Samples:
     return {key: change for key, change in changes.items() if change}
 
 
-def tell_everything(metrics: Metrics) -> None:
+def count_everything(metrics: Metrics) -> None:
     metrics.call_started(LOCALIZE)
     metrics.call_handled(LOCALIZE, "OK", 0.2)
     metrics.admitted(0.5)
@@ -160,7 +162,7 @@ def metrics() -> Metrics:
 
 
 def test_names_types_and_labels_are_those_that_dashboards_know(metrics: Metrics) -> None:
-    tell_everything(metrics)
+    count_everything(metrics)
     families = {f.name: f for f in text_string_to_metric_families(generate_latest(metrics.registry).decode())}
     ours = {name: family for name, family in families.items() if name.startswith(("mapless", "grpc"))}
     found = {
@@ -186,31 +188,24 @@ def test_metrics_that_nobody_moved_yet_are_described(metrics: Metrics) -> None:
     assert families >= {name.removesuffix("_total") for name in COUNTERS} | set(GAUGES) | set(HISTOGRAMS)
 
 
-@pytest.mark.parametrize("reason", Refusal)
-def test_a_refusal_is_counted_once_and_was_zero_before(metrics: Metrics, reason: Refusal) -> None:
-    before = samples_of(metrics)
-    key = ("mapless_admission_rejected_total", frozenset({("reason", reason.value)}))
+@pytest.mark.parametrize(
+    ("name", "labels", "event"),
+    [
+        *(("admission_rejected", {"reason": it.value}, partial(Metrics.refused, reason=it)) for it in Refusal),
+        *(
+            ("jobs_terminated", {"stage": stage, "outcome": it.value}, partial(Metrics.ended, stage=stage, ending=it))
+            for stage in STAGES
+            for it in Ending
+        ),
+        *(("answers", {"outcome": it}, partial(Metrics.answered, outcome=it)) for it in OUTCOMES),
+    ],
+)
+def test_an_event_is_counted_once_and_was_zero_before(
+    metrics: Metrics, name: str, labels: dict[str, str], event: Callable[[Metrics], None]
+) -> None:
+    before, key = samples_of(metrics), (f"mapless_{name}_total", frozenset(labels.items()))
     assert before[key] == 0
-    metrics.refused(reason)
-    assert changed(before, samples_of(metrics)) == {key: 1}
-
-
-@pytest.mark.parametrize("ending", Ending)
-@pytest.mark.parametrize("stage", STAGES)
-def test_an_ending_is_counted_once_and_was_zero_before(metrics: Metrics, stage: str, ending: Ending) -> None:
-    before = samples_of(metrics)
-    key = ("mapless_jobs_terminated_total", frozenset({("stage", stage), ("outcome", ending.value)}))
-    assert before[key] == 0
-    metrics.ended(stage, ending)
-    assert changed(before, samples_of(metrics)) == {key: 1}
-
-
-@pytest.mark.parametrize("outcome", [LOCALIZED, *(reason.value for reason in RejectionReason)])
-def test_an_answer_is_counted_under_its_outcome(metrics: Metrics, outcome: str) -> None:
-    before = samples_of(metrics)
-    key = ("mapless_answers_total", frozenset({("outcome", outcome)}))
-    assert before[key] == 0
-    metrics.answered(outcome)
+    event(metrics)
     assert changed(before, samples_of(metrics)) == {key: 1}
 
 
@@ -279,7 +274,7 @@ def test_there_is_an_edge_where_something_is_promised(metrics: Metrics, histogra
 
 
 def test_series_do_not_grow_with_what_is_told(metrics: Metrics) -> None:
-    tell_everything(metrics)
+    count_everything(metrics)
     for i in range(100):
         metrics.computed(f"stage-{i}", f"bucket-{i}", 1, 0.1)
         metrics.stages({f"stage-{i}": 0.1})
@@ -318,17 +313,6 @@ def test_quality_that_is_not_known_or_not_a_number_is_left_out(metrics: Metrics)
     assert samples["mapless_scale_deviation_count", frozenset()] == 0
 
 
-def test_metrics_are_what_the_others_tell(metrics: Metrics) -> None:
-    def hears(queue: Observer, calls: CallObserver, loop: LoopObserver) -> None:
-        queue.ended("refine", Ending.OK)
-        calls.call_started(LOCALIZE)
-        loop.beat()
-
-    before = samples_of(metrics)
-    hears(metrics, metrics, metrics)  # the types are checked by mypy
-    assert len(changed(before, samples_of(metrics))) == 3
-
-
 def test_two_servers_in_one_process_count_for_themselves() -> None:
     first, second = Metrics(), Metrics()
     first.failed_fatally()
@@ -337,7 +321,7 @@ def test_two_servers_in_one_process_count_for_themselves() -> None:
 
 
 def test_caches_are_read_when_somebody_asks(metrics: Metrics) -> None:
-    tell_everything(metrics)
+    count_everything(metrics)
     samples = samples_of(metrics)
     assert samples["mapless_reference_cache_hits_total", frozenset()] == 1
     assert samples["mapless_reference_cache_bytes", frozenset()] == 6
@@ -352,7 +336,7 @@ def test_caches_are_read_when_somebody_asks(metrics: Metrics) -> None:
 def test_one_that_cannot_be_read_blinds_nobody_to_the_others(
     metrics: Metrics, caplog: pytest.LogCaptureFixture
 ) -> None:
-    tell_everything(metrics)
+    count_everything(metrics)
 
     def broken() -> LruCache[str]:
         raise RuntimeError("the cache is gone")

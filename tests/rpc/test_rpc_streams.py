@@ -1,7 +1,4 @@
-"""Calls that are answered by a stream: counted once however they end, and closed behind them.
-
-Those that could last for ever are waited for by nobody; those that come to an end are calls like all others.
-"""
+"""Streams are counted once however they end, and closed; a drain waits for finite ones, and not for endless ones."""
 
 from __future__ import annotations
 
@@ -35,7 +32,7 @@ LIMIT_S = 30.0
 
 @dataclass
 class Counted:
-    """Calls as they were counted."""
+    """Counts of calls."""
 
     started: int = 0
     handled: list[str] = field(default_factory=list)
@@ -49,7 +46,7 @@ class Counted:
 
 
 class Numbers:
-    """Messages that count up to `last`; then it ends, or raises what it was given, or waits for ever."""
+    """Messages that count up to `last`; then the stream ends, raises, or waits for ever."""
 
     def __init__(self, last: int, then: Exception | str = "end") -> None:
         self._last, self._then, self._count = last, then, 0
@@ -79,7 +76,7 @@ async def serving(
     understand: Callable[[bytes], pb.WatchQueriesRequest] = pb.WatchQueriesRequest.FromString,
     **options: Any,
 ) -> AsyncIterator[tuple[Any, CallGuard]]:
-    """A channel to a server whose streams are answered so; of a message that nobody reads it takes 64 KiB."""
+    """A channel to a server whose streams give these numbers; it buffers 64 KiB of an unread message."""
 
     async def watch(request: pb.WatchQueriesRequest, call: Call) -> Numbers:
         if isinstance(numbers, Exception):
@@ -123,10 +120,11 @@ async def until(condition: Callable[[], bool]) -> None:
     await asyncio.wait_for(wait(), LIMIT_S)
 
 
-async def test_a_stream_that_ends_by_itself() -> None:
+@pytest.mark.parametrize("method", [METHOD, FINITE])
+async def test_all_messages_arrive_and_the_stream_is_counted(method: str) -> None:
     counted, numbers = Counted(), Numbers(5)
     async with serving(numbers, counted) as (channel, _):
-        call = watching(channel)
+        call = watching(channel, method=method)
         assert await read(call) == [1, 2, 3, 4, 5]
         assert "x-request-id" in dict(await call.trailing_metadata())
     assert (counted.started, counted.handled, numbers.is_closed) == (1, ["OK"], True)
@@ -141,20 +139,20 @@ async def test_a_stream_that_ends_by_itself() -> None:
     ],
 )
 @pytest.mark.parametrize("when", ["at once", "later"])
-async def test_a_stream_that_fails(error: Exception, code: str, when: str) -> None:
-    counted, numbers = Counted(), Numbers(2, error)
+@pytest.mark.parametrize("method", [METHOD, FINITE])
+async def test_a_failing_stream_ends_with_the_error(error: Exception, code: str, when: str, method: str) -> None:
+    counted, numbers, seen = Counted(), Numbers(2, error), list[int]()
     async with serving(error if when == "at once" else numbers, counted) as (channel, _):
         with pytest.raises(grpc.RpcError) as caught:
-            await read(watching(channel))
+            await read(watching(channel, method=method), seen)
         failure = from_rpc_error(caught.value)
-    assert failure.code == code
+    assert (failure.code, counted.handled) == (code, [code])
     assert failure.request_id
     assert "secret" not in str(failure)
-    assert counted.handled == [code]
-    assert numbers.is_closed == (when == "later")
+    assert (seen, numbers.is_closed) == (([], False) if when == "at once" else ([1, 2], True))
 
 
-async def test_a_caller_who_goes_ends_it() -> None:
+async def test_a_leaving_caller_ends_the_stream() -> None:
     counted, numbers = Counted(), Numbers(1, "wait")
     async with serving(numbers, counted) as (channel, _):
         call = watching(channel)
@@ -165,18 +163,18 @@ async def test_a_caller_who_goes_ends_it() -> None:
         await until(lambda: counted.handled == ["CANCELLED"])
 
 
-async def test_a_caller_who_reads_nothing_and_goes_ends_it() -> None:
+async def test_a_leaving_caller_that_reads_nothing_ends_the_stream() -> None:
     counted, numbers = Counted(), Numbers(10**9, "wait")
     async with serving(numbers, counted) as (channel, _):
         call = watching(channel)
         await call.initial_metadata()
-        await asyncio.sleep(0.1)  # until what is under way fills all there is room for
+        await asyncio.sleep(0.1)  # until the buffers are full
         call.cancel()
         await until(lambda: numbers.is_closed)
 
 
 class Photographs(Numbers):
-    """Messages that are larger than what a connection takes before somebody reads."""
+    """Messages that are larger than a connection buffers."""
 
     async def __anext__(self) -> pb.WatchQueriesResponse:
         await asyncio.sleep(0.001)
@@ -192,7 +190,7 @@ async def test_a_watcher_leaving_during_a_photo_is_no_server_fault(how: str, cap
         async with serving(numbers, counted) as (channel, _):
             call = watching(channel, 1.0 if how == "reaches its deadline" else LIMIT_S)
             await call.initial_metadata()
-            await asyncio.sleep(0.3)  # nobody reads: the server waits in the middle of a message
+            await asyncio.sleep(0.3)  # the server waits in the middle of a message
             if how == "cancels":
                 call.cancel()
             elif how == "closes its channel":
@@ -228,7 +226,7 @@ async def test_a_missing_message_is_reported_without_a_deadline_too() -> None:
     assert counted.handled == ["DEADLINE_EXCEEDED"]
 
 
-async def test_nobody_waits_for_its_end() -> None:
+async def test_a_drain_does_not_wait_for_an_endless_stream() -> None:
     async with serving(Numbers(0, "wait"), Counted()) as (channel, guard):
         call = watching(channel)
         await call.initial_metadata()
@@ -238,8 +236,14 @@ async def test_nobody_waits_for_its_end() -> None:
         call.cancel()
 
 
-async def test_a_caller_who_may_not_any_more_sees_nothing_more() -> None:
-    allowed = [True, True, True, True, False]  # at the door, with the message, and before each that is sent
+async def test_a_revoked_token_ends_the_stream() -> None:
+    allowed = [
+        True,
+        True,
+        True,
+        True,
+        False,
+    ]  # with the headers, with the message, and before each message that is sent
 
     def authenticate(*_: Any) -> Principal:
         if not allowed.pop(0):
@@ -256,7 +260,7 @@ async def test_a_caller_who_may_not_any_more_sees_nothing_more() -> None:
 
 
 class Large(Numbers):
-    """Messages that are more together than a connection takes before somebody reads."""
+    """Messages that are together larger than a connection buffers."""
 
     async def __anext__(self) -> pb.WatchQueriesResponse:
         message = await super().__anext__()
@@ -265,20 +269,12 @@ class Large(Numbers):
 
 
 class Asked:
-    """What a message is understood as."""
+    """A parsed request."""
 
     scene = "scenes/hall"
 
 
-class TestStreamsThatComeToAnEnd:
-    async def test_all_that_is_sent_comes_and_they_are_counted(self) -> None:
-        counted, numbers = Counted(), Numbers(2)
-        async with serving(numbers, counted) as (channel, _):
-            call = watching(channel, method=FINITE)
-            assert await read(call) == [1, 2]
-            assert "x-request-id" in dict(await call.trailing_metadata())
-        assert (counted.started, counted.handled, numbers.is_closed) == (1, ["OK"], True)
-
+class TestFiniteStreams:
     @pytest.mark.parametrize("options", [{"default_deadline_s": 0.3}, {"max_deadline_s": 0.3}])
     async def test_their_deadline_is_that_of_unary_calls(self, options: dict[str, Any]) -> None:
         counted, numbers, seen = Counted(), Numbers(1, "wait"), list[int]()
@@ -291,7 +287,7 @@ class TestStreamsThatComeToAnEnd:
         assert failure.request_id
         assert counted.handled == ["DEADLINE_EXCEEDED"]
 
-    async def test_the_server_waits_for_their_end(self) -> None:
+    async def test_a_drain_waits_for_them(self) -> None:
         numbers = Numbers(1, "wait")
         async with serving(numbers, Counted()) as (channel, guard):
             call = watching(channel, method=FINITE)
@@ -303,15 +299,7 @@ class TestStreamsThatComeToAnEnd:
             await asyncio.wait_for(idle, LIMIT_S)
             assert numbers.is_closed
 
-    async def test_an_error_after_a_message_is_told_with_details(self) -> None:
-        counted, seen = Counted(), list[int]()
-        async with serving(Numbers(1, FailedPrecondition("not now")), counted) as (channel, _):
-            with pytest.raises(grpc.RpcError) as caught:
-                await read(watching(channel, method=FINITE), seen)
-        assert (from_rpc_error(caught.value).reason, seen) == ("FAILED_PRECONDITION", [1])
-
-    async def test_what_was_made_in_time_waits_for_a_slow_reader(self, caplog: pytest.LogCaptureFixture) -> None:
-        """The servicer is through with it long before, and the caller is told no other end later."""
+    async def test_messages_in_time_wait_for_a_slow_reader(self, caplog: pytest.LogCaptureFixture) -> None:
         with caplog.at_level("WARNING"):
             counted, numbers = Counted(), Large(8)
             async with serving(numbers, counted, default_deadline_s=0.2) as (channel, _):
@@ -324,8 +312,7 @@ class TestStreamsThatComeToAnEnd:
             assert counted.handled == ["OK"]
         assert not caplog.records
 
-    async def test_the_request_does_not_wait_for_who_reads_slowly(self) -> None:
-        """It is a photograph."""
+    async def test_a_slow_reader_does_not_keep_the_request_in_memory(self) -> None:
         requests: list[weakref.ref[Asked]] = []
 
         def understand(data: bytes) -> Any:
@@ -343,7 +330,7 @@ class TestStreamsThatComeToAnEnd:
 
     async def test_one_that_expired_before_it_began_leaves_nothing(self) -> None:
         def authenticate(*_: Any) -> Principal:
-            time.sleep(0.15)  # at the door, and with the message
+            time.sleep(0.15)  # with the headers, and with the message
             return Principal()
 
         with warnings.catch_warnings(record=True) as told:
@@ -356,7 +343,7 @@ class TestStreamsThatComeToAnEnd:
             gc.collect()
         assert not told
 
-    async def test_who_was_let_in_is_answered(self) -> None:
+    async def test_the_caller_is_authenticated_twice_only(self) -> None:
         asked = []
 
         def authenticate(*_: Any) -> Principal:
@@ -365,12 +352,12 @@ class TestStreamsThatComeToAnEnd:
 
         async with serving(Numbers(2), Counted(), authenticate=authenticate) as (channel, _):
             assert await read(watching(channel, method=FINITE)) == [1, 2]
-        assert len(asked) == 2  # at the door, and with the message
+        assert len(asked) == 2  # with the headers, and with the message
 
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> Iterator[None]:
-    """A server that waits for no reader, and has nothing to complain of."""
+    """A server with short limits for readers, which logs no warning."""
     for limit in ("SEND_LIMIT_S", "ENDLESS_SEND_LIMIT_S"):
         monkeypatch.setattr(rpc, limit, 0.1)
     monkeypatch.setattr(sending, "_STATUS_LIMIT_S", 0.1)
@@ -381,11 +368,11 @@ def impatient(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture)
 
 @pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("method", [METHOD, FINITE])
-class TestWhoReadsTooSlowly:
-    """No deadline ends it: its messages were made in time, and the caller gave none."""
+class TestSlowReaders:
+    """The call has no deadline."""
 
     @pytest.mark.parametrize("read_before", [0, 1])
-    async def test_is_told_when_it_reads_again_and_holds_no_call(self, method: str, read_before: int) -> None:
+    async def test_one_gets_the_error_when_it_reads_again(self, method: str, read_before: int) -> None:
         counted, numbers = Counted(), Large(8)
         async with serving(numbers, counted) as (channel, guard):
             before = len(asyncio.all_tasks())
@@ -404,7 +391,7 @@ class TestWhoReadsTooSlowly:
         assert seen == [read_before + 1]
         assert counted.handled == ["DEADLINE_EXCEEDED"]
 
-    async def test_leaves_nothing_behind_when_it_never_reads_and_goes(self, method: str) -> None:
+    async def test_one_that_leaves_without_reading_leaves_no_task(self, method: str) -> None:
         counted = Counted()
         async with serving(Large(8), counted) as (channel, _):
             before = len(asyncio.all_tasks())

@@ -1,18 +1,14 @@
-"""Before the first call is taken a photograph is localized: rendered, with a known pose, by everything that is real.
-
-So what is broken shows at the start, in one sentence, and not in the calls; and while that lasts, the server says so.
-"""
+"""The warm-up localizes a rendered photograph of known pose; a failure ends the start with one sentence."""
 
 from __future__ import annotations
 
-import asyncio
 import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -41,6 +37,7 @@ from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Result, Tier
 from mapless_server.engine.queue_engine import QueueEngine
+from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
@@ -55,28 +52,31 @@ from mapless_server.store import Store
 
 LIMIT_S = 60.0
 TRUTH = np.array([0.25, 0.025, 0.0])
-"""Where the rendered photograph was taken, from what `warm_up` says of it."""
+"""Camera centre of the rendered photograph, see `warm_up`."""
 
 
-def test_the_real_method_localizes_the_rendered_scene(tmp_path: Path) -> None:
+@asynccontextmanager
+async def warm(folder: Path, tiers: Sequence[Tier], method: Method | None = None) -> AsyncIterator[QueueEngine]:
+    """An engine that is about to be warmed up; it is when the block is left."""
+    with Store.open(folder) as store:
+        engine = engine_over(store, tiers, EngineOptions(), method=method)
+        try:
+            yield engine
+            await warm_up(engine)
+        finally:
+            await engine.close()
+
+
+async def test_the_real_method_localizes_the_rendered_scene(tmp_path: Path) -> None:
     results: list[Result] = []
+    async with warm(tmp_path, make_tiers(Settings(data_dir=tmp_path))) as engine:
+        run = engine.run
 
-    async def test() -> None:
-        with Store.open(tmp_path) as store:
-            engine = engine_over(store, make_tiers(Settings(data_dir=tmp_path)), EngineOptions())
-            run = engine.run
+        async def watched(job: Job) -> Result:
+            results.append(await run(job))
+            return results[-1]
 
-            async def watched(job: Job) -> Result:
-                results.append(await run(job))
-                return results[-1]
-
-            engine.run = watched  # type: ignore[method-assign]
-            try:
-                await warm_up(engine)
-            finally:
-                await engine.close()
-
-    asyncio.run(test())
+        engine.run = watched  # type: ignore[method-assign]
     assert len(results) == ROUNDS
     for result in results:
         found = result.answer.outcome
@@ -86,22 +86,13 @@ def test_the_real_method_localizes_the_rendered_scene(tmp_path: Path) -> None:
         assert found.covariance is not None
 
 
-def test_every_tier_is_asked_for_its_view_of_the_references(tmp_path: Path) -> None:
-    """Whatever a network needs once, it needs before the first call."""
+async def test_every_tier_describes_the_references(tmp_path: Path) -> None:
+    """So that its network is loaded before the first call."""
     extractors = [StandInExtractor(f"stand-in {i}") for i in range(2)]
-
-    async def test() -> None:
-        with Store.open(tmp_path) as store:
-            tiers = [Tier(it, Pipeline(cast(Any, StandInReconstructor()))) for it in extractors]
-            engine = engine_over(store, tiers, EngineOptions(), method=whole(lambda *_: answer_at(TRUTH)))
-            try:
-                await warm_up(engine)
-            finally:
-                await engine.close()
-
-    asyncio.run(test())
-    for extractor in extractors:
-        assert len(extractor.seen) >= 3
+    tiers = [Tier(it, Pipeline(cast(Any, StandInReconstructor()))) for it in extractors]
+    async with warm(tmp_path, tiers, whole(lambda *_: answer_at(TRUTH))):
+        pass
+    assert all(len(extractor.seen) >= 3 for extractor in extractors)
 
 
 def answer_at(centre: NDArray[np.float64]) -> Answer:
@@ -117,8 +108,10 @@ def engine_of(localize: Callable[..., Answer], begin: Callable[[], object] = lam
     return make
 
 
-def test_the_queue_expects_the_duration_of_the_last_round(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Kernels are compiled and pages are read in the first."""
+async def test_the_queue_expects_the_duration_of_the_last_round(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first one compiles kernels and reads pages."""
     seen: list[tuple[str, str, float]] = []
     observe = CostModel.observe
 
@@ -132,22 +125,15 @@ def test_the_queue_expects_the_duration_of_the_last_round(tmp_path: Path, monkey
         time.sleep(0.0 if any(stage == "refine" for stage, _, _ in seen) else 0.3)
         return answer_at(TRUTH)
 
-    async def test() -> None:
-        with Store.open(tmp_path) as store:
-            tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
-            engine = engine_over(store, tiers, EngineOptions(), method=whole(localize))
-            try:
-                await warm_up(engine)
-            finally:
-                await engine.close()
-            assert [stage for stage, _, _ in seen] == ["prepare", "coarse", "refine"] * ROUNDS
-            for stage, kind, seconds in seen[-3:]:
-                assert engine.queue._scheduler.costs.predict(stage, kind) == pytest.approx(seconds)
-
-    asyncio.run(test())
+    tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
+    async with warm(tmp_path, tiers, whole(localize)) as engine:
+        pass
+    assert [stage for stage, _, _ in seen] == ["prepare", "coarse", "refine"] * ROUNDS
+    for stage, kind, seconds in seen[-3:]:
+        assert engine.queue._scheduler.costs.predict(stage, kind) == pytest.approx(seconds)
 
 
-def test_the_servers_own_localization_is_charged_to_nobody(tmp_path: Path) -> None:
+def test_the_warm_up_is_charged_to_no_tenant(tmp_path: Path) -> None:
     """However little computing a tenant may use, and however long the first photograph takes."""
 
     def localize(*_: Any) -> Answer:
@@ -183,15 +169,15 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("way", BROKEN)
-def test_a_method_that_is_broken_ends_the_start(tmp_path: Path, way: str) -> None:
-    localize, told = BROKEN[way]
+def test_a_broken_method_ends_the_start(tmp_path: Path, way: str) -> None:
+    localize, message = BROKEN[way]
     settings = Settings(host="127.0.0.1", port=0, data_dir=tmp_path, metrics=False)
     with (
         pytest.raises(StartupError, match="the first localization failed") as caught,
         listening(settings, Store.open(tmp_path), engine_of(localize)),
     ):
         raise AssertionError("it began to serve")
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -203,7 +189,7 @@ def free_port() -> int:
 
 @contextmanager
 def starting(folder: Path, make: MakeEngine) -> Iterator[tuple[str, Callable[[], None]]]:
-    """The address of a server that starts, and what waits until it has."""
+    """The address of a server that starts, and a function that waits until it serves."""
     port = free_port()
     settings = Settings(host="127.0.0.1", port=port, data_dir=folder, metrics=False)
     with ThreadPoolExecutor(1) as thread, ExitStack() as stack:
@@ -212,7 +198,7 @@ def starting(folder: Path, make: MakeEngine) -> Iterator[tuple[str, Callable[[],
 
 
 @pytest.mark.parametrize("phase", ["the engine is made", "the first photograph is localized"])
-def test_a_server_that_starts_says_so_and_then_serves(tmp_path: Path, phase: str) -> None:
+def test_a_starting_server_rejects_calls_and_then_serves(tmp_path: Path, phase: str) -> None:
     began, gate = threading.Event(), threading.Event()
 
     def hold() -> None:
