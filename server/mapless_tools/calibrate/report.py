@@ -159,8 +159,7 @@ def to_json(report: CalibrationReport) -> dict[str, Any]:
         "stored": report.stored,
         "held": [_held(it) for it in found.held],
         "reliability": {kind: _reliability(report, kind) for kind in ("position", "rotation")},
-        "right": {"position_m": report.right.position_m, "rotation_deg": report.right.rotation_deg}
-        | _share(found.right),
+        "right": asdict(report.right) | _share(found.right),
         "auroc": finite(found.auroc),
         "risk_coverage": [asdict(point) for point in found.trusted],
         "rules": [*RULES],
@@ -174,24 +173,11 @@ def _excess(outcome: Outcome) -> float:
 
 
 def _held(it: Held) -> dict[str, Any]:
-    after = None if it.after is None else _share(it.after)
-    return {
-        "claim": it.claim,
-        "probability": it.probability,
-        "before": _share(it.before),
-        "factor": it.factor,
-        "after": after,
-    }
+    return asdict(it) | {"before": _share(it.before), "after": it.after and _share(it.after)}
 
 
 def _share(share: Share) -> dict[str, Any]:
-    return {
-        "part": share.part,
-        "whole": share.whole,
-        "share": finite(share.value),
-        "low": share.low,
-        "high": share.high,
-    }
+    return asdict(share) | {"share": finite(share.value)}
 
 
 def _reliability(report: CalibrationReport, kind: str) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from .averages import Average, Group
@@ -82,45 +83,32 @@ def format_median(translation_cm: float, rotation_deg: float) -> str:
 
 
 def _dense(group: Group) -> Table:
-    paper = group.benchmark.paper if group.benchmark else None
     names = group.benchmark.scenes if group.benchmark else {}
     scenes = tuple(dict.fromkeys((*names, *group.scenes)))
-    rows = [
-        Row(
-            (
-                _ours(m),
-                *(_median(group.summaries.get((s, DENSE, m))) for s in scenes),
-                _average(group.average(DENSE, m)),
-            ),
-            OURS,
-        )
-        for m in group.methods
-    ]
-    for method in reversed(paper.methods if paper else ()):
-        cells = (*(_papers(method.scenes.get(scene)) for scene in scenes), _papers(method.average.get(DENSE)))
-        rows.append(Row((_theirs(method), *cells), PAPERS if method.variant else RIVAL))
+    rows = []
+    for m in group.methods:
+        medians = (_median(group.summaries.get((scene, DENSE, m))) for scene in scenes)
+        rows.append(Row((_ours(m), *medians, _average(group.average(DENSE, m))), OURS))
+    for method in _paper_methods(group):
+        medians = (_papers(method.scenes.get(scene)) for scene in scenes)
+        rows.append(_paper_row(method, *medians, _papers(method.average.get(DENSE))))
     head = ("method", *(names.get(scene, scene) for scene in scenes), "average")
-    notes = [f'Of the paper: its table "{paper.dense_table}".'] if paper else []
+    notes = [f'Of the paper: its table "{group.benchmark.paper.dense_table}".'] if group.benchmark else []
     return Table("Dense: median error, cm/°", head, tuple(rows), (*notes, *_average_notes(group)))
 
 
 def _by_setting(group: Group) -> Table:
-    paper = group.benchmark.paper if group.benchmark else None
-    rows = [
-        Row((_ours(m), *(_average(group.average(setting, m)) for setting in group.settings)), OURS)
-        for m in group.methods
-    ]
-    for method in reversed(paper.methods if paper else ()):
+    rows = [_average_row(group, _ours(m), m) for m in group.methods]
+    for method in _paper_methods(group):
         if any(setting in method.average for setting in group.settings if setting != DENSE):
             cells = (_papers(method.average[s], FAILED) if s in method.average else NOTHING for s in group.settings)
-            rows.append(Row((_theirs(method), *cells), PAPERS if method.variant else RIVAL))
-    notes = [f'Of the paper: its table "{paper.sparse_table}"; failed: in at least one scene.'] if paper else []
-    return Table(
-        "By number of references: mean over scenes of the median error, cm/°",
-        ("method", *map(setting_name, group.settings)),
-        tuple(rows),
-        (*notes, *_average_notes(group)),
-    )
+            rows.append(_paper_row(method, *cells))
+    title = "By number of references: mean over scenes of the median error, cm/°"
+    notes: list[str] = []
+    if group.benchmark:
+        notes = [f'Of the paper: its table "{group.benchmark.paper.sparse_table}"; failed: in at least one scene.']
+    head = ("method", *map(setting_name, group.settings))
+    return Table(title, head, tuple(rows), (*notes, *_average_notes(group)))
 
 
 def _recall(group: Group) -> Table:
@@ -132,10 +120,10 @@ def _recall(group: Group) -> Table:
                 shares = (f"{100 * share:.1f}" for share in average.recall.values())
                 localized = f"{average.localized} of {average.queries}"
                 rows.append(Row((f"{_ours(method)}, {setting_name(setting)}", *shares, localized), OURS))
-    for paper in reversed(group.benchmark.paper.methods if group.benchmark else ()):
+    for paper in _paper_methods(group):
         if paper.recall_percent:
             shares = (f"{paper.recall_percent[bar]:g}" if bar in paper.recall_percent else NOTHING for bar in _BARS)
-            rows.append(Row((f"{_theirs(paper)}, dense", *shares, NOTHING), PAPERS if paper.variant else RIVAL))
+            rows.append(_paper_row(paper, *shares, NOTHING, setting=", dense"))
     head = ("method", *(bar.replace("_", ", ").replace("deg", "°").replace("cm", " cm") for bar in _BARS), "localized")
     return Table("Share of queries within, %", head, tuple(rows), _average_notes(group))
 
@@ -158,10 +146,7 @@ def _scales(group: Group) -> Table:
     last = group.methods[-1].variant
     backends = {result.backend for run in group.runs.values() for result in run.results}
     methods = [method for method in group.methods if method.variant == last]
-    rows = [
-        Row((method.scale, *(_average(group.average(setting, method)) for setting in group.settings)), OURS)
-        for method in methods
-    ]
+    rows = [_average_row(group, method.scale, method) for method in methods]
     return Table(
         f"Ablation of the scale, variant {last}: mean over scenes of the median error, cm/°",
         ("scale", *map(setting_name, group.settings)),
@@ -204,8 +189,17 @@ def _ours(method: Method) -> str:
     return f"mapless {method.label}"
 
 
-def _theirs(method: PaperMethod) -> str:
-    return f"{method.name} (paper)"
+def _average_row(group: Group, name: str, method: Method) -> Row:
+    return Row((name, *(_average(group.average(setting, method)) for setting in group.settings)), OURS)
+
+
+def _paper_methods(group: Group) -> Sequence[PaperMethod]:
+    """The paper's own first, then the rivals from the best down."""
+    return group.benchmark.paper.methods[::-1] if group.benchmark else ()
+
+
+def _paper_row(method: PaperMethod, *cells: str, setting: str = "") -> Row:
+    return Row((f"{method.name} (paper){setting}", *cells), PAPERS if method.variant else RIVAL)
 
 
 def _median(summary: Summary | None) -> str:
