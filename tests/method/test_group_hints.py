@@ -9,7 +9,7 @@ from support.groups import NOTHING
 from support.scenes import make_scene, random_for
 
 from mapless_server.method.answer import Answer
-from mapless_server.method.groups.hints import hinted_group
+from mapless_server.method.groups.checks import hinted_group
 from mapless_server.method.groups.images import rejection_without_matches
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 

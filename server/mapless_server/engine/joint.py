@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from mapless.geometry import RigidTransform
-from mapless_server.method.groups.checks import check_mounting, check_unit
-from mapless_server.method.groups.hints import hinted_group
+from mapless_server.method.groups.checks import check_mounting, check_unit, hinted_group
 from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOptions, solve_sequence

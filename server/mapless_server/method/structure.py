@@ -21,7 +21,6 @@ from mapless.geometry import Array
 
 from .arrays import AnyArray, length, namespace
 from .correspond import Correspondences
-from .keypoints import keypoint_depths, keypoint_offsets, keypoint_rays
 from .observations import (
     FIRST_GUESS,
     ONE_PIXEL,
@@ -35,7 +34,7 @@ from .observations import (
 from .options import check_bounds
 from .reconstruction import Reconstruction
 from .results import KeypointNoise, MetricScale, Structure
-from .tracks import Tracks, build_tracks
+from .tracks import Tracks, build_tracks, keypoint_depths, keypoint_offsets, keypoint_rays
 from .views import PosedView
 
 

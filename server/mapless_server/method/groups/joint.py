@@ -21,9 +21,8 @@ from mapless.geometry import Array, RigidTransform
 from ..optimize import MinimizeOptions, minimize
 from ..pnp import reprojection_errors_px
 from ..results import PointMatches
-from .freedom import F, Freedom
 from .images import MatchedImage, PosedImage
-from .problem import GroupProblem, JointOptions
+from .problem import F, Freedom, GroupProblem, JointOptions
 
 __all__ = ["Freedom", "JointEstimate", "JointOptions", "adjust_in_rounds", "adjust_jointly", "covariance_in_world"]
 

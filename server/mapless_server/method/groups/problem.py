@@ -2,24 +2,119 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Generic
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array
+from mapless.geometry import Array, RigidTransform
 
 from ..adjust import AdjustOptions
 from ..bundle import Bundle, BundleProblem, NormalEquations, Poses, bundle_of, reference_information
 from ..optimize import solve_step
 from ..options import check_bounds
+from ..pnp import reprojection_errors_px
 from ..results import PointMatches
+from ..tracks import Tracks
+from ..uncertainty.linearization import tracks_with_query
 from ..views import PosedView
-from .freedom import F, Freedom
 from .images import MatchedImage
-from .parts import Part, Shared, part_of
+
+F = TypeVar("F", bound="Freedom")
+
+
+class Freedom(Protocol):
+    """How the photographs of a group may move, and what holds them together; a point in its parameters' space.
+
+    Attributes:
+        size: number N of parameters.
+    """
+
+    @property
+    def size(self) -> int:
+        """See the class."""
+        ...
+
+    def camera_from_world(self, image: int) -> RigidTransform:
+        """Of one photograph."""
+        ...
+
+    def jacobian(self, image: int) -> Array:
+        """(6, N): the left perturbation (v, w) of its camera_from_world by the parameters."""
+        ...
+
+    def moved(self: F, step: Array) -> F:
+        """After a step (N,) of the parameters."""
+        ...
+
+    def relaxed(self: F) -> F:
+        """The same point, with what holds the photographs together believed as far as it has turned out to be true."""
+        ...
+
+    def cost(self) -> float:
+        """Of what holds the photographs together."""
+        ...
+
+    def equations(self) -> tuple[Array, Array]:
+        """J^T J (N, N) and J^T r (N,) of the same."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What a photograph contributes.
+
+    Attributes:
+        source: the photograph.
+        world_from_camera: its pose at the start.
+        chosen: (P_b,) points of its structure that it is matched with.
+        tracks: of these, over its references and, last, the photograph itself.
+    """
+
+    source: MatchedImage
+    world_from_camera: RigidTransform
+    chosen: NDArray[np.intp]
+    tracks: Tracks
+
+
+def part_of(
+    source: MatchedImage, matches: PointMatches, freedom: Freedom, max_error_px: float, max_matches: int
+) -> Part:
+    """With the matches that are near enough, evenly thinned."""
+    structure, pose = source.structure, freedom.camera_from_world(source.image).inverse()
+    pixels = source.query.features.keypoints[matches.keypoint].astype(np.float64)
+    errors_px = reprojection_errors_px(source.query.camera, pose, structure.x_in_world[matches.point], pixels)
+    used = np.flatnonzero(errors_px < max_error_px)
+    used = used[:: max(1, -(-len(used) // max_matches))]
+    tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(source.references))
+    return Part(source, pose, np.flatnonzero(chosen), tracks)
+
+
+class Shared:
+    """How often measurements of keypoints stand in a group."""
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self._times: Counter[object] = Counter()
+        for part in parts:
+            self._times.update(_measurements(part))
+
+    def times(self, part: Part) -> Array:
+        """(O,) of a part's observations."""
+        return np.array([self._times[it] for it in _measurements(part)], np.float64)
+
+
+def _measurements(part: Part) -> list[object]:
+    """What identifies each observation: the photograph and the keypoint."""
+    views = [it.view for it in part.source.references]
+    # A photograph of the group that was sent twice was measured once.
+    names: list[object] = [it.key for it in part.source.references]
+    names.append(part.source.query.features.keypoints.tobytes())
+    keypoints = [it.features.keypoints for it in (*views, part.source.query)]
+    rows = zip(part.tracks.view.tolist(), part.tracks.keypoint.tolist(), strict=True)
+    return [(names[v], *keypoints[v][k].tolist()) for v, k in rows]
 
 
 @dataclass(frozen=True)

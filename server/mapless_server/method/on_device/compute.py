@@ -11,11 +11,11 @@ from mapless.geometry import Camera
 
 from ..arrays import AnyArray
 from ..coarse.device import DeviceReconstruction
-from ..keypoints import positive
 from ..match import MatchOptions
 from ..observations import back_project
 from ..scale_equations import Known, Predicted, ScaleCandidates, ScaleOptions, scale_candidates
 from ..structure import StructureOptions, refine_points
+from ..tracks import positive
 from .match import DevicePoints, MatchInputs, match_on_device
 from .structure import DeviceTracks, StructureInputs, observe_on_device
 

@@ -17,8 +17,8 @@ from mapless.geometry import Camera
 
 from ..arrays import AnyArray, normalize
 from ..correspond import Correspondences
-from ..keypoints import keypoint_offsets
 from ..match import MatchOptions
+from ..tracks import keypoint_offsets
 from ..views import PosedView, View
 
 CHUNK_ELEMENTS = 2**25

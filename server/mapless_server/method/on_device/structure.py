@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..arrays import AnyArray
-from ..keypoints import keypoint_offsets, keypoint_rays
 from ..observations import Observations
 from ..results import KeypointNoise
-from ..tracks import Tracks
+from ..tracks import Tracks, keypoint_offsets, keypoint_rays
 from ..views import PosedView
 
 
