@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
@@ -26,12 +26,12 @@ from mapless.scenes import Vector, unit_vector
 FILE_NAME = "cameras.json"
 MAX_NAME_LENGTH = 128
 MAX_SIDE_PX = 2**30
-"""No image's: what arithmetic with doubles and 32 bits takes without complaint."""
+"""More than any image's, and few enough for arithmetic with doubles and 32 bits."""
 SPLITS = ("", "train", "test")
-_MAX_TOLD = 1000
-"""Characters of what is told of a file's content, which may be anything and of any length."""
+_MAX_QUOTED = 1000
+"""Characters that messages quote of a file's content, which may be anything and of any length."""
 
-Told = TypeVar("Told")
+Parsed = TypeVar("Parsed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class Dataset:
         ground_truth: how the poses were found ("SfM (COLMAP)", "KinectFusion"); empty if the file does not say.
         format: name of the layout it was read from.
         refused: frames that are not among `frames`, and why.
-        notes: what a person should know of how it was read: a choice made for them, a unit that is not metres.
+        notes: how it was read, for the user: a choice that was made, a unit that is not metres.
         datum: where the world is on the Earth; None if the file does not say.
         down_in_world: unit vector to where things fall, likewise.
     """
@@ -105,35 +105,19 @@ class Dataset:
 
 def printable(text: str) -> str:
     """A text that quotes what others wrote, as a terminal can show it: cut, and with nothing that moves the cursor."""
-    text = text if len(text) <= _MAX_TOLD else f"{text[:_MAX_TOLD]}..."
+    text = text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}..."
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
-def read_folder(path: Path) -> Dataset:
+def read_folder(path: Path, skips_unusable: bool = False) -> Dataset:
     """Read the frames of a folder; images are not opened.
+
+    Args:
+        path: the folder.
+        skips_unusable: whether frames that are malformed are only listed in `refused`, as long as another one is not.
 
     Raises:
         ValueError: no `cameras.json`, or something in it is missing or malformed; the message names frame and field.
-    """
-    file = path / FILE_NAME
-    content = read_content(path)
-    frames: list[Frame] = []
-    taken: set[str] = set()
-    for index, entry in enumerate(content["frames"]):
-        try:
-            frame = read_frame(path, entry, taken)
-        except ValueError as error:
-            raise ValueError(f"{file}: {frame_label(index, entry)}: {error}") from error
-        taken.add(frame.name)
-        frames.append(frame)
-    return dataset_of(path, content, frames)
-
-
-def read_content(path: Path) -> dict[str, Any]:
-    """What `cameras.json` of a folder holds; its frames are a list that nobody has looked into.
-
-    Raises:
-        ValueError: the file cannot be read, is not JSON, or holds no frames; the message names it.
     """
     file = path / FILE_NAME
     content = read_json(file)
@@ -141,7 +125,38 @@ def read_content(path: Path) -> dict[str, Any]:
         raise ValueError(f"{file}: frames must be a list with at least one frame")
     if not isinstance(content.get("metric", True), bool):
         raise ValueError(f"{file}: metric must be true or false")
-    return content
+    frames: list[Frame] = []
+    refused: list[Refusal] = []
+    names: set[str] = set()
+    images: set[Path] = set()
+    for index, entry in enumerate(content["frames"]):
+        image = entry.get("image", "?") if isinstance(entry, dict) else "?"
+        label = f"frames[{index}] ({image})"
+        try:
+            frame = read_frame(path, entry, names)
+            if frame.image_path in images:
+                raise ValueError(f"image: {image!r} is named twice")
+        except ValueError as error:
+            if not skips_unusable:
+                raise ValueError(f"{file}: {label}: {error}") from error
+            refused.append(Refusal(f"{FILE_NAME}: {label}", str(error)))
+            continue
+        names.add(frame.name)
+        images.add(frame.image_path)
+        frames.append(frame)
+    if not frames:
+        first = refused[0]
+        raise ValueError(f"{path}: none of {len(refused)} frames can be used; {first.frame}: {first.reason}")
+    return Dataset(
+        path.resolve().name,
+        tuple(frames),
+        content.get("metric", True),
+        _text(content, "source"),
+        _text(content, "ground_truth"),
+        refused=tuple(refused),
+        datum=_parsed(path, content, "datum", Datum.from_json),
+        down_in_world=_parsed(path, content, "down_in_world", _direction),
+    )
 
 
 def read_json(file: Path) -> Any:
@@ -154,28 +169,12 @@ def read_json(file: Path) -> Any:
         raise ValueError(f"{file} is not JSON: {error}") from error
 
 
-def dataset_of(
-    path: Path, content: Mapping[str, Any], frames: Sequence[Frame], refused: Sequence[Refusal] = ()
-) -> Dataset:
-    """Frames and what `cameras.json` says of them all; ValueError names what it says wrongly."""
-    return Dataset(
-        path.resolve().name,
-        tuple(frames),
-        content.get("metric", True),
-        _text(content, "source"),
-        _text(content, "ground_truth"),
-        refused=tuple(refused),
-        datum=_told(path, content, "datum", Datum.from_json),
-        down_in_world=_told(path, content, "down_in_world", _direction),
-    )
-
-
 def _text(content: Mapping[str, Any], field: str) -> str:
-    told = content.get(field, "")
-    return printable(told) if isinstance(told, str) else ""
+    text = content.get(field, "")
+    return printable(text) if isinstance(text, str) else ""
 
 
-def _told(path: Path, content: Mapping[str, Any], field: str, read: Callable[[object], Told]) -> Told | None:
+def _parsed(path: Path, content: Mapping[str, Any], field: str, read: Callable[[object], Parsed]) -> Parsed | None:
     if content.get(field) is None:
         return None
     try:
@@ -187,11 +186,6 @@ def _told(path: Path, content: Mapping[str, Any], field: str, read: Callable[[ob
 def _direction(content: object) -> Vector:
     x, y, z = _numbers({"it": content}, "it", (3,)).tolist()
     return unit_vector(x, y, z)
-
-
-def frame_label(index: int, entry: object) -> str:
-    """How messages call an entry of `frames`."""
-    return f"frames[{index}] ({entry.get('image', '?') if isinstance(entry, dict) else '?'})"
 
 
 def reference_id(image: str, taken: Container[str]) -> str:

@@ -88,5 +88,9 @@ def test_names_are_legal_and_unique(tmp_path: Path) -> None:
     assert reference_id("images/frame-000001.color.jpg", set()) == "frame-000001.color"
     assert reference_id("images/.a b..é-.png", set()) == "_a_b___"
     assert reference_id("other/a.jpg", {"a", "a_2"}) == "a_3"
-    frames = read_folder(write(tmp_path, entry(), entry(), entry())).frames
+    images = ["images/a.jpg", "left/a.jpg", "right/a.jpg"]
+    for image in images:
+        (tmp_path / image).parent.mkdir()
+        (tmp_path / image).write_bytes(b"not opened")
+    frames = read_folder(write(tmp_path, *(entry(image=image) for image in images))).frames
     assert [frame.name for frame in frames] == ["a", "a_2", "a_3"]

@@ -92,7 +92,7 @@ def test_cameras_json_keeps_what_is_usable_and_names_the_rest(tmp_path: Path) ->
     for reason, part in zip(why, expected, strict=True):
         assert part in reason
     assert "frames[4] (images/0.png)" in next(iter(reasons(dataset)))
-    with pytest.raises(ValueError, match=r"cameras\.json: frames\[5\].*leads out"):
+    with pytest.raises(ValueError, match=r"cameras\.json: frames\[4\].*named twice"):
         read_folder(tmp_path)  # what we wrote ourselves is right, or not ours
 
 
