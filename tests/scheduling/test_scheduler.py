@@ -1,8 +1,9 @@
-"""The schedule's laws, on a virtual clock with toy stages, under every order of events that can be thought of."""
+"""Laws of the scheduler, on a virtual clock with toy stages, in any order of events."""
 
 from __future__ import annotations
 
 import gc
+import math
 import weakref
 from collections import Counter
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from support.queues import CountingObserver
 
 from mapless_server.scheduling import (
     Abandoned,
@@ -22,7 +24,6 @@ from mapless_server.scheduling import (
     Flow,
     Job,
     Next,
-    Observer,
     Refusal,
     Refused,
     Stage,
@@ -45,37 +46,27 @@ OPTIONS = WorkQueueOptions(max_queued_s=2.0, max_bytes=1000, quantum_s=0.2)
 FAR_S = 1e6
 
 
-class Counting(Observer):
-    """Keeps what it hears."""
+class PlantedQuota:
+    """Admits so many jobs, and keeps what is charged and settled."""
 
-    def __init__(self) -> None:
-        self.refusals: Counter[Refusal] = Counter()
-        self.endings: Counter[Ending] = Counter()
-        self.depth: dict[str, int] = {}
-        self.inflight: dict[str, int] = {}
-        self.admissions = 0
+    def __init__(self, admitted: float = math.inf) -> None:
+        self.admitted = admitted
+        self.charged: list[float] = []
+        self.settled: list[tuple[float, float]] = []
 
-    def admitted(self, cost_s: float) -> None:
-        self.admissions += 1
+    def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
+        self.charged.append(cost_s)
+        return 0.0 if len(self.charged) <= self.admitted else 7.0
 
-    def refused(self, reason: Refusal) -> None:
-        self.refusals[reason] += 1
-
-    def queued(self, stage: str, jobs: int, cost_s: float) -> None:
-        self.depth[stage] = jobs
-
-    def running(self, stage: str, jobs: int) -> None:
-        self.inflight[stage] = jobs
-
-    def ended(self, stage: str, ending: Ending) -> None:
-        self.endings[ending] += 1
+    def settle(self, tenant: str, predicted_s: float, actual_s: float, now_s: float) -> None:
+        self.settled.append((predicted_s, actual_s))
 
 
 class Toy:
-    """A schedule that knows what its stages cost, and the jobs that were put to it."""
+    """A scheduler that has learned what its stages cost, and its jobs."""
 
     def __init__(self, options: WorkQueueOptions = OPTIONS, quota: Any = None) -> None:
-        self.observer = Counting()
+        self.observer = CountingObserver()
         self.scheduler = Scheduler(STAGES, LANES, options, self.observer, quota=quota)
         for stage, cost_s in COST_S.items():
             self.scheduler.costs.observe(stage, "toy", cost_s)
@@ -132,17 +123,25 @@ def onward(job: Job, fallback: Fallback | None = None) -> StageResult:
     return Next(Step(stage.then, "toy", job.step.bucket, job.step.payload), fallback)
 
 
-def run_through(toy: Toy, most_batches: int = 1000) -> list[tuple[str, int]]:
-    """Computes until nothing waits; stage and payload of what was computed, in order."""
-    done: list[tuple[str, int]] = []
-    for _ in range(most_batches):
+def run_through(toy: Toy) -> None:
+    """Computes until nothing waits."""
+    for _ in range(1000):
         batches = [batch for lane in LANES if (batch := toy.scheduler.take(lane, toy.now_s)) is not None]
         if not batches:
-            return done
+            return
         for batch in batches:
-            done += [(batch.stage.name, job.step.payload) for job in batch.jobs]
             toy.finish(batch, *map(onward, batch.jobs))
     raise AssertionError("it never ends")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("max_queued_s", 0.0), ("max_bytes", -1), ("flow_share", 1.1), ("time_margin", 0.9), ("first_stage_interval", 1)],
+)
+def test_an_option_outside_its_bounds_is_named(field: str, value: float) -> None:
+    options: dict[str, Any] = {field: value}
+    with pytest.raises(ValueError, match=f"WorkQueueOptions.{field} must be .*, is {value}"):
+        WorkQueueOptions(**options)
 
 
 class TestAdmission:
@@ -206,19 +205,7 @@ class TestAdmission:
         assert toy.ending_of(before) is Ending.OK
 
     def test_a_tenant_pays_for_what_it_used(self) -> None:
-        class Quota:
-            def __init__(self) -> None:
-                self.charged: list[float] = []
-                self.settled: list[tuple[float, float]] = []
-
-            def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
-                self.charged.append(cost_s)
-                return 0.0 if len(self.charged) < 3 else 7.0
-
-            def settle(self, tenant: str, predicted_s: float, actual_s: float, now_s: float) -> None:
-                self.settled.append((predicted_s, actual_s))
-
-        quota = Quota()
+        quota = PlantedQuota(admitted=2)
         toy = Toy(quota=quota)
         toy.admit()
         cancelled = toy.admit()
@@ -256,7 +243,7 @@ class TestOrder:
             sizes.append(len(batch.jobs))
             toy.finish(batch, *(Done(None) for _ in batch.jobs))
         assert sizes == [3, 3, 1, 1]
-        assert toy.observer.inflight["coarse"] == toy.observer.depth["coarse"] == 0
+        assert toy.observer.inflight["coarse"] == toy.observer.waiting["coarse"] == 0
 
     def test_a_batch_that_did_not_fit_is_not_tried_again(self) -> None:
         toy = Toy(WorkQueueOptions(max_queued_s=1000))
@@ -367,20 +354,12 @@ class TestTime:
         assert toy.ending_of(job) is Ending.OK
 
     def test_whoever_gives_up_while_it_is_computed_pays_for_it(self) -> None:
-        settled: list[tuple[float, float]] = []
-
-        class Quota:
-            def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
-                return 0.0
-
-            def settle(self, tenant: str, predicted_s: float, actual_s: float, now_s: float) -> None:
-                settled.append((predicted_s, actual_s))
-
-        toy = Toy(quota=Quota())
+        quota = PlantedQuota()
+        toy = Toy(quota=quota)
         toy.admit(deadline_s=5.0)
         toy.take("host")
         toy.scheduler.expire(5.0)
-        ((predicted_s, actual_s),) = settled
+        ((predicted_s, actual_s),) = quota.settled
         assert actual_s == predicted_s > 0
 
     def test_more_than_admitted_is_computed_only_where_room_is(self) -> None:
@@ -490,7 +469,7 @@ class Events(RuleBasedStateMachine):
         )
         running = Counter(job_stage for it in self.batches for job_stage in [it.stage.name] * len(it.jobs))
         for stage in COST_S:
-            assert self.toy.observer.depth.get(stage, 0) == waiting[stage]
+            assert self.toy.observer.waiting.get(stage, 0) == waiting[stage]
             assert self.toy.observer.inflight.get(stage, 0) == running[stage]
 
     def teardown(self) -> None:

@@ -1,7 +1,7 @@
-"""The queue's hands: real threads and a real loop, toy stages, and everything that can go wrong in them.
+"""The executor: real threads, a real event loop, toy stages, and all that can go wrong in them.
 
-Whatever happens, every caller is told how its job ended, once; what is guilty fails alone; and nothing stays behind,
-neither jobs nor threads nor tasks. Order, admission and accounts are the schedule's and tested there.
+Every caller learns once how its job ended; a job that fails does so alone; no job, thread or task stays behind. Order,
+admission and bookings are the scheduler's and tested there.
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Callable, Coroutine, Iterable, Sequence
+from dataclasses import replace
+from functools import wraps
+from typing import Any, ParamSpec
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.queues import CountingObserver
 
 from mapless_server.scheduling import (
     Abandoned,
@@ -32,7 +33,6 @@ from mapless_server.scheduling import (
     Flow,
     Job,
     Next,
-    Observer,
     Refusal,
     Refused,
     Stage,
@@ -47,135 +47,114 @@ ROOMY = WorkQueueOptions(max_queued_s=1e6, heartbeat_s=0.05)
 LIMIT_S = 20.0
 FAR_S = 600.0
 MAX_BATCH = 8
-LANES = {"toy-host": 2, "toy-device": 1}
+
+P = ParamSpec("P")
 
 
-class Guilty(Exception):
-    """Planted."""
+class PlantedError(Exception):
+    """Of a job."""
 
 
-class Lost(Exception):
-    """Planted: the device is not to be trusted any more."""
+class LostDevice(Exception):
+    """After which nothing is trusted."""
 
 
 def failure_of(error: Exception) -> Failure:
-    if isinstance(error, Lost):
+    if isinstance(error, LostDevice):
         return Failure.DEVICE_LOST
     return Failure.OUT_OF_MEMORY if isinstance(error, MemoryError) else Failure.JOB_FAILED
 
 
-class Account(Observer):
-    """Keeps what it hears."""
-
-    def __init__(self) -> None:
-        self.admissions = 0
-        self.refusals: Counter[Refusal] = Counter()
-        self.endings: Counter[Ending] = Counter()
-        self.waiting: Counter[str] = Counter()
-        self.inflight: Counter[str] = Counter()
-        self.batches: list[tuple[str, int]] = []
-        self.out_of_memory = 0
-
-    def admitted(self, cost_s: float) -> None:
-        self.admissions += 1
-
-    def refused(self, reason: Refusal) -> None:
-        self.refusals[reason] += 1
-
-    def queued(self, stage: str, jobs: int, cost_s: float) -> None:
-        self.waiting[stage] = jobs
-
-    def running(self, stage: str, jobs: int) -> None:
-        self.inflight[stage] = jobs
-
-    def computed(self, stage: str, bucket: str, jobs: int, seconds: float) -> None:
-        self.batches.append((stage, jobs))
-
-    def ended(self, stage: str, ending: Ending) -> None:
-        self.endings[ending] += 1
-
-    def ran_out_of_memory(self) -> None:
-        self.out_of_memory += 1
+def echo(jobs: Sequence[Job]) -> Sequence[StageResult]:
+    return [Done(job.step.payload) for job in jobs]
 
 
-@dataclass
-class Shop:
-    """A queue of two toy stages, "first" by two threads and "then" in batches by one; `compute` is what both do.
+def then(job: Job, payload: Any = None, fallback: Fallback | None = None) -> Next:
+    """To the second stage."""
+    return Next(Step("then", "toy", "b", job.step.payload if payload is None else payload), fallback)
+
+
+class Toy:
+    """A queue of the stages "first", of two threads, and "then", in batches of one thread; closed at the end.
 
     Attributes:
-        compute: of a batch.
-        observer: of the queue.
-        gate: the jobs whose payload is "plug" hold their thread until it is opened.
-        plugged: released by each of them.
+        compute: computes both stages.
+        gate: opens the threads that are blocked by jobs with the payload "plug".
         seen: payloads in the order in which they were computed, batch by batch.
-        fatals: told to the owner.
+        fatals: that the owner was notified of.
     """
 
-    compute: ComputeBatch = lambda jobs: [Done(job.step.payload) for job in jobs]
-    observer: Observer = field(default_factory=Account)
-    options: WorkQueueOptions = ROOMY
-    gate: threading.Event = field(default_factory=threading.Event)
-    plugged: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
-    seen: list[list[Any]] = field(default_factory=list)
-    fatals: list[Fatal] = field(default_factory=list)
-    _plugs: list[asyncio.Task[Any]] = field(default_factory=list)
+    def __init__(self, compute: ComputeBatch = echo, options: WorkQueueOptions = ROOMY) -> None:
+        self.compute = compute
+        self.options = options
+        self.observer = CountingObserver()
+        self.gate = threading.Event()
+        self.seen: list[list[Any]] = []
+        self.fatals: list[Fatal] = []
+        self._plugged = threading.Semaphore(0)
+        self._plugs: list[asyncio.Task[Any]] = []
 
-    @property
-    def account(self) -> Account:
-        assert isinstance(self.observer, Account)
-        return self.observer
-
-    @asynccontextmanager
-    async def open(self) -> AsyncIterator[WorkQueue]:
-        """The queue, which is closed at the end; then neither threads nor tasks of it may be left."""
+    async def __aenter__(self) -> Toy:
         first, then = Stage("first", "toy-host", "then"), Stage("then", "toy-device", max_batch=MAX_BATCH)
-        queue = WorkQueue({first: self._serve, then: self._serve}, LANES, self.options, self.observer, failure_of)
-        queue.on_fatal = self.fatals.append
-        others = asyncio.all_tasks()
-        try:
-            yield queue
-        finally:
-            self.gate.set()
-            await asyncio.wait_for(queue.close(), LIMIT_S)
-            await outcomes(self._plugs)
-            assert asyncio.all_tasks() <= others
-            assert not [it.name for it in threading.enumerate() if it.name.startswith("toy-")]
-            assert queue.job_count == 0
+        stages, lanes = {first: self._serve, then: self._serve}, {"toy-host": 2, "toy-device": 1}
+        self.queue = WorkQueue(stages, lanes, self.options, self.observer, failure_of)
+        self.queue.on_fatal = self.fatals.append
+        self._others = asyncio.all_tasks()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Neither threads nor tasks may be left."""
+        self.gate.set()
+        await asyncio.wait_for(self.queue.close(), LIMIT_S)
+        await outcomes(self._plugs)
+        assert asyncio.all_tasks() <= self._others
+        assert not [it.name for it in threading.enumerate() if it.name.startswith("toy-")]
+        assert self.queue.job_count == 0
 
     def _serve(self, jobs: Sequence[Job]) -> Sequence[StageResult]:
         payloads = [job.step.payload for job in jobs]
         if payloads == ["plug"]:
-            self.plugged.release()
+            self._plugged.release()
             assert self.gate.wait(LIMIT_S)
             return [Done("plug")]
         self.seen.append(payloads)
         return self.compute(jobs)
 
-    async def plug(self, queue: WorkQueue, stage: str = "then", threads: int = 1) -> list[asyncio.Task[Any]]:
-        """Keeps threads busy until the gate is opened, so that what comes now waits."""
-        plugs = [submit(queue, "plug", stage, client="plug", bucket="plug") for _ in range(threads)]
+    def submit(
+        self, payload: Any, stage: str = "then", *, client: str = "c", bucket: str = "b", lasts_s: float = FAR_S
+    ) -> asyncio.Task[Any]:
+        """A caller that waits for a job; the task's result is the job's."""
+        deadline_s = time.monotonic() + lasts_s
+
+        async def call() -> Any:
+            return await self.queue.run(Job(Flow("t", client), Step(stage, "toy", bucket, payload), deadline_s, 1))
+
+        return asyncio.ensure_future(call())
+
+    async def plug(self, stage: str = "then", threads: int = 1) -> list[asyncio.Task[Any]]:
+        """Keeps threads busy until the gate is opened, so that jobs wait."""
+        plugs = [self.submit("plug", stage, client="plug", bucket="plug") for _ in range(threads)]
         self._plugs += plugs
         for _ in plugs:
-            assert await asyncio.to_thread(self.plugged.acquire, timeout=LIMIT_S)
+            assert await asyncio.to_thread(self._plugged.acquire, timeout=LIMIT_S)
         return plugs
 
+    async def waiting(self, payloads: Iterable[Any], **more: Any) -> list[asyncio.Task[Any]]:
+        """Callers whose jobs all wait for the second stage, behind a plug."""
+        self.gate.clear()
+        await self.plug()
+        calls = [self.submit(payload, **more) for payload in payloads]
+        await self.until_jobs(len(calls) + 1)
+        return calls
 
-def submit(
-    queue: WorkQueue,
-    payload: Any,
-    stage: str = "then",
-    *,
-    client: str = "c",
-    bucket: str = "b",
-    lasts_s: float = FAR_S,
-) -> asyncio.Task[Any]:
-    """A caller that waits for a job; the task's result is the job's."""
-    deadline_s = time.monotonic() + lasts_s
+    async def together(self, payloads: Iterable[Any], **more: Any) -> list[Any]:
+        """Outcomes of jobs that are computed in one batch, as far as it is large enough."""
+        calls = await self.waiting(payloads, **more)
+        self.gate.set()
+        return await outcomes(calls)
 
-    async def call() -> Any:
-        return await queue.run(Job(Flow("t", client), Step(stage, "toy", bucket, payload), deadline_s, 1))
-
-    return asyncio.ensure_future(call())
+    async def until_jobs(self, count: int) -> None:
+        await until(lambda: self.queue.job_count == count)
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -190,597 +169,459 @@ async def outcomes(calls: Sequence[asyncio.Task[Any]]) -> list[Any]:
     return await asyncio.wait_for(asyncio.gather(*calls, return_exceptions=True), LIMIT_S)
 
 
-def run(test: Coroutine[Any, Any, None]) -> None:
-    """Runs it on a loop of its own; whatever the loop is told of and nobody heard is a failure."""
-    unheard: list[dict[str, Any]] = []
+def in_loop(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
+    """Runs a test in an event loop of its own; an exception that reaches only the loop is a failure."""
 
-    async def heard() -> None:
-        asyncio.get_running_loop().set_exception_handler(lambda _, context: unheard.append(context))
-        await test
+    @wraps(test)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> None:
+        unhandled: list[dict[str, Any]] = []
 
-    asyncio.run(heard())
-    assert not unheard
+        async def observed() -> None:
+            asyncio.get_running_loop().set_exception_handler(lambda _, context: unhandled.append(context))
+            await test(*args, **kwargs)
 
+        asyncio.run(observed())
+        assert not unhandled
 
-async def waiting(shop: Shop, queue: WorkQueue, payloads: Sequence[Any], **more: Any) -> list[asyncio.Task[Any]]:
-    """Callers whose jobs all wait for the stage "then", behind a plug."""
-    await shop.plug(queue)
-    calls = [submit(queue, payload, **more) for payload in payloads]
-    await until(lambda: queue.job_count == len(payloads) + 1)
-    return calls
+    return wrapper
 
 
 class TestResults:
-    def test_a_job_goes_through_its_stages_and_its_records_say_when(self) -> None:
+    @in_loop
+    async def test_a_job_goes_through_its_stages_and_its_records_say_when(self) -> None:
         marks: dict[str, tuple[float, float]] = {}
 
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
-            stage = jobs[0].step.stage
-            start_s = time.monotonic()
+            stage, start_s = jobs[0].step.stage, time.monotonic()
             time.sleep(0.01)
             marks[stage] = (start_s, time.monotonic())
-            if stage == "then":
-                return [Done(job.step.payload) for job in jobs]
-            return [Next(Step("then", "toy", "b", job.step.payload)) for job in jobs]
+            return [then(job) if stage == "first" else Done(job.step.payload) for job in jobs]
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                others = await waiting(shop, queue, ["x", "y"])
-                before_s = time.monotonic()
-                job = Job(Flow("t", "c"), Step("first", "toy", "b", "z"), before_s + FAR_S, 1)
-                running = asyncio.ensure_future(queue.run(job))
-                await until(lambda: shop.account.waiting["then"] == 3)
-                shop.gate.set()
-                value = await running
-                await outcomes(others)
-            first, then = job.records
-            assert (value, first.stage, then.stage, first.jobs, then.jobs) == ("z", "first", "then", 1, 3)
-            for visit, (start_s, end_s) in ((first, marks["first"]), (then, marks["then"])):
-                assert visit.queued_s <= visit.start_s <= start_s < end_s <= visit.end_s
-            assert before_s <= first.queued_s
-            assert then.queued_s == first.end_s  # nothing lies between two stages
-            assert shop.account.batches[-1] == ("then", 3)
+        async with Toy(compute) as toy:
+            others = await toy.waiting(["x", "y"])
+            before_s = time.monotonic()
+            job = Job(Flow("t", "c"), Step("first", "toy", "b", "z"), before_s + FAR_S, 1)
+            running = asyncio.ensure_future(toy.queue.run(job))
+            await until(lambda: toy.observer.waiting["then"] == 3)
+            toy.gate.set()
+            value = await running
+            await outcomes(others)
+        first, second = job.records
+        assert (value, first.stage, second.stage, first.jobs, second.jobs) == ("z", "first", "then", 1, 3)
+        for record, (start_s, end_s) in ((first, marks["first"]), (second, marks["then"])):
+            assert record.queued_s <= record.start_s <= start_s < end_s <= record.end_s
+        assert before_s <= first.queued_s
+        assert second.queued_s == first.end_s  # nothing lies between two stages
+        assert toy.observer.batches[-1] == ("then", 3)
 
-        run(test())
-
-    def test_a_batchs_output_is_taken_up_by_as_many_threads_at_once(self) -> None:
-        """One piece of news, work for two."""
+    @in_loop
+    async def test_a_batchs_output_is_taken_up_by_as_many_threads_at_once(self) -> None:
+        """One notification, work for two."""
         both = threading.Barrier(2, timeout=LIMIT_S)
 
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
             if jobs[0].step.stage == "then":
-                time.sleep(0.05)  # until both have heard that there is nothing to do
+                time.sleep(0.05)  # until both threads wait
                 return [Next(Step("first", "toy", "b", job.step.payload)) for job in jobs]
             both.wait()
             return [Done(job.step.payload) for job in jobs]
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                calls = await waiting(shop, queue, range(2))
-                shop.gate.set()
-                assert await outcomes(calls) == [0, 1]
+        async with Toy(compute) as toy:
+            assert await toy.together(range(2)) == [0, 1]
 
-        run(test())
-
-    def test_a_light_caller_does_not_wait_for_a_heavy_ones_jobs(self) -> None:
-        async def test() -> None:
-            shop = Shop()
-            async with shop.open() as queue:
-                plugs = await shop.plug(queue, "first", threads=2)
-                heavy = [submit(queue, f"heavy {i}", "first", client="heavy") for i in range(100)]
-                await until(lambda: queue.job_count == 102)
-                light = submit(queue, "light", "first", client="light")
-                await until(lambda: queue.job_count == 103)
-                shop.gate.set()
-                await outcomes([*plugs, *heavy, light])
-            assert len(shop.seen) == 101
-            assert shop.seen.index(["light"]) < 8
-
-        run(test())
-
-    def test_nor_where_only_what_follows_costs_anything(self) -> None:
-        """A turn is measured by all that it brings about, not by its first stage alone."""
+    @pytest.mark.parametrize("is_first_stage_cheap", [False, True])
+    @in_loop
+    async def test_a_light_caller_does_not_wait_for_a_heavy_ones_jobs(self, is_first_stage_cheap: bool) -> None:
+        """Even if only the second stage takes time: the cost of a turn includes all stages."""
 
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
             if jobs[0].step.stage == "first":
-                return [Next(Step("then", "toy", "b", job.step.payload)) for job in jobs]
+                return [then(job) for job in jobs]
             time.sleep(0.1)
             return [Done(job.step.payload) for job in jobs]
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                for _ in range(3):  # it is learned what they cost
-                    await submit(queue, "first of all", "first")
-                shop.seen.clear()
-                plugs = await shop.plug(queue, "first", threads=2)
-                heavy = [submit(queue, f"heavy {i}", "first", client="heavy") for i in range(40)]
-                await until(lambda: queue.job_count == 42)
-                light = submit(queue, "light", "first", client="light")
-                await until(lambda: queue.job_count == 43)
-                shop.gate.set()
-                await outcomes([*plugs, *heavy, light])
-            assert [it for it in shop.seen if len(it) == 1].index(["light"]) < 10
-
-        run(test())
+        async with Toy(compute if is_first_stage_cheap else echo) as toy:
+            if is_first_stage_cheap:
+                for _ in range(3):  # learns the costs
+                    await toy.submit("first of all", "first")
+            count = 40 if is_first_stage_cheap else 100
+            toy.seen.clear()
+            plugs = await toy.plug("first", threads=2)
+            heavy = [toy.submit(f"heavy {i}", "first", client="heavy") for i in range(count)]
+            await toy.until_jobs(count + 2)
+            light = toy.submit("light", "first", client="light")
+            await toy.until_jobs(count + 3)
+            toy.gate.set()
+            await outcomes([*plugs, *heavy, light])
+        assert [it for it in toy.seen if len(it) == 1].index(["light"]) < (10 if is_first_stage_cheap else 8)
 
 
 class TestFailure:
     @settings(max_examples=25, deadline=None)
     @given(st.lists(st.booleans(), min_size=1, max_size=3 * MAX_BATCH))
-    def test_the_guilty_jobs_of_a_batch_fail_alone(self, guilty: list[bool]) -> None:
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+    @in_loop
+    async def test_the_failing_jobs_of_a_batch_fail_alone(self, fails: list[bool]) -> None:
+        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             for job in jobs:
-                if guilty[job.step.payload]:
-                    raise Guilty(job.step.payload)
-            return [Done(job.step.payload) for job in jobs]
+                if job.step.payload != "later" and fails[job.step.payload]:
+                    raise PlantedError(job.step.payload)
+            return echo(jobs)
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                calls = await waiting(shop, queue, range(len(guilty)))
-                shop.gate.set()
-                for i, outcome in enumerate(await outcomes(calls)):
-                    assert outcome.args == (i,) if guilty[i] else outcome == i
-                shop.compute = lambda jobs: [Done("innocent") for _ in jobs]
-                assert await submit(queue, "later") == "innocent"
-            assert shop.account.endings[Ending.FAILED] == sum(guilty)
-            assert not shop.fatals
+        async with Toy(compute) as toy:
+            for i, outcome in enumerate(await toy.together(range(len(fails)))):
+                assert outcome.args == (i,) if fails[i] else outcome == i
+            assert await toy.submit("later") == "later"
+        assert toy.observer.endings[Ending.FAILED] == sum(fails)
+        assert not toy.fatals
 
-        run(test())
-
-    def test_a_job_given_an_exception_fails_alone_and_once(self) -> None:
+    @in_loop
+    async def test_a_job_given_an_exception_fails_alone_and_once(self) -> None:
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
-            return [Guilty() if job.step.payload == 1 else Done(job.step.payload) for job in jobs]
+            return [PlantedError() if job.step.payload == 1 else Done(job.step.payload) for job in jobs]
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                calls = await waiting(shop, queue, range(3))
-                shop.gate.set()
-                zero, one, two = await outcomes(calls)
-            assert (zero, type(one), two) == (0, Guilty, 2)
-            assert shop.seen == [[0, 1, 2]]
-
-        run(test())
+        async with Toy(compute) as toy:
+            zero, one, two = await toy.together(range(3))
+        assert (zero, type(one), two) == (0, PlantedError, 2)
+        assert toy.seen == [[0, 1, 2]]
 
     @pytest.mark.parametrize("error", [StopIteration(), StopAsyncIteration(), asyncio.TimeoutError(), KeyError("x")])
-    def test_any_exception_is_the_jobs_alone(self, error: Exception) -> None:
+    @in_loop
+    async def test_any_exception_is_the_jobs_alone(self, error: Exception) -> None:
         """Some of them mean something to futures and coroutines."""
 
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             if jobs[0].step.payload == "bad":
                 raise error
-            return [Done("good")]
+            return echo(jobs)
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                (outcome,) = await outcomes([submit(queue, "bad")])
-                assert isinstance(outcome, type(error) | RuntimeError)
-                assert await submit(queue, "good") == "good"
-            assert not shop.fatals
-
-        run(test())
+        async with Toy(compute) as toy:
+            (outcome,) = await outcomes([toy.submit("bad")])
+            assert isinstance(outcome, type(error) | RuntimeError)
+            assert await toy.submit("good") == "good"
+        assert not toy.fatals
 
     @pytest.mark.parametrize("surplus", [-1, 1])
-    def test_a_stage_with_the_wrong_number_of_results_fails_all(self, surplus: int) -> None:
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+    @in_loop
+    async def test_a_stage_with_the_wrong_number_of_results_fails_all(self, surplus: int) -> None:
+        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             if "right" in [job.step.payload for job in jobs]:
-                return [Done("right")]
-            return [Done("of whom?")] * (len(jobs) + surplus)
+                return echo(jobs)
+            return [Done("whose?")] * (len(jobs) + surplus)
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                calls = await waiting(shop, queue, range(4))
-                shop.gate.set()
-                for outcome in await outcomes(calls):
-                    assert isinstance(outcome, RuntimeError)
-                    assert "results" in str(outcome)
-                assert await submit(queue, "right") == "right"
-
-        run(test())
+        async with Toy(compute) as toy:
+            for outcome in await toy.together(range(4)):
+                assert isinstance(outcome, RuntimeError)
+                assert "results" in str(outcome)
+            assert await toy.submit("right") == "right"
 
     @pytest.mark.parametrize("fits", [1, 2, 3, 5])
-    def test_out_of_memory_halves_the_batch_for_good(self, fits: int) -> None:
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+    @in_loop
+    async def test_out_of_memory_halves_the_batch_for_good(self, fits: int) -> None:
+        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             if len(jobs) > fits and jobs[0].step.bucket == "large":
                 raise MemoryError
-            return [Done(job.step.payload) for job in jobs]
+            return echo(jobs)
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                for _ in range(2):
-                    before, shop.gate = shop.account.out_of_memory, threading.Event()
-                    calls = await waiting(shop, queue, range(7), bucket="large")
-                    shop.gate.set()
-                    assert await outcomes(calls) == [*range(7)]
-                assert before == shop.account.out_of_memory > 0
-                # Photographs of another shape have nothing to do with it.
-                shop.gate = threading.Event()
-                calls = await waiting(shop, queue, range(7), bucket="small")
-                shop.gate.set()
-                assert await outcomes(calls) == [*range(7)]
-            assert shop.seen[-1] == [*range(7)]
-            assert set(shop.account.endings) == {Ending.OK}
+        async with Toy(compute) as toy:
+            for _ in range(2):
+                before = toy.observer.out_of_memory
+                assert await toy.together(range(7), bucket="large") == [*range(7)]
+            assert before == toy.observer.out_of_memory > 0
+            assert await toy.together(range(7), bucket="small") == [*range(7)]
+        assert toy.seen[-1] == [*range(7)], "other buckets are not limited"
+        assert set(toy.observer.endings) == {Ending.OK}
 
-        run(test())
-
-    def test_memory_of_a_failed_attempt_is_free_for_its_halves(self) -> None:
-        """An exception that is still handled holds the frames that it came through, and the tensors in them."""
+    @in_loop
+    async def test_memory_of_a_failed_attempt_is_free_for_its_halves(self) -> None:
+        """An exception that is being handled holds the frames that it came through, and the tensors in them."""
         held: list[weakref.ref[Any]] = []
 
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             assert not any(it() for it in held)
             tensor = {len(jobs)} - {1}
             if tensor:
                 held.append(weakref.ref(tensor))
                 raise MemoryError
-            return [Done(job.step.payload) for job in jobs]
+            return echo(jobs)
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                calls = await waiting(shop, queue, range(4))
-                shop.gate.set()
-                assert await outcomes(calls) == [*range(4)]
-            assert len(held) == 3
+        async with Toy(compute) as toy:
+            assert await toy.together(range(4)) == [*range(4)]
+        assert len(held) == 3
 
-        run(test())
-
-    def test_a_batch_size_that_was_too_much_once_stays_so(self) -> None:
+    @in_loop
+    async def test_a_batch_size_that_was_too_much_once_stays_so(self) -> None:
         """Though a later half of the same batch would have allowed more."""
-        tried: list[int] = []
 
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
-            tried.append(len(jobs))
+        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             if len(jobs) > (1 if 0 in [job.step.payload for job in jobs] else 2):
                 raise MemoryError
-            return [Done(job.step.payload) for job in jobs]
+            return echo(jobs)
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                calls = await waiting(shop, queue, range(8))
-                shop.gate.set()
-                await outcomes(calls)
-                tried.clear()
-                shop.gate = threading.Event()
-                calls = await waiting(shop, queue, range(1, 9))
-                shop.gate.set()
-                await outcomes(calls)
-            assert tried == [1] * 8
+        async with Toy(compute) as toy:
+            await toy.together(range(8))
+            toy.seen.clear()
+            await toy.together(range(1, 9))
+        assert [len(it) for it in toy.seen] == [1] * 8
 
-        run(test())
-
-    def test_one_job_that_is_too_large_alone_is_told_so(self) -> None:
+    @in_loop
+    async def test_a_job_that_is_too_large_alone_ends_out_of_memory(self) -> None:
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
             raise MemoryError
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                (outcome,) = await outcomes([submit(queue, 0)])
-            assert isinstance(outcome, MemoryError)
-            assert shop.account.endings == {Ending.OUT_OF_MEMORY: 1}
-
-        run(test())
+        async with Toy(compute) as toy:
+            (outcome,) = await outcomes([toy.submit(0)])
+        assert isinstance(outcome, MemoryError)
+        assert toy.observer.endings == {Ending.OUT_OF_MEMORY: 1}
 
 
 class TestEndOfAll:
-    async def _ends(self, shop: Shop, queue: WorkQueue, calls: Sequence[asyncio.Task[Any]]) -> None:
-        """Everybody is told, the owner once, and nothing is computed any more."""
+    async def _ends(self, toy: Toy, calls: Sequence[asyncio.Task[Any]]) -> None:
+        """Every caller and, once, the owner learns it, and nothing is computed any more."""
         for outcome in await outcomes(calls):
             assert isinstance(outcome, Fatal)
-        assert [type(it) for it in shop.fatals] == [Fatal]
-        assert not queue.is_alive_within(FAR_S)
-        computed = len(shop.seen)
+        assert [type(it) for it in toy.fatals] == [Fatal]
+        assert not toy.queue.is_alive_within(FAR_S)
+        computed = len(toy.seen)
         for stage in ("first", "then"):
-            (refused,) = await outcomes([submit(queue, "late", stage)])
+            (refused,) = await outcomes([toy.submit("late", stage)])
             assert isinstance(refused, Refused)
             assert refused.reason is Refusal.DRAINING
-        assert len(shop.seen) == computed
-        assert queue.job_count == 0
+        assert len(toy.seen) == computed
+        assert toy.queue.job_count == 0
 
-    @pytest.mark.parametrize("way", ["raised", "returned"])
-    def test_a_lost_device_ends_the_queue(self, way: str, caplog: pytest.LogCaptureFixture) -> None:
+    @pytest.mark.parametrize("is_raised", [True, False])
+    @in_loop
+    async def test_a_lost_device_ends_the_queue(self, is_raised: bool, caplog: pytest.LogCaptureFixture) -> None:
+        error = LostDevice("poisoned context")
+
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
-            if "lost" not in [job.step.payload for job in jobs]:
-                return [Done("garbage") for _ in jobs]
-            if way == "raised":
-                raise Lost("poisoned context")
-            return [Lost("poisoned context") if job.step.payload == "lost" else Done("garbage") for job in jobs]
+            payloads = [job.step.payload for job in jobs]
+            if is_raised and "lost" in payloads:
+                raise error
+            return [error if it == "lost" else Done("garbage") for it in payloads]
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                await shop.plug(queue)
-                busy = await shop.plug(queue, "first", threads=2)
-                calls = [submit(queue, payload) for payload in (0, "lost", 2)]
-                calls += [submit(queue, "waits", "first"), submit(queue, "another", bucket="other")]
-                await until(lambda: queue.job_count == 8)
-                shop.gate.set()
-                await outcomes(busy)
-                await self._ends(shop, queue, calls[:3])
-                # The jobs of the other lane ran before or were told; none got lost.
-                for outcome in await outcomes(calls[3:]):
-                    assert isinstance(outcome, Fatal) or outcome == "garbage"
-            assert "poisoned context" in str(shop.fatals[0])
+        async with Toy(compute) as toy:
+            await toy.plug()
+            busy = await toy.plug("first", threads=2)
+            calls = [toy.submit(payload) for payload in (0, "lost", 2)]
+            calls += [toy.submit("waits", "first"), toy.submit("another", bucket="other")]
+            await toy.until_jobs(8)
+            toy.gate.set()
+            await outcomes(busy)
+            await self._ends(toy, calls[:3])
+            # The jobs of the other lane were computed before or failed.
+            for outcome in await outcomes(calls[3:]):
+                assert isinstance(outcome, Fatal) or outcome == "garbage"
+        critical = [it.getMessage() for it in caplog.records if it.levelname == "CRITICAL"]
+        assert critical == ["the device is lost: poisoned context"] == [str(it) for it in toy.fatals]
 
-        run(test())
-        assert [it.getMessage() for it in caplog.records if it.levelname == "CRITICAL"] == [
-            "the device is lost: poisoned context"
-        ]
-
-    def test_two_threads_that_lose_it_at_once_are_one_end(self) -> None:
+    @in_loop
+    async def test_two_threads_that_lose_it_at_once_are_one_end(self) -> None:
         both = threading.Barrier(2, timeout=LIMIT_S)
 
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
             both.wait()
-            raise Lost
+            raise LostDevice
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                calls = [submit(queue, i, "first") for i in range(2)]
-                await self._ends(shop, queue, calls)
-            assert len(shop.fatals) == 1
+        async with Toy(compute) as toy:
+            await self._ends(toy, [toy.submit(i, "first") for i in range(2)])
 
-        run(test())
-
-    @pytest.mark.parametrize("hook", ["queued", "running", "waited", "computed", "ended"])
-    def test_a_bug_in_the_loop_itself_ends_the_queue(self, hook: str) -> None:
-        """As an observer that raises, which it must not."""
-        shop = Shop()
+    @pytest.mark.parametrize("event", ["queued", "running", "waited", "computed", "ended"])
+    @in_loop
+    async def test_a_bug_in_the_loop_itself_ends_the_queue(self, event: str) -> None:
+        """Such as an observer that raises, which it must not."""
         broken = threading.Event()
 
         def raise_if_broken(*_: Any) -> None:
             if broken.is_set():
-                raise Guilty(hook)
+                raise PlantedError(event)
 
-        setattr(shop.observer, hook, raise_if_broken)
-
-        async def test() -> None:
-            async with shop.open() as queue:
-                asyncio.get_running_loop().set_exception_handler(lambda *_: None)  # told as loudly as can be
-                calls = await waiting(shop, queue, range(3))
-                broken.set()
-                shop.gate.set()
-                await until(lambda: bool(shop.fatals))
-                await self._ends(shop, queue, calls)
-                broken.clear()
-
-        run(test())
+        async with Toy() as toy:
+            asyncio.get_running_loop().set_exception_handler(lambda *_: None)  # the loop may be told, too
+            setattr(toy.observer, event, raise_if_broken)
+            calls = await toy.waiting(range(3))
+            broken.set()
+            toy.gate.set()
+            await until(lambda: bool(toy.fatals))
+            await self._ends(toy, calls)
+            broken.clear()
 
     @pytest.mark.parametrize("error", [SystemExit(3), KeyboardInterrupt()])
-    def test_a_stage_that_wants_to_end_the_program_ends_the_queue(self, error: BaseException) -> None:
+    @in_loop
+    async def test_a_stage_that_wants_to_end_the_program_ends_the_queue(self, error: BaseException) -> None:
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
             raise error
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                await self._ends(shop, queue, [submit(queue, 0)])
+        async with Toy(compute) as toy:
+            await self._ends(toy, [toy.submit(0)])
 
-        run(test())
+    @in_loop
+    async def test_a_stage_that_hangs_ends_the_queue(self) -> None:
+        async with Toy(options=replace(ROOMY, stall_limit_s=0.2)) as toy:
+            plugs = await toy.plug()
+            await self._ends(toy, [*plugs, toy.submit("waits")])
+        assert "the stage then has computed for" in str(toy.fatals[0])
+        assert "hangs" in str(toy.fatals[0])
 
-    def test_a_stage_that_hangs_ends_the_queue(self) -> None:
-        async def test() -> None:
-            shop = Shop(options=replace(ROOMY, stall_limit_s=0.2))
-            async with shop.open() as queue:
-                plugs = await shop.plug(queue)
-                await self._ends(shop, queue, [*plugs, submit(queue, "waits")])
-                assert "the stage then has computed for" in str(shop.fatals[0])
-                assert "hangs" in str(shop.fatals[0])
-
-        run(test())
-
-    def test_a_long_stage_that_checks_between_steps_does_not_hang(self) -> None:
-        steps_s, limit_s = 2.0, 1.0
-        shop = Shop(options=replace(ROOMY, stall_limit_s=limit_s))
-
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
-            until_s = time.monotonic() + (steps_s if jobs[0].step.payload == "long" else 0.1)
+    @in_loop
+    async def test_a_long_stage_that_checks_between_steps_does_not_hang(self) -> None:
+        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
+            until_s = time.monotonic() + (2.0 if jobs[0].step.payload == "long" else 0.1)
             while time.monotonic() < until_s:
                 jobs[-1].check()
                 time.sleep(0.02)
             if jobs[0].step.payload == "hangs":
-                assert shop.gate.wait(LIMIT_S)
-            return [Done(job.step.payload) for job in jobs]
+                assert toy.gate.wait(LIMIT_S)
+            return echo(jobs)
 
-        shop.compute = compute
+        async with Toy(compute, replace(ROOMY, stall_limit_s=1.0)) as toy:
+            assert await outcomes([toy.submit("long")]) == ["long"]
+            assert not toy.fatals
+            await self._ends(toy, [toy.submit("hangs")])
 
-        async def test() -> None:
-            async with shop.open() as queue:
-                assert await outcomes([submit(queue, "long")]) == ["long"]
-                assert not shop.fatals
-                await self._ends(shop, queue, [submit(queue, "hangs")])
+    @in_loop
+    async def test_closing_ends_waiting_jobs_and_awaits_the_computing(self) -> None:
+        async with Toy() as toy:
+            calls = await toy.waiting(range(3))
+            closing = asyncio.ensure_future(toy.queue.close())
+            for outcome in await outcomes(calls):
+                assert isinstance(outcome, Fatal)
+            assert not closing.done()
+            toy.gate.set()
+            await asyncio.wait_for(closing, LIMIT_S)
+        assert not toy.seen
+        assert not toy.fatals
 
-        run(test())
-
-    def test_closing_notifies_the_waiting_and_awaits_the_computing(self) -> None:
-        async def test() -> None:
-            shop = Shop()
-            async with shop.open() as queue:
-                calls = await waiting(shop, queue, range(3))
-                closing = asyncio.ensure_future(queue.close())
-                for outcome in await outcomes(calls):
-                    assert isinstance(outcome, Fatal)
-                assert not closing.done()
-                shop.gate.set()
-                await asyncio.wait_for(closing, LIMIT_S)
-                assert not shop.seen
-                assert not shop.fatals
-
-        run(test())
-
-    def test_closing_does_not_wait_for_ever(self, caplog: pytest.LogCaptureFixture) -> None:
-        async def test() -> None:
-            shop = Shop()
-            async with shop.open() as queue:
-                await shop.plug(queue)
-                await asyncio.wait_for(queue.close(limit_s=0.1), LIMIT_S)
-                assert not shop.gate.is_set()
-
-        run(test())
+    @in_loop
+    async def test_closing_does_not_wait_for_ever(self, caplog: pytest.LogCaptureFixture) -> None:
+        async with Toy() as toy:
+            await toy.plug()
+            await asyncio.wait_for(toy.queue.close(limit_s=0.1), LIMIT_S)
+            assert not toy.gate.is_set()
         (said,) = [it.getMessage() for it in caplog.records if it.levelname == "ERROR"]
         assert "toy-device" in said
         assert "left behind" in said
 
-    def test_a_queue_that_never_began_can_be_closed(self) -> None:
-        async def test() -> None:
-            async with Shop().open() as queue:
-                await queue.close()
-                (refused,) = await outcomes([submit(queue, 0)])
-                assert isinstance(refused, Refused)
-                assert not queue.is_alive_within(FAR_S)
+    @in_loop
+    async def test_a_queue_that_never_began_can_be_closed(self) -> None:
+        async with Toy() as toy:
+            await toy.queue.close()
+            (refused,) = await outcomes([toy.submit(0)])
+            assert isinstance(refused, Refused)
+            assert not toy.queue.is_alive_within(FAR_S)
 
-        run(test())
-
-    def test_draining_finishes_what_waits(self) -> None:
-        async def test() -> None:
-            shop = Shop()
-            async with shop.open() as queue:
-                calls = await waiting(shop, queue, range(3))
-                queue.drain()
-                (refused,) = await outcomes([submit(queue, "late")])
-                assert isinstance(refused, Refused)
-                shop.gate.set()
-                assert await outcomes(calls) == [0, 1, 2]
-
-        run(test())
+    @in_loop
+    async def test_draining_finishes_what_waits(self) -> None:
+        async with Toy() as toy:
+            calls = await toy.waiting(range(3))
+            toy.queue.drain()
+            (refused,) = await outcomes([toy.submit("late")])
+            assert isinstance(refused, Refused)
+            toy.gate.set()
+            assert await outcomes(calls) == [0, 1, 2]
 
 
 class TestCallersWhoLeave:
-    def test_one_who_waits_frees_its_place_and_is_not_computed(self) -> None:
-        async def test() -> None:
-            shop = Shop()
-            async with shop.open() as queue:
-                calls = await waiting(shop, queue, range(3))
-                calls[1].cancel()
-                await until(lambda: queue.job_count == 3)
-                assert shop.account.waiting["then"] == 2
-                shop.gate.set()
-                zero, one, two = await outcomes(calls)
-                assert (zero, type(one), two) == (0, asyncio.CancelledError, 2)
-            assert shop.seen == [[0, 2]]
-            assert shop.account.endings == {Ending.CANCELLED: 1, Ending.OK: 3}
-
-        run(test())
+    @in_loop
+    async def test_one_who_waits_frees_its_place_and_is_not_computed(self) -> None:
+        async with Toy() as toy:
+            calls = await toy.waiting(range(3))
+            calls[1].cancel()
+            await toy.until_jobs(3)
+            assert toy.observer.waiting["then"] == 2
+            toy.gate.set()
+            zero, one, two = await outcomes(calls)
+            assert (zero, type(one), two) == (0, asyncio.CancelledError, 2)
+        assert toy.seen == [[0, 2]]
+        assert toy.observer.endings == {Ending.CANCELLED: 1, Ending.OK: 3}
 
     @pytest.mark.parametrize("way", [Ending.CANCELLED, Ending.EXPIRED])
-    def test_a_thread_finds_out_that_nobody_waits_any_more(self, way: Ending) -> None:
-        """The caller is told at once; the thread is not interrupted, but it asks."""
+    @in_loop
+    async def test_a_thread_notices_at_its_next_check_that_a_job_ended(self, way: Ending) -> None:
+        """The caller learns it at once; the thread is not interrupted."""
         began, asks, noticed = threading.Event(), threading.Event(), threading.Event()
 
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             if jobs[0].step.payload == "next":
-                return [Done("next")]
+                return echo(jobs)
             jobs[0].check()
             began.set()
             assert asks.wait(LIMIT_S)
-            try:
+            with pytest.raises(Abandoned) as abandoned:
                 jobs[0].check()
-            except Abandoned:
-                noticed.set()
-                raise
-            return [Done("nobody reads this")]
+            noticed.set()
+            raise abandoned.value
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                call = submit(queue, 0, lasts_s=0.3 if way is Ending.EXPIRED else FAR_S)
-                assert await asyncio.to_thread(began.wait, LIMIT_S)
-                if way is Ending.CANCELLED:
-                    call.cancel()
-                (outcome,) = await outcomes([call])
-                assert isinstance(outcome, Expired if way is Ending.EXPIRED else asyncio.CancelledError)
-                assert queue.job_count == 0
-                assert not noticed.is_set()
-                follows = submit(queue, "next")
-                asks.set()
-                assert await asyncio.wait_for(follows, LIMIT_S) == "next"
-                assert noticed.is_set()
-            assert shop.account.endings == {way: 1, Ending.OK: 1}
+        async with Toy(compute) as toy:
+            call = toy.submit(0, lasts_s=0.3 if way is Ending.EXPIRED else FAR_S)
+            assert await asyncio.to_thread(began.wait, LIMIT_S)
+            if way is Ending.CANCELLED:
+                call.cancel()
+            (outcome,) = await outcomes([call])
+            assert isinstance(outcome, Expired if way is Ending.EXPIRED else asyncio.CancelledError)
+            assert toy.queue.job_count == 0
+            assert not noticed.is_set()
+            follows = toy.submit("next")
+            asks.set()
+            assert await asyncio.wait_for(follows, LIMIT_S) == "next"
+            assert noticed.is_set()
+        assert toy.observer.endings == {way: 1, Ending.OK: 1}
 
-        run(test())
+    @in_loop
+    async def test_a_waiting_call_ends_at_its_deadline_without_a_thread(self) -> None:
+        async with Toy() as toy:
+            await toy.submit("quick")  # so that enough time is predicted
+            (outcome,) = await outcomes(await toy.waiting(["late"], lasts_s=0.2))
+            assert isinstance(outcome, Expired)
+            assert not toy.gate.is_set()
+        assert toy.seen == [["quick"]]
 
-    def test_a_waiting_call_ends_at_its_deadline_without_a_thread(self) -> None:
-        async def test() -> None:
-            shop = Shop()
-            async with shop.open() as queue:
-                await submit(queue, "quick")  # so the queue believes that there is time
-                calls = await waiting(shop, queue, ["late"], lasts_s=0.2)
-                (outcome,) = await outcomes(calls)
-                assert isinstance(outcome, Expired)
-                assert not shop.gate.is_set()
-            assert shop.seen == [["quick"]]
-
-        run(test())
-
-    def test_what_is_at_hand_is_given_when_time_runs_out(self) -> None:
-        shop = Shop()
-
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+    @in_loop
+    async def test_a_fallback_is_given_when_time_runs_out(self) -> None:
+        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             if jobs[0].step.stage == "then":
-                return [Done("quick")]
+                return echo(jobs)
             fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), time.monotonic() + 0.4)
-            return [Next(Step("then", "toy", "b", "plug"), fallback) for _ in jobs]
+            return [then(job, "plug", fallback) for job in jobs]
 
-        shop.compute = compute
-
-        async def test() -> None:
-            async with shop.open() as queue:
-                await submit(queue, "quick")  # so the queue believes that there is time
-                assert await asyncio.wait_for(submit(queue, 0, "first"), LIMIT_S) == "coarse"
-                assert not shop.gate.is_set()
-            assert shop.account.endings == {Ending.OK: 1, Ending.DEGRADED: 1}
-
-        run(test())
+        async with Toy(compute) as toy:
+            await toy.submit("quick")  # so that enough time is predicted
+            assert await asyncio.wait_for(toy.submit(0, "first"), LIMIT_S) == "coarse"
+            assert not toy.gate.is_set()
+        assert toy.observer.endings == {Ending.OK: 1, Ending.DEGRADED: 1}
 
     @pytest.mark.parametrize("seed", range(3))
-    def test_in_any_order_everything_comes_to_its_end(self, seed: int) -> None:
+    @in_loop
+    async def test_in_any_order_everything_comes_to_its_end(self, seed: int) -> None:
         """Callers come, leave at any moment, run out of time, fail and go through one stage or two."""
-        fates = random.Random(seed)
+        random_ = random.Random(seed)
 
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
-            verdicts: list[StageResult] = []
-            for job in jobs:
-                if job.step.payload % 7 == 0:
-                    raise Guilty
-                onward = job.step.stage == "first"
-                verdicts.append(Next(Step("then", "toy", "b", job.step.payload)) if onward else Done(job.step.payload))
-            return verdicts
+            if any(job.step.payload % 7 == 0 for job in jobs):
+                raise PlantedError
+            return [then(job) if job.step.stage == "first" else Done(job.step.payload) for job in jobs]
 
-        async def caller(queue: WorkQueue, number: int) -> Any:
-            for _ in range(fates.randrange(20)):
+        async def caller(number: int) -> Any:
+            for _ in range(random_.randrange(20)):
                 await asyncio.sleep(0)
-            lasts_s = fates.choice([0.0, 0.001, 0.005, FAR_S, FAR_S])
-            call = submit(queue, number, fates.choice(["first", "then"]), client=fates.choice("abc"), lasts_s=lasts_s)
-            if fates.random() < 0.3:
-                for _ in range(1 + fates.randrange(30)):  # it has begun
+            lasts_s = random_.choice([0.0, 0.001, 0.005, FAR_S, FAR_S])
+            stage, client = random_.choice(["first", "then"]), random_.choice("abc")
+            call = toy.submit(number, stage, client=client, lasts_s=lasts_s)
+            if random_.random() < 0.3:
+                for _ in range(1 + random_.randrange(30)):  # it has begun
                     await asyncio.sleep(0)
                 call.cancel()
             return (await asyncio.gather(call, return_exceptions=True))[0]
 
-        async def test() -> None:
-            shop = Shop(compute)
-            async with shop.open() as queue:
-                callers = [asyncio.ensure_future(caller(queue, i)) for i in range(400)]
-                told = await outcomes(callers)
-                assert queue.job_count == 0
-                await until(lambda: not any(shop.account.inflight.values()))
-                assert not any(shop.account.waiting.values())
-            account, kinds = shop.account, Counter(map(type, told))
-            assert account.admissions + account.refusals.total() == len(told)
-            assert account.endings.total() == account.admissions
-            assert set(kinds) <= {int, Guilty, Expired, Refused, asyncio.CancelledError}
-            assert kinds[int] > 20
-            assert all(it == number for number, it in enumerate(told) if isinstance(it, int))
-            assert not shop.fatals
-
-        run(test())
+        async with Toy(compute) as toy:
+            found = await outcomes([asyncio.ensure_future(caller(i)) for i in range(400)])
+            assert toy.queue.job_count == 0
+            await until(lambda: not any(toy.observer.inflight.values()))
+            assert not any(toy.observer.waiting.values())
+        observer, kinds = toy.observer, Counter(map(type, found))
+        assert observer.admissions + observer.refusals.total() == len(found)
+        assert observer.endings.total() == observer.admissions
+        assert set(kinds) <= {int, PlantedError, Expired, Refused, asyncio.CancelledError}
+        assert kinds[int] > 20
+        assert all(it == number for number, it in enumerate(found) if isinstance(it, int))
+        assert not toy.fatals

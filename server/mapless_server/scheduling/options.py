@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,10 @@ class WorkQueueOptions:
     heartbeat_s: float = 1.0
 
     def __post_init__(self) -> None:
-        for option in fields(self):
-            value = getattr(self, option.name)
-            if not value > 0:
-                raise ValueError(f"{option.name} is {value}, must be positive")
+        least = {"time_margin": 1, "first_stage_interval": 2}
+        for name, value in vars(self).items():
+            if not (value > 0 and value >= least.get(name, 0)):
+                bound = f"at least {least[name]}" if name in least else "above 0"
+                raise ValueError(f"WorkQueueOptions.{name} must be {bound}, is {value}")
         if self.flow_share > 1:
-            raise ValueError(f"flow_share is {self.flow_share}, must be at most 1")
-        if self.time_margin < 1:
-            raise ValueError(f"time_margin is {self.time_margin}, must be at least 1")
-        if self.first_stage_interval < 2:
-            raise ValueError(f"first_stage_interval is {self.first_stage_interval}, must be at least 2")
+            raise ValueError(f"WorkQueueOptions.flow_share must be at most 1, is {self.flow_share}")

@@ -1,0 +1,48 @@
+"""An observer of work queues that counts their events."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from mapless_server.scheduling import Ending, Observer, Refusal
+
+
+class CountingObserver(Observer):
+    """Counts events, and keeps the latest loads of stages."""
+
+    def __init__(self) -> None:
+        self.admissions = 0
+        self.out_of_memory = 0
+        self.refusals: Counter[Refusal] = Counter()
+        self.endings: Counter[Ending] = Counter()
+        self.waiting: Counter[str] = Counter()
+        self.inflight: Counter[str] = Counter()
+        self.batches: list[tuple[str, int]] = []
+
+    def admitted(self, cost_s: float) -> None:
+        """Implements Observer."""
+        self.admissions += 1
+
+    def refused(self, reason: Refusal) -> None:
+        """Implements Observer."""
+        self.refusals[reason] += 1
+
+    def queued(self, stage: str, jobs: int, cost_s: float) -> None:
+        """Implements Observer."""
+        self.waiting[stage] = jobs
+
+    def running(self, stage: str, jobs: int) -> None:
+        """Implements Observer."""
+        self.inflight[stage] = jobs
+
+    def computed(self, stage: str, bucket: str, jobs: int, seconds: float) -> None:
+        """Implements Observer."""
+        self.batches.append((stage, jobs))
+
+    def ended(self, stage: str, ending: Ending) -> None:
+        """Implements Observer."""
+        self.endings[ending] += 1
+
+    def ran_out_of_memory(self) -> None:
+        """Implements Observer."""
+        self.out_of_memory += 1
