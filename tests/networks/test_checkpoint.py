@@ -173,7 +173,7 @@ def test_files_of_another_kind_are_refused_unopened(tensors: Tensors, file: Path
         load_strictly(on_meta(), file)
 
 
-@pytest.mark.parametrize("name", ["pi3", "pi3x"])
+@pytest.mark.parametrize("name", ["pi3", "pi3x", "megaloc"])
 def test_the_official_file_has_the_size_of_its_tensors(name: str) -> None:
     """The header of a float32 file without metadata, as the library writes it, and its data, to the byte.
 

@@ -286,13 +286,6 @@ def test_weights_without_a_known_digest_are_taken_and_recorded(folder: Path, fil
     assert look_up(weights, folder).status is Status.RECORDED
 
 
-def test_a_pickle_under_another_name_is_not_added(weights: Weights, folder: Path, file: Path) -> None:
-    file.write_bytes(pickle.dumps({"a": 1}))
-    with pytest.raises(CheckpointError, match="it is a pickle"):
-        add(weights, file, folder)
-    assert not folder.exists()
-
-
 def test_a_check_reports_damage_and_records_files_added_by_hand(weights: Weights, folder: Path) -> None:
     with pytest.raises(WeightsMissing):
         check(weights, folder)

@@ -119,20 +119,6 @@ def test_single_frames_are_refused_by_name_and_the_rest_is_in(
     assert stored(client, scene) == ["p00", *(f"p{i:02d}" for i in range(5, 12))]
 
 
-def test_a_pose_that_changed_is_refused_not_overwritten(
-    server: RunningServer, client: Client, scene: str, folder: Path
-) -> None:
-    assert run_import(server, folder, scene).exit_code == 0
-    file = folder / "cameras.json"
-    content = json.loads(file.read_text())
-    content["frames"][5]["world_from_camera"][0][3] += 0.25
-    file.write_text(json.dumps(content))
-    done = run_import(server, folder, scene)
-    assert done.exit_code == 1
-    assert "p05" in done.stdout
-    assert "its pose is 0.25 m" in done.stdout
-
-
 def test_a_dry_run_needs_no_server_and_stores_nothing(folder: Path, tmp_path: Path) -> None:
     done = run("import", folder, "nowhere", "--dry-run", "--report", tmp_path / "report.json")
     assert done.exit_code == 0
