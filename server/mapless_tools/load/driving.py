@@ -18,12 +18,10 @@ from mapless_tools.progress import Progress
 from .arrivals import Mix, Requests, plan_calls
 from .records import CallRecord, Fate
 from .requests import requests_for, store_references
-from .sender import Target, send_closed_loop, send_open_loop
-from .step import Step, run_step
+from .sender import Target, send_open_loop
+from .step import Step, closed_loop_step, run_step
 from .watch import ServerUnderLoad, priority_over
 
-CLOSED_SETTLE_SHARE = 0.2
-"""Of a step of calls side by side, what rates leave out: as many answers are missing at first as calls are begun."""
 _RAMP_GAIN = 1.03
 """Twice as many calls side by side give so much more, or the server is saturated."""
 
@@ -85,7 +83,8 @@ async def find_saturation(
     for power in itertools.count(1):
         concurrency = 2**power
         progress(f"saturation, {concurrency} calls side by side", 0, 1)
-        step = await closed_step(f"{concurrency} at a time", server, target, concurrency, seconds)
+        name, requests = f"{concurrency} at a time", server.requests.good
+        step = await closed_loop_step(name, server.under_load, target, requests, concurrency, seconds)
         steps.append(step)
         per_s = step.account.completed_per_s
         if per_s < _RAMP_GAIN * best_per_s or step.account.count(Fate.REFUSED) or step.answers == 0:
@@ -95,17 +94,6 @@ async def find_saturation(
     if best_per_s == 0:
         raise RuntimeError(f"the server answered nothing: {dict(steps[-1].account.outcomes)}")
     return steps, best_per_s
-
-
-async def closed_step(name: str, server: LoadedServer, target: Target, concurrency: int, seconds: float) -> Step:
-    """A step of so many calls side by side."""
-    return await run_step(
-        name,
-        server.under_load,
-        lambda: send_closed_loop(target, server.requests.good, concurrency, seconds),
-        seconds,
-        settle_s=CLOSED_SETTLE_SHARE * seconds,
-    )
 
 
 async def open_step(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack, ExitStack
 from dataclasses import dataclass
 from statistics import median
@@ -17,19 +17,16 @@ from mapless_tools.demo import Photograph
 from mapless_tools.progress import Progress
 
 from . import no_op
-from .driving import CLOSED_SETTLE_SHARE
 from .echo import ECHO_METHOD, SHORT_METHOD
-from .records import Fate
 from .report import Check
 from .requests import METHOD, photo_request, read_answer, store_references
-from .sender import Target, connected, send_closed_loop
-from .step import Step, run_step
+from .sender import connected
+from .step import Step, closed_loop_step
 from .watch import ServerUnderLoad
 
 MIN_CALLS_PER_S = 300.0
 MAX_OVERHEAD_MS = 2.0
 BARE, ECHO, MAPLESS = "bare, short answer", "bare echo", "mapless, no-op"
-_EXPECTED = {MAPLESS: "rejected LOW_TEXTURE", BARE: "", ECHO: ""}
 
 
 @dataclass(frozen=True)
@@ -62,18 +59,49 @@ class Subject:
     """A server that is compared: its steps, one a round."""
 
     name: str
-    unloaded: Sequence[Step]
-    saturated: Sequence[Step]
+    unloaded: list[Step]
+    saturated: list[Step]
 
     @property
     def p50_ms(self) -> float:
         """The median round's median latency of one call at a time."""
-        return median(_p50_ms(step) for step in self.unloaded)
+        return median(self.p50s_ms)
+
+    @property
+    def p50s_ms(self) -> list[float]:
+        """Each round's median latency of one call at a time."""
+        return [step.account.answers.p50_ms or 0.0 for step in self.unloaded]
+
+    @property
+    def p99_ms(self) -> float:
+        """The median round's 99th percentile of one call at a time."""
+        return median(step.account.answers.p99_ms or 0.0 for step in self.unloaded)
+
+    @property
+    def own_share(self) -> float:
+        """Of one core, used by the generator at saturation, in the median round."""
+        return median(step.own_share for step in self.saturated)
 
     @property
     def calls_per_s(self) -> float:
         """The median round's rate at saturation."""
         return median(step.account.completed_per_s for step in self.saturated)
+
+
+@dataclass(frozen=True)
+class Called:
+    """A server and the method that is called.
+
+    Attributes:
+        address, process_id: of the server.
+        method: path of the RPC.
+        outcome: of every call; empty: any.
+    """
+
+    address: str
+    process_id: int
+    method: str = METHOD
+    outcome: str = "rejected LOW_TEXTURE"
 
 
 def measure_overhead(options: OverheadOptions, progress: Progress) -> list[Subject]:
@@ -87,15 +115,19 @@ def measure_overhead(options: OverheadOptions, progress: Progress) -> list[Subje
         data_dir = stack.enter_context(tempfile.TemporaryDirectory(prefix="mapless-load-"))
         bare = stack.enter_context(child_module("mapless_tools.load.echo"))
         ours = stack.enter_context(child_module("mapless_tools.load.no_op", data_dir))
-        request = _prepared(ours, options)
-        return asyncio.run(_compare(bare, ours, request, options, progress))
+        places = {
+            BARE: Called(bare.address, bare.process_id, SHORT_METHOD, ""),
+            ECHO: Called(bare.address, bare.process_id, ECHO_METHOD, ""),
+            MAPLESS: Called(ours.address, ours.process_id),
+        }
+        return asyncio.run(compare_by_turns(places, _prepared(ours, options), options, progress))
 
 
 def overhead_checks(subjects: Sequence[Subject]) -> list[Check]:
     """The bars; the server is compared with the bare one whose answers are as short, which is the harder comparison."""
     by_name = {subject.name: subject for subject in subjects}
     ours, bare = by_name[MAPLESS], by_name[BARE]
-    rounds = [_p50_ms(a) - _p50_ms(b) for a, b in zip(ours.unloaded, bare.unloaded, strict=True)]
+    rounds = [a - b for a, b in zip(ours.p50s_ms, bare.p50s_ms, strict=True)]
     overhead = median(rounds)
     return [
         Check(
@@ -123,13 +155,9 @@ def overhead_lines(subjects: Sequence[Subject], options: OverheadOptions) -> lis
         "|---|---|---|---|---|---|",
     ]
     for subject in subjects:
-        p99 = median(step.account.answers.p99_ms or 0.0 for step in subject.unloaded)
         cpu_ms = median(1000 * step.cpu_s_per_answer for step in subject.saturated)
-        own = median(step.own_share for step in subject.saturated)
-        lines.append(
-            f"| {subject.name} | {subject.p50_ms:.2f} | {p99:.2f} | {subject.calls_per_s:.0f} | {cpu_ms:.2f} "
-            f"| {100 * own:.0f} % |"
-        )
+        cells = (f"{subject.p50_ms:.2f}", f"{subject.p99_ms:.2f}", f"{subject.calls_per_s:.0f}", f"{cpu_ms:.2f}")
+        lines.append(f"| {subject.name} | {' | '.join(cells)} | {100 * subject.own_share:.0f} % |")
     return [*lines, ""]
 
 
@@ -159,54 +187,39 @@ def _prepared(server: ChildServer, options: OverheadOptions) -> bytes:
     return photo_request(photo, no_op.CAMERA, [reference.name for reference in references])
 
 
-async def _compare(
-    bare: ChildServer, ours: ChildServer, request: bytes, options: OverheadOptions, progress: Progress
+async def compare_by_turns(
+    places: Mapping[str, Called], request: bytes, options: OverheadOptions, progress: Progress
 ) -> list[Subject]:
-    unloaded: dict[str, list[Step]] = {BARE: [], ECHO: [], MAPLESS: []}
-    saturated: dict[str, list[Step]] = {BARE: [], ECHO: [], MAPLESS: []}
-    places = {BARE: (bare, SHORT_METHOD), ECHO: (bare, ECHO_METHOD), MAPLESS: (ours, METHOD)}
+    """Calls servers with the same request, one at a time and side by side, in rounds.
+
+    Raises:
+        RuntimeError: a call did not end as it should, or came too late.
+    """
+    subjects = {name: Subject(name, [], []) for name in places}
     async with AsyncExitStack() as stack:
-        targets: dict[str, Target] = {}
-        for name, (server, method) in places.items():
-            reader = read_answer if name == MAPLESS else _nothing
-            targets[name] = await stack.enter_async_context(
-                connected(server.address, method, options.clients, 30.0, reader)
+        targets = {
+            name: await stack.enter_async_context(
+                connected(it.address, it.method, options.clients, 30.0, read_answer if it.outcome else lambda _: "")
             )
-            await _step(name, server, targets[name], request, 4, 0.5)  # once, so that no round pays for the start
+            for name, it in places.items()
+        }
+
+        async def step(name: str, concurrency: int, seconds: float) -> Step:
+            server, title = ServerUnderLoad(places[name].process_id), f"{name}, {concurrency} at a time"
+            it = await closed_loop_step(title, server, targets[name], [request], concurrency, seconds)
+            if set(it.account.outcomes) != {f"OK {places[name].outcome}".strip()}:
+                raise RuntimeError(f"{title}: calls ended as {dict(it.account.outcomes)}")
+            if it.answers != it.account.sent:
+                raise RuntimeError(f"{title}: calls came too late: {dict(it.account.fates)}")
+            return it
+
+        for name in places:
+            await step(name, 4, 0.5)  # so that no round pays for the start
         for done in range(options.rounds):
             progress("overhead, rounds", done, options.rounds)
-            for name, (server, _) in places.items():
-                unloaded[name].append(await _step(name, server, targets[name], request, 1, options.unloaded_s))
-            for name, (server, _) in places.items():
-                saturated[name].append(
-                    await _step(name, server, targets[name], request, options.concurrency, options.saturated_s)
-                )
+            for name, subject in subjects.items():
+                subject.unloaded.append(await step(name, 1, options.unloaded_s))
+            for name, subject in subjects.items():
+                subject.saturated.append(await step(name, options.concurrency, options.saturated_s))
         progress("overhead, rounds", options.rounds, options.rounds)
-    return [Subject(name, unloaded[name], saturated[name]) for name in places]
-
-
-async def _step(
-    name: str, server: ChildServer, target: Target, request: bytes, concurrency: int, duration_s: float
-) -> Step:
-    step = await run_step(
-        f"{name}, {concurrency} at a time",
-        ServerUnderLoad(server.process_id),
-        lambda: send_closed_loop(target, [request], concurrency, duration_s),
-        duration_s,
-        settle_s=CLOSED_SETTLE_SHARE * duration_s,
-    )
-    if set(step.account.outcomes) != {f"OK {_EXPECTED[name]}".strip()}:
-        raise RuntimeError(f"{step.name}: calls ended as {dict(step.account.outcomes)}")
-    if step.account.count(Fate.ANSWERED) != step.account.sent:
-        raise RuntimeError(f"{step.name}: calls came too late: {dict(step.account.fates)}")
-    return step
-
-
-def _nothing(_: bytes) -> str:
-    return ""
-
-
-def _p50_ms(step: Step) -> float:
-    p50_ms = step.account.answers.p50_ms
-    assert p50_ms is not None
-    return p50_ms
+    return list(subjects.values())

@@ -13,12 +13,12 @@ from mapless_server.settings import available_cores
 from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
 
-from .driving import LoadedServer, closed_step, find_saturation, open_step, server_with_scene
+from .driving import LoadedServer, find_saturation, open_step, server_with_scene
 from .records import Fate
 from .report import Check, loop_lag_check, trend_check
 from .requests import METHOD, read_answer
 from .sender import connected
-from .step import Step
+from .step import Step, closed_loop_step
 
 MIN_SHARE_OF_IDEAL = 0.9
 MAX_P99_OVER_UNLOADED_P50 = 3.0
@@ -144,7 +144,9 @@ def pipeline_json(result: PipelineResult) -> dict[str, Any]:
 async def _measure(place: Place, server: LoadedServer, options: PipelineOptions, progress: Progress) -> PipelineResult:
     async with connected(server.address, METHOD, options.clients, options.deadline_s, read_answer) as target:
         progress("unloaded", 0, 1)
-        unloaded = await closed_step("unloaded", server, target, 1, options.unloaded_s)
+        unloaded = await closed_loop_step(
+            "unloaded", server.under_load, target, server.requests.good, 1, options.unloaded_s
+        )
         ramp, saturation_per_s = await find_saturation(server, target, options.ramp_s, progress)
         steps = []
         for number, share in enumerate(options.shares):

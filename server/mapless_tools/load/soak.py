@@ -20,14 +20,14 @@ from mapless_tools.progress import Progress
 
 from .arrivals import Mix
 from .churn import WORK, Outcomes, Workers, churning
-from .driving import LoadedServer, closed_step, find_saturation, open_step, server_with_scene
+from .driving import LoadedServer, find_saturation, open_step, server_with_scene
 from .records import Fate
 from .report import Check, loop_lag_check
 from .requests import METHOD, mixed_requests, read_answer
 from .scrape import Reconciliation, reconcile
 from .sender import connected
 from .slopes import CONFIDENCE, MIN_SAMPLES, Slope, slope
-from .step import Step
+from .step import Step, closed_loop_step
 from .watch import FIELDS, ServerState, column, server_states
 
 UNITS: Mapping[str, str] = {
@@ -188,7 +188,9 @@ async def _measure(place: Place, server: LoadedServer, options: SoakOptions, pro
     workers = Workers(server.address, place, Outcomes(), options.churn)
     async with connected(server.address, METHOD, options.clients, options.deadline_s, read_answer) as target:
         progress("unloaded", 0, 1)
-        before = [await closed_step("unloaded", server, target, 1, options.ramp_s)]
+        before = [
+            await closed_loop_step("unloaded", server.under_load, target, server.requests.good, 1, options.ramp_s)
+        ]
         p50_ms = before[0].account.answers.p50_ms or 1000.0
         rate_per_s = options.rate_per_s
         if rate_per_s is None:

@@ -11,10 +11,13 @@ from typing import Any
 
 from .records import Account, CallRecord, Fate, account_of
 from .scrape import Scrape
+from .sender import Target, send_closed_loop
 from .slopes import MIN_SAMPLES, Slope, slope
 from .watch import SAMPLE_EVERY_S, ProcessSample, ServerUnderLoad, process_samples
 
 Send = Callable[[], Awaitable[list[CallRecord]]]
+CLOSED_SETTLE_SHARE = 0.2
+"""Of a step of calls side by side, what rates leave out: at first as many answers are missing as calls have begun."""
 TREND_CONFIDENCE = 0.95
 TREND_FIELDS = ("resident_mib", "threads", "descriptors")
 
@@ -147,6 +150,19 @@ async def run_step(
         scraped=None if before is None or after is None else after.since(before),
         own_cpu_s=own_s,
         wall_s=wall_s,
+    )
+
+
+async def closed_loop_step(
+    name: str, server: ServerUnderLoad, target: Target, requests: Sequence[bytes], concurrency: int, seconds: float
+) -> Step:
+    """A step of so many calls side by side; rates leave out its first fifth."""
+    return await run_step(
+        name,
+        server,
+        lambda: send_closed_loop(target, requests, concurrency, seconds),
+        seconds,
+        settle_s=CLOSED_SETTLE_SHARE * seconds,
     )
 
 

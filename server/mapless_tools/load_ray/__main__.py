@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from mapless_tools.progress import Progress, progress_bars
 
 from .cluster import ClusterFailed
 from .database import NoDatabase
-from .overhead import OverheadOptions, measure_overhead, overhead_checks, overhead_json, overhead_lines
+from .overhead import OPTIONS, measure_overhead, overhead_checks, overhead_json, overhead_lines
 from .replacing import (
     failover_checks,
     kill_one,
@@ -40,7 +40,7 @@ Part = tuple[list[str], list[Check], dict[str, Any]]
 
 def overhead(given: argparse.Namespace, progress: Progress) -> Part:
     """Of the ingress."""
-    options = OverheadOptions(rounds=2, unloaded_s=0.5, saturated_s=0.5) if given.quick else OverheadOptions()
+    options = replace(OPTIONS, rounds=2, unloaded_s=0.5, saturated_s=0.5) if given.quick else OPTIONS
     ways = measure_overhead(options, progress)
     return overhead_lines(ways, options), overhead_checks(ways), overhead_json(ways, options)
 

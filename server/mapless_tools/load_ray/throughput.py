@@ -17,13 +17,12 @@ from mapless_tools.load.records import Fate
 from mapless_tools.load.report import Check
 from mapless_tools.load.requests import METHOD, read_answer, requests_for, store_references
 from mapless_tools.load.sender import Target, connected
-from mapless_tools.load.step import Step
-from mapless_tools.load.watch import read_process
+from mapless_tools.load.step import Step, closed_loop_step
+from mapless_tools.load.watch import ServerUnderLoad, read_process
 from mapless_tools.progress import Progress
 
 from .cluster import Cluster, application, running_cluster
 from .database import VARIABLE, database_url
-from .overhead import closed_loop
 
 MIN_GAIN = 1.7
 
@@ -129,8 +128,8 @@ async def _compare(
     rounds = []
 
     async def step(name: str, target: Target, concurrency: int) -> Step:
-        duration_s = options.step_s
-        it = await closed_loop(name, first.process_id, target, requests, concurrency, duration_s, duration_s / 5)
+        server, title = ServerUnderLoad(first.process_id), f"{name}, {concurrency} at a time"
+        it = await closed_loop_step(title, server, target, requests, concurrency, options.step_s)
         if it.answers != it.account.sent:
             late = it.account.count(Fate.OVERDUE)
             raise RuntimeError(f"{name}: calls ended as {dict(it.account.outcomes)}, {late} late")
