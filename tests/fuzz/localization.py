@@ -27,8 +27,7 @@ from mapless_server.security.tenancy import scene_id_of, tenant_of
 from mapless_server.services.messages.answers import (
     MAX_SESSION_COORDINATE_M,
     answer_frames_of,
-    framed_to_message,
-    geo_pose_to_message,
+    set_frames,
 )
 from mapless_server.services.messages.groups import (
     poses_from_message,
@@ -72,10 +71,9 @@ def _check_localize(request: pb.LocalizeRequest) -> None:
     _check_query(query, [request.scene])
     if addressee.session_from_camera is not None:
         check_pose(addressee.session_from_camera, MAX_SESSION_COORDINATE_M)
-    told = framed_to_message(addressee.axes, POSE, COVARIANCE, addressee.session_from_camera)
-    _check_finite(told)
-    if attributes.datum is not None:
-        _check_finite(geo_pose_to_message(POSE, attributes.datum))
+    answer = pb.Localization()
+    set_frames(answer, POSE, COVARIANCE, addressee.axes, addressee.session_from_camera, attributes.datum)
+    _check_finite(answer)
 
 
 def _check_rig(request: pb.LocalizeRigRequest) -> None:

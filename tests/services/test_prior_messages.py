@@ -16,7 +16,6 @@ from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.wire import FieldError
 from mapless_server.services.messages.priors import (
     UNKNOWN_HEIGHT_SIGMA_M,
-    narrowing_from_message,
     needs_attributes,
     priors_from_message,
 )
@@ -156,7 +155,7 @@ def test_retrieval_takes_what_its_request_has() -> None:
     message = ParseDict(
         {"positionPrior": {"positionM": vector(0, 0, 0), "radiusM": 2}}, reference_pb.RetrieveReferencesRequest()
     )
-    narrowing = narrowing_from_message(message)
+    narrowing, _ = priors_from_message(message, NOTHING)
     assert narrowing.position is not None
     assert narrowing.position.radius_m == 2
 

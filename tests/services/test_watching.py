@@ -11,7 +11,7 @@ import pytest
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.errors import FailedPrecondition, Overloaded, Unavailable
 from mapless_server.security.tenancy import key_of
-from mapless_server.services.watching import MAX_WATCHERS, MAX_WATCHERS_OF_TENANT, QUEUE_LENGTH, Watch, Watchers
+from mapless_server.services.watching import MAX_WATCHERS, MAX_WATCHERS_OF_TENANT, QUEUE_LENGTH, Watcher, Watchers
 
 HALL, OTHER = key_of("default", "hall"), key_of("default", "other")
 REQUEST = pb.LocalizeRequest(image=b"photograph")
@@ -27,7 +27,7 @@ def publish(watchers: Watchers, inliers: int, scene: str = HALL, debug: pb.Debug
     watchers.publish(scene, REQUEST, answer(inliers), debug)  # type: ignore[arg-type]
 
 
-async def next_of(watch: Watch) -> pb.WatchQueriesResponse:
+async def next_of(watch: Watcher) -> pb.WatchQueriesResponse:
     return await asyncio.wait_for(watch.__anext__(), LIMIT_S)
 
 

@@ -18,7 +18,13 @@ from support.scenes import random_for
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless.scenes import Calibration
 from mapless_server.method.uncertainty.accuracy import Accuracy, accuracy_from_covariance
-from mapless_server.services.messages.factors import Conditions, Factors, claimed, scaled_accuracy, scaled_covariance
+from mapless_server.services.messages.radii import (
+    Conditions,
+    Factors,
+    reported_radii,
+    scaled_accuracy,
+    scaled_covariance,
+)
 from mapless_tools.calibrate.claims import (
     MIN_QUERIES,
     Claim,
@@ -166,7 +172,7 @@ class TestApplying:
 
     def test_multiplies_radii(self) -> None:
         before = Accuracy(1.0, 2.0, 3.0, 4.0)
-        after = claimed(before, self.COVARIANCE, SIFT, self.calibration())
+        after = reported_radii(before, self.COVARIANCE, SIFT, self.calibration())
         assert after.accuracy == Accuracy(2.0, 6.0, 1.5, 3.0)
         assert after.calibrated
 
@@ -191,7 +197,7 @@ class TestApplying:
         before = Accuracy(1.0, 2.0, 3.0, 4.0)
         other = self.calibration(replace(SIFT, **{field: "other"}))
         for calibration in (None, other):
-            after = claimed(before, self.COVARIANCE, SIFT, calibration)
+            after = reported_radii(before, self.COVARIANCE, SIFT, calibration)
             assert after.accuracy == before
             assert not after.calibrated
             np.testing.assert_array_equal(after.covariance, self.COVARIANCE)

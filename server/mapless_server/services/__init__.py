@@ -1,5 +1,7 @@
-"""The RPCs: messages to values, the engine's results to messages; one module a service.
+"""The RPCs: requests become values for the engine and the store, and their results become responses.
 
-May import rpc and what is below it. Begin with `localization`; `messages/` converts, `capture/` records calls for
-replay, `watching` sends answers to the viewers of a scene, `handlers` registers all services with gRPC.
+May import rpc and what is below it. Begin with `localization`, the LocalizationService; `references` is the
+ReferenceService. `messages/` converts requests and responses, `progressive` streams coarse and final answers,
+`watching` sends answers to the watchers of a scene, `capture/` records calls for replay, and `handlers` registers all
+services with gRPC.
 """

@@ -1,4 +1,4 @@
-"""What is served: both services, health and reflection, behind one guard, whoever listens for their calls."""
+"""The handlers of all RPCs: both services, health and reflection, each behind the call guard."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ LOCALIZE_METHODS = frozenset(
 
 
 class Services:
-    """Answers UNAVAILABLE until it is given an engine, and is drained in order.
+    """All services of a server: they answer UNAVAILABLE until `open` sets the engine, and `drain` ends them in order.
 
     Attributes:
-        handlers: by service and method, to be added to whatever server listens.
+        handlers: by service and method, for the server that listens.
     """
 
     def __init__(
@@ -82,21 +82,21 @@ class Services:
             self._add_reflection((*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME))
 
     def add_to(self, server: Any) -> None:
-        """Has a grpc.aio.Server that does not run yet answer the services' calls."""
+        """Adds the handlers to a grpc.aio.Server that does not run yet."""
         for service, methods in self.handlers.items():
             server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(service, methods),))
 
     def add_registered_method_handlers(self, service: str, methods: Mapping[str, Any]) -> None:
-        """Takes a servicer's methods from grpc's generated code, to which this is a server."""
+        """Receives a servicer's methods from grpc's generated code, which sees this object as its server."""
         self.handlers[service] = {
             name: self._guard.guarded(f"/{service}/{name}", handler) for name, handler in methods.items()
         }
 
     def add_generic_rpc_handlers(self, handlers: object) -> None:
-        """Ignores what generated code says a second time, in the way that older servers understand."""
+        """Ignores the second registration of generated code, which is for older servers."""
 
     def _add_reflection(self, service_names: tuple[str, ...]) -> None:
-        """Both versions of the protocol: the package has v1alpha only, and v1 is the same bytes under another name."""
+        """Adds both versions of the protocol: the package has v1alpha alone; v1 is the same under another name."""
         method = grpc.stream_stream_rpc_method_handler(
             ReflectionServicer(service_names).ServerReflectionInfo,
             request_deserializer=reflection_pb2.ServerReflectionRequest.FromString,
@@ -106,16 +106,16 @@ class Services:
             self.add_registered_method_handlers(service, {"ServerReflectionInfo": method})
 
     async def open(self, engine: Engine) -> None:
-        """Serves with an engine that is warm."""
+        """Starts to serve, with an engine that has been warmed up."""
         self._engine = engine
         await self.set_serving(True)
 
     async def drain(self, delay_s: float, grace_s: float) -> None:
-        """Says that it stops, and after a delay refuses new calls and gives the running ones a time to finish.
+        """Reports that it stops serving; after a delay refuses new calls, and waits for the running ones.
 
         Args:
-            delay_s: for load balancers, which go on sending until they have looked at the health.
-            grace_s: after which nothing is waited for any longer.
+            delay_s: time for load balancers to notice, which send calls until their next health check.
+            grace_s: longest wait for running calls.
         """
         await self.set_serving(False)
         if delay_s:
@@ -127,11 +127,11 @@ class Services:
             self._engine.drain()
 
     async def close(self) -> None:
-        """Returns when the store is not used any more; to be called when nothing listens."""
+        """Returns when the store is no longer used; to be called after the server has stopped listening."""
         await asyncio.to_thread(self._references.close)
 
     async def set_serving(self, is_serving: bool) -> None:
-        """What health says from now on, of every service that can be."""
+        """Sets the health of all services."""
         status = health_pb2.HealthCheckResponse
         self._is_serving = is_serving
         for service in ("", *SERVICE_NAMES):
@@ -140,7 +140,7 @@ class Services:
         self._metrics.set_serving(is_serving)
 
     async def set_changeable(self, is_changeable: bool) -> None:
-        """What health says of the ReferenceService: a store that cannot be written serves queries all the same."""
+        """Sets whether the ReferenceService is healthy: queries are served even while the store cannot be written."""
         self._is_changeable = is_changeable
         if self._is_serving:
             await self.set_serving(True)

@@ -38,7 +38,7 @@ from .messages.groups import (
 from .messages.priors import needs_attributes
 from .messages.queries import query_from_message
 from .progressive import coarse_then_final
-from .watching import Watch, Watchers
+from .watching import Watcher, Watchers
 
 
 class LocalizationService(rpcs.LocalizationServiceServicer):
@@ -164,7 +164,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._finish_group(request, response, outcome, queries, group.results, call)
         return response
 
-    async def WatchQueries(self, request: pb.WatchQueriesRequest, call: Call) -> Watch:
+    async def WatchQueries(self, request: pb.WatchQueriesRequest, call: Call) -> Watcher:
         """Implements LocalizationService.WatchQueries."""
         scene_key = key_of(call.principal.tenant, wire.scene_id_from_name(request.scene, "scene"))
         call.note(scene=scene_key)

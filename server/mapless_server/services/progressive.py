@@ -1,4 +1,4 @@
-"""Coarse first, refined after: an answer and what is known before it, as a stream of at most two messages."""
+"""LocalizeProgressively: a stream of at most two messages, the coarse answer if there is one and the final answer."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Any
 from mapless.v1 import localization_service_pb2 as pb
 
 Coarse = asyncio.Future[pb.LocalizeResponse]
-"""Gets the coarse answer, on the event loop, if there is one."""
+"""Is set to the coarse answer, on the event loop, if there is one."""
 
 
 async def coarse_then_final(
     answer: Callable[[Coarse], Coroutine[Any, Any, pb.LocalizeResponse]],
 ) -> AsyncGenerator[pb.LocalizeProgressivelyResponse, None]:
-    """The coarse answer as soon as there is one, if there is, and the final one.
+    """Yields the coarse answer as soon as it is known, if there is one, and then the final answer.
 
-    The answer is computed whether the messages are read or not: a slow reader delays only its own messages. Closing the
-    generator cancels the answer, and frees its place in the queue.
+    The answer is computed whether the messages are read or not, so a slow reader delays only its own messages. Closing
+    the generator cancels the answer, and frees its place in the queue.
 
     Args:
-        answer: gives the final answer; before it may set its argument.
+        answer: returns the final answer; before, it may set its argument to the coarse answer.
 
     Raises:
-        Exception: whatever `answer` raises, after the coarse message if there was one.
+        Exception: as `answer`, after the coarse message if there was one.
     """
     coarse: Coarse = asyncio.get_running_loop().create_future()
     answering = asyncio.ensure_future(answer(coarse))

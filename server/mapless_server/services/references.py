@@ -1,4 +1,4 @@
-"""ReferenceService: scenes and references as resources; images are described before the store is touched."""
+"""ReferenceService: scenes and references as resources; images are described before anything is stored."""
 # ruff: noqa: N802  methods carry the names of their RPCs
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from mapless_server.errors import AlreadyExists
 from mapless_server.rpc.call import Call
 from mapless_server.scenes import Viewpoint
 from mapless_server.security.tenancy import SceneKey, key_of, scene_id_of
-from mapless_server.store import ContradictingDown, NewReference, ReferenceRecord, Store
+from mapless_server.store import ContradictingDown, NewReference, ReferenceRecord, SceneAttributes, Store
 
-from .messages.priors import narrowing_from_message
+from .messages.priors import priors_from_message
 from .messages.queries import photo_from_message, reference_ids_from_names, reference_key_from_name, scene_key_from_name
 from .messages.references import (
     Page,
@@ -39,7 +39,7 @@ from .messages.references import (
 MAX_BATCH = 1000
 MAX_RETRIEVED = 1000
 DEFAULT_AUDITS, MAX_AUDITS = 10, 100
-STORE_THREADS = 4  # writers queue for one lock anyhow; these keep readers from waiting behind them
+STORE_THREADS = 4  # writers share one lock; the other threads keep readers from waiting for it
 
 T = TypeVar("T")
 M = TypeVar("M", pb.Scene, pb.Reference)
@@ -48,16 +48,16 @@ Draft = tuple[str, Photo, RigidTransform]
 
 
 class ReferenceService(rpcs.ReferenceServiceServicer):
-    """Keeps scenes and their references."""
+    """Stores scenes and their references."""
 
     def __init__(self, engine: Callable[[], Engine], store: Store) -> None:
-        """`engine` gives it, or raises Unavailable as long as there is none."""
+        """`engine` returns the engine; it raises Unavailable while the server starts."""
         self._engine = engine
         self._store = store
         self._threads = ThreadPoolExecutor(STORE_THREADS, thread_name_prefix="store")
 
     def close(self) -> None:
-        """Waits for what the store is doing."""
+        """Waits for running operations of the store."""
         self._threads.shutdown(wait=True)
 
     async def CreateScene(self, request: pb.CreateSceneRequest, call: Call) -> pb.CreateSceneResponse:
@@ -81,8 +81,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         try:
             scene = await self._stored(partial(self._store.update_scene, key, **changes))
         except ContradictingDown as error:
-            guilty = "down_in_world" if changes.get("down_in_world") else "datum"
-            raise FieldError(f"scene.{guilty}", str(error)) from None
+            field = "down_in_world" if changes.get("down_in_world") else "datum"
+            raise FieldError(f"scene.{field}", str(error)) from None
         return pb.UpdateSceneResponse(scene=scene_to_message(scene))
 
     async def ListScenes(self, request: pb.ListScenesRequest, call: Call) -> pb.ListScenesResponse:
@@ -100,7 +100,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         return pb.DeleteSceneResponse()
 
     def _delete_scene(self, engine: Engine, scene_key: SceneKey) -> None:
-        # Gone it may be even where this fails late, or where nobody waits for it any more.
+        # The scene may be deleted although this fails late, or although the call has ended.
         try:
             engine.forget_references(self._store.delete_scene(scene_key))
         finally:
@@ -128,9 +128,9 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             if item.scene not in ("", request.scene):
                 raise FieldError(f"requests[{i}].scene", f"must be empty or {request.scene!r}")
             if item.reference_id in seen:
-                raise FieldError(f"requests[{i}].reference_id", f"{names.shown(item.reference_id)} stands twice")
+                raise FieldError(f"requests[{i}].reference_id", f"{names.shown(item.reference_id)} is repeated")
             seen.add(item.reference_id)
-        # Every look at a photograph copies it: too much for the event loop.
+        # Each access to a photograph copies it, which takes too long for the event loop.
         drafts = await asyncio.to_thread(
             lambda: [self._draft(item, f"requests[{i}]") for i, item in enumerate(request.requests)]
         )
@@ -171,7 +171,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
         if not 0 <= request.count <= MAX_RETRIEVED:
             raise FieldError("count", f"must be 0 to {MAX_RETRIEVED}, is {request.count}")
-        narrowing = narrowing_from_message(request)
+        narrowing, _ = priors_from_message(request, SceneAttributes())
         photo = photo_from_message(request, "", engine.options.image_limits)
         count = request.count or DEFAULT_REFERENCE_COUNT
         choice = await engine.retrieve(scene_key, photo, count, narrowing, call.caller)
@@ -215,7 +215,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         return message
 
     def _draft(self, request: pb.CreateReferenceRequest, path: str) -> Draft:
-        """What a request asks to store, all checked but the pixels; FieldError or InvalidArgument names the field."""
+        """A reference to create, all checked except the pixels; FieldError or InvalidArgument names the field."""
         reference_id = wire.checked_id(request.reference_id, wire.joined(path, "reference_id"))
         path = wire.joined(path, "reference")
         if not request.HasField("reference"):
@@ -230,7 +230,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         return reference_id, photo, world_from_camera
 
     async def _add(self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call) -> Sequence[ReferenceRecord]:
-        # Describing takes long: an unknown scene is worth noticing before. The store looks again when it adds.
+        # Describing takes long, so an unknown scene is rejected before. The store checks again when it adds.
         await self._stored(self._store.get_generation, scene_key)
         described = await self._engine().describe([photo for _, photo, _ in drafts], call.caller)
         references = [
@@ -240,7 +240,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         return await self._stored(self._store.add_references, scene_key, references)
 
     async def _stored(self, operation: Callable[..., T], *arguments: object) -> T:
-        """An operation of the store, off the event loop; Unavailable while the server starts."""
+        """Runs an operation of the store in a thread; raises Unavailable while the server starts."""
         self._engine()
         return await asyncio.get_running_loop().run_in_executor(self._threads, operation, *arguments)
 

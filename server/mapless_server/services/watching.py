@@ -1,9 +1,10 @@
-"""Who watches a scene's queries as they are answered: a hub between Localize and WatchQueries.
+"""Publishes answered queries to the watchers of their scene: from Localize to WatchQueries.
 
-Everything runs on the event loop. Photographs are held in memory until they are sent, a few for each watcher, and
-stored nowhere: at most MAX_WATCHERS times QUEUE_LENGTH, so 24 images of `max_image_mib` (384 MiB by default), and the
-message that each watcher is being sent. One that reads nothing for a minute is sent away (see `sending`); what it was
-being sent is held until it reads it or its connection ends. Without watchers it costs a look into a dictionary.
+Everything runs on the event loop. Photographs are in memory until they are sent, and are not stored: at most
+MAX_WATCHERS times QUEUE_LENGTH, so 24 images of `max_image_mib` (384 MiB by default), and the message being sent to
+each watcher. A watcher that reads nothing for a minute is disconnected (see `rpc.sending`); the message that was
+being sent to it stays in memory until it is read or the connection ends. Without watchers the cost is one look-up in a
+dictionary.
 """
 
 from __future__ import annotations
@@ -19,58 +20,55 @@ from mapless_server.errors import FailedPrecondition, Overloaded, Unavailable
 from mapless_server.security.tenancy import SceneKey, tenant_of
 
 MAX_WATCHERS = 8
-"""Of all scenes together: each may hold `QUEUE_LENGTH` photographs in memory."""
+"""Of all scenes together: each may have `QUEUE_LENGTH` photographs in memory."""
 MAX_WATCHERS_OF_TENANT = 4
-"""So that one tenant cannot keep the others from watching."""
+"""So that one tenant cannot use up the limit of all."""
 QUEUE_LENGTH = 3
-"""Answers that wait for a watcher; one that reads more slowly than they come misses the oldest."""
+"""Answers that wait for a watcher; a slow reader misses the oldest."""
 
 
 @dataclass(frozen=True, eq=False)
-class Watched:
-    """A query that was answered: its photograph as it was sent, its camera, and the answer with what it rests on."""
+class WatchedAnswer:
+    """An answered query: its photograph as it was sent, its camera, and the answer with its matches."""
 
     image: bytes
     intrinsics: geometry_pb.CameraIntrinsics
     answer: pb.LocalizeResponse
 
 
-class Watch:
-    """What somebody who watches a scene gets to see: messages, for as long as they are asked for.
+class Watcher:
+    """The messages to one watcher of a scene, an asynchronous iterator; ends with Unavailable when the server stops."""
 
-    It ends with Unavailable, when the server stops.
-    """
-
-    def __init__(self, forget: Callable[[Watch], None], max_message_bytes: int) -> None:
-        """`forget` is told when it ends; messages larger than the limit go without their photograph."""
-        self._forget = forget
+    def __init__(self, unregister: Callable[[Watcher], None], max_message_bytes: int) -> None:
+        """`unregister` is called when it is closed; messages above the limit are sent without their photograph."""
+        self._unregister = unregister
         self._max_message_bytes = max_message_bytes
-        self._waiting: deque[Watched] = deque(maxlen=QUEUE_LENGTH)
+        self._waiting: deque[WatchedAnswer] = deque(maxlen=QUEUE_LENGTH)
         self._missed_count = 0
-        self._is_over = False
-        self._news = asyncio.Event()
+        self._has_ended = False
+        self._changed = asyncio.Event()
 
-    def tell(self, watched: Watched) -> None:
-        """Something to see."""
+    def put(self, watched: WatchedAnswer) -> None:
+        """Adds an answer; drops the oldest one if too many wait."""
         if len(self._waiting) == QUEUE_LENGTH:
             self._missed_count += 1
         self._waiting.append(watched)
-        self._news.set()
+        self._changed.set()
 
     def end(self) -> None:
-        """There will be nothing more."""
-        self._is_over = True
-        self._news.set()
+        """Ends it, after the server has begun to stop."""
+        self._has_ended = True
+        self._changed.set()
 
-    def __aiter__(self) -> Watch:
+    def __aiter__(self) -> Watcher:
         return self
 
     async def __anext__(self) -> pb.WatchQueriesResponse:
-        """The oldest that was not seen, and how many were missed before it."""
-        while not (self._waiting or self._is_over):
-            self._news.clear()
-            await self._news.wait()
-        if self._is_over:
+        """The oldest answer that waits, with the number of those that were missed before it."""
+        while not (self._waiting or self._has_ended):
+            self._changed.clear()
+            await self._changed.wait()
+        if self._has_ended:
             raise Unavailable("the server is stopping", reason="DRAINING", retry_after_s=1.0)
         watched = self._waiting.popleft()
         missed, self._missed_count = self._missed_count, 0
@@ -82,89 +80,89 @@ class Watch:
         return message
 
     async def aclose(self) -> None:
-        """Nobody looks any more."""
-        self._forget(self)
+        """Ends it from the watcher's side."""
+        self._unregister(self)
 
 
 class Watchers:
-    """Passes answers on to those who watch their scene."""
+    """The watchers of all scenes."""
 
     def __init__(self, are_allowed: bool, max_message_bytes: int = 32 * 2**20) -> None:
-        """Nobody watches yet.
+        """Has no watchers at first.
 
         Args:
-            are_allowed: the setting: whether callers' photographs may be shown to others at all.
+            are_allowed: the setting `allow_watching`: whether callers' photographs may be shown to others.
             max_message_bytes: the largest message that can be sent.
         """
         self._are_allowed = are_allowed
         self._max_message_bytes = max_message_bytes
-        self._of_scene: dict[SceneKey, set[Watch]] = {}
+        self._by_scene: dict[SceneKey, set[Watcher]] = {}
 
     def is_watched(self, scene_key: SceneKey) -> bool:
-        """Whether somebody watches the scene: then its answers are wanted with what they rest on."""
-        return scene_key in self._of_scene
+        """Whether the scene has a watcher, so that its answers are wanted with their matches."""
+        return scene_key in self._by_scene
 
     def publish(
         self, scene_key: SceneKey, request: pb.LocalizeRequest, response: pb.LocalizeResponse, debug: pb.Debug | None
     ) -> None:
-        """Shows an answer to those who watch its scene.
+        """Sends an answer to the watchers of its scene.
 
         Args:
-            scene_key: which scene.
+            scene_key: the scene.
             request: with the photograph.
-            response: as its caller gets it; it is not changed, and not kept.
-            debug: what the answer rests on; None where the computation did not come so far.
+            response: to the caller; it is copied, not changed.
+            debug: the matches; None where the computation did not come so far.
         """
-        watches = self._of_scene.get(scene_key)
-        if watches is None:
+        watchers = self._by_scene.get(scene_key)
+        if watchers is None:
             return
         answer = pb.LocalizeResponse()
         answer.CopyFrom(response)
         if debug is not None:
             answer.debug.CopyFrom(debug)
-        # A part of a message keeps all of it, with the image a second time.
+        # A copy, since a field of a message keeps the whole message in memory, with its image.
         intrinsics = geometry_pb.CameraIntrinsics()
         intrinsics.CopyFrom(request.intrinsics)
-        watched = Watched(request.image, intrinsics, answer)
-        for watch in watches:
-            watch.tell(watched)
+        watched = WatchedAnswer(request.image, intrinsics, answer)
+        for watcher in watchers:
+            watcher.put(watched)
 
     def check(self, tenant: str) -> None:
-        """Whether somebody may begin to watch.
+        """Checks whether a tenant may have another watcher.
 
         Raises:
             FailedPrecondition: the server is not configured to allow it.
-            Overloaded: too many watch already.
+            Overloaded: there are too many watchers.
         """
         if not self._are_allowed:
             raise FailedPrecondition(
                 "the server does not show callers' photographs; its setting allow_watching lets it",
                 reason="WATCHING_NOT_ALLOWED",
             )
-        counts = {key: len(watches) for key, watches in self._of_scene.items()}
+        counts = {key: len(watchers) for key, watchers in self._by_scene.items()}
         of_tenant = sum(count for key, count in counts.items() if tenant_of(key) == tenant)
         if sum(counts.values()) >= MAX_WATCHERS or of_tenant >= MAX_WATCHERS_OF_TENANT:
-            raise Overloaded("too many watch already", reason="TOO_MANY_WATCHERS", retry_after_s=5.0)
+            raise Overloaded("there are too many watchers", reason="TOO_MANY_WATCHERS", retry_after_s=5.0)
 
-    def watch(self, scene_key: SceneKey) -> Watch:
-        """The scene's answers from now on, until it is closed.
+    def watch(self, scene_key: SceneKey) -> Watcher:
+        """A watcher of the scene's answers from now on, until it is closed.
 
         Raises:
             FailedPrecondition, Overloaded: see `check`.
         """
         self.check(tenant_of(scene_key))
-        watch = Watch(lambda it: self._forget(scene_key, it), self._max_message_bytes)
-        self._of_scene.setdefault(scene_key, set()).add(watch)
-        return watch
+        watcher = Watcher(lambda it: self._unregister(scene_key, it), self._max_message_bytes)
+        self._by_scene.setdefault(scene_key, set()).add(watcher)
+        return watcher
 
     def close(self) -> None:
-        """Sends everybody away, since the server stops."""
-        for watches in self._of_scene.values():
-            for watch in watches:
-                watch.end()
+        """Ends all watchers, when the server stops."""
+        for watchers in self._by_scene.values():
+            for watcher in watchers:
+                watcher.end()
 
-    def _forget(self, scene_key: SceneKey, watch: Watch) -> None:
-        watches = self._of_scene[scene_key]
-        watches.remove(watch)
-        if not watches:
-            del self._of_scene[scene_key]
+    def _unregister(self, scene_key: SceneKey, watcher: Watcher) -> None:
+        watchers = self._by_scene[scene_key]
+        watchers.remove(watcher)
+        if not watchers:
+            del self._by_scene[scene_key]

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import betaincinv
 from scipy.stats import rankdata
 
-from mapless_server.services.messages.factors import Conditions, Factors
+from mapless_server.services.messages.radii import Conditions, Factors
 
 from .claims import Claim, Sample, TooFewQueries, fit_factors, left_one_out
 from .queries import Outcome

@@ -14,7 +14,7 @@ from mapless.names import check_id
 from mapless.scenes import Calibration
 from mapless_server.serve.assembly import image_limits
 from mapless_server.serve.signals import terminable
-from mapless_server.services.messages.factors import Factors
+from mapless_server.services.messages.radii import Factors
 from mapless_server.settings import Settings, load_settings
 from mapless_tools.child import temporary_server
 from mapless_tools.connection import Connection, connected

@@ -1,4 +1,4 @@
-"""What the method says of a query, as messages."""
+"""Messages of an answer: localization or rejection, frames, diagnostics."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from mapless_server.method.results import MetricScale
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_server.store import SceneAttributes
 
-from .factors import Claimed, Conditions, claimed
 from .queries import enum_from_message, enum_to_message
+from .radii import Conditions, ReportedRadii, reported_radii
 
 
 @dataclass(frozen=True, eq=False)
 class AnswerFrames:
-    """The frames that an answer is given in, beside OpenCV's.
+    """The frames that a caller wants its answer in, beside OpenCV's.
 
     Attributes:
         axes: of the caller's camera.
-        session_from_camera: at the moment of capture, in these axes; None if the request has none.
+        session_from_camera: at the time of capture, in these axes; None if the request has none.
     """
 
     axes: Axes
@@ -37,29 +37,25 @@ class AnswerFrames:
 
 
 def answer_frames_of(request: pb.LocalizeRequest) -> AnswerFrames:
-    """The frames that a request wants its answer in; FieldError names what is wrong."""
+    """The frames of a request; FieldError names the field that is wrong."""
     return AnswerFrames(axes_from_message(request.options), session_from_message(request))
 
 
 def outcome_to_message(result: Result, options: LocalizeOptions, frames: AnswerFrames) -> pb.LocalizeResponse:
-    """Message of an answer, with nothing in it but its outcome."""
+    """The response with its outcome alone."""
     outcome = result.answer.outcome
     if isinstance(outcome, Rejection):
         return pb.LocalizeResponse(rejection=rejection_to_message(outcome))
-    claim = claim_of(outcome.covariance, result, options)
-    return pb.LocalizeResponse(localization=_localization_to_message(outcome, claim, result.attributes, frames))
-
-
-def claim_of(covariance: Array | None, result: Result, options: LocalizeOptions) -> Claimed | None:
-    """What is told of a pose's error, by its covariance (6, 6) and the scene's calibration; None if there is none."""
-    if covariance is None:
-        return None
-    conditions = Conditions(result.tier.features, result.tier.backend, options.variant.name, __version__)
-    return claimed(accuracy_from_covariance(covariance), covariance, conditions, result.attributes.calibration)
+    radii = None
+    if outcome.covariance is not None:
+        accuracy = accuracy_from_covariance(outcome.covariance)
+        conditions = Conditions(result.tier.features, result.tier.backend, options.variant.name, __version__)
+        radii = reported_radii(accuracy, outcome.covariance, conditions, result.attributes.calibration)
+    return pb.LocalizeResponse(localization=_localization_to_message(outcome, radii, result.attributes, frames))
 
 
 def _localization_to_message(
-    localization: Localization, claim: Claimed | None, attributes: SceneAttributes, frames: AnswerFrames
+    localization: Localization, radii: ReportedRadii | None, attributes: SceneAttributes, frames: AnswerFrames
 ) -> pb.Localization:
     message = pb.Localization(
         world_from_camera=wire.transform_to_message(localization.world_from_camera),
@@ -70,13 +66,13 @@ def _localization_to_message(
         trust=localization.trust,
         prior_checks=[_check_to_message(check) for check in localization.prior_checks],
     )
-    if claim is not None:
-        message.covariance.CopyFrom(covariance_to_message(claim.covariance))
-        message.accuracy.CopyFrom(accuracy_to_message(claim))
+    if radii is not None:
+        message.covariance.CopyFrom(covariance_to_message(radii.covariance))
+        message.accuracy.CopyFrom(accuracy_to_message(radii))
     set_frames(
         message,
         localization.world_from_camera,
-        claim.covariance if claim else None,
+        radii.covariance if radii else None,
         frames.axes,
         frames.session_from_camera,
         attributes.datum,
@@ -89,15 +85,14 @@ def covariance_to_message(covariance: Array) -> pb.PoseCovariance:
     return pb.PoseCovariance(row_major=covariance.ravel().tolist())
 
 
-def accuracy_to_message(claim: Claimed) -> pb.Accuracy:
+def accuracy_to_message(radii: ReportedRadii) -> pb.Accuracy:
     """Message of radii."""
-    radii = claim.accuracy
     return pb.Accuracy(
-        position_68_m=radii.position_68_m,
-        position_95_m=radii.position_95_m,
-        rotation_68_deg=radii.rotation_68_deg,
-        rotation_95_deg=radii.rotation_95_deg,
-        calibrated=claim.calibrated,
+        position_68_m=radii.accuracy.position_68_m,
+        position_95_m=radii.accuracy.position_95_m,
+        rotation_68_deg=radii.accuracy.rotation_68_deg,
+        rotation_95_deg=radii.accuracy.rotation_95_deg,
+        calibrated=radii.calibrated,
     )
 
 
@@ -138,7 +133,7 @@ def _hint_to_message(hint: Hint) -> pb.Hint:
 
 
 def diagnostics_to_message(result: Result, options: LocalizeOptions) -> pb.Diagnostics:
-    """Message of what was used and where the time went; the caller knows the call's id and durations."""
+    """Message of what was used and where the time went, except the call's id and durations."""
     answer, tier = result.answer, result.tier
     message = pb.Diagnostics(
         backend=tier.backend,
@@ -160,7 +155,7 @@ def diagnostics_to_message(result: Result, options: LocalizeOptions) -> pb.Diagn
 
 def _reference_uses(result: Result) -> list[pb.ReferenceUse]:
     answer = result.answer
-    # Counts are missing when the stage that counts was not reached.
+    # Counts are missing where the stage that counts was not reached.
     match_counts = answer.reference_match_counts or (0,) * len(result.references)
     inlier_counts = answer.reference_inlier_counts or (0,) * len(result.references)
     similarities = {it.key: it.similarity for it in result.choice.references} if result.choice else {}
@@ -184,16 +179,16 @@ def _scale_to_message(scale: MetricScale) -> pb.ScaleEstimate:
 
 
 MAX_SESSION_COORDINATE_M = 1e7
-"""Where no device has tracked itself to; what is further is a mistake, and long sums of squares would lose digits."""
+"""No device tracks itself this far; larger coordinates are mistakes, and their squares would lose digits."""
 
 
 def axes_from_message(options: pb.LocalizeOptions) -> Axes:
-    """The axes that a request speaks of its camera in; FieldError if there are no such axes."""
+    """The axes of the caller's camera; FieldError if the number is not one of them."""
     return enum_from_message(options.axes, pb.Axes, Axes.OPENCV, "options.axes")
 
 
 def session_from_message(request: pb.LocalizeRequest) -> RigidTransform | None:
-    """Where the device believed its camera to be, in the request's axes; FieldError if it is no pose."""
+    """The camera's pose as the device tracked it, in the request's axes; FieldError if it is no pose."""
     if not request.HasField("session_from_camera"):
         return None
     return wire.transform_from_message(request.session_from_camera, "session_from_camera", MAX_SESSION_COORDINATE_M)
@@ -207,39 +202,30 @@ def set_frames(
     session_from_camera: RigidTransform | None,
     datum: Datum | None,
 ) -> None:
-    """Puts a pose into an answer as its caller wants it, too: `in_axes`, and `geo_pose` where there is a datum.
+    """Sets the pose in the caller's frames: `in_axes`, and `geo_pose` where there is a datum.
 
     Args:
-        message: the answer, changed.
-        world_from_camera: OpenCV.
-        covariance: (6, 6) as it is answered, so with the scene's calibration if there is one; None if there is none.
+        message: the answer; it is changed.
+        world_from_camera: of the camera, in OpenCV's axes.
+        covariance: (6, 6) as reported, so calibrated if the answer is; None if there is none.
         axes: the caller's.
-        session_from_camera: of the moment of capture, in these axes; None if the caller has said nothing of it.
+        session_from_camera: at the time of capture, in these axes; None if the request has none.
         datum: the scene's.
     """
-    message.in_axes.CopyFrom(framed_to_message(axes, world_from_camera, covariance, session_from_camera))
+    framed = message.in_axes
+    framed.axes = enum_to_message(axes, pb.Axes)
+    framed.world_from_camera.CopyFrom(wire.transform_to_message(pose_to(axes, world_from_camera)))
+    if covariance is not None:
+        framed.covariance.row_major.extend(covariance_to(axes, covariance).ravel().tolist())
+    if session_from_camera is not None:
+        world_from_session = world_from_session_in(axes, world_from_camera, session_from_camera)
+        framed.world_from_session.CopyFrom(wire.transform_to_message(world_from_session))
     if datum is not None:
         message.geo_pose.CopyFrom(geo_pose_to_message(world_from_camera, datum))
 
 
-def framed_to_message(
-    axes: Axes, world_from_camera: RigidTransform, covariance: Array | None, session_from_camera: RigidTransform | None
-) -> pb.FramedPose:
-    """Message of a pose in other axes; arguments as of `set_frames`."""
-    message = pb.FramedPose(
-        axes=enum_to_message(axes, pb.Axes),
-        world_from_camera=wire.transform_to_message(pose_to(axes, world_from_camera)),
-    )
-    if covariance is not None:
-        message.covariance.row_major.extend(covariance_to(axes, covariance).ravel().tolist())
-    if session_from_camera is not None:
-        world_from_session = world_from_session_in(axes, world_from_camera, session_from_camera)
-        message.world_from_session.CopyFrom(wire.transform_to_message(world_from_session))
-    return message
-
-
 def geo_pose_to_message(world_from_camera: RigidTransform, datum: Datum) -> pb.GeoPose:
-    """Message of a pose on the Earth, its zeros written."""
+    """Message of a pose on the Earth; zeros are present as values."""
     found = geopose(world_from_camera, datum)
     q = found.quaternion
     return pb.GeoPose(

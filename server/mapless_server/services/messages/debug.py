@@ -1,8 +1,7 @@
-"""What a pose rests on, as a message: pixels of the photographs as they were sent, points in the caller's world.
+"""Message of a pose's support: pixels of the photographs as they were sent, points in the scene's world.
 
-The pipeline works on reduced photographs without distortion. Its pixels and those of the file that was sent show the
-same rays, so a pixel goes to a ray by the one camera and back by the other: that undoes the reduction, and distorts
-again, in one step.
+The method works on reduced photographs without distortion. A pixel is converted to a ray by the camera of the reduced
+photograph, and to a pixel by the camera that was sent: that undoes the reduction and distorts again in one step.
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ if TYPE_CHECKING:
     from mapless_server.method.views import View
 
 MAX_MATCHES = 2000
-"""Some 100 KB of message, and more than a picture shows."""
+"""About 100 KB of message, and more than can be seen in a picture."""
 
 
 def debug_to_message(support: Support) -> pb.Debug:
-    """The matches of a support; where there are too many, inliers go first, thinned out evenly."""
+    """The matches of a support; where there are too many, inliers are preferred, sampled evenly."""
     estimate, matches = support.estimate, support.matches
     inlier = np.zeros(len(matches), bool) if estimate is None else estimate.inliers
     error_px = np.full(len(matches), np.nan) if estimate is None else estimate.errors_px
@@ -48,14 +47,14 @@ def debug_to_message(support: Support) -> pb.Debug:
 
 
 def sent_pixels(view: View, pixels: NDArray[np.floating]) -> Array:
-    """Where pixels (N, 2) of a view are in the photograph as it was sent, (N, 2)."""
+    """Pixels (N, 2) of a view in the photograph as it was sent, (N, 2)."""
     if view.photograph is None:
         return np.asarray(pixels, np.float64)
     return view.photograph.camera.project(view.camera.rays(pixels))
 
 
 def _chosen(inlier: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Which matches to tell of, in their order."""
+    """Indices of the matches to report, ascending."""
     inliers, others = np.flatnonzero(inlier), np.flatnonzero(~inlier)
     inliers = _thinned(inliers, MAX_MATCHES)
     return np.sort(np.concatenate([inliers, _thinned(others, MAX_MATCHES - len(inliers))]))

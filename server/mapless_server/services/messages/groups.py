@@ -1,4 +1,4 @@
-"""Requests with several photographs, and what is answered to them."""
+"""Messages of rigs and sequences: requests with several photographs, and their responses."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ from .answers import (
     geo_pose_to_message,
     rejection_to_message,
 )
-from .factors import Claimed
 from .queries import (
     MAX_CANDIDATES,
     MAX_REFERENCES,
@@ -38,6 +37,7 @@ from .queries import (
     reference_count_from_message,
     reference_ids_from_names,
 )
+from .radii import ReportedRadii
 
 if TYPE_CHECKING:
     from mapless_server.engine.groups import GroupResult
@@ -59,12 +59,12 @@ def queries_from_message(
     Args:
         request: the message.
         list_name: its field that holds them.
-        bounds: how many there may be, at least and at most.
-        tenant: whose scene it is.
-        engine: its limits and defaults.
+        bounds: least and largest number of photographs.
+        tenant: the scene's owner.
+        engine: limits and defaults.
 
     Raises:
-        FieldError, InvalidArgument: names the field that is wrong, "images[2].intrinsics".
+        FieldError, InvalidArgument: it names the field that is wrong, "images[2].intrinsics".
     """
     scene_id = wire.scene_id_from_name(request.scene, "scene")
     messages = getattr(request, list_name)
@@ -73,9 +73,11 @@ def queries_from_message(
         raise FieldError(list_name, f"must be {least} to {most}, are {len(messages)}")
     options = options_from_message(request.options, engine.coverage)
     if options.variant is not Variant.BEST:
-        raise FieldError("options.variant", "several photographs are posed together by the default variant alone")
+        raise FieldError(
+            "options.variant", f"must be BEST, the default, for several photographs, is {options.variant.name}"
+        )
     if isinstance(request, pb.LocalizeRigRequest) and axes_from_message(request.options) is not Axes.OPENCV:
-        raise FieldError("options.axes", "a rig is posed in OpenCV's axes alone")
+        raise FieldError("options.axes", "must be OPENCV, the default, for a rig")
     reranks = request.options.rerank_references
     count = reference_count_from_message(request.options)
     return tuple(
@@ -99,12 +101,12 @@ def _reference_ids(names: Sequence[str], scene_id: str, most: int, path: str) ->
     try:
         return reference_ids_from_names(names, scene_id, most)
     except FieldError as error:
-        told = str(error).removeprefix(f"{error.field}: ")
-        raise FieldError(wire.joined(path, error.field), told) from None
+        message = str(error).removeprefix(f"{error.field}: ")
+        raise FieldError(wire.joined(path, error.field), message) from None
 
 
 def poses_from_message(messages: Sequence[Any], list_name: str, pose_name: str) -> tuple[RigidTransform, ...]:
-    """The pose that each photograph of a list comes with; FieldError names the one that is none."""
+    """The pose given with each photograph of a list; FieldError names the one that is missing or no pose."""
     poses = []
     for i, message in enumerate(messages):
         path = f"{list_name}[{i}].{pose_name}"
@@ -115,14 +117,14 @@ def poses_from_message(messages: Sequence[Any], list_name: str, pose_name: str) 
 
 
 def session_poses_from_message(request: pb.LocalizeSequenceRequest) -> tuple[Axes, tuple[RigidTransform, ...]]:
-    """The axes of the caller, and where its device believed its camera to be, both in OpenCV's axes."""
+    """The caller's axes, and the poses as its device tracked them, converted to OpenCV's axes."""
     axes = axes_from_message(request.options)
     poses = poses_from_message(request.frames, "frames", "session_from_camera")
     return axes, tuple(pose_from(axes, pose) for pose in poses)
 
 
 def session_from_rig_from_message(request: pb.LocalizeRigRequest) -> RigidTransform | None:
-    """Where the device believed its rig to be, OpenCV's axes; FieldError if it is no pose."""
+    """The rig's pose as the device tracked it, in OpenCV's axes; FieldError if it is no pose."""
     if not request.HasField("session_from_rig"):
         return None
     return wire.transform_from_message(request.session_from_rig, "session_from_rig", MAX_SESSION_COORDINATE_M)
@@ -135,7 +137,7 @@ def rig_to_message(
     request: pb.LocalizeRigRequest,
     session_from_rig: RigidTransform | None,
 ) -> pb.LocalizeRigResponse:
-    """The answer, but for what the call alone knows."""
+    """The response, except the call's id."""
     if isinstance(outcome, Rejection):
         response = pb.LocalizeRigResponse(rejection=rejection_to_message(outcome))
     else:
@@ -162,7 +164,7 @@ def sequence_to_message(
     request: pb.LocalizeSequenceRequest,
     axes: Axes,
 ) -> pb.LocalizeSequenceResponse:
-    """The answer, but for what the call alone knows."""
+    """The response, except the call's id."""
     if isinstance(outcome, Rejection):
         response = pb.LocalizeSequenceResponse(rejection=rejection_to_message(outcome))
     else:
@@ -184,7 +186,7 @@ def sequence_to_message(
 
 
 def _in_axes(world_from_session: Similarity, axes: Axes) -> RigidTransform:
-    """Rotation and translation of a similarity between frames that are both told in these axes."""
+    """Rotation and translation of a similarity between world and session, both in these axes."""
     mirror = WORLD_FROM_RIGHT_HANDED[axes]
     return RigidTransform(mirror @ world_from_session.rotation @ mirror.T, mirror @ world_from_session.translation)
 
@@ -194,11 +196,11 @@ def _set_support(
     matched: Sequence[PosedImage],
     covariance: Array,
 ) -> None:
-    """What the two kinds of answers have in common."""
-    # A scene's calibration was measured of single photographs.
-    claim = Claimed(accuracy_from_covariance(covariance), covariance, False)
-    message.covariance.CopyFrom(covariance_to_message(claim.covariance))
-    message.accuracy.CopyFrom(accuracy_to_message(claim))
+    """Sets the fields that both kinds of localizations have: covariance, radii and counts."""
+    # Not calibrated: a scene's calibration was measured with single photographs.
+    radii = ReportedRadii(accuracy_from_covariance(covariance), covariance, False)
+    message.covariance.CopyFrom(covariance_to_message(radii.covariance))
+    message.accuracy.CopyFrom(accuracy_to_message(radii))
     message.inlier_count = sum(int(it.inliers.sum()) for it in matched)
     message.match_count = sum(len(it.matches) for it in matched)
     message.reprojection_error_px = float(np.median(np.concatenate([it.errors_px[it.inliers] for it in matched])))

@@ -1,6 +1,6 @@
-"""What requests say of the camera beforehand, checked: limits, and soft priors in the scene's world.
+"""Priors of requests: hard limits and soft priors, checked and converted to the scene's world.
 
-Nothing behind this module knows of latitudes: what a satellite receiver says becomes a position in the world here.
+A geographic position becomes a position in the world here; no other module handles latitudes.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ from mapless_server.scenes import Cone, Narrowing, Sphere
 from mapless_server.store import SceneAttributes
 
 UNKNOWN_HEIGHT_SIGMA_M = 1000.0
-"""Of a receiver that tells no height: within three of these, above or below the datum, stand all buildings."""
+"""Of a receiver without a height: all buildings are within three of these above or below the datum."""
 
 MIN_SIGMA_M, MAX_SIGMA_M = 1e-4, 1e6
-"""Of a position: finer than any survey, and wider than any scene."""
+"""Of a position: finer than any survey, wider than any scene."""
 
 MIN_SIGMA_DEG, MAX_SIGMA_DEG = 1e-3, 90.0
-"""Of a direction. With more than 90 degrees it says nothing."""
+"""Of a direction; beyond 90 degrees a prior has no effect."""
 
 
 def needs_attributes(request: Any) -> bool:
-    """Whether what the request says is only understood with the scene's datum or its down."""
+    """Whether its priors can be converted only with the scene's datum or down direction."""
     if _has(request, "geo_position_prior"):
         return True
     return _has(request, "gravity_prior") and not request.gravity_prior.HasField("down_in_world")
 
 
 def priors_from_message(request: Any, attributes: SceneAttributes) -> tuple[Narrowing, Priors]:
-    """What a LocalizeRequest says of the camera: which references come into question, and what the solver is told.
+    """The priors of a request: limits of the references to choose from, and priors of the pose.
 
     Args:
         request: any message with some of the fields position_prior, geo_position_prior, gravity_prior, heading_prior
@@ -54,8 +54,8 @@ def priors_from_message(request: Any, attributes: SceneAttributes) -> tuple[Narr
         attributes: of its scene.
 
     Raises:
-        FieldError: one of them says nothing sensible; or a geo position is given together with a position or for a
-            scene without a datum, or gravity where nobody has said which way is down in the world.
+        FieldError: a value is out of range; or a geo position is given together with a position or for a scene without
+            a datum, or gravity where neither the request nor the scene has a down direction in the world.
     """
     limits: dict[str, Any] = {}
     soft: dict[str, Any] = {}
@@ -73,16 +73,6 @@ def priors_from_message(request: Any, attributes: SceneAttributes) -> tuple[Narr
         soft["pose"] = _pose(request.pose_prior, "pose_prior")
     priors = Priors(**soft)
     return replace(Narrowing.of(priors), **limits), priors
-
-
-def narrowing_from_message(request: Any) -> Narrowing:
-    """What `position_prior` and `heading_prior` of a RetrieveReferencesRequest say.
-
-    Raises:
-        FieldError: one of them says nothing sensible.
-    """
-    narrowing, _ = priors_from_message(request, SceneAttributes())
-    return narrowing
 
 
 def _has(request: Any, field: str) -> bool:
@@ -105,7 +95,7 @@ def _position(message: pb.PositionPrior, field: str) -> tuple[Sphere | None, Pos
 
 
 def _geo_position(message: pb.GeoPositionPrior, attributes: SceneAttributes, field: str) -> PositionPrior:
-    """In the world, where the covariance's axes are east, north and up at the place itself."""
+    """In the world; the axes of the covariance are east, north and up at the position."""
     datum = attributes.datum
     if datum is None:
         raise FieldError(field, "needs a scene with a datum (UpdateScene sets one)")
@@ -120,9 +110,9 @@ def _geo_position(message: pb.GeoPositionPrior, attributes: SceneAttributes, fie
     elif message.vertical_sigma_m:
         raise FieldError(f"{field}.height_m", "is required with vertical_sigma_m")
     place = GeoPosition(message.latitude_deg, message.longitude_deg, height_m)
-    turn = world_from_enu_at(place, datum).rotation
+    rotation = world_from_enu_at(place, datum).rotation
     in_enu = np.diag([message.horizontal_sigma_m] * 2 + [vertical_sigma_m]) ** 2
-    covariance = turn @ in_enu @ turn.T
+    covariance = rotation @ in_enu @ rotation.T
     return PositionPrior(world_from_geodetic(place, datum), (covariance + covariance.T) / 2)
 
 
@@ -161,7 +151,7 @@ def _pose(message: pb.PosePrior, field: str) -> PosePrior:
 
 
 def _direction(message: Any, name: str, field: str) -> Array:
-    """A vector of the message, (3,), brought to unit length."""
+    """A vector of the message, (3,), normalized."""
     if not message.HasField(name):
         raise FieldError(f"{field}.{name}", "is required")
     vector: geometry_pb2.Vector3 = getattr(message, name)
@@ -169,7 +159,7 @@ def _direction(message: Any, name: str, field: str) -> Array:
     length = math.hypot(*direction)
     if not 0 < length < math.inf:
         raise FieldError(f"{field}.{name}", "must have a finite length above 0")
-    # In two steps: the length of very short vectors has lost digits.
+    # In two steps, since the squares of very small components lose digits.
     direction = direction / np.abs(direction).max()
     return np.asarray(direction / np.linalg.norm(direction))
 

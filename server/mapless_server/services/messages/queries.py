@@ -1,4 +1,4 @@
-"""What a request asks of the method, checked as far as it can be without the store."""
+"""From a LocalizeRequest to a Query; every field is checked that can be checked without the store."""
 
 from __future__ import annotations
 
@@ -22,35 +22,35 @@ E = TypeVar("E", bound=Enum)
 
 
 def enum_to_message(value: Enum, enum: wire.ProtoEnum) -> Any:
-    """The number of a value on the wire."""
+    """The protobuf number of a value."""
     return enum.Value(wire.enum_prefix(enum) + value.name)
 
 
 def enum_from_message(number: int, enum: wire.ProtoEnum, default: E, field: str) -> E:
-    """The value of a number, the default for 0; FieldError if it is none."""
+    """The value of a protobuf number, the default for 0; FieldError if the number is unknown."""
     if number == 0:
         return default
     if number not in enum.values():
-        raise FieldError(field, f"{number} is no value of {enum.DESCRIPTOR.name}")
+        raise FieldError(field, f"must be one of {enum.DESCRIPTOR.name}'s values, is {number}")
     return type(default)[enum.Name(number).removeprefix(wire.enum_prefix(enum))]
 
 
 def scene_key_from_name(name: str, field: str, tenant: str) -> SceneKey:
-    """The key of a tenant's scene of this name; FieldError if it is none."""
+    """The key of a tenant's scene; FieldError if the name is not a scene's."""
     return key_of(tenant, wire.scene_id_from_name(name, field))
 
 
 def reference_key_from_name(name: str, field: str, tenant: str) -> tuple[SceneKey, str]:
-    """The key of a tenant's scene, and the reference's id within it; FieldError if the name is none."""
+    """The key of a tenant's scene, and the reference's id within it; FieldError if the name is not a reference's."""
     scene_id, reference_id = wire.reference_ids_from_name(name, field)
     return key_of(tenant, scene_id), reference_id
 
 
 def reference_ids_from_names(names_given: Sequence[str], scene_id: str, most: int) -> tuple[str, ...]:
-    """Ids of the references that `references` of a request names, in order.
+    """Ids of the references in a request's `references`, in order.
 
     Raises:
-        FieldError: there are more than `most`, or one is no name, of another scene, or stands twice.
+        FieldError: there are more than `most`, or one is no reference's name, of another scene, or repeated.
     """
     if len(names_given) > most:
         raise FieldError("references", f"must be at most {most}, are {len(names_given)}")
@@ -61,13 +61,13 @@ def reference_ids_from_names(names_given: Sequence[str], scene_id: str, most: in
         if its_scene_id != scene_id:
             raise FieldError(field, f"{names.shown(name)} is a reference of another scene than {scene_id!r}")
         if reference_id in reference_ids:
-            raise FieldError(field, f"{names.shown(name)} stands twice")
+            raise FieldError(field, f"{names.shown(name)} is repeated")
         reference_ids[reference_id] = None
     return tuple(reference_ids)
 
 
 def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
-    """The photograph in a message's `image` and `intrinsics`, its header checked; cheap enough for the event loop.
+    """The photograph of a message's `image` and `intrinsics`; reads the image's header alone, so it is fast.
 
     Raises:
         FieldError: the intrinsics are missing, out of range, or of another size than the image.
@@ -88,7 +88,7 @@ def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
 
 MAX_REFERENCES = 64
 MAX_CANDIDATES = 1000
-"""References that a request may name when the server is to choose among them."""
+"""References that a request may name where the server chooses among them."""
 
 
 def query_from_message(
@@ -96,7 +96,7 @@ def query_from_message(
 ) -> Query:
     """The query of a request; FieldError or InvalidArgument names the field that is wrong.
 
-    `attributes` are the scene's, of which only what `needs_attributes` says is looked at.
+    `attributes` are the scene's; they may be empty unless `needs_attributes`.
     """
     scene_id = wire.scene_id_from_name(request.scene, "scene")
     most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
@@ -115,7 +115,7 @@ def query_from_message(
 
 
 def reference_count_from_message(message: pb.LocalizeOptions) -> int:
-    """How many references are to be chosen where none is named."""
+    """How many references are chosen where none is named."""
     count = message.reference_count
     if not 0 <= count <= MAX_REFERENCES:
         raise FieldError("options.reference_count", f"must be 0 to {MAX_REFERENCES}, is {count}")
@@ -123,11 +123,11 @@ def reference_count_from_message(message: pb.LocalizeOptions) -> int:
 
 
 def options_from_message(message: pb.LocalizeOptions, coverage: float) -> LocalizeOptions:
-    """Options of the method; FieldError names the one that is none.
+    """Options of the method; FieldError names the one that is wrong.
 
     Args:
         message: of the request.
-        coverage: where it says none.
+        coverage: the default of the server.
     """
     if not 0 <= message.coverage < 1:
         raise FieldError("options.coverage", f"must be above 0 and below 1, or 0, is {message.coverage:g}")

@@ -1,4 +1,4 @@
-"""What is known of references, as messages."""
+"""Messages of the ReferenceService: scenes, references, pages of lists, audits, coverage."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ Record = TypeVar("Record")
 
 
 class PageRequest(Protocol):
-    """A request for a page of a list."""
+    """A request for one page of a list."""
 
     @property
     def page_size(self) -> int:
-        """How much is wanted; 0 for the default."""
+        """The number of items wanted; 0 for the default."""
 
     @property
     def page_token(self) -> str:
-        """Of the page before; empty for the first."""
+        """The token that the page before returned; empty for the first page."""
 
 
 class Page:
-    """One page of a list: how much to ask the store for, where to begin, where the next page begins.
+    """One page of a list: how many items to read, where to begin, and the token of the next page.
 
-    A token is the tenant, the collection and the last id of the page before: opaque to callers, and good for its own
+    A token is the tenant, the collection and the last id of the page before: opaque to callers, and valid for its own
     list only.
 
     Raises:
-        FieldError: a negative page size, or a token that this list did not give.
+        FieldError: a negative page size, or a token of another list.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Page:
             raise FieldError("page_size", f"must not be negative, is {request.page_size}")
         self._size = min(request.page_size or default_size, max_size)
         self._list = f"{tenant}\n{collection}"
-        self.limit = self._size + 1  # one more tells whether there is a next page
+        self.limit = self._size + 1  # one more shows whether there is a next page
         self.after = self._read_token(request.page_token) if request.page_token else ""
 
     def cut(self, records: Sequence[Record], id_of: Callable[[Record], str]) -> tuple[Sequence[Record], str]:
@@ -82,7 +82,7 @@ class Page:
                 return names.check_id(after)
         except (binascii.Error, ValueError):
             pass
-        raise FieldError("page_token", "is not one that this list gave")
+        raise FieldError("page_token", "must be a next_page_token of this list")
 
 
 def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
@@ -99,7 +99,7 @@ def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
 
 
 def choice_to_message(choice: Choice, scene_id: str) -> pb.RetrieveReferencesResponse:
-    """Message of references that were chosen."""
+    """Message of chosen references."""
     message = pb.RetrieveReferencesResponse(descriptor=choice.descriptor, store_generation=choice.generation)
     for chosen in choice.references:
         message.references.add(
@@ -111,7 +111,7 @@ def choice_to_message(choice: Choice, scene_id: str) -> pb.RetrieveReferencesRes
 
 
 def audit_to_message(audit: ReferenceAudit) -> pb.ReferenceAudit:
-    """Message of an audit; what is not known is 0."""
+    """Message of an audit; unknown values are 0."""
     return pb.ReferenceAudit(
         name=audit.reference,
         verdict=enum_to_message(audit.verdict, pb.AuditVerdict),
@@ -128,7 +128,7 @@ def audit_to_message(audit: ReferenceAudit) -> pb.ReferenceAudit:
 
 
 def coverage_to_message(coverage: Coverage) -> pb.CheckCoverageResponse:
-    """Message of a forecast, without the generation."""
+    """Message of a coverage check, without the generation."""
     return pb.CheckCoverageResponse(
         verdict=enum_to_message(coverage.verdict, pb.CoverageVerdict),
         message=coverage.message,
@@ -155,7 +155,7 @@ def scene_to_message(scene: SceneRecord) -> pb.Scene:
 
 
 def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
-    """What is known of a scene to be created; FieldError names what is none."""
+    """Attributes of a scene to be created; FieldError names the one that is wrong."""
     try:
         return SceneAttributes(
             datum_from_message(request.datum, "datum") if request.HasField("datum") else None,
@@ -168,17 +168,17 @@ def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
 
 
 def changes_from_message(request: pb.UpdateSceneRequest) -> dict[str, Any]:
-    """Arguments of ``Store.update_scene``: what a request's mask names, None for what its scene lacks.
+    """Arguments of ``Store.update_scene``: the fields in a request's mask, None for those that its scene lacks.
 
     Raises:
-        FieldError: the mask is empty or names what cannot be changed, or a value is none.
+        FieldError: the mask is empty or names a field that cannot be changed, or a value is wrong.
     """
     paths = list(dict.fromkeys(request.update_mask.paths))
     if not paths:
         raise FieldError("update_mask", f"must name what to change: {', '.join(_READERS)}")
     for path in paths:
         if path not in _READERS:
-            raise FieldError("update_mask", f"{names.shown(path)} is none of {', '.join(_READERS)}")
+            raise FieldError("update_mask", f"must name only {', '.join(_READERS)}, names {names.shown(path)}")
     scene = request.scene
     return {
         path: _READERS[path](getattr(scene, path), joined("scene", path)) if scene.HasField(path) else None
@@ -187,7 +187,7 @@ def changes_from_message(request: pb.UpdateSceneRequest) -> dict[str, Any]:
 
 
 def _measured(message: pb.SceneCalibration, field: str) -> Calibration:
-    """A calibration that says what it was measured with; when, the server says itself."""
+    """A calibration with its conditions; the server sets its time itself."""
     variants: wire.ProtoEnum = localization_pb.Variant
     if message.variant not in variants.values()[1:]:
         raise FieldError(joined(field, "variant"), f"must be one of Variant's values, is {message.variant}")

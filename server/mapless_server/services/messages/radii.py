@@ -1,9 +1,9 @@
-"""What a scene's calibration does to an answer: radii and covariance are multiplied, if they are what was measured."""
+"""The radii and the covariance that an answer reports: those of the method, times the factors of a calibration."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from mapless_server.method.uncertainty.accuracy import Accuracy
 
 @dataclass(frozen=True)
 class Factors:
-    """What the radii of an answer are multiplied by; as they are, by default.
+    """Factors of an answer's radii; 1 leaves them as they are.
 
     Attributes:
         position_68, position_95: of the position's radii.
@@ -27,12 +27,13 @@ class Factors:
     rotation_95: float = 1.0
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(it) and MIN_FACTOR <= it <= MAX_FACTOR for it in astuple(self)):
-            raise ValueError(f"a factor of claimed radii must be {MIN_FACTOR:g} to {MAX_FACTOR:g}: {self}")
+        for name, value in asdict(self).items():
+            if not (math.isfinite(value) and MIN_FACTOR <= value <= MAX_FACTOR):
+                raise ValueError(f"{name} must be {MIN_FACTOR:g} to {MAX_FACTOR:g}, is {value:g}")
 
     @classmethod
     def of(cls, calibration: Calibration) -> Factors:
-        """Those of a scene's calibration."""
+        """The factors of a scene's calibration."""
         return cls(
             calibration.position_factor_68,
             calibration.position_factor_95,
@@ -42,19 +43,19 @@ class Factors:
 
     @property
     def inverse(self) -> Factors:
-        """Those that undo these, as far as they are within the bounds."""
+        """The factors that undo these, as far as the bounds allow."""
         return Factors(*(min(max(1 / it, MIN_FACTOR), MAX_FACTOR) for it in astuple(self)))
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What computed an answer; factors are true of nothing else.
+    """What computed an answer; factors hold only under the conditions that they were measured under.
 
     Attributes:
         features: name of the local features, with their options: "sift-2048-1024px-0.02".
         backend: of the coarse stage.
         variant: form of the method, as `Diagnostics` names it: "BEST".
-        server_version: another one may claim other radii.
+        server_version: another version may report other radii.
     """
 
     features: str
@@ -64,8 +65,8 @@ class Conditions:
 
 
 @dataclass(frozen=True, eq=False)
-class Claimed:
-    """What is told of an answer's error.
+class ReportedRadii:
+    """How uncertain an answer is, as reported.
 
     Attributes:
         accuracy: radii.
@@ -78,23 +79,25 @@ class Claimed:
     calibrated: bool
 
 
-def claimed(accuracy: Accuracy, covariance: Array, conditions: Conditions, calibration: Calibration | None) -> Claimed:
-    """The claim of an answer: calibrated, if the scene's calibration was measured under the same conditions.
+def reported_radii(
+    accuracy: Accuracy, covariance: Array, conditions: Conditions, calibration: Calibration | None
+) -> ReportedRadii:
+    """Calibrated radii, if the scene's calibration was measured under the same conditions.
 
     Args:
-        accuracy: as the method claims it.
-        covariance: (6, 6) likewise.
+        accuracy: of the method.
+        covariance: (6, 6) of the method.
         conditions: what computed the answer.
         calibration: of the scene; None if it has none.
     """
     if calibration is None or not calibration.is_of(*astuple(conditions)):
-        return Claimed(accuracy, covariance, False)
+        return ReportedRadii(accuracy, covariance, False)
     factors = Factors.of(calibration)
-    return Claimed(scaled_accuracy(accuracy, factors), scaled_covariance(covariance, factors), True)
+    return ReportedRadii(scaled_accuracy(accuracy, factors), scaled_covariance(covariance, factors), True)
 
 
 def scaled_accuracy(accuracy: Accuracy, factors: Factors) -> Accuracy:
-    """Radii times factors; the one for 95 % is never smaller than the one for 68 %."""
+    """Radii times factors; the 95 % radius is never smaller than the 68 % radius."""
     position_68_m = factors.position_68 * accuracy.position_68_m
     rotation_68_deg = factors.rotation_68 * accuracy.rotation_68_deg
     return replace(
@@ -109,8 +112,8 @@ def scaled_accuracy(accuracy: Accuracy, factors: Factors) -> Accuracy:
 def scaled_covariance(covariance: Array, factors: Factors) -> Array:
     """The covariance (6, 6) whose 68 % radii are those of the given one times the factors.
 
-    C -> D C D with D = diag(fp, fp, fp, fr, fr, fr): positions by fp^2, rotations by fr^2, what couples them by fp fr,
-    so that it stays positive semi-definite and all correlations stay what they are.
+    C -> D C D with D = diag(fp, fp, fp, fr, fr, fr): positions by fp^2, rotations by fr^2, their covariances by fp fr,
+    so that it stays positive semi-definite and all correlations are kept.
     """
     scale = np.repeat([factors.position_68, factors.rotation_68], 3)
     return np.asarray(scale[:, None] * covariance * scale, float)
