@@ -17,17 +17,19 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselects the nightly tests of other tenths. Tests that share a file's costly set-up stay together."""
+    """Deselects the nightly tests of other tenths."""
     tenth = config.getoption("--tenth")
     if tenth is None:
         return
-    units = sorted({_unit(item) for item in items if item.get_closest_marker("nightly")})
+    units = sorted({unit for unit in map(_unit, items) if unit})
     others = {unit for number, unit in enumerate(units) if number % 10 != tenth}
     config.hook.pytest_deselected(items=[item for item in items if _unit(item) in others])
     items[:] = [item for item in items if _unit(item) not in others]
 
 
 def _unit(item: pytest.Item) -> str:
-    module = item.getparent(pytest.Module)
-    shares_set_up = module is not None and any(mark.name == "nightly" for mark in module.own_markers)
-    return item.nodeid.partition("::")[0] if shares_set_up else item.nodeid
+    """What a nightly test runs with: those whose marker has one name, which share a costly set-up; else itself."""
+    marker = item.get_closest_marker("nightly")
+    if marker is None:
+        return ""
+    return str(marker.args[0]) if marker.args else item.nodeid

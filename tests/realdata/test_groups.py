@@ -22,7 +22,7 @@ from mapless.geometry import Array
 from mapless_tools.child import CONNECT, child_server
 from mapless_tools.dataset import Dataset, Frame
 
-pytestmark = [pytest.mark.realdata, pytest.mark.nightly]
+pytestmark = [pytest.mark.realdata, pytest.mark.nightly("groups")]
 
 KITCHEN = "7scenes-redkitchen-seq01-first600"
 STARTS = (40, 200, 380, 530)

@@ -59,7 +59,8 @@ from support.ray_app import FAILS, HANGS, SECRET
 from mapless_tools.load_ray.callers import Calls, Scenes, calling
 from mapless_tools.load_ray.cluster import Cluster, Replica, application, running_cluster
 
-pytestmark = [pytest.mark.nightly, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.timeout(300)
+nightly = pytest.mark.nightly("ray")
 
 DATA = Path(os.environ.get("TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
 LIMIT_S = 60.0
@@ -145,7 +146,7 @@ def essence(answer: pb.LocalizeResponse) -> bytes:
     return bytes(answer.SerializeToString(deterministic=True))
 
 
-@pytest.mark.parametrize("make_place", [rendered, photographed])
+@pytest.mark.parametrize("make_place", [rendered, pytest.param(photographed, marks=nightly)])
 def test_answers_are_those_of_the_plain_server_bit_for_bit(
     url: str, real: Cluster, make_place: Callable[[], Place]
 ) -> None:
@@ -271,6 +272,7 @@ def test_errors_are_those_of_the_plain_server_with_details(url: str, guarded: Gu
             assert there.value.request_id
 
 
+@nightly
 def test_faults_are_internal_without_a_word_of_the_exception(guarded: Guarded) -> None:
     with guarded.stub() as stub, pytest.raises(grpc.RpcError) as caught:
         stub.Localize(localize_request("faulty"), timeout=30, metadata=guarded.metadata(("x-request-id", "mine")))
@@ -280,6 +282,7 @@ def test_faults_are_internal_without_a_word_of_the_exception(guarded: Guarded) -
     assert SECRET not in repr(failure.trailing_metadata())
 
 
+@nightly
 def test_a_request_id_is_taken_over(guarded: Guarded) -> None:
     with guarded.stub() as stub:
         answer, call = stub.Localize.with_call(
@@ -289,6 +292,7 @@ def test_a_request_id_is_taken_over(guarded: Guarded) -> None:
     assert dict(call.trailing_metadata())["x-request-id"] == "mine"
 
 
+@nightly
 def test_invalid_tokens_and_other_tenants_are_kept_out(guarded: Guarded) -> None:
     with Client(guarded.cluster.address) as nobody, pytest.raises(MaplessError) as caught:
         nobody.get_scene(SCENES[0])
@@ -300,6 +304,7 @@ def test_invalid_tokens_and_other_tenants_are_kept_out(guarded: Guarded) -> None
         stranger.get_scene(SCENES[0])
 
 
+@nightly
 def test_the_callers_deadline_comes_along(guarded: Guarded, client: Client) -> None:
     """The replica itself says that it passed; and refuses at once what it knows to take longer."""
     with pytest.raises(DeadlineExceeded) as caught:
@@ -320,6 +325,7 @@ def test_the_callers_deadline_comes_along(guarded: Guarded, client: Client) -> N
         assert "DEADLINE_INFEASIBLE" in set(pool.map(reason, range(12)))
 
 
+@nightly
 def test_too_much_is_refused_with_the_time_to_come_back(guarded: Guarded) -> None:
     with guarded.client(max_attempts=1) as once, futures.ThreadPoolExecutor(32) as pool:
         calls = [pool.submit(once.localize, PHOTO, CAMERA, "slow", timeout_s=30) for _ in range(32)]
@@ -331,6 +337,7 @@ def test_too_much_is_refused_with_the_time_to_come_back(guarded: Guarded) -> Non
         assert error.retry_after_s
 
 
+@nightly
 @pytest.mark.parametrize(("size_mib", "expected"), [(20, "INVALID_ARGUMENT"), (33, "RESOURCE_EXHAUSTED")])
 def test_the_limit_of_messages_is_that_of_the_settings(guarded: Guarded, size_mib: int, expected: str) -> None:
     request = pb.LocalizeRequest(
@@ -341,6 +348,7 @@ def test_the_limit_of_messages_is_that_of_the_settings(guarded: Guarded, size_mi
     assert from_rpc_error(caught.value).code == expected
 
 
+@nightly
 def test_health_and_reflection_are_the_standard_ones(guarded: Guarded) -> None:
     with grpc.insecure_channel(guarded.cluster.address) as channel:
         for name in ("", *SERVICE_NAMES):
@@ -356,6 +364,7 @@ def test_health_and_reflection_are_the_standard_ones(guarded: Guarded) -> None:
 # Which replica answers
 
 
+@nightly
 def test_calls_of_a_scene_reach_one_replica_and_scenes_both(guarded: Guarded, client: Client) -> None:
     at = {scene: who(client, scene) for scene in SCENES}
     assert set(at.values()) == {replica.process_id for replica in guarded.cluster.replicas()}
@@ -363,6 +372,7 @@ def test_calls_of_a_scene_reach_one_replica_and_scenes_both(guarded: Guarded, cl
         assert {scene: who(another, scene) for scene in SCENES} == at
 
 
+@nightly
 def test_calls_that_name_no_scene_come_to_both_by_turns(guarded: Guarded) -> None:
     with guarded.stub() as stub:
         request = localize_request(SCENES[0])
@@ -418,6 +428,7 @@ def replaced(cluster: Cluster, gone: set[Replica]) -> bool:
     return len(now) == 2 and not now & gone
 
 
+@nightly
 def test_a_replica_that_is_killed_costs_retries_and_no_call(guarded: Guarded) -> None:
     victim = guarded.cluster.replicas()[0]
     with called(guarded):
@@ -425,6 +436,7 @@ def test_a_replica_that_is_killed_costs_retries_and_no_call(guarded: Guarded) ->
         wait_until(lambda: replaced(guarded.cluster, {victim}))
 
 
+@nightly
 def test_a_replica_whose_queue_hangs_ends_and_is_replaced(guarded: Guarded, client: Client) -> None:
     fill(client, "hanging", how=HANGS)
     victim = guarded.cluster.replicas()[0]
@@ -435,6 +447,7 @@ def test_a_replica_whose_queue_hangs_ends_and_is_replaced(guarded: Guarded, clie
     assert not Path(f"/proc/{victim.process_id}").exists()
 
 
+@nightly
 def test_a_redeploy_costs_no_call_and_ends_endless_streams(guarded: Guarded) -> None:
     """Not even a retry: calls that run are finished, and new ones come to the replicas that are left."""
     before = set(guarded.cluster.replicas())
@@ -459,6 +472,7 @@ def test_a_redeploy_costs_no_call_and_ends_endless_streams(guarded: Guarded) -> 
     assert not before & set(guarded.cluster.replicas())
 
 
+@nightly
 def test_without_any_replica_callers_are_told_to_come_back(guarded: Guarded) -> None:
     with guarded.client(max_attempts=1, timeout_s=5.0) as once, guarded.client() as patient:
         for replica in guarded.cluster.replicas():

@@ -45,7 +45,7 @@ from mapless_tools.replay import report as report_module
 from mapless_tools.replay.recompute import recompute
 from mapless_tools.replay.report import Report, Selection, select
 
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.nightly("replay")
 
 ANGLES = range(-24, 25, 8)
 QUERIES = [corner.pose(angle, height) for angle, height in ((3.3, -1.5), (-14.0, -1.7), (20.0, -1.55))]
