@@ -19,7 +19,7 @@ import yaml  # type: ignore[import-untyped]
 from sqlalchemy import make_url
 
 from mapless.cli.arguments import make_parser
-from mapless_server.security.binding import assess_binding
+from mapless_server.security import assess_binding
 from mapless_server.settings import PREFIX, Settings, load_settings
 from mapless_server.store.postgresql import CONNECTIONS_AT_MOST
 

@@ -26,7 +26,7 @@ import yaml  # type: ignore[import-untyped]
 from mapless_server.networks.weights.catalogue import CATALOGUE
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
-from mapless_server.security.binding import assess_binding
+from mapless_server.security import assess_binding
 from mapless_server.serve.run import CLOSING_LIMIT_S, NOTIFY_S
 from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.settings import PREFIX, Settings, load_settings

@@ -31,7 +31,7 @@ from mapless_server.method.results import PoseStage
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.scenes import Narrowing, Sphere
 from mapless_server.scheduling import Abandoned, CostModel, Ending, Flow, Job
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import engine_over
 from mapless_server.store import NewReference, Store
 

@@ -22,7 +22,7 @@ from mapless_server.engine.queue_engine import JOIN, QueueEngine
 from mapless_server.engine.stages import PREPARE
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.rpc.call import Call
+from mapless_server.rpc import Call
 from mapless_server.scenes import Narrowing
 from mapless_server.scheduling import (
     Flow,
@@ -35,7 +35,7 @@ from mapless_server.scheduling import (
     WorkQueueOptions,
     compute_items,
 )
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.services.localization import localize_photographs
 
 LIMIT_S = 30.0

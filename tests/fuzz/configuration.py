@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 
-from mapless_server.security.binding import assess_binding
+from mapless_server.security import assess_binding
 from mapless_server.settings import PREFIX, ConfigError, LoadedSettings, Settings, load_settings
 from mapless_server.store import StoreError, postgresql
 

@@ -13,7 +13,7 @@ from mapless import wire
 from mapless.geometry import MAX_COORDINATE_M, Camera, RigidTransform
 from mapless.wire import FieldError
 from mapless_server.errors import InvalidArgument, RequestError
-from mapless_server.rpc.status import to_status
+from mapless_server.rpc import to_status
 from mapless_tools.ingest.formats.collecting import check_camera
 
 _TRAILER_BYTES = 8192

@@ -18,10 +18,8 @@ import grpc
 
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.observability.logs import JsonFormatter, TextFormatter
-from mapless_server.rpc.call import CLIENT_ID_KEY, REQUEST_ID_KEY, Call
-from mapless_server.rpc.guard import CallGuard
-from mapless_server.security.access import METHOD_ROLES, Authenticator
-from mapless_server.security.errors import SecurityError
+from mapless_server.rpc import CLIENT_ID_KEY, REQUEST_ID_KEY, Call, CallGuard
+from mapless_server.security import METHOD_ROLES, Authenticator, SecurityError
 from mapless_server.security.tokens import Token, Tokens, read_tokens, sha256_of
 
 from . import folders

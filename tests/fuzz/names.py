@@ -12,8 +12,7 @@ from random import Random
 from mapless import names, wire
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.wire import FieldError
-from mapless_server.security.principal import DEFAULT_TENANT
-from mapless_server.security.tenancy import end_of_keys, key_of, scene_id_of, tenant_of
+from mapless_server.security import DEFAULT_TENANT, end_of_keys, key_of, scene_id_of, tenant_of
 from mapless_server.services.messages.queries import reference_ids_from_names
 from mapless_server.services.messages.references import MAX_PAGE_SIZE, Page
 from mapless_tools.dataset import legal_id

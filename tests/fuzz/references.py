@@ -26,10 +26,9 @@ from mapless.v1 import reference_service_pb2 as pb
 from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Caller, Description, Photo
 from mapless_server.method.views import Features, View
-from mapless_server.rpc.call import Call
+from mapless_server.rpc import Call
 from mapless_server.scenes import Choice, Coverage, CoverageVerdict, Narrowing, Viewpoint
-from mapless_server.security.principal import Principal
-from mapless_server.security.tenancy import SceneKey, key_of, scene_id_of, tenant_of
+from mapless_server.security import Principal, SceneKey, key_of, scene_id_of, tenant_of
 from mapless_server.services import references as reference_service
 from mapless_server.services.messages.references import MAX_PAGE_SIZE
 from mapless_server.store import NewReference, ReferenceRecord, SceneAttributes, SceneRecord, codec, rows

@@ -19,8 +19,7 @@ from mapless.geometry import Camera, RigidTransform
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image, png_chunks
 from mapless_server.images.png_chunks import essential_png
-from mapless_server.security.errors import SecurityError
-from mapless_server.security.tokens import read_tokens
+from mapless_server.security import SecurityError, read_tokens
 from mapless_server.settings import ConfigError, load_settings
 from mapless_server.store import codec
 from mapless_tools.dataset import Refusal, printable

@@ -20,11 +20,10 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.errors import NotFound, Overloaded, PermissionDenied, Unauthenticated
 from mapless_server.observability.call_record import MAX_STEPS, TracedStep
-from mapless_server.rpc import receiving
+from mapless_server.rpc import CallGuard, receiving
 from mapless_server.rpc.call import ANSWER_MARGIN_SHARE, Call
-from mapless_server.rpc.guard import CallGuard
 from mapless_server.rpc.receiving import OpenMethods, Receiver
-from mapless_server.security.principal import Principal, Role
+from mapless_server.security import Principal, Role
 
 CHECK, WATCH = "/grpc.health.v1.Health/Check", "/grpc.health.v1.Health/Watch"
 METHOD = "/mapless.v1.LocalizationService/Localize"

@@ -19,11 +19,9 @@ from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.errors import FailedPrecondition, Unauthenticated
+from mapless_server.rpc import Call, CallGuard, sending
 from mapless_server.rpc import guard as rpc
-from mapless_server.rpc import sending
-from mapless_server.rpc.call import Call
-from mapless_server.rpc.guard import CallGuard
-from mapless_server.security.principal import Principal
+from mapless_server.security import Principal
 
 METHOD = "/mapless.v1.LocalizationService/WatchQueries"
 FINITE = "/mapless.v1.LocalizationService/LocalizeProgressively"

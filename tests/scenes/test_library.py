@@ -25,7 +25,7 @@ from mapless_server.method.context import StageContext
 from mapless_server.method.views import View
 from mapless_server.scenes import FeaturesMissing, Loaded, ReferenceLibrary, load_usable
 from mapless_server.scenes import library as library_module
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import DATABASE_FILE, NewReference, Store
 from mapless_server.store.sqlite import choose_library
 

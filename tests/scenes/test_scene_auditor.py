@@ -26,7 +26,7 @@ from mapless_server.scenes import (
     SceneIndexes,
     Viewpoint,
 )
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store
 
 KEY = SceneKey("s")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapless_server.security.rate import RateLimiter
+from mapless_server.security import RateLimiter
 
 rates = st.floats(0.01, 8)
 bursts = st.floats(0.1, 30)

@@ -26,10 +26,18 @@ from mapless_server.engine.query import Description
 from mapless_server.errors import NotFound, RequestError
 from mapless_server.images import ImageLimits
 from mapless_server.method.views import Features, View
-from mapless_server.rpc.call import Call
+from mapless_server.rpc import Call
 from mapless_server.scenes import Choice, Coverage, CoverageVerdict
-from mapless_server.security.principal import DEFAULT_TENANT, Principal
-from mapless_server.security.tenancy import SceneKey, check_tenant, end_of_keys, key_of, scene_id_of, tenant_of
+from mapless_server.security import (
+    DEFAULT_TENANT,
+    Principal,
+    SceneKey,
+    check_tenant,
+    end_of_keys,
+    key_of,
+    scene_id_of,
+    tenant_of,
+)
 from mapless_server.services.references import ReferenceService
 from mapless_server.store import Store
 

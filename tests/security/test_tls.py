@@ -22,9 +22,7 @@ from support.certificates import DAY, Pair, authority, signed
 from mapless import Client, ConnectOptions, MaplessError, Unavailable
 from mapless.__main__ import main
 from mapless.errors import from_rpc_error
-from mapless_server.security.access import Authenticator
-from mapless_server.security.errors import SecurityError
-from mapless_server.security.principal import Role
+from mapless_server.security import Authenticator, Role, SecurityError
 from mapless_server.security.tls import Tls, TlsFiles, read_material
 
 METHOD = "/mapless.v1.ReferenceService/GetScene"

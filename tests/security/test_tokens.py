@@ -25,11 +25,22 @@ from typer.testing import CliRunner
 
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 from mapless_server.errors import PermissionDenied, RequestError, Unauthenticated
-from mapless_server.security.access import METHOD_ROLES, OPEN_METHODS, Authenticator, certificate_name
-from mapless_server.security.errors import SecurityError
-from mapless_server.security.principal import DEFAULT_TENANT, Principal, Role
+from mapless_server.security import (
+    DEFAULT_TENANT,
+    METHOD_ROLES,
+    OPEN_METHODS,
+    Authenticator,
+    Principal,
+    Role,
+    SecurityError,
+    Tokens,
+    certificate_name,
+    create_token,
+    read_tokens,
+    revoke_token,
+    sha256_of,
+)
 from mapless_server.security.reloading import Reloading, keep_fresh
-from mapless_server.security.tokens import Tokens, create_token, read_tokens, revoke_token, sha256_of
 from mapless_tools.cli import tokens as command
 
 NOW = datetime(2030, 1, 1, tzinfo=timezone.utc)

@@ -44,7 +44,7 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import CostModel, Job
-from mapless_server.security.rate import RateLimiter
+from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import MakeEngine, StartupError, engine_options, engine_over, make_tiers
 from mapless_server.serve.warm_up import ROUNDS, warm_up
 from mapless_server.settings import Settings

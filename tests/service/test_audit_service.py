@@ -13,7 +13,7 @@ from support.servers import listening
 from support.wall import wall
 
 from mapless import Camera, Client, InvalidArgument, NewReference, NotFound, RigidTransform
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import make_engine
 from mapless_server.settings import Settings
 from mapless_server.store import Store

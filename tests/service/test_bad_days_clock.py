@@ -24,7 +24,7 @@ from support.servers import CAMERA, PHOTO, pose
 from support.waiting import wait_until
 
 from mapless import Client, ConnectOptions, DeadlineExceeded, LocalizationResult, NewReference, Unauthenticated
-from mapless_server.security.tokens import create_token
+from mapless_server.security import create_token
 
 JUMPS_H = ((5.0, 2.0), (-7.0, 12.0))
 """And the deadline of a call meanwhile, seconds: the server learns from the first what calls take."""

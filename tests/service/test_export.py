@@ -20,7 +20,7 @@ from typer.testing import CliRunner, Result
 from mapless import Client, Datum, NewReference, Scene
 from mapless.geodesy import enu_from_y_up
 from mapless.geometry import Fisheye, RadialTangential
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import Store
 from mapless_tools.ingest.command import export_command, import_command
 from mapless_tools.ingest.formats import read_dataset

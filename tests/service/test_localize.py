@@ -29,7 +29,7 @@ from mapless.geometry import Camera
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import Store
 
 DEEP = np.random.default_rng(3).integers(0, 65536, (64, 96, 3)).astype(np.uint16)

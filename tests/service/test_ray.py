@@ -45,7 +45,7 @@ from mapless import (
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.security.tokens import create_token
+from mapless_server.security import create_token
 from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.store import Store
 from mapless_tools.child import child_server

@@ -24,7 +24,7 @@ from mapless import (
     Priors,
     Rejected,
 )
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import Store
 
 COUNT = 12

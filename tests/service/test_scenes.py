@@ -19,7 +19,7 @@ from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1.geometry_pb2 import Vector3
 from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.security.tenancy import key_of
+from mapless_server.security import key_of
 from mapless_server.store import Store
 
 DATUM = Datum(47.5, 8.25, 400.0, enu_from_y_up(0))

@@ -35,9 +35,7 @@ from mapless import (
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1.geometry_pb2 import Vector3
-from mapless_server.security.access import METHOD_ROLES
-from mapless_server.security.principal import Role
-from mapless_server.security.tokens import create_token, revoke_token, sha256_of
+from mapless_server.security import METHOD_ROLES, Role, create_token, revoke_token, sha256_of
 
 LIMIT_S = 30.0
 EXPIRED = "mapless_expired"

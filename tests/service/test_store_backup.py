@@ -26,8 +26,7 @@ from support.stores import (
 from typer.testing import CliRunner
 
 from mapless.geodesy import Datum
-from mapless_server.security.principal import DEFAULT_TENANT
-from mapless_server.security.tenancy import SceneKey, key_of
+from mapless_server.security import DEFAULT_TENANT, SceneKey, key_of
 from mapless_server.store import (
     DATABASE_FILE,
     PostgresqlDatabase,

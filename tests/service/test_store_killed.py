@@ -27,8 +27,7 @@ from support.waiting import wait_until
 from mapless.geometry import Camera, RigidTransform
 from mapless_server import errors
 from mapless_server.method.views import Features, View
-from mapless_server.security.principal import DEFAULT_TENANT
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import (
     DATABASE_FILE,
     NewReference,

@@ -17,7 +17,7 @@ from mapless import Client, ConnectOptions, LocalizationResult, NewReference
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.security.tokens import create_token, revoke_token
+from mapless_server.security import create_token, revoke_token
 from mapless_server.services.watching import MAX_WATCHERS_OF_TENANT
 
 LIMIT_S = 30.0

@@ -28,9 +28,8 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.method.views import Features, PosedView, View
-from mapless_server.rpc.call import Call
-from mapless_server.security.principal import Principal
-from mapless_server.security.tenancy import SceneKey, key_of
+from mapless_server.rpc import Call
+from mapless_server.security import Principal, SceneKey, key_of
 from mapless_server.services.capture import deletion as deletion_module
 from mapless_server.services.capture import recorder as recorder_module
 from mapless_server.services.capture.calls import (

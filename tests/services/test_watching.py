@@ -10,7 +10,7 @@ import pytest
 
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.errors import FailedPrecondition, Overloaded, Unavailable
-from mapless_server.security.tenancy import key_of
+from mapless_server.security import key_of
 from mapless_server.services.watching import MAX_WATCHERS, MAX_WATCHERS_OF_TENANT, QUEUE_LENGTH, Watcher, Watchers
 
 HALL, OTHER = key_of("default", "hall"), key_of("default", "other")

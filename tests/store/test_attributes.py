@@ -20,8 +20,7 @@ from mapless.geodesy import Datum, enu_from_y_up
 from mapless.geometry import Quaternion, rotation_from_vector
 from mapless.scenes import Calibration, unit_vector
 from mapless_server import errors
-from mapless_server.security.principal import DEFAULT_TENANT
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import ContradictingDown, SceneAttributes, Store, codec, deletion, queries
 
 OFFICE, HALL, NOWHERE = map(SceneKey, ("office", "hall", "nowhere"))

@@ -24,7 +24,7 @@ from support.stores import (
 )
 
 from mapless_server import errors
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import IndexedReference, NewReference, Store, verify
 
 OFFICE, HALL = SceneKey("office"), SceneKey("hall")

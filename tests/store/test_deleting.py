@@ -25,8 +25,7 @@ from support.stores import (
 )
 
 from mapless_server import errors
-from mapless_server.security.principal import DEFAULT_TENANT
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import (
     DATABASE_FILE,
     PostgresqlDatabase,

@@ -22,7 +22,7 @@ from support.stores import (
     view_of,
 )
 
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import (
     DATABASE_FILE,
     SCHEMA_VERSION,

@@ -13,7 +13,7 @@ import pytest
 from mapless.geometry import Camera, RigidTransform
 from mapless_server import errors
 from mapless_server.method.views import Features, View
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store, sqlite
 
 HALL = SceneKey("hall")

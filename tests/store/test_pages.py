@@ -12,7 +12,7 @@ import pytest
 from support.stores import EXTRACTOR, make_reference, view_of
 
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import DATABASE_FILE, SqliteDatabase, Store, deletion, verify
 
 SCENE = SceneKey("office")

@@ -13,8 +13,7 @@ from support import postgres
 from support.stores import EXTRACTOR, Shared, assert_same_view, make_reference, view_of
 
 from mapless_server import errors
-from mapless_server.security.principal import DEFAULT_TENANT
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import Store, StoreError, postgresql
 
 OFFICE = SceneKey("office")

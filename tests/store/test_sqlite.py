@@ -15,8 +15,7 @@ import pytest
 from support.stores import EXTRACTOR, Folder, make_reference
 
 from mapless_server import errors
-from mapless_server.security.principal import DEFAULT_TENANT
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import Store, StoreError, sqlite, tables
 
 OFFICE = SceneKey("office")

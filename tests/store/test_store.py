@@ -31,8 +31,7 @@ from support.stores import (
 from mapless.geometry import Distortion, Fisheye, RadialTangential, RigidTransform
 from mapless_server import errors
 from mapless_server.method.views import Features, View
-from mapless_server.security.principal import DEFAULT_TENANT
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import LruCache, NewReference, Store, codec
 
 DENIALS = {

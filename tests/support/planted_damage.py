@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import Store
 
 _COLUMN = {

@@ -26,7 +26,7 @@ from mapless_server.method.answer import Answer
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.observability.logs import configure_logging
 from mapless_server.observability.metrics import Metrics
-from mapless_server.security.rate import RateLimiter
+from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import engine_options, engine_over
 from mapless_server.serve.run import serve
 from mapless_server.settings import Settings, load_settings

@@ -23,7 +23,7 @@ from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
 from mapless_server.observability.metrics import Metrics
-from mapless_server.security.rate import RateLimiter
+from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import engine_options, engine_over
 from mapless_server.settings import Settings
 from mapless_server.store import Store

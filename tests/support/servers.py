@@ -32,7 +32,7 @@ from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.observability.metrics import Metrics
-from mapless_server.security.rate import RateLimiter
+from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import MakeEngine, engine_options, engine_over
 from mapless_server.serve.running import Running, running_server
 from mapless_server.settings import Settings

@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # services need not load what computes
     from mapless_server.method.groups.sequence import SequenceEstimate
     from mapless_server.method.rejection import Rejection
     from mapless_server.scenes import Choice, Coverage, Narrowing, ReferenceAudit, Viewpoint
-    from mapless_server.security.tenancy import SceneKey
+    from mapless_server.security import SceneKey
 
     from .query import Caller, Description, Photo, Query, Result, Tier
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mapless_server.method.views import PosedView, View
     from mapless_server.scenes import Choice, Narrowing, Vector
     from mapless_server.scheduling import Flow
-    from mapless_server.security.tenancy import SceneKey
+    from mapless_server.security import SceneKey
 
 UNFINISHED = "/unfinished"
 """Ends the name of a stage: its tier came to no answer, see `Result`."""

@@ -31,7 +31,7 @@ from mapless_server.scheduling import (
     WorkQueue,
     compute_items,
 )
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 
 from . import joint
 from .failures import failure_of

@@ -23,7 +23,7 @@ from mapless_server.scenes import (
     Selection,
     rank_references,
 )
-from mapless_server.security.tenancy import SceneKey, scene_id_of
+from mapless_server.security import SceneKey, scene_id_of
 from mapless_server.store import SceneAttributes
 
 from .query import Description, Photo

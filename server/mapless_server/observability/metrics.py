@@ -21,7 +21,7 @@ from prometheus_client.metrics_core import Metric
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.scheduling import Ending, Observer, Refusal
-from mapless_server.security.access import ENDLESS_METHODS
+from mapless_server.security import ENDLESS_METHODS
 
 from .scraped import Scraped
 

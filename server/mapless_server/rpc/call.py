@@ -14,7 +14,7 @@ from mapless_server.engine.query import Caller
 from mapless_server.observability.call_record import CallRecord
 from mapless_server.observability.tracing import Metadata
 from mapless_server.scheduling import Flow, StageRecord
-from mapless_server.security.principal import Principal
+from mapless_server.security import Principal
 
 from .receiving import Context
 

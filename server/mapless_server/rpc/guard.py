@@ -18,8 +18,7 @@ from mapless.wire import FieldError
 from mapless_server.errors import DeadlineExceeded, InvalidArgument, RequestError, Unavailable
 from mapless_server.observability.logs import as_extra
 from mapless_server.observability.tracing import CallSpan, Metadata, NoTracer, Tracer
-from mapless_server.security.access import ENDLESS_METHODS, OPEN_METHODS
-from mapless_server.security.principal import Principal
+from mapless_server.security import ENDLESS_METHODS, OPEN_METHODS, Principal
 
 from .call import REQUEST_ID_KEY, Call, Deadlines, begin_call, metadata_of
 from .receiving import Context, OpenMethods, Receiver

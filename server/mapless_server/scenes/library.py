@@ -23,7 +23,7 @@ from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import Photograph, PosedView
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import DescribedReference, ReferenceRecord, SceneAttributes, Store
 
 log = logging.getLogger(__name__)

@@ -1,6 +1,41 @@
 """Who may do what: tokens, TLS, tenancy, the address that may be listened on, and each tenant's computing time.
 
-May import method, networks, images and scheduling, and uses none of them. Begin with `protection.Protection`, which is
-made from the settings, and `access.METHOD_ROLES`, the role that each method takes. `tenancy` has the keys of scenes,
-which all rooms below the services use. Modules are imported one by one: a store needs keys of scenes, and no TLS.
+Imports only errors and settings. Begin with `protection.Protection`, which is made from the settings, and
+`METHOD_ROLES` in `access`, the role that each method takes. `tenancy` has the keys of scenes, which all rooms below the
+services use. `protection` and `tls` are imported by name: a store needs keys of scenes, and no TLS.
 """
+
+from .access import ENDLESS_METHODS, METHOD_ROLES, OPEN_METHODS, Authenticator, certificate_name
+from .binding import assess_binding, is_loopback
+from .errors import SecurityError
+from .principal import DEFAULT_TENANT, Principal, Role
+from .rate import RateLimiter
+from .tenancy import KEY_SEPARATOR, SceneKey, check_tenant, end_of_keys, key_of, scene_id_of, tenant_of
+from .tokens import Tokens, create_token, read_tokens, revoke_token, sha256_of
+
+__all__ = [
+    "DEFAULT_TENANT",
+    "ENDLESS_METHODS",
+    "KEY_SEPARATOR",
+    "METHOD_ROLES",
+    "OPEN_METHODS",
+    "Authenticator",
+    "Principal",
+    "RateLimiter",
+    "Role",
+    "SceneKey",
+    "SecurityError",
+    "Tokens",
+    "assess_binding",
+    "certificate_name",
+    "check_tenant",
+    "create_token",
+    "end_of_keys",
+    "is_loopback",
+    "key_of",
+    "read_tokens",
+    "revoke_token",
+    "scene_id_of",
+    "sha256_of",
+    "tenant_of",
+]

@@ -31,7 +31,7 @@ from mapless_server.scenes import (
     VladDescriptor,
 )
 from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
-from mapless_server.security.rate import RateLimiter
+from mapless_server.security import RateLimiter
 from mapless_server.settings import Settings, available_cores
 from mapless_server.store import Store, StoreError
 

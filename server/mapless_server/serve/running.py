@@ -19,7 +19,7 @@ from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
 from mapless_server.observability.tracing import NoTracer, Tracer
 from mapless_server.scheduling import Fatal
-from mapless_server.security.errors import SecurityError
+from mapless_server.security import SecurityError
 from mapless_server.security.protection import Protection
 from mapless_server.security.reloading import keep_fresh
 from mapless_server.services.capture.calls import CaptureError

@@ -26,7 +26,7 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.views import Photograph, PosedView
 from mapless_server.scenes import Choice, Narrowing
 from mapless_server.scheduling import Flow
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import SceneAttributes
 
 log = logging.getLogger(__name__)

@@ -21,7 +21,7 @@ from mapless_server.engine.interface import Engine
 from mapless_server.errors import Unavailable
 from mapless_server.observability.metrics import Metrics
 from mapless_server.observability.tracing import Tracer
-from mapless_server.rpc.guard import Authenticate, CallGuard
+from mapless_server.rpc import Authenticate, CallGuard
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 

@@ -19,8 +19,8 @@ from mapless_server.method.answer import Localization
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.results import MetricScale
 from mapless_server.observability.metrics import LOCALIZED, Metrics
-from mapless_server.rpc.call import Call
-from mapless_server.security.tenancy import key_of
+from mapless_server.rpc import Call
+from mapless_server.security import key_of
 from mapless_server.store import SceneAttributes, Store
 
 from .capture.calls import Request, Response

@@ -17,9 +17,9 @@ from mapless.wire import FieldError
 from mapless_server.engine.interface import Engine
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo
 from mapless_server.errors import AlreadyExists
-from mapless_server.rpc.call import Call
+from mapless_server.rpc import Call
 from mapless_server.scenes import Viewpoint
-from mapless_server.security.tenancy import SceneKey, key_of, scene_id_of
+from mapless_server.security import SceneKey, key_of, scene_id_of
 from mapless_server.store import ContradictingDown, NewReference, ReferenceRecord, SceneAttributes, Store
 
 from .messages.priors import priors_from_message

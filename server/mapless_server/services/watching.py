@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.errors import FailedPrecondition, Overloaded, Unavailable
-from mapless_server.security.tenancy import SceneKey, tenant_of
+from mapless_server.security import SceneKey, tenant_of
 
 MAX_WATCHERS = 8
 """Of all scenes together: each may have `QUEUE_LENGTH` photographs in memory."""

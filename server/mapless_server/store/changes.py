@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, Select, and_, select
 
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 
 from . import queries, rows
 from .faults import unless_damaged

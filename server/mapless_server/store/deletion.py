@@ -16,7 +16,7 @@ from itertools import accumulate
 from sqlalchemy import ColumnElement, Connection, ScalarSelect, Table, delete, func, insert, select, update
 
 from mapless_server.errors import Overloaded
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 
 from .database import Database
 from .faults import DamagedPages

@@ -9,8 +9,7 @@ from sqlalchemy import ColumnElement, Connection, Row, Select, Table, delete, se
 from sqlalchemy.dialects import postgresql, sqlite
 
 from mapless_server.errors import AlreadyExists, NotFound
-from mapless_server.security.principal import DEFAULT_TENANT
-from mapless_server.security.tenancy import KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
+from mapless_server.security import DEFAULT_TENANT, KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
 
 from .deletion import is_detached
 from .tables import features, global_descriptor, image, reference, removed_reference, scene, scene_generation

@@ -11,7 +11,7 @@ from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, 
 from sqlalchemy import Connection, Row, Select, select
 
 from mapless_server.errors import AlreadyExists, NotFound, RequestError
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 
 from . import queries, rows, tables
 from .cache import LruCache

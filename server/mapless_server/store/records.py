@@ -14,7 +14,7 @@ from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.scenes import Calibration, Vector
 from mapless_server.method.views import View
-from mapless_server.security.tenancy import SceneKey, scene_id_of
+from mapless_server.security import SceneKey, scene_id_of
 
 MAX_DOWN_DISAGREEMENT_DEG = 10.0
 """Datums are oriented by compass or by hand, to some degrees; 90 degrees mean a world whose y is up, not z."""

@@ -14,7 +14,7 @@ from sqlalchemy import Row
 
 from mapless_server.errors import DataLoss
 from mapless_server.method.views import View
-from mapless_server.security.tenancy import SceneKey, scene_id_of
+from mapless_server.security import SceneKey, scene_id_of
 
 from . import codec
 from .records import DescribedReference, IndexedReference, NewReference, ReferenceRecord, SceneAttributes, SceneRecord

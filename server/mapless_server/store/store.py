@@ -17,7 +17,7 @@ from mapless.geodesy import Datum
 from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
 from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.method.views import View
-from mapless_server.security.tenancy import SceneKey, scene_id_of
+from mapless_server.security import SceneKey, scene_id_of
 
 from . import deletion, queries, rows, tables
 from .cache import LruCache

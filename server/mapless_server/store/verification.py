@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Row, Select, Table, func, select
 from sqlalchemy.exc import DBAPIError
 
 from mapless_server.errors import DataLoss
-from mapless_server.security.tenancy import SceneKey, scene_id_of, tenant_of
+from mapless_server.security import SceneKey, scene_id_of, tenant_of
 
 from . import codec, queries, rows
 from .deletion import is_detached

@@ -19,7 +19,7 @@ from rich.progress import track
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.method.views import Features, View
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store
 
 SCENE = SceneKey("scale")

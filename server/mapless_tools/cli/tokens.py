@@ -10,7 +10,6 @@ from typing import Annotated
 
 import typer
 
-from mapless_server.security.principal import DEFAULT_TENANT
 from mapless_server.serve.command import fail
 
 token_app = typer.Typer(help="Tokens that callers must have: create, list and revoke them.", no_args_is_help=True)
@@ -22,13 +21,16 @@ TokensFile = Annotated[Path | None, typer.Option(help="The file of tokens; defau
 def create_command(
     name: Annotated[str, typer.Option(help="Name of the holder; unique, and the caller's name in the log.")],
     role: Annotated[str, typer.Option(help="Rights of the holder: read, localize (and read), or write (everything).")],
-    tenant: Annotated[str, typer.Option(help="Tenant whose scenes the holder can access.")] = DEFAULT_TENANT,
+    tenant: Annotated[
+        str | None, typer.Option(help="Tenant whose scenes the holder can access; default: default.")
+    ] = None,
     expires: Annotated[str | None, typer.Option(help="When it ends, 2027-01-01T00:00:00Z; default: never.")] = None,
     tokens_file: TokensFile = None,
 ) -> None:
     """Create a token and print it, once: the file has only its hash."""
-    from mapless_server.security.tokens import create_token
+    from mapless_server.security import DEFAULT_TENANT, create_token
 
+    tenant = tenant or DEFAULT_TENANT
     with _tokens_file(tokens_file) as path:
         token = create_token(path, name, tenant, role, _read_time(expires) if expires else None)
     typer.echo(f"the token {name!r} of tenant {tenant!r}; it is not shown again:", err=True)
@@ -38,7 +40,7 @@ def create_command(
 @token_app.command("list")
 def list_command(tokens_file: TokensFile = None) -> None:
     """Show all tokens with their roles, tenants and expiry."""
-    from mapless_server.security.tokens import read_tokens
+    from mapless_server.security import read_tokens
 
     with _tokens_file(tokens_file) as path:
         tokens = read_tokens(path).tokens
@@ -56,7 +58,7 @@ def revoke_command(
     name: Annotated[str, typer.Argument(help="The token's name, as listed.")], tokens_file: TokensFile = None
 ) -> None:
     """Remove a token; a running server rejects it about a second later."""
-    from mapless_server.security.tokens import revoke_token
+    from mapless_server.security import revoke_token
 
     with _tokens_file(tokens_file) as path:
         revoke_token(path, name)
@@ -65,7 +67,7 @@ def revoke_command(
 @contextmanager
 def _tokens_file(given: Path | None) -> Iterator[Path]:
     """The file of tokens; an error ends the command with one line."""
-    from mapless_server.security.errors import SecurityError
+    from mapless_server.security import SecurityError
     from mapless_server.settings import ConfigError, load_settings
 
     try:

@@ -28,7 +28,7 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import Features, View
 from mapless_server.observability.logs import configure_logging
 from mapless_server.observability.metrics import Metrics
-from mapless_server.security.rate import RateLimiter
+from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import engine_options, engine_over
 from mapless_server.serve.run import serve
 from mapless_server.settings import Settings, load_settings

@@ -28,10 +28,9 @@ from mapless_server.method.localize import refine
 from mapless_server.method.pipeline import Coarse, coarse_answer
 from mapless_server.method.rejection import Rejection
 from mapless_server.observability.metrics import Metrics
-from mapless_server.rpc.call import Call
+from mapless_server.rpc import Call
 from mapless_server.scheduling import Done, Flow, Job
-from mapless_server.security.principal import Principal
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import Principal, SceneKey
 from mapless_server.services.capture.calls import CapturedCall, CaptureError, Response, diagnostics_of
 from mapless_server.services.localization import LocalizationService
 from mapless_server.services.watching import Watchers

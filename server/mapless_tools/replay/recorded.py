@@ -19,7 +19,7 @@ from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import Photograph, PosedView, View
 from mapless_server.scenes import STORED_IMAGES, Choice, Loaded, Selection
-from mapless_server.security.tenancy import SceneKey, scene_id_of
+from mapless_server.security import SceneKey, scene_id_of
 from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CapturedReference, DamagedCapture
 from mapless_server.services.capture.files import blob_path
 from mapless_server.store import LruCache, SceneAttributes, codec

@@ -33,7 +33,7 @@ def view_command(
     """
     from mapless import MaplessError
     from mapless_server.extras import install_hint
-    from mapless_server.security.binding import is_loopback
+    from mapless_server.security import is_loopback
     from mapless_server.serve.signals import terminable
     from mapless_server.settings import ConfigError, load_settings
     from mapless_tools.child import ServerFailed

@@ -15,7 +15,7 @@ from mapless_server.errors import DataLoss, NotFound, RequestError, Unavailable
 from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import PosedView
-from mapless_server.security.tenancy import SceneKey, scene_id_of
+from mapless_server.security import SceneKey, scene_id_of
 
 from ..indexes import SceneIndexes
 from ..library import Loaded, ReferenceLibrary, load_usable

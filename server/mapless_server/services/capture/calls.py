@@ -23,7 +23,7 @@ from mapless.geometry import Camera, RigidTransform
 from mapless.names import check_id
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.scenes import Choice, RankedReference
-from mapless_server.security.tenancy import check_tenant
+from mapless_server.security import check_tenant
 from mapless_server.store import SceneAttributes, codec
 
 

@@ -10,7 +10,7 @@ from mapless.names import parse_reference_name
 from mapless_server.engine.query import Query, Result
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.scenes import Choice
-from mapless_server.security.tenancy import SceneKey, tenant_of
+from mapless_server.security import SceneKey, tenant_of
 from mapless_server.store import ReferenceRecord, SceneRecord, Store, codec
 
 from .calls import CapturedPart, CapturedReference

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from itertools import groupby
 
 from mapless_server.errors import DataLoss, NotFound, Unavailable
-from mapless_server.security.tenancy import SceneKey
+from mapless_server.security import SceneKey
 from mapless_server.store import SceneRecord, Store, time_us
 
 from .folder import CapturedEntry, CaptureFolder

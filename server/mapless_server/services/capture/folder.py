@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from mapless_server.security.tenancy import SceneKey, key_of
+from mapless_server.security import SceneKey, key_of
 
 from .calls import BlobDeleted, CapturedCall, CaptureError, DamagedCapture, decode_call, encode_call
 from .files import (

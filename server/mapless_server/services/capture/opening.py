@@ -14,7 +14,7 @@ from mapless_server import __version__
 from mapless_server.engine.query import Tier
 from mapless_server.observability.metrics import Metrics
 from mapless_server.observability.provenance import ROOT, commit_of, cpu_model
-from mapless_server.security.tenancy import check_tenant
+from mapless_server.security import check_tenant
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 

@@ -19,8 +19,8 @@ from google.protobuf.message import Message
 from mapless.names import parse_scene_name
 from mapless_server.engine.query import Query, Result, Tier
 from mapless_server.errors import DataLoss, NotFound, Unavailable
-from mapless_server.rpc.call import Call
-from mapless_server.security.tenancy import key_of
+from mapless_server.rpc import Call
+from mapless_server.security import key_of
 from mapless_server.store import SceneAttributes, Store, time_us
 
 from .calls import BlobDeleted, CapturedCall, Request, Response, diagnostics_of

@@ -17,7 +17,7 @@ from mapless_server.method.options import Variant
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.uncertainty.accuracy import accuracy_from_covariance
 from mapless_server.scenes import Narrowing
-from mapless_server.security.tenancy import key_of
+from mapless_server.security import key_of
 
 from .answers import (
     MAX_SESSION_COORDINATE_M,

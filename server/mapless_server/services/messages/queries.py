@@ -13,7 +13,7 @@ from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query
 from mapless_server.images import ImageLimits, image_size
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.security.tenancy import SceneKey, key_of
+from mapless_server.security import SceneKey, key_of
 from mapless_server.store import SceneAttributes
 
 from .priors import priors_from_message
