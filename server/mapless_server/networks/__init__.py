@@ -2,7 +2,7 @@
 
 A network takes images of one scene and gives, up to one similarity, each view's pose and the point seen at each of its
 pixels. The modules' names are those of the official checkpoints' entries. Imports only `mapless_server.extras`, and
-nothing at all at import: torch takes seconds. Begin with `network`.
+nothing at all at import: torch takes seconds. Begin with `pi3`, then `network`.
 
     blocks.py      attention, normalization, rotary positions
     encoder.py     each image to patch tokens

@@ -4,3 +4,15 @@ formats/ reads the layouts of folders, check/ compares photographs with their po
 other. Other tools take `formats` from here. Imports the client, the method of the server, and what all tools share.
 Begin with `command`.
 """
+
+FORMATS = {
+    "cameras": "cameras",
+    "colmap": "colmap",
+    "7scenes": "seven_scenes",
+    "12scenes": "twelve_scenes",
+    "cambridge": "cambridge",
+    "nerf": "nerf",
+    "tum": "tum",
+    "arkit": "arkit",
+}
+"""Layouts that can be read: each name, and the module of `formats` that reads it. Here, where --help has it quickly."""

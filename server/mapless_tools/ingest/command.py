@@ -11,12 +11,14 @@ import typer
 from mapless_server.serve.command import fail
 from mapless_tools.connection import Connection, Scene, with_connection_flags
 
+from . import FORMATS
+
 if TYPE_CHECKING:
     from mapless_server.settings import Settings
 
     from .formats import Intrinsics
 
-FORMAT_NAMES = "auto, cameras, colmap, 7scenes, 12scenes, cambridge, nerf, tum, arkit"
+FORMAT_NAMES = ", ".join(["auto", *FORMATS])
 
 DataDir = Annotated[
     Path | None, typer.Option(help="Folder of the store, where no --address is given; default: that of the settings.")

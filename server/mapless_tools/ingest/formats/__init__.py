@@ -1,10 +1,65 @@
 """Layouts in which photographs with poses lie on disks, read into `dataset.Dataset`, and two that are written.
 
-Each layout is a module with one public function `read(path, options) -> Dataset`; its docstring describes the files.
-Conventions of a layout end there: the cameras and poses that it returns follow ours. Begin with `reading`.
+Each layout is a module with `fits(path) -> bool` and `read(path, options) -> Dataset`; its docstring describes the
+files. Conventions of a layout end there: the cameras and poses that it returns follow ours. A new one is a new module,
+and its name in `ingest.FORMATS`.
 """
 
-from .options import FORMATS, Intrinsics, ReadOptions
-from .reading import read_dataset, recognize
+from __future__ import annotations
 
-__all__ = ["FORMATS", "Intrinsics", "ReadOptions", "read_dataset", "recognize"]
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+from mapless_tools.dataset import Dataset, printable
+
+from .. import FORMATS
+from .options import Intrinsics, ReadOptions
+
+__all__ = ["Intrinsics", "ReadOptions", "read_dataset", "recognize"]
+
+
+def recognize(path: Path) -> str:
+    """Name of the layout that a folder has.
+
+    Raises:
+        ValueError: it has none that is known, or several; the message names them.
+    """
+    if not path.is_dir():
+        raise ValueError(f"{path} is not a folder")
+    found = [name for name in FORMATS if _module(name).fits(path)]
+    if not found:
+        raise ValueError(f"{path} has no layout that is known ({', '.join(FORMATS)}); name one with --format")
+    if len(found) > 1:
+        raise ValueError(f"{path} has several layouts: {', '.join(found)}; name one with --format")
+    return found[0]
+
+
+def read_dataset(path: Path, format: str = "auto", options: ReadOptions | None = None) -> Dataset:
+    """Read the posed photographs of a folder.
+
+    Args:
+        path: the folder (`7scenes`: a scene; `12scenes`: a room; `colmap`: a model, or what holds one).
+        format: one of FORMATS, or "auto" to recognize it; `Dataset.format` is then its name.
+        options: see ReadOptions.
+
+    Returns:
+        The dataset. Frames that cannot be used are in `refused`, with the reason; at least one can be.
+
+    Raises:
+        ValueError: the folder as a whole cannot be read; the message, which can be printed, names file and field.
+    """
+    if format != "auto" and format not in FORMATS:
+        raise ValueError(f"format must be auto or one of {', '.join(FORMATS)}, not {format!r}")
+    if not path.is_dir():
+        raise ValueError(f"{path} is not a folder")
+    module = _module(recognize(path) if format == "auto" else format)
+    try:
+        dataset: Dataset = module.read(path, options or ReadOptions())
+    except ValueError as error:
+        raise ValueError(printable(str(error))) from error
+    return dataset
+
+
+def _module(name: str) -> ModuleType:
+    return importlib.import_module(f".{FORMATS[name]}", __name__)

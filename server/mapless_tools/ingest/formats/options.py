@@ -7,9 +7,6 @@ from pathlib import Path
 
 from mapless.geometry import Camera
 
-FORMATS = ("cameras", "colmap", "7scenes", "12scenes", "cambridge", "nerf", "tum", "arkit")
-"""Names of the layouts that can be read."""
-
 
 @dataclass(frozen=True)
 class Intrinsics:
