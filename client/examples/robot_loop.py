@@ -1,10 +1,10 @@
-"""A robot's loop: a video in, poses out; it goes on when the server goes away and comes back.
+"""A robot's loop: a video in, poses out; it continues after the server was away.
 
     python robot_loop.py drive.mp4 --camera camera.json --scene hall --poses poses.jsonl --tum poses.tum
 
-One call at a time, always with the newest frame: a pose of long ago helps nobody, so what the server had no time for is
-skipped, not queued. The pose before, as uncertain as the robot can have moved since, is the next call's prior; the
-server says if the photograph contradicts it. Needs mapless and OpenCV (to decode the video and encode its frames).
+One call at a time, always with the newest frame: an old pose is of no use, so frames that arrive during a call are
+skipped, not queued. The previous pose, with the uncertainty of the robot's motion since, is the next call's prior; the
+server reports if the photograph contradicts it. Needs mapless and OpenCV (to decode the video and encode its frames).
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ import numpy as np
 
 import mapless
 
-JPEG_QUALITY = 90  # a tenth of a PNG's bytes, and no feature less
-MAX_SPEED_M_S, MAX_TURN_RAD_S = 1.5, 1.5  # of this robot: how far a pose can be wrong after a second
-PRIOR_LIFE_S = 5.0  # after which the last pose says nothing any more
-LONGEST_PAUSE_S = 5.0  # between two looks for a server that is away
+JPEG_QUALITY = 90  # a tenth of a PNG's bytes, with the same features
+MAX_SPEED_M_S, MAX_TURN_RAD_S = 1.5, 1.5  # of this robot: bounds of its motion in a second
+PRIOR_LIFE_S = 5.0  # after which the last pose is no prior any more
+LONGEST_PAUSE_S = 5.0  # between two attempts to reach a lost server
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class LatestFrame:
         threading.Thread(target=self._play, daemon=True).start()
 
     def __iter__(self) -> Iterator[Frame]:
-        """Each frame that is new when it is asked for; ends with the video."""
+        """The newest frame at each step; ends with the video."""
         seen = -1
         while (frame := self._newer_than(seen)) is not None:
             seen = frame.number
@@ -122,14 +122,14 @@ class Outputs:
         """No pose, and why."""
         self._write(frame, reason=reason)
 
-    def _write(self, frame: Frame, **told: Any) -> None:
-        line = {"frame": frame.number, "capture_time": frame.capture_time.isoformat(), **told}
+    def _write(self, frame: Frame, **fields: Any) -> None:
+        line = {"frame": frame.number, "capture_time": frame.capture_time.isoformat(), **fields}
         print(json.dumps(line), file=self.poses, flush=True)
 
 
 @dataclass
 class Robot:
-    """What the robot remembers from one frame to the next."""
+    """State of the robot between frames."""
 
     client: mapless.Client
     camera: mapless.Camera
@@ -139,7 +139,7 @@ class Robot:
     pause_s: float = field(default=0.0, init=False)
 
     def look(self, frame: Frame) -> None:
-        """One frame: asks, writes what is answered, and waits if the server wants or needs it."""
+        """Localizes one frame, writes the answer, and waits if the server requests it or is away."""
         encoded, jpeg = cv2.imencode(".jpg", frame.pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         assert encoded
         start_s = time.monotonic()
@@ -162,12 +162,12 @@ class Robot:
                 self.last = None
             return
         if any(check.conflict for check in answer.prior_checks):
-            print(f"frame {frame.number}: the pose before contradicts the photograph", file=sys.stderr)
+            print(f"frame {frame.number}: the previous pose contradicts the photograph", file=sys.stderr)
         self.last = (frame.capture_time, answer)
         self.outputs.localized(frame, answer, time.monotonic() - start_s)
 
     def _prior(self, frame: Frame) -> mapless.PosePrior | None:
-        """The last pose, and how far the robot may have gone since: a walk of unknown direction."""
+        """The last pose, with the uncertainty of motion since in an unknown direction."""
         if self.last is None:
             return None
         captured, pose = self.last
@@ -178,9 +178,9 @@ class Robot:
         return mapless.PosePrior(pose.world_from_camera, pose.covariance + np.diag(moved**2))
 
     def _wait(self, error: mapless.MaplessError) -> None:
-        """As long as the server asks; a little longer each time while it is away."""
+        """Waits as long as the server requests; longer each time while it is away."""
         if error.retry_after_s is None and self.pause_s == 0:
-            print(f"no answer ({error}); going on trying", file=sys.stderr)
+            print(f"no answer ({error}); retrying", file=sys.stderr)
         self.pause_s = min(max(2 * self.pause_s, 0.1), LONGEST_PAUSE_S)
         time.sleep(error.retry_after_s or self.pause_s)
 

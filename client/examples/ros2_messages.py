@@ -35,7 +35,7 @@ def photo_from_image(message: Any) -> bytes:
     """The file that a sensor_msgs/CompressedImage holds, or the JPEG of a sensor_msgs/Image.
 
     Raises:
-        ValueError: an encoding that cameras do not have, or fewer bytes than the size asks for.
+        ValueError: an unsupported encoding, or fewer bytes than the size needs.
     """
     if not hasattr(message, "encoding"):
         return bytes(message.data)
@@ -43,7 +43,7 @@ def photo_from_image(message: Any) -> bytes:
         raise ValueError(f"encoding {message.encoding!r} is none of {', '.join(sorted(_ENCODINGS))}")
     channels, conversion = _ENCODINGS[message.encoding]
     if message.step < message.width * channels or len(message.data) < message.height * message.step:
-        raise ValueError(f"an image of {message.width} x {message.height} has more than {len(message.data)} bytes")
+        raise ValueError(f"an image of {message.width} x {message.height} needs more than {len(message.data)} bytes")
     rows = np.frombuffer(bytes(message.data), np.uint8)[: message.height * message.step].reshape(message.height, -1)
     pixels = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
     image = pixels if conversion is None else cv2.cvtColor(pixels, conversion)

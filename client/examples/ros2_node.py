@@ -4,7 +4,7 @@ r"""A ROS 2 node: images in, geometry_msgs/PoseWithCovarianceStamped out, for ro
         -r image:=/camera/image_raw/compressed -r camera_info:=/camera/camera_info
 
 It publishes `pose`: of the body in `map_frame`, stamped with the time of the image, with the covariance that mapless
-estimated for that very image. It publishes nothing for an image that was not localized, and says why on the log. One
+estimated for that very image. It publishes nothing for an image that was not localized, and logs the reason. One
 call at a time, always with the newest image. `body_from_camera` is the pose of camera_link in the body's frame,
 x y z and quaternion x y z w; the default publishes camera_link's own pose.
 """
@@ -35,7 +35,7 @@ PARAMETERS: dict[str, Any] = {
 
 
 class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
-    """Keeps the newest image, and a thread that asks about it."""
+    """Keeps the newest image, and a thread that localizes it."""
 
     def __init__(self) -> None:
         super().__init__("mapless")

@@ -2,12 +2,17 @@
 
 >>> answer = mapless.localize("photo.jpg", camera)
 
-asks the server of MAPLESS_ADDRESS (or localhost:50051) in the scene of MAPLESS_SCENE (or its only one), and
+localizes a photograph with the server of MAPLESS_ADDRESS (default localhost:50051) in the scene of MAPLESS_SCENE
+(default: its only scene), and
 
 >>> with Client("localhost:50051") as client:
 ...     answer = client.localize("photo.jpg", camera, scene="kitchen")
 
-can do all that the interface can; `mapless.aio.Client` is the same for asyncio.
+has all calls of the interface; `mapless.aio.Client` is the same for asyncio.
+
+Begin with `Client` (client.py) and its calls (calls/), which return the values of answers.py, groups.py and results.py.
+geometry.py states the conventions of frames and units. exchange.py has retries and deadlines, wire.py the conversion
+between values and messages, report/ the HTML report of an answer, cli/ the command `mapless`.
 """
 
 from . import aio

@@ -11,7 +11,7 @@ from .cli.folder import EXIT_FAILED, EXIT_USAGE
 from .client import Client
 from .errors import MaplessError
 
-EXIT_INTERRUPTED = 130  # as shells have it
+EXIT_INTERRUPTED = 130  # as in shells
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         field = f" (field {error.field})" if error.field and error.field not in error.message else ""
         print(f"mapless: {error}{field}", file=sys.stderr)
         sys.exit(EXIT_FAILED)
-    except BrokenPipeError:  # whoever reads our output has seen enough
+    except BrokenPipeError:  # the reader of our output has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(EXIT_FAILED)
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""What Localize answers, as values."""
+"""Answers of Localize: `LocalizationResult` and `Rejected`, and their parts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .wire import optional
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Errors not exceeded in 68 and 95 % of cases; `calibrated` on photographs with known poses or not."""
+    """Radii: errors not exceeded in 68 and 95 % of cases; `calibrated` if measured on photographs with known poses."""
 
     position_68_m: float
     position_95_m: float
@@ -30,9 +30,9 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class ReferenceUse:
-    """What one reference contributed: matches with the photograph, and inliers of the pose.
+    """Contribution of one reference: matches with the photograph, and inliers of the pose.
 
-    `similarity` to the photograph, -1 to 1, where the server chose it; else 0.
+    `similarity` to the photograph, -1 to 1, if the server chose the reference; else 0.
     """
 
     name: str
@@ -47,8 +47,8 @@ class ScaleEstimate:
 
     Attributes:
         metres_per_unit: the scale.
-        stage: what gave it, "TRIANGULATION" or "TRAJECTORY".
-        deviation: relative, of the scaled camera trajectory's radius from the true one.
+        stage: how it was estimated, "TRIANGULATION" or "TRAJECTORY".
+        deviation: relative deviation of the scaled camera trajectory's radius from the true one.
     """
 
     metres_per_unit: float
@@ -58,18 +58,18 @@ class ScaleEstimate:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What was used for an answer and where the time went.
+    """Inputs, software and times of an answer.
 
     Attributes:
         request_id: identifies the call in the server's log.
-        backend, weights_sha256, features, variant, store_generation, server_version: what computed it, from what.
-        references: those used, in the order they were given or chosen.
-        scale: None if that stage was not reached.
+        backend, weights_sha256, features, variant, store_generation, server_version: software, options and data used.
+        references: the references used, in the order given or chosen.
+        scale: None if its stage was not reached.
         stage_s: seconds by stage, in order.
-        queue_s, total_s: seconds that the call waited and took, inside the server.
-        processed_width_px, processed_height_px: size of the image as it was processed.
-        retrieval: what the references were chosen by; empty if they were used as they were given.
-        captured: whether the server is to keep the call for a time, photograph and all.
+        queue_s, total_s: time in the queue and total time in the server, seconds.
+        processed_width_px, processed_height_px: size of the processed image.
+        retrieval: descriptor that chose the references; empty if they were used as given.
+        captured: whether the server keeps the call for a time, including the photograph.
     """
 
     request_id: str
@@ -92,10 +92,10 @@ class Diagnostics:
 
 @dataclass(frozen=True, eq=False)
 class FramedPose:
-    """A pose in the axes that were asked for, "ARKIT" for instance; see `mapless.axes`.
+    """A pose in the requested axes, "ARKIT" for instance; see `mapless.axes`.
 
     Attributes:
-        axes: which.
+        axes: name of the axes.
         world_from_camera: both frames in these axes.
         covariance: (6, 6) in these axes, order x y z rx ry rz; None if not estimated.
         world_from_session: puts whatever the device tracks into the world; None if no `session_from_camera` was sent.
@@ -113,10 +113,10 @@ class PriorCheck:
 
     Attributes:
         kind: "POSITION", "HEADING", "GRAVITY" or "POSE".
-        mahalanobis: distance between the prior and the pose that the photograph alone gives, both uncertain.
-        degrees_of_freedom: numbers compared.
+        mahalanobis: distance between the prior and the pose from the photograph alone, with the covariances of both.
+        degrees_of_freedom: degrees of freedom of the comparison.
         conflict: whether the prior contradicts the photograph.
-        used: whether it took part in finding the pose.
+        used: whether it contributed to the pose.
     """
 
     kind: str
@@ -128,13 +128,13 @@ class PriorCheck:
 
 @dataclass(frozen=True)
 class Hint:
-    """What would help to localize a photograph that was not.
+    """Advice after a rejection.
 
     Attributes:
-        stage: that could not do its work; empty where none began.
+        stage: the stage that failed; empty if none began.
         advice: for programs: the value of Advice without its prefix, "RETAKE_PHOTOGRAPH".
-        message: one sentence for a person: what to do.
-        best_reference: name of the one that shares most with the photograph; empty where none shares anything.
+        message: one sentence for a person.
+        best_reference: name of the reference with the most in common with the photograph; empty if there is none.
     """
 
     stage: str
@@ -145,7 +145,7 @@ class Hint:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A pose that the photograph could have, its inliers, and the names of the references that support it."""
+    """A possible pose of the photograph, its inliers, and the names of the references that support it."""
 
     world_from_camera: RigidTransform
     inlier_count: int
@@ -154,15 +154,15 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Debug:
-    """The 2D-3D matches that a pose rests on; pixels are those of the photographs as they were sent.
+    """The 2D-3D matches that support a pose; pixels are those of the original photographs.
 
     Attributes:
-        query_px: (M, 2) where the photograph shows the points.
+        query_px: (M, 2) keypoints in the photograph.
         x_in_world: (M, 3) the points, metres.
         is_inlier: (M,) whether the match agrees with the pose.
-        error_px: (M,) reprojection errors, pixels of the processed image; NaN where there is none.
-        reference: (M,) index into `Diagnostics.references` of one that shows the point.
-        reference_px: (M, 2) where it shows it.
+        error_px: (M,) reprojection errors, pixels of the processed image; NaN if undefined.
+        reference: (M,) index into `Diagnostics.references` of a reference that shows the point.
+        reference_px: (M, 2) the point's pixel in that reference.
     """
 
     query_px: Array
@@ -175,23 +175,23 @@ class Debug:
 
 @dataclass(frozen=True, eq=False)
 class LocalizationResult:
-    """Where a photograph was taken.
+    """The pose of a photograph, with its accuracy.
 
     Attributes:
         world_from_camera: the camera's pose; its translation is the camera centre in the scene's world frame, metres.
         covariance: (6, 6), order x y z rx ry rz, metres and radians about fixed world axes; None if not estimated.
-        accuracy: radii of the same; None if it is.
-        trust: share of right answers that look no better than this one, 0 to 1; None where nothing has checked it.
-        in_axes: the same pose in the axes that were asked for, and what puts the device's session into the world.
+        accuracy: radii of the pose; None without covariance.
+        trust: share of right answers that look no better than this one, 0 to 1; None for an unverified pose.
+        in_axes: the same pose in the requested axes, with `world_from_session`.
         geo_pose: the same pose on the Earth; None unless the scene has a datum.
         prior_checks: how the answer compares with each soft prior.
-        pose_stage: "REFINED" or "INITIAL"; "COARSE" for a pose that nothing has checked, because there was no time to,
-            which only a call that allows it is given, or because there was none yet (`localize_progressively`).
-        inlier_count, match_count: 2D-3D matches that agree with the pose, and all that were tried.
+        pose_stage: "REFINED" or "INITIAL"; "COARSE" for an unverified pose, either of a call with `allow_coarse` that
+            ran out of time, or the first of `localize_progressively`.
+        inlier_count, match_count: number of 2D-3D matches that agree with the pose, and of all matches.
         reprojection_error_px: median of the inliers, pixels of the processed image.
-        debug: the matches it rests on, if they were asked for.
+        debug: the matches that support it, if requested.
         capture_time, session_from_camera: as they were sent.
-        is_final: whether no better answer follows; False for the coarse one of `localize_progressively` alone.
+        is_final: False only for the coarse answer of `localize_progressively`, which another answer follows.
     """
 
     world_from_camera: RigidTransform
@@ -213,10 +213,10 @@ class LocalizationResult:
 
     @property
     def world_from_session(self) -> RigidTransform | None:
-        """Puts whatever the device tracked since into the world; None if no `session_from_camera` was sent.
+        """Transform from the device's session to the world, requested axes; None without `session_from_camera`.
 
-        The answer is of the moment of capture, and the device has moved on: its pose now is `world_from_session` times
-        its own `session_from_camera` now. In the axes that were asked for, as these are.
+        The answer holds for the moment of capture. The device's current pose in the world is `world_from_session` times
+        its current `session_from_camera`.
         """
         return None if self.in_axes is None else self.in_axes.world_from_session
 
@@ -228,11 +228,11 @@ class Rejected:
     Attributes:
         reason: for programs: the value of RejectionReason without its prefix, "LOW_OVERLAP".
         message: one sentence for a person, with the numbers that decided.
-        hint: what would help.
-        hypotheses: poses that contradict each other, the better supported first, where the reason is "AMBIGUOUS".
-        debug: the matches, if they were asked for and there were any.
+        hint: advice.
+        hypotheses: contradictory poses, the best supported first, if the reason is "AMBIGUOUS".
+        debug: the matches, if requested and found.
         capture_time, session_from_camera: as they were sent.
-        is_final: always; a rejection is never a first answer.
+        is_final: always True.
     """
 
     reason: str

@@ -1,4 +1,4 @@
-"""Poses in the axes of whoever uses them: OpenCV, ARKit, ARCore, Unity, ROS; both ways.
+"""Conversion of poses between the axes of OpenCV, ARKit, ARCore, Unity and ROS.
 
 mapless itself speaks OpenCV's: a camera's x points right, y down and z forward, in a right-handed world.
 
@@ -12,15 +12,15 @@ axes       a camera's x, y, z              the world
 `ROS`      forward, left, up (REP 103)     as the scene has it (REP 103's has z up)
 =========  ==============================  =============================================================
 
-World axes are never turned, only mirrored for Unity, since which way a scene's world points is its operator's choice:
+World axes are never rotated, only mirrored for Unity, since the operator chooses the orientation of a scene's world:
 one for headsets and phones should have y up, one for robots z up. A scene with z up is answered to ARKit as a pose in a
 world with z up. The mirror leaves a world with y up one with y up.
 
 Right, down and forward are those of the pixel raster as it was sent, whatever the device's posture: the photograph of a
 phone that is held upright lies in the file, and is answered, as its landscape sensor saw it. That is what `ARFrame`'s
-`capturedImage` and `camera.transform`, and ARCore's `acquireCameraImage` and `getPose`, speak of, too. Who turns the
-raster before sending it, or is given poses that turn with the display (ARCore's `getDisplayOrientedPose`, Unity's
-camera), goes from one to the other with `turned_raster`.
+`capturedImage` and `camera.transform`, and ARCore's `acquireCameraImage` and `getPose`, refer to, too. For a raster
+that was rotated before sending, or poses that rotate with the display (ARCore's `getDisplayOrientedPose`, Unity's
+camera), `turned_raster` converts between the two.
 
 Quaternions need no rule of their own: in each of these, Unity included, (x, y, z, w) stands for the same matrix.
 """
@@ -36,7 +36,7 @@ from .geometry import Array, RigidTransform
 
 
 class Axes(Enum):
-    """Whose axes, see the module."""
+    """Axes of a platform, see the module."""
 
     OPENCV = "opencv"
     ARKIT = "arkit"
@@ -97,7 +97,7 @@ def pose_from(axes: Axes, world_from_camera: RigidTransform) -> RigidTransform:
 def world_from_session_in(
     axes: Axes, world_from_camera: RigidTransform, session_from_camera: RigidTransform
 ) -> RigidTransform:
-    """What puts whatever a device tracks into the world, both frames in these axes.
+    """Transform from a device's session to the world, both frames in these axes.
 
     Times the device's `session_from_camera` of any later moment, in these axes, it is the camera in the world in them.
 
@@ -132,8 +132,8 @@ def camera_points_from(axes: Axes, x_in_camera: ArrayLike) -> Array:
 def covariance_to(axes: Axes, covariance: ArrayLike) -> Array:
     """The covariance of a pose in these axes, (6, 6), in ROS's order: x, y, z, then rotations about fixed world axes.
 
-    A rotation by the vector w, R' = Exp(w) R, is in a mirrored world M R' = Exp(det(M) M w) M R: a rotation vector does
-    not only change its place, but its sense. Its own inverse.
+    A rotation by the vector w, R' = Exp(w) R, is in a mirrored world M R' = Exp(det(M) M w) M R: a mirror also reverses
+    the sense of a rotation vector. Its own inverse.
     """
     changed: Array = _COVARIANCE_SIGNS[axes] * np.asarray(covariance, float)
     return changed

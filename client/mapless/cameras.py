@@ -1,4 +1,4 @@
-"""Cameras and poses from files: the interface's JSON, four numbers, or a folder's cameras.json."""
+"""Reads cameras and poses: the interface's JSON, four numbers, or a folder's cameras.json."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
     """A camera: a JSON file or JSON text as the interface defines CameraIntrinsics, or "fx,fy,cx,cy" in pixels.
 
     Args:
-        source: where from.
-        photo: a photograph that it took; four numbers take the size of the image from its header.
+        source: the file, the JSON text, or the numbers.
+        photo: a photograph of the camera; four numbers need its header for the image size.
 
     Raises:
         OSError: a file cannot be read.
-        ValueError: it is no camera.
+        ValueError: the source is no valid camera.
     """
     text = str(source)
     if not _NUMBERS.fullmatch(text):
         if Path(text).name == FOLDER_FILE:
-            raise ValueError(f"{text} holds the cameras of a folder's photographs, where a single camera is wanted")
+            raise ValueError(f"{text} holds the cameras of a folder's photographs, but a single camera is needed")
         return wire.camera_from_message(_read_json(text, geometry_pb2.CameraIntrinsics()), "camera")
     numbers = text.split(",")
     if len(numbers) != 4 or not all(numbers):
-        raise ValueError(f"{text}: a camera in numbers is four of them: fx,fy,cx,cy")
+        raise ValueError(f"{text}: a camera must be four numbers, fx,fy,cx,cy")
     if photo is None:
-        raise ValueError(f"{text}: four numbers are a camera only together with a photograph that it took")
+        raise ValueError(f"{text}: a camera of four numbers needs a photograph, for the image size")
     try:
         width_px, height_px = size_of_image(Path(photo).read_bytes())
     except ValueError as error:
         raise ValueError(f"{photo}: {error}") from None
     focal_x_px, focal_y_px, principal_x_px, principal_y_px = map(float, numbers)
     camera = Camera(width_px, height_px, focal_x_px, focal_y_px, principal_x_px, principal_y_px)
-    return wire.camera_from_message(wire.camera_to_message(camera), "camera")  # which checks the ranges
+    return wire.camera_from_message(wire.camera_to_message(camera), "camera")  # checks the bounds
 
 
 def read_pose(source: str | Path) -> RigidTransform:
@@ -56,20 +56,20 @@ def read_pose(source: str | Path) -> RigidTransform:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no pose.
+        ValueError: the source is no valid pose.
     """
     return wire.transform_from_message(_read_json(str(source), geometry_pb2.RigidTransform()), "pose")
 
 
 def read_cameras(file: str | Path) -> dict[Path, Camera]:
-    """The photographs of a cameras.json, and the camera of each, in the file's order.
+    """The photographs of a cameras.json with their cameras, in the file's order.
 
     The file has `frames`, each with `image` (path beside the file), `width`, `height`, `K` (3x3, pixels) and perhaps
-    `dist` (OpenCV's k1 k2 p1 p2 k3); poses in it are not looked at.
+    `dist` (OpenCV's k1 k2 p1 p2 k3); poses are ignored.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no such file; names the frame.
+        ValueError: the file has another form; names the frame.
     """
     path = Path(file)
     try:
@@ -98,7 +98,7 @@ def _photograph(path: Path, index: int, frame: Any) -> tuple[Path, Camera]:
 
 
 def _read_json(source: str, message: M) -> M:
-    """The message that a JSON file, or JSON text, holds."""
+    """The message of a JSON file or JSON text."""
     text = source if source.lstrip().startswith("{") else Path(source).read_text()
     try:
         json_format.Parse(text, message)

@@ -1,13 +1,13 @@
-"""Where on the Earth a scene is: WGS84, the scene's datum, and OGC GeoPose 1.0.
+"""Positions on the Earth: WGS84, the datum of a scene, and OGC GeoPose 1.0.
 
-Three frames, all right-handed, metric and float64, in which a nanometre still shows at the Earth's radius:
+Three frames, all right-handed, metric and float64, which resolves a nanometre at the Earth's radius:
 
 * ECEF: origin at the Earth's centre, z through the north pole, x through latitude 0, longitude 0.
 * ENU at a place: origin there, x east, y north, z up along the ellipsoid's normal.
-* the world of a scene, which its `Datum` fixes to ENU at one place, its world's origin.
+* the world of a scene, related by its `Datum` to ENU at the world's origin.
 
-ENU at another place is turned against that of the datum, by 0.0001 to 0.2 degrees over 10 m to 10 km. A GeoPose is
-given in ENU at the place of the pose, so that turn is part of it.
+ENU at another place is rotated against that of the datum, by 0.0001 to 0.2 degrees over 10 m to 10 km. A GeoPose is
+given in ENU at the place of the pose, so it includes that rotation.
 
 Heights are above the ellipsoid, as satellite receivers give them, not above the sea: the two differ by up to 107 m.
 """
@@ -32,16 +32,16 @@ _E2 = FLATTENING * (2 - FLATTENING)
 _SECOND_E2 = _E2 / (1 - _E2)
 
 MIN_HEIGHT_M, MAX_HEIGHT_M = -12_000.0, 100_000.0
-"""Of a datum: from below the sea's floor to where the air ends."""
+"""Bounds of a datum's height: below the deepest sea, above the atmosphere."""
 
 _DATUM_NUMBERS = ("latitude_deg", "longitude_deg", "height_m")
 
 
 def enu_from_y_up(heading_deg: float) -> Quaternion:
-    """`Datum.enu_from_world` of a world with y up, as headsets have it.
+    """`Datum.enu_from_world` of a world with y up, as on headsets.
 
     Args:
-        heading_deg: where its -z, ahead of a headset at its session's start, points: clockwise from north.
+        heading_deg: direction of its -z, a headset's forward at the start of its session: clockwise from north.
     """
     half = math.radians(heading_deg) / 2
     cosine, sine = math.sqrt(0.5) * math.cos(half), math.sqrt(0.5) * math.sin(half)
@@ -49,10 +49,10 @@ def enu_from_y_up(heading_deg: float) -> Quaternion:
 
 
 def enu_from_z_up(heading_deg: float) -> Quaternion:
-    """`Datum.enu_from_world` of a world with z up, as robots have it.
+    """`Datum.enu_from_world` of a world with z up, as on robots.
 
     Args:
-        heading_deg: where its x points: clockwise from north, so 90 where x is east, as REP 103 would have it.
+        heading_deg: direction of its x: clockwise from north, so 90 if x is east, as in REP 103.
     """
     half = math.radians(90 - heading_deg) / 2
     return Quaternion(0.0, 0.0, math.sin(half), math.cos(half)).normalized()
@@ -77,11 +77,11 @@ class GeoPosition:
 
 @dataclass(frozen=True)
 class Datum:
-    """Where a scene's world is on the Earth.
+    """Position and orientation of a scene's world on the Earth.
 
     Attributes:
         latitude_deg, longitude_deg, height_m: of the world's origin, WGS84, height above the ellipsoid.
-        enu_from_world: turns the world's axes to east, north and up at its origin. Default: they are these already.
+        enu_from_world: rotation of the world's axes to east, north and up at its origin; by default the identity.
     """
 
     latitude_deg: float
@@ -104,20 +104,20 @@ class Datum:
         return GeoPosition(self.latitude_deg, self.longitude_deg, self.height_m)
 
     def ecef_from_world(self) -> RigidTransform:
-        """Where the world is in the Earth."""
+        """The pose of the world in ECEF."""
         ecef_from_enu = ecef_from_enu_at(self.origin)
         return ecef_from_enu.compose(RigidTransform(self.enu_from_world.matrix(), np.zeros(3)))
 
     def to_json(self) -> dict[str, Any]:
-        """What `json.dumps` writes; the names are the attributes'."""
+        """As a JSON object with the attributes' names."""
         return asdict(self)
 
     @staticmethod
     def from_json(content: object) -> Datum:
-        """From what `json.loads` reads; enu_from_world may be left out.
+        """From a JSON object; enu_from_world is optional.
 
         Raises:
-            ValueError: it is none: a member is missing, is no number or out of range.
+            ValueError: a member is missing, is no number or out of bounds.
         """
         latitude_deg, longitude_deg, height_m = (_number(content, name) for name in _DATUM_NUMBERS)
         turned = content.get("enu_from_world") if isinstance(content, dict) else None
@@ -127,7 +127,7 @@ class Datum:
         return Datum(latitude_deg, longitude_deg, height_m, Quaternion(x, y, z, w))
 
     def down_in_world(self) -> Array:
-        """Unit vector (3,) to below, along the ellipsoid's normal: some hundredths of a degree from a plumb line."""
+        """Unit vector (3,) down along the ellipsoid's normal, within some hundredths of a degree of gravity."""
         up: Array = self.enu_from_world.matrix()[2]
         return -up
 
@@ -137,11 +137,11 @@ class GeoPose:
     """OGC GeoPose 1.0, Basic-Quaternion; the names are the standard's.
 
     Attributes:
-        lat, lon: where the body is, WGS84, degrees.
+        lat, lon: position of the body, WGS84, degrees.
         h: its height above the ellipsoid, metres.
-        quaternion: turns the body's axes to east, north and up at that very place. The standard leaves it open how the
-            axes lie in the body; here x is forward, y left and z up, so that a camera that looks east and is held
-            upright has the identity.
+        quaternion: rotation of the body's axes to east, north and up at the body's position. The standard does not
+            define the body's axes; here x is forward, y left and z up, so an upright camera that looks east has the
+            identity.
     """
 
     lat: float
@@ -155,11 +155,11 @@ class GeoPose:
 
     @property
     def position(self) -> GeoPosition:
-        """Where the body is."""
+        """Position of the body."""
         return GeoPosition(self.lat, self.lon, self.h)
 
     def to_json(self) -> dict[str, dict[str, float]]:
-        """What `json.dumps` writes as the standard has it: each of its members, all numbers, and nothing else."""
+        """As a JSON object with exactly the standard's members."""
         position = {"lat": self.lat, "lon": self.lon, "h": self.h}
         return {
             part: {name: float(number) for name, number in numbers.items()}
@@ -168,10 +168,10 @@ class GeoPose:
 
     @staticmethod
     def from_json(content: object) -> GeoPose:
-        """From what `json.loads` reads; members that the standard does not have are passed over.
+        """From a JSON object; members that the standard does not define are ignored.
 
         Raises:
-            ValueError: it is none: a member is missing, is no number or out of range.
+            ValueError: a member is missing, is no number or out of bounds.
         """
         position, quaternion = (
             content.get(it) if isinstance(content, dict) else None for it in ("position", "quaternion")
@@ -193,8 +193,8 @@ def ecef_from_geodetic(place: GeoPosition) -> Array:
 def geodetic_from_ecef(x_in_ecef: ArrayLike) -> GeoPosition:
     """The place of a point (3,) in ECEF; on the Earth's axis the longitude is 0.
 
-    Bowring 1976, iterated: two rounds would do for a nanometre anywhere on the ground or in orbit. Within 50 km of the
-    Earth's centre, where normals of the ellipsoid meet, the answer is some place, not the place.
+    Bowring 1976, iterated: two iterations give a nanometre on the ground and in orbit. Within 50 km of the Earth's
+    centre, where normals of the ellipsoid intersect, the result is not unique.
     """
     x, y, z = np.asarray(x_in_ecef, float).tolist()
     from_axis_m = math.hypot(x, y)
@@ -212,7 +212,7 @@ def geodetic_from_ecef(x_in_ecef: ArrayLike) -> GeoPosition:
 
 
 def ecef_from_enu_at(place: GeoPosition) -> RigidTransform:
-    """The frame east, north, up at a place. At a pole the longitude says which way is east."""
+    """The frame east, north, up at a place. At a pole the longitude defines east."""
     sin_lat, cos_lat = _sine_and_cosine(place.latitude_deg)
     sin_lon, cos_lon = _sine_and_cosine(place.longitude_deg)
     east = (-sin_lon, cos_lon, 0.0)
@@ -232,9 +232,9 @@ def world_from_geodetic(place: GeoPosition, datum: Datum) -> Array:
 
 
 def world_from_enu_at(place: GeoPosition, datum: Datum) -> RigidTransform:
-    """The frame east, north, up at a place, in a scene's world: carries what is said of a place into the scene.
+    """The frame east, north, up at a place, as a pose in a scene's world.
 
-    A receiver's covariance C of east, north and up is R C R^T there, R being the rotation.
+    The covariance C of a receiver's east, north and up is R C R^T in the world, with R the rotation.
     """
     return datum.ecef_from_world().inverse().compose(ecef_from_enu_at(place))
 
@@ -255,7 +255,7 @@ def pose_from_geopose(pose: GeoPose, datum: Datum) -> RigidTransform:
 
 
 def _sine_and_cosine(angle_deg: float) -> tuple[float, float]:
-    """Exact where the answer is: the cosine of 90 degrees is 0, and not 6e-17."""
+    """Exact at multiples of 90 degrees: the cosine of 90 degrees is 0, not 6e-17."""
     rest_deg = math.remainder(angle_deg, 90)
     sine, cosine = math.sin(math.radians(rest_deg)), math.cos(math.radians(rest_deg))
     quarter = round((angle_deg - rest_deg) / 90) % 4

@@ -26,12 +26,12 @@ MAX_COORDINATE_M = 1e7
 """Of a stored pose: the Earth's centre is not as far from anything on it."""
 
 ROTATION_TOLERANCE = 1e-3
-"""How far a given rotation may be from orthonormal (or a quaternion's norm from 1) before it is refused."""
+"""How far a given rotation may be from orthonormal (or a quaternion's norm from 1) before it is rejected."""
 
 
 @dataclass(frozen=True)
 class Quaternion:
-    """A unit quaternion with named parts; ``q`` and ``-q`` are the same rotation, and w >= 0 is the one we write."""
+    """A unit quaternion with named parts; ``q`` and ``-q`` are the same rotation; the one with w >= 0 is written."""
 
     x: float
     y: float
@@ -285,12 +285,12 @@ class Camera:
 
     @classmethod
     def from_fov(cls, width_px: int, height_px: int, horizontal_fov_deg: float) -> Camera:
-        """The pinhole camera with square pixels that looks through the image's middle: of simulators and data sheets.
+        """The pinhole camera with square pixels and a centred principal point, as in simulators and data sheets.
 
         The field of view is the angle between the image's left and its right edge, above 0 and below 180 degrees.
         """
         if not 0 < horizontal_fov_deg < 180:
-            raise ValueError(f"a field of view is above 0 and below 180 degrees, not {horizontal_fov_deg:g}")
+            raise ValueError(f"horizontal_fov_deg must be above 0 and below 180, is {horizontal_fov_deg:g}")
         focal_px = width_px / 2 / math.tan(math.radians(horizontal_fov_deg) / 2)
         return cls(width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2)
 
@@ -362,5 +362,5 @@ Number = TypeVar("Number", float, NDArray[np.floating])
 
 
 def resized_pixel(pixel: Number, scale: float) -> Number:
-    """Where a pixel coordinate goes when its image is resampled by ``scale`` (new size / old size)."""
+    """A pixel coordinate after its image was resampled by ``scale`` (new size / old size)."""
     return scale * (pixel + 0.5) - 0.5

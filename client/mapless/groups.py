@@ -1,4 +1,4 @@
-"""Photographs that are posed together, a rig's or a sequence's: what is sent and what is answered, as values."""
+"""Photographs that are localized together, of a rig or a sequence: inputs and answers."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from .wire import optional
 
 @dataclass(frozen=True, eq=False)
 class RigImage:
-    """What one camera of a rig took.
+    """The photograph of one camera of a rig.
 
     Attributes:
         image: the photograph.
-        camera: which took it, in pixels of the file as it is stored, before any EXIF rotation.
-        rig_from_camera: where it is mounted, metres, OpenCV's axes; the rig's frame is yours to choose.
-        references: what to compare it with, at most 64; none: the server chooses.
+        camera: its camera, in pixels of the file as it is stored, before any EXIF rotation.
+        rig_from_camera: pose of the camera in the rig, metres, OpenCV's axes; the rig's frame is arbitrary.
+        references: the references to use, at most 64; empty: the server chooses.
     """
 
     image: ImageSource
@@ -46,14 +46,14 @@ class RigImage:
 
 @dataclass(frozen=True, eq=False)
 class SequenceFrame:
-    """One photograph of a sequence, and what the device knew then.
+    """One photograph of a sequence, with the device's own pose.
 
     Attributes:
         image: the photograph.
-        camera: which took it, in pixels of the file as it is stored, before any EXIF rotation.
-        session_from_camera: where the device believed its camera to be, in the axes that the call names.
-        capture_time: when it was taken, with time zone; echoed.
-        references: what to compare it with, at most 64; none: the server chooses.
+        camera: its camera, in pixels of the file as it is stored, before any EXIF rotation.
+        session_from_camera: the pose that the device tracked, in the axes of the call.
+        capture_time: time of the photograph, with time zone.
+        references: the references to use, at most 64; empty: the server chooses.
     """
 
     image: ImageSource
@@ -65,13 +65,13 @@ class SequenceFrame:
 
 @dataclass(frozen=True, eq=False)
 class ImageReport:
-    """What one photograph contributed to a joint answer.
+    """Contribution of one photograph to a joint answer.
 
     Attributes:
         inlier_count: its 2D-3D matches that agree with the joint pose.
-        match_count: its 2D-3D matches that were tried.
-        rejected_alone: why it would not have been localized alone, "LOW_OVERLAP"; None if it would.
-        diagnostics: what was used for it and where the time went.
+        match_count: all its 2D-3D matches.
+        rejected_alone: reason of its rejection if localized alone, "LOW_OVERLAP"; None if it would be accepted.
+        diagnostics: its inputs and times.
     """
 
     inlier_count: int
@@ -82,17 +82,16 @@ class ImageReport:
 
 @dataclass(frozen=True, eq=False)
 class RigLocalization:
-    """Where a rig was.
+    """The pose of a rig.
 
     Attributes:
         world_from_rig: its pose at capture time.
         covariance: (6, 6) of the rig's origin, order x y z rx ry rz, metres and radians about fixed world axes.
-        accuracy: radii of the same.
-        inlier_count, match_count: 2D-3D matches of all photographs that agree with the pose, and all that were tried.
+        accuracy: radii of the same pose.
+        inlier_count, match_count: number of 2D-3D matches of all photographs that agree with the pose, and of all.
         reprojection_error_px: median of the inliers, pixels of the processed images.
-        images: what each contributed, in order.
-        world_from_session: puts whatever the device tracked since into the world; None if no `session_from_rig` was
-            sent.
+        images: contribution of each photograph, in order.
+        world_from_session: transform from the device's session to the world; None without `session_from_rig`.
         geo_pose: the same pose on the Earth; None unless the scene has a datum.
         capture_time: as it was sent.
     """
@@ -111,18 +110,18 @@ class RigLocalization:
 
 @dataclass(frozen=True, eq=False)
 class SequenceLocalization:
-    """Where a device was along a sequence.
+    """The poses of a sequence.
 
     Attributes:
-        world_from_session: puts whatever the device tracks after the last photograph into the world, in the axes that
-            the call names; its scale is 1 unless it was to be estimated.
-        scale_sigma: standard deviation of that scale; 0 unless it was to be estimated.
-        world_from_camera: of each photograph, freed of drift, OpenCV's axes.
+        world_from_session: transform from the device's session, after the last photograph, to the world, in the axes
+            of the call; its scale is 1 unless it was estimated.
+        scale_sigma: standard deviation of that scale; 0 unless it was estimated.
+        world_from_camera: pose of each photograph, corrected for drift, OpenCV's axes.
         covariance: (6, 6) of the last of them, order x y z rx ry rz, metres and radians about fixed world axes.
-        accuracy: radii of the same.
-        inlier_count, match_count: 2D-3D matches of all photographs that agree with the poses, and all that were tried.
+        accuracy: radii of the same pose.
+        inlier_count, match_count: number of 2D-3D matches of all photographs that agree with the poses, and of all.
         reprojection_error_px: median of the inliers, pixels of the processed images.
-        images: what each contributed, in order.
+        images: contribution of each photograph, in order.
         axes: of `world_from_session`, "OPENCV".
     """
 
@@ -140,12 +139,12 @@ class SequenceLocalization:
 
 @dataclass(frozen=True, eq=False)
 class GroupRejected:
-    """The server could not localize the photographs, not even together.
+    """The server could not localize the photographs together.
 
     Attributes:
         reason: for programs: the value of RejectionReason without its prefix, "LOW_OVERLAP".
         message: one sentence for a person, with the numbers that decided.
-        images: what each contributed, in order; each says why it alone was not enough.
+        images: contribution of each photograph, in order.
         hint, hypotheses: as of `Rejected`.
         capture_time: as it was sent.
     """

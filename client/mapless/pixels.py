@@ -1,4 +1,4 @@
-"""The size of a photograph, from its file's header: JPEG, PNG or WebP, without decoding it."""
+"""The size of a JPEG, PNG or WebP image from its header, without decoding."""
 
 from __future__ import annotations
 

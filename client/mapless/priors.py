@@ -55,7 +55,9 @@ class GravityPrior:
 
     Attributes:
         down_in_camera: (3,) direction of gravity in OpenCV's camera axes: (0, 1, 0) for a camera held upright and
-        level. sigma_deg: standard deviation about each of two axes. down_in_world: (3,); None for the scene's.
+        level.
+        sigma_deg: standard deviation about each of two axes.
+        down_in_world: (3,); None for the scene's.
     """
 
     down_in_camera: Array

@@ -1,4 +1,4 @@
-"""Scenes, references and what is said of them, as values."""
+"""Scenes, references, and results of retrieval, audit and coverage."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Scene:
     """A set of references that share one world frame; `generation` is raised by every change.
 
     Attributes:
-        scene_id, generation, reference_count, create_time: what the server keeps.
-        datum: where the world is on the Earth; None if nobody has said so.
-        down_in_world: unit vector to where things fall; None if nobody has said so but, perhaps, the datum.
-        calibration: how far off answers were found to be; None if that was never measured.
+        scene_id, generation, reference_count, create_time: set by the server.
+        datum: position of the world on the Earth; None if unknown.
+        down_in_world: unit vector of gravity; None if unknown or given by the datum alone.
+        calibration: measured factors of radii; None if never measured.
     """
 
     scene_id: str
@@ -34,7 +34,7 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A stored photograph; `image`, the file's bytes, only if asked for."""
+    """A stored photograph; `image` has the file's bytes if requested."""
 
     scene_id: str
     reference_id: str
@@ -48,7 +48,7 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class RetrievedReference:
-    """A reference that resembles a photograph: its name, how much it does (cosine, -1 to 1), and its pose."""
+    """A reference similar to a photograph: its name, cosine similarity (-1 to 1) and pose."""
 
     name: str
     similarity: float
@@ -57,17 +57,17 @@ class RetrievedReference:
 
 @dataclass(frozen=True)
 class ReferenceAudit:
-    """What a reference's neighbours say about it.
+    """Result of the audit of one reference against its neighbours.
 
     Attributes:
         name: "scenes/{scene}/references/{reference}".
         verdict: the value of AuditVerdict without its prefix, "CONSISTENT" or "WRONG_POSE".
         message: one sentence for a person, with the numbers that decided.
-        neighbour_count, match_count, inlier_count: what it was compared with, the matches, and those that agree.
-        reprojection_error_px: median of those under the stored pose, pixels of the processed image; 0 without matches.
-        position_offset_m, rotation_offset_deg: from the stored pose to what the neighbours say; 0 where unknown.
-        focal_ratio: their focal length over the stored one; 0 where unknown.
-        other: the reference that it was swapped with or is a duplicate of; else empty.
+        neighbour_count, match_count, inlier_count: references compared, matches with them, and matches that agree.
+        reprojection_error_px: median of the inliers under the stored pose, pixels of the processed image; 0 if none.
+        position_offset_m, rotation_offset_deg: from the stored pose to the one estimated from neighbours; 0 if unknown.
+        focal_ratio: focal length estimated from neighbours over the stored one; 0 if unknown.
+        other: the reference it is swapped with or a duplicate of; else empty.
     """
 
     name: str
@@ -85,15 +85,15 @@ class ReferenceAudit:
 
 @dataclass(frozen=True)
 class Coverage:
-    """Whether a photograph taken somewhere would be localized.
+    """Prediction whether a photograph at a pose would be localized.
 
     Attributes:
         verdict: "LOCALIZABLE", "DOUBTFUL" or "NOT_LOCALIZABLE".
         message: one sentence for a person, with the numbers that decided.
-        expected_match_count: 2D-3D matches that a photograph is expected to have.
-        image_share: share of the image in which there would be any, 0 to 1.
-        position_68_m: position error expected not to be exceeded in 68 % of cases; None where there is none to expect.
-        references: names of those that would serve, those that see most first.
+        expected_match_count: expected number of 2D-3D matches.
+        image_share: share of the image with matches, 0 to 1.
+        position_68_m: expected 68 % radius of the position, metres; None if not predicted.
+        references: names of the usable references, those with most matches first.
     """
 
     verdict: str

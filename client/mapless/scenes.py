@@ -17,7 +17,7 @@ from .v1 import reference_service_pb2 as pb
 from .wire import FieldError, joined
 
 MIN_FACTOR, MAX_FACTOR = 0.01, 1000.0
-"""Of radii: what lies beyond is no calibration, but something else that went wrong."""
+"""Bounds of factors: values beyond indicate another fault, not a lack of calibration."""
 
 MAX_TEXT = 128
 """Characters of each text of a calibration."""
@@ -36,25 +36,25 @@ class Unchanged(Enum):
 
 
 UNCHANGED: Final = Unchanged.UNCHANGED
-"""Of a scene's datum, down or calibration when it is updated: leave it as it is. None is another thing: forget it."""
+"""Value of `update_scene` that keeps a property; None deletes it."""
 
 UnchangedType = Literal[Unchanged.UNCHANGED]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """How far off answers in a scene were found to be, on photographs with known poses.
+    """Measured factors of the radii of answers in a scene, from photographs with known poses.
 
-    The radii that an answer claims are multiplied by the factors, so that they hold the truth as often as they say; but
-    for answers that something else computed than what was measured.
+    The radii of answers are multiplied by the factors, so that they contain the truth as often as they state. Answers
+    of another method or server version than measured remain uncalibrated.
 
     Attributes:
         position_factor_68, position_factor_95: of the position's radii at 68 and 95 %, 0.01 to 1000.
         rotation_factor_68, rotation_factor_95: of the angle's.
-        query_count: photographs that were measured, at least 1.
-        features, backend, variant: what computed their answers, as `Diagnostics` names it ("BEST").
-        server_version: of the server that was measured.
-        create_time: when the calibration was stored, by the server's clock; None for one that is about to be.
+        query_count: number of photographs measured, at least 1.
+        features, backend, variant: method of their answers, as in `Diagnostics` ("BEST").
+        server_version: version of the measured server.
+        create_time: time of storing, by the server's clock; None before.
     """
 
     position_factor_68: float
@@ -80,7 +80,7 @@ class Calibration:
                 raise ValueError(f"{name} must have at most {MAX_TEXT} characters, has {len(getattr(self, name))}")
 
     def is_of(self, features: str, backend: str, variant: str, server_version: str) -> bool:
-        """Whether it was measured with what computed an answer."""
+        """Whether it was measured with the given method and server version."""
         measured = (self.features, self.backend, self.variant, self.server_version)
         return measured == (features, backend, variant, server_version)
 
@@ -89,12 +89,12 @@ def unit_vector(x: float, y: float, z: float) -> Vector:
     """The direction of a vector.
 
     Raises:
-        ValueError: it is of no length, or not finite.
+        ValueError: its length is 0 or not finite.
     """
     longest = max(abs(x), abs(y), abs(z))
     if not 0 < longest < math.inf or not all(map(math.isfinite, (x, y, z))):
-        raise ValueError("must be finite and of some length")
-    x, y, z = x / longest, y / longest, z / longest  # squares of what is very small or large would be none
+        raise ValueError("must be finite and not zero")
+    x, y, z = x / longest, y / longest, z / longest  # against under- and overflow of squares
     length = math.sqrt(x * x + y * y + z * z)
     return x / length, y / length, z / length
 
@@ -142,7 +142,7 @@ def direction_to_message(direction: Vector) -> geometry_pb2.Vector3:
 
 
 def direction_from_message(message: geometry_pb2.Vector3, field: str) -> Vector:
-    """The direction, of unit length; FieldError if it has none."""
+    """The direction as a unit vector; FieldError if it is zero or not finite."""
     try:
         return unit_vector(message.x, message.y, message.z)
     except ValueError as error:
@@ -150,7 +150,7 @@ def direction_from_message(message: geometry_pb2.Vector3, field: str) -> Vector:
 
 
 def calibration_to_message(calibration: Calibration) -> pb.SceneCalibration:
-    """Message of a calibration; its variant is unspecified if this program does not know it."""
+    """Message of a calibration; an unknown variant becomes unspecified."""
     numbers = dict(_VARIANT.items())
     message = pb.SceneCalibration(
         **{name: getattr(calibration, name) for name in FACTORS + TEXTS},
@@ -163,7 +163,7 @@ def calibration_to_message(calibration: Calibration) -> pb.SceneCalibration:
 
 
 def calibration_from_message(message: pb.SceneCalibration, field: str) -> Calibration:
-    """Calibration of a message, with the time that it says; a variant newer than this program is its number as text.
+    """Calibration of a message, with its time; an unknown variant, from a newer program, is its number as text.
 
     Raises:
         FieldError: a number is out of range, or a text too long.

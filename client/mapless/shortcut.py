@@ -1,6 +1,6 @@
-"""One line for those who have one server: `mapless.localize("photo.jpg", camera)`.
+"""Localization in one line, `mapless.localize("photo.jpg", camera)`, with a server from the environment.
 
-The server is that of MAPLESS_ADDRESS, the token that of MAPLESS_TOKEN, the scene that of MAPLESS_SCENE.
+MAPLESS_ADDRESS has the server, MAPLESS_TOKEN the token, MAPLESS_SCENE the scene.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ def localize(
     axes: Axes | str = "",
     timeout_s: float | None = None,
 ) -> LocalizationResult | Rejected:
-    """Where a photograph was taken, in one line; `Client.localize` can do more.
+    """Localizes a photograph, in one line; `Client.localize` has more options.
 
     The connection is kept for the next call, and closed when the program ends. Raises `MaplessError`.
 
     Args:
         image: the photograph.
         camera: the camera that took it, in pixels of the file as it is stored, before any EXIF rotation.
-        scene: where to look; None: that in MAPLESS_SCENE, or the server's only one, which takes a call to find out.
-        address: "host:port"; None: that in MAPLESS_ADDRESS, or localhost:50051.
-        options: how to connect; None: without encryption, with the token in MAPLESS_TOKEN if there is one.
-        priors: what is known of the camera beforehand.
+        scene: the scene; None for MAPLESS_SCENE, or else the server's only scene, which costs another call.
+        address: "host:port"; None for MAPLESS_ADDRESS, or else localhost:50051.
+        options: options of the connection; None for no encryption, with the token of MAPLESS_TOKEN if it is set.
+        priors: what is known of the pose before the photograph is used.
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of `LocalizationResult.in_axes`.
         timeout_s: deadline of the call.
 
@@ -58,12 +58,12 @@ def localize(
 
 
 def default_address() -> str:
-    """Of the server that is meant where none is said."""
+    """The server's default address."""
     return os.environ.get(ADDRESS_VARIABLE) or DEFAULT_ADDRESS
 
 
 def _client(address: str, options: ConnectOptions) -> Client:
-    """The connection of this process; one that was made before a fork belongs to the parent."""
+    """The connection of this process; one made before a fork belongs to the parent process."""
     key = (os.getpid(), address, options)
     with _lock:
         if key not in _clients:
@@ -75,7 +75,7 @@ def _only_scene(client: Client, timeout_s: float | None) -> str:
     scenes = [scene.scene_id for scene in client.list_scenes(timeout_s=timeout_s)]
     if len(scenes) != 1:
         there = f"there are {', '.join(scenes)}" if scenes else "the server has none"
-        raise ValueError(f"say which scene, as an argument or in {SCENE_VARIABLE}: {there}")
+        raise ValueError(f"name the scene, as an argument or in {SCENE_VARIABLE}: {there}")
     return scenes[0]
 
 

@@ -1,20 +1,20 @@
-"""Where the command `mapless` begins: outside the package, so that Ctrl-C while that is loaded is quiet, too."""
+"""Entry point of the command `mapless`, outside the package, so that Ctrl-C during its import is quiet, too."""
 
 from __future__ import annotations
 
 import os
 import signal
 
-EXIT_INTERRUPTED = 130  # as shells have it
+EXIT_INTERRUPTED = 130  # as in shells
 
 
 def main() -> None:
     """Run the command line; exits."""
     before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:  # else who started us wants it ignored
-        # Not an exception: modules that are half loaded turn it into others. Nothing has to be put in order yet.
+    if before is signal.default_int_handler:  # else the parent process wants it ignored
+        # Not an exception, which a partly imported module may convert to another. Nothing needs cleaning up yet.
         signal.signal(signal.SIGINT, lambda *_: os._exit(EXIT_INTERRUPTED))
-    # Read when it is loaded; what it logs of a failed connection, the error says, and in words.
+    # Read at import. Failed connections are reported by our errors, so gRPC's own log is not needed.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
     from mapless.__main__ import main as run
 

@@ -79,7 +79,7 @@ namespace Mapless
 
         /// <summary>Does not connect yet.</summary>
         /// <param name="address">"https://host:50051", or "http://..." for a server without TLS.</param>
-        /// <param name="token">Shown to the server, if it asks for one. Only over https.</param>
+        /// <param name="token">Sent to the server, if it requires one. Only over https.</param>
         /// <param name="clientId">Which device this is; the server is fair between them.</param>
         /// <param name="handler">What speaks HTTP/2; YetAnotherHttpHandler if null.</param>
         public MaplessClient(string address, string token = null, string clientId = null, HttpMessageHandler handler = null)
@@ -111,7 +111,7 @@ namespace Mapless
         /// are the raster's, x right, y up, z forward; SensorPose makes it from the pose of Unity's camera.
         /// </param>
         /// <param name="captureTime">When that was; echoed.</param>
-        /// <param name="timeout">After which nobody waits any more; without it a lost server would block for ever.</param>
+        /// <param name="timeout">Deadline of the call; without it a lost server would block for ever.</param>
         /// <param name="cancellation">Ends the call earlier, on the server, too.</param>
         /// <exception cref="RpcException">
         /// Unavailable and ResourceExhausted: try again later, with a newer photograph. Others say what is wrong.

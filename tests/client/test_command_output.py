@@ -28,7 +28,7 @@ def test_each_prior_has_its_line() -> None:
     )
     assert [line.strip() for line in lines(localized(prior_checks=checks)) if "prior" in line] == [
         "prior     GRAVITY agrees, used",
-        "prior     HEADING agrees, knows less than the photograph, not needed",
+        "prior     HEADING agrees, less certain than the photograph, not needed",
         "prior     POSITION contradicts the photograph: 8.0 standard deviations, not used",
     ]
 
@@ -41,7 +41,7 @@ def test_what_hardly_any_right_answer_looks_like_is_warned_of() -> None:
 
 
 @pytest.mark.parametrize(
-    ("is_final", "first"), [(False, "coarse pose, the refined one is to come"), (True, "coarse pose")]
+    ("is_final", "first"), [(False, "coarse pose, the refined one follows"), (True, "coarse pose")]
 )
 def test_a_coarse_pose_is_not_called_localized(is_final: bool, first: str) -> None:
     coarse = localized(
@@ -49,7 +49,7 @@ def test_a_coarse_pose_is_not_called_localized(is_final: bool, first: str) -> No
     )
     told = lines(coarse)
     assert told[0] == first
-    assert told[-1] == "  support   checked by nothing, 0.30 s"
+    assert told[-1] == "  support   not verified, 0.30 s"
     assert not [line for line in told if "within" in line]
 
 
@@ -94,10 +94,10 @@ def test_pixels_are_to_be_encoded_first() -> None:
 
 @pytest.mark.parametrize("numbers", ["1,2", "1,2,3", "1,2,3,", "1,2,3,4,5"])
 def test_a_camera_in_numbers_is_four_of_them(numbers: str) -> None:
-    with pytest.raises(ValueError, match="four of them"):
+    with pytest.raises(ValueError, match="four numbers"):
         read_camera(numbers)
 
 
 def test_the_cameras_of_a_folder_are_not_one_camera(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="a single camera is wanted"):
+    with pytest.raises(ValueError, match="a single camera is needed"):
         read_camera(tmp_path / "cameras.json")

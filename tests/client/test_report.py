@@ -219,7 +219,7 @@ def test_references_without_matches_are_not_mapped_or_counted() -> None:
 
 
 def test_matches_that_were_not_asked_for_are_told_from_none() -> None:
-    assert "they come with include_debug" in report_html(localized(debug=None), PHOTO, CAMERA)
+    assert "they need include_debug" in report_html(localized(debug=None), PHOTO, CAMERA)
     early = replace(diagnostics(), stage_s={"features": 0.1})
     assert "include_debug" not in report_html(rejected(diagnostics=early), PHOTO, CAMERA)
 
@@ -233,8 +233,8 @@ def test_what_is_not_calibrated_says_so_where_it_is_read_first() -> None:
 def test_what_the_server_is_to_keep_is_said() -> None:
     captured = replace(diagnostics(), captured=True)
     for answer in (localized(diagnostics=captured), rejected(diagnostics=captured)):
-        assert "The server is to keep this call" in report_html(answer, PHOTO, CAMERA)
-    assert "The server is to keep this call" not in report_html(localized(), PHOTO, CAMERA)
+        assert "The server keeps this call" in report_html(answer, PHOTO, CAMERA)
+    assert "The server keeps this call" not in report_html(localized(), PHOTO, CAMERA)
 
 
 def embedded(html: str) -> bytes:
@@ -322,7 +322,7 @@ class TestPictures:
     )
     def test_what_is_no_picture_is_left_out(self, image: bytes) -> None:
         html = report_html(localized(), image, CAMERA)
-        assert "is left out" in html
+        assert "is omitted" in html
         assert "data:image" not in html
 
 

@@ -279,7 +279,7 @@ def test_a_person_is_told_which_is_which(
     with playing(([COARSE, FINAL], None)) as (address, _):
         exit_code, lines, _ = command(capsys, address, photo)
     assert exit_code == 0
-    assert [line for line in lines if line[0] != " "] == ["coarse pose, the refined one is to come", "localized"]
+    assert [line for line in lines if line[0] != " "] == ["coarse pose, the refined one follows", "localized"]
 
 
 def test_what_fails_leaves_no_file_and_a_folder_is_refused(

@@ -1,4 +1,4 @@
-"""The command line's arguments, and what of them says how to connect."""
+"""The arguments of the command line, and the options of the connection that they give."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from . import commands, localize
 DESCRIPTION = """\
 The command `mapless`: what the client can do, from a shell.
 
-`localize` tells a person a few lines, and programs everything: JSON where standard output is no terminal, or with
---json. All else is JSON. Exit codes: 0 done, 1 a call failed, 2 wrong usage, 3 a photograph was not localized (the
-answer says why).
+`localize` prints a few lines on a terminal, and JSON with all fields where standard output is no terminal, or with
+--json. All other commands print JSON. Exit codes: 0 success, 1 a call failed, 2 wrong usage, 3 a photograph was not
+localized (the answer has the reason).
 """
 
 FILE_FORMATS = """\
@@ -31,7 +31,7 @@ POSE is a JSON file likewise, RigidTransform:
 """
 
 
-_COUNT_DEFAULT = "(default: as many as the server thinks best)"
+_COUNT_DEFAULT = "(default: the server's)"
 
 _CONNECTION_DEFAULTS: dict[str, Any] = {
     "timeout": 30.0,
@@ -45,7 +45,7 @@ _CONNECTION_DEFAULTS: dict[str, Any] = {
 
 
 class _Command(argparse.ArgumentParser):
-    """A command: takes the flags that say how to connect as well, and leaves those that stand before it."""
+    """A command, which accepts the flags of the connection too; they override those given before the command."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -53,7 +53,7 @@ class _Command(argparse.ArgumentParser):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The whole command line; `run` of what it parses is the command."""
+    """The parser of the command line; `run` of its result is the command's function."""
     parser = argparse.ArgumentParser(
         prog="mapless",
         description=DESCRIPTION,
@@ -66,22 +66,22 @@ def make_parser() -> argparse.ArgumentParser:
     groups = parser.add_subparsers(title="commands", required=True, metavar="COMMAND", parser_class=_Command)
     health = groups.add_parser(
         "health",
-        help="whether the server takes calls",
+        help="whether the server accepts calls",
         description="The server as a whole, then each service. The ReferenceService alone is NOT_SERVING while the "
-        "store cannot be written: queries are answered, changes refused. Exit code 0 if the server as a whole serves, "
+        "store cannot be written: queries are answered, changes rejected. Exit code 0 if the server as a whole serves, "
         "else 1.",
     )
     health.set_defaults(run=commands.health)
     _add_scene(groups.add_parser("scene", help="create, update, get, list, delete"))
     _add_reference(groups.add_parser("reference", help="add, list, delete"))
-    _add_localize(groups.add_parser("localize", help="where a photograph was taken, or a folder of them"))
+    _add_localize(groups.add_parser("localize", help="localize a photograph, or a folder of them"))
     _add_questions(groups)
     return parser
 
 
 def connect_options(arguments: argparse.Namespace) -> ConnectOptions:
-    """How to connect; OSError or ValueError if the flags or their files do not fit."""
-    # Not a flag of its own: what stands on a command line, everybody on the machine can read.
+    """Options of the connection; OSError or ValueError for wrong flags or files."""
+    # Not a flag of its own: all users of the machine can read a command line.
     token = arguments.token_file.read_text() if arguments.token_file else os.environ.get(TOKEN_VARIABLE)
     return ConnectOptions(
         timeout_s=arguments.timeout,
@@ -95,7 +95,7 @@ def connect_options(arguments: argparse.Namespace) -> ConnectOptions:
 
 
 def _add_connection(parser: argparse.ArgumentParser) -> None:
-    """Flags without defaults, so that a command where they are not given changes nothing."""
+    """Adds flags without defaults, so that a command without them keeps the values given before it."""
     group = parser.add_argument_group("connection")
 
     def add(flag: str, **options: Any) -> None:
@@ -105,19 +105,19 @@ def _add_connection(parser: argparse.ArgumentParser) -> None:
     add("--timeout", type=float, help=f"of a call, seconds (default: {_CONNECTION_DEFAULTS['timeout']:g})")
     add("--tls", action="store_true", help="encrypt; --ca and --cert imply it")
     add("--ca", type=Path, metavar="FILE", help="certificate that signed the server's, PEM (default: the system's)")
-    add("--cert", type=Path, metavar="FILE", help="our own certificate, PEM, if the server asks")
+    add("--cert", type=Path, metavar="FILE", help="the client's certificate, PEM, if the server requires one")
     add("--key", type=Path, metavar="FILE", help="its key, PEM")
-    add("--token-file", type=Path, metavar="FILE", help=f"holds the token to show (default: that in {TOKEN_VARIABLE})")
-    add("--client-id", help="which of the token's users this is")
+    add("--token-file", type=Path, metavar="FILE", help=f"holds the token (default: that in {TOKEN_VARIABLE})")
+    add("--client-id", help="identifies this user among those of the token")
 
 
 def _add_scene(scene: argparse.ArgumentParser) -> None:
     actions = scene.add_subparsers(required=True, metavar="ACTION")
-    create = actions.add_parser("create", help="a new, empty one")
+    create = actions.add_parser("create", help="create an empty scene")
     create.add_argument("scene")
     _add_place(create)
     create.set_defaults(run=commands.create_scene)
-    update = actions.add_parser("update", help="change what is known of it as a whole")
+    update = actions.add_parser("update", help="change its datum, direction of gravity or calibration")
     update.add_argument("scene")
     _add_place(update)
     update.add_argument(
@@ -125,7 +125,7 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         choices=["datum", "down_in_world", "calibration"],
-        help="what is no longer known; may be repeated",
+        help="property to delete; may be repeated",
     )
     update.set_defaults(run=commands.update_scene)
     for action, run in (("get", commands.get_scene), ("delete", commands.delete_scene)):
@@ -148,9 +148,9 @@ def _add_place(command: argparse.ArgumentParser) -> None:
         type=float,
         nargs=4,
         metavar=("X", "Y", "Z", "W"),
-        help="quaternion that turns the world's axes to east, north, up; default: they are these",
+        help="quaternion that rotates the world's axes to east, north, up (default: the identity)",
     )
-    command.add_argument("--down", type=float, nargs=3, metavar=("X", "Y", "Z"), help="where things fall in the world")
+    command.add_argument("--down", type=float, nargs=3, metavar=("X", "Y", "Z"), help="direction of gravity")
 
 
 def _add_reference(reference: argparse.ArgumentParser) -> None:
@@ -175,45 +175,45 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
     command.add_argument("scene")
     command.add_argument("photo", type=Path, help="or a folder of photographs")
     command.add_argument(
-        "--camera", help="that took it, or all, see `mapless --help`; beside or in a cameras.json none is needed"
+        "--camera", help="the camera of the photographs, see `mapless --help`; not needed with a cameras.json"
     )
-    command.add_argument("--reference", action="append", default=[], help="compare with this one; may be repeated")
+    command.add_argument("--reference", action="append", default=[], help="use this reference; may be repeated")
     command.add_argument(
         "--count", type=_count, default=0, help=f"how many references the server chooses {_COUNT_DEFAULT}"
     )
-    command.add_argument("--rerank", action="store_true", help="the server chooses among those given")
+    command.add_argument("--rerank", action="store_true", help="the server chooses among the references given")
     _add_priors(command)
     command.add_argument(
         "--gravity",
         type=float,
         nargs=3,
         metavar=("X", "Y", "Z"),
-        help="gravity prior: down in the camera's axes (x right, y down, z forward), for scenes that know their down",
+        help="gravity prior: down in the camera's axes (x right, y down, z forward), for scenes with a known down",
     )
     command.add_argument(
-        "--gravity-sigma", type=float, default=1.0, metavar="DEG", help="how well it is known (default: %(default)s)"
+        "--gravity-sigma", type=float, default=1.0, metavar="DEG", help="its standard deviation (default: %(default)s)"
     )
-    command.add_argument("--axes", default="", help="opencv, arkit, arcore, unity or ros: adds the pose in these")
+    command.add_argument("--axes", default="", help="opencv, arkit, arcore, unity or ros: adds the pose in these axes")
     command.add_argument(
-        "--coverage", type=float, default=0.0, help="share of the right answers to accept (default: the server's)"
+        "--coverage", type=float, default=0.0, help="share of right answers to accept (default: the server's)"
     )
     command.add_argument("--variant", default="", help="best, full, no_structure or coarse")
     command.add_argument("--scale-strategy", default="", help="two_stage, triangulation or trajectory")
-    command.add_argument("--allow-coarse", action="store_true", help="a coarse pose will do if time runs out")
+    command.add_argument("--allow-coarse", action="store_true", help="accept a coarse pose if time runs out")
     command.add_argument(
-        "--progressive", action="store_true", help="tell a coarse pose as soon as there is one, and then the answer"
+        "--progressive", action="store_true", help="print a coarse pose as soon as there is one, then the answer"
     )
-    command.add_argument("--parallel", type=int, default=2, help="calls at a time for a folder (default: %(default)s)")
+    command.add_argument("--parallel", type=int, default=2, help="concurrent calls for a folder (default: %(default)s)")
     shown = command.add_argument_group("output")
-    shown.add_argument("--json", action="store_true", help="JSON on a terminal, too; for a folder a line each")
+    shown.add_argument("--json", action="store_true", help="JSON on a terminal, too; for a folder one line each")
     shown.add_argument("--output", type=Path, metavar="FILE", help="write the JSON to a file")
-    shown.add_argument("--debug", action="store_true", help="the matches it rests on in the JSON, too")
-    shown.add_argument("--draw", type=Path, metavar="FOLDER", help="write a page for each photograph, to be looked at")
+    shown.add_argument("--debug", action="store_true", help="include the matches that support the answer in the JSON")
+    shown.add_argument("--draw", type=Path, metavar="FOLDER", help="write an HTML report for each photograph")
     command.set_defaults(run=localize.run)
 
 
 def _count(text: str) -> int:
-    """At least 1: in a request 0 leaves the number to the server, which is what leaving out the flag says."""
+    """At least 1: in a request, 0 stands for the server's default, as does omitting the flag."""
     count = int(text)
     if count < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, is {count}")
@@ -221,7 +221,7 @@ def _count(text: str) -> int:
 
 
 def _add_questions(groups: argparse._SubParsersAction[_Command]) -> None:
-    retrieve = groups.add_parser("retrieve", help="the references that resemble a photograph most")
+    retrieve = groups.add_parser("retrieve", help="find the references most similar to a photograph")
     retrieve.add_argument("scene")
     retrieve.add_argument("photo", type=Path)
     retrieve.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
@@ -229,10 +229,10 @@ def _add_questions(groups: argparse._SubParsersAction[_Command]) -> None:
     _add_priors(retrieve)
     retrieve.set_defaults(run=commands.retrieve)
 
-    coverage = groups.add_parser("coverage", help="whether a photograph taken somewhere would be localized")
+    coverage = groups.add_parser("coverage", help="predict whether a photograph at a pose would be localized")
     coverage.add_argument("scene")
     coverage.add_argument("--camera", required=True, help="the camera, see `mapless --help`")
-    coverage.add_argument("--pose", required=True, help="where it would be: its world_from_camera, likewise")
+    coverage.add_argument("--pose", required=True, help="its world_from_camera, likewise")
     coverage.set_defaults(run=commands.coverage)
 
 

@@ -1,4 +1,4 @@
-"""All commands but `localize`: a call each, and its answer as JSON."""
+"""All commands except `localize`: each makes a call and prints its answer as JSON."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ _STATE = {True: "SERVING", False: "NOT_SERVING"}
 
 
 def health(client: Client, arguments: argparse.Namespace) -> int:
-    """Whether the server takes calls, and each of its services: changes can be refused while queries are answered."""
+    """State of the server and of each service: changes can be rejected while queries are answered."""
     serving = client.is_serving()
     print(_STATE[serving])
     for service in SERVICES:
-        # A proxy that answers for its servers may know the whole alone.
+        # A proxy may answer for the whole server only.
         with suppress(NotFound):
             print(f"{service.rpartition('.')[2]} {_STATE[client.is_serving(service)]}")
     return 0 if serving else EXIT_FAILED
 
 
 def create_scene(client: Client, arguments: argparse.Namespace) -> int:
-    """A new scene."""
+    """Creates a scene."""
     datum, down = _datum(arguments), arguments.down
     return print_json(client.create_scene(arguments.scene, datum=datum, down_in_world=down))
 
 
 def update_scene(client: Client, arguments: argparse.Namespace) -> int:
-    """What is known of a scene as a whole."""
+    """Changes properties of a scene."""
     changes: dict[str, Any] = dict.fromkeys(arguments.forget)
     if arguments.datum is not None:
         changes["datum"] = _datum(arguments)
     if arguments.down is not None:
         changes["down_in_world"] = arguments.down
     if not changes:
-        raise ValueError("say what to change: --datum, --down or --forget")
+        raise ValueError("nothing to change: give --datum, --down or --forget")
     return print_json(client.update_scene(arguments.scene, **changes))
 
 
 def _datum(arguments: argparse.Namespace) -> Datum | None:
     if arguments.datum is None:
         if arguments.enu_from_world is not None:
-            raise ValueError("--enu-from-world is part of a --datum")
+            raise ValueError("--enu-from-world needs --datum")
         return None
     latitude_deg, longitude_deg, height_m = arguments.datum
     if arguments.enu_from_world is None:
@@ -61,23 +61,23 @@ def _datum(arguments: argparse.Namespace) -> Datum | None:
 
 
 def get_scene(client: Client, arguments: argparse.Namespace) -> int:
-    """A scene, with its datum and its calibration if it has any."""
+    """Prints a scene with its datum and calibration."""
     return print_json(client.get_scene(arguments.scene))
 
 
 def list_scenes(client: Client, arguments: argparse.Namespace) -> int:
-    """All scenes."""
+    """Lists all scenes."""
     return print_json(list(client.list_scenes()))
 
 
 def delete_scene(client: Client, arguments: argparse.Namespace) -> int:
-    """A scene and all that is in it."""
+    """Deletes a scene and its references."""
     client.delete_scene(arguments.scene)
     return 0
 
 
 def add_reference(client: Client, arguments: argparse.Namespace) -> int:
-    """A photograph with its camera and pose."""
+    """Stores a photograph with its camera and pose."""
     reference = NewReference(
         reference_id=arguments.id or arguments.photo.stem,
         image=arguments.photo,
@@ -88,18 +88,18 @@ def add_reference(client: Client, arguments: argparse.Namespace) -> int:
 
 
 def list_references(client: Client, arguments: argparse.Namespace) -> int:
-    """All references of a scene."""
+    """Lists the references of a scene."""
     return print_json(list(client.list_references(arguments.scene)))
 
 
 def delete_reference(client: Client, arguments: argparse.Namespace) -> int:
-    """A reference."""
+    """Deletes a reference."""
     client.delete_reference(arguments.scene, arguments.reference)
     return 0
 
 
 def retrieve(client: Client, arguments: argparse.Namespace) -> int:
-    """What a photograph resembles."""
+    """Finds the references most similar to a photograph."""
     camera = read_camera(arguments.camera, arguments.photo)
     return print_json(
         client.retrieve_references(arguments.photo, camera, arguments.scene, arguments.count, priors=priors(arguments))
@@ -107,7 +107,7 @@ def retrieve(client: Client, arguments: argparse.Namespace) -> int:
 
 
 def coverage(client: Client, arguments: argparse.Namespace) -> int:
-    """Whether a photograph taken somewhere would be localized."""
+    """Predicts whether a photograph at a pose would be localized."""
     pose, camera = read_pose(arguments.pose), read_camera(arguments.camera)
     found = client.check_coverage(arguments.scene, pose, camera)
     print_json(found)

@@ -1,4 +1,4 @@
-"""Answers as JSON for programs, and as a few lines for a person."""
+"""Answers as JSON, and as text for a terminal."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from ..answers import Accuracy, LocalizationResult, PriorCheck, Rejected
 from ..geometry import Camera, RigidTransform
 
 DOUBTFUL_TRUST = 0.05
-"""Below, an answer looks worse than 19 of 20 right ones: usually what was said of the camera is wrong."""
+"""Below it, an answer looks worse than 19 of 20 right ones: usually the intrinsics are wrong."""
 
 _CAPTURED = "captured by the server"
 
 
 def print_json(value: object) -> int:
-    """Prints a value, and says that all went well."""
+    """Prints a value as JSON; returns exit code 0."""
     print(json.dumps(plain(value), indent=2), flush=True)
     return 0
 
 
 def plain(value: Any) -> Any:
-    """What JSON can hold of a result; geometry in the form that --camera and --pose read."""
+    """A result as JSON values, with geometry in the form that --camera and --pose read."""
     if isinstance(value, Camera):
         return plain(wire.camera_to_message(value))
     if isinstance(value, RigidTransform):
@@ -50,43 +50,43 @@ def plain(value: Any) -> Any:
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, float) and not math.isfinite(value):
-        return None  # JSON has no other word for it
+        return None  # JSON has neither NaN nor infinity
     return value
 
 
 def lines(answer: LocalizationResult | Rejected) -> list[str]:
-    """What a person wants to know first."""
+    """An answer as a few lines."""
     if isinstance(answer, Rejected):
-        told = [f"not localized: {answer.reason}", f"  {answer.message}"]
+        text = [f"not localized: {answer.reason}", f"  {answer.message}"]
         if answer.hint is not None and answer.hint.message:
-            told.append(f"  {answer.hint.message}")
+            text.append(f"  {answer.hint.message}")
         if answer.hint is not None and answer.hint.best_reference:
-            told.append(f"  shares most with reference {answer.hint.best_reference.rpartition('/')[2]}")
-        return [*told, f"  {_CAPTURED}"] if answer.diagnostics.captured else told
+            text.append(f"  shares most with reference {answer.hint.best_reference.rpartition('/')[2]}")
+        return [*text, f"  {_CAPTURED}"] if answer.diagnostics.captured else text
     pose = answer.world_from_camera if answer.in_axes is None else answer.in_axes.world_from_camera
     frame = "" if answer.in_axes is None else f"   in {answer.in_axes.axes} axes"
     x, y, z = pose.translation
     q = pose.quaternion()
-    told = [
+    text = [
         f"{_outcome(answer)}{frame}",
         f"  position  {x:.3f}  {y:.3f}  {z:.3f} m{_radius(answer.accuracy, 'position', 'm')}",
         f"  rotation  x {q.x:.4f}  y {q.y:.4f}  z {q.z:.4f}  w {q.w:.4f}{_radius(answer.accuracy, 'rotation', 'deg')}",
     ]
     if answer.geo_pose is not None:
         geo = answer.geo_pose
-        told.append(f"  on earth  {geo.lat:.7f}, {geo.lon:.7f}, {geo.h:.2f} m")
-    told += [f"  prior     {_checked(check)}" for check in answer.prior_checks]
+        text.append(f"  on earth  {geo.lat:.7f}, {geo.lon:.7f}, {geo.h:.2f} m")
+    text += [f"  prior     {_checked(check)}" for check in answer.prior_checks]
     captured = f", {_CAPTURED}" if answer.diagnostics.captured else ""
-    told.append(f"  support   {_support(answer)}, {answer.diagnostics.total_s:.2f} s{captured}")
+    text.append(f"  support   {_support(answer)}, {answer.diagnostics.total_s:.2f} s{captured}")
     if answer.trust is not None and answer.trust < DOUBTFUL_TRUST:
-        told.append(
+        text.append(
             f"  warning   fewer than {100 * DOUBTFUL_TRUST:g} % of right answers look as doubtful: check the intrinsics"
         )
-    return told
+    return text
 
 
 def line(name: str, answer: LocalizationResult | Rejected) -> str:
-    """The same in one line of a table."""
+    """An answer as one row of a table."""
     if isinstance(answer, Rejected):
         return f"{name}  not localized: {answer.reason}"
     x, y, z = answer.world_from_camera.translation
@@ -97,30 +97,30 @@ def line(name: str, answer: LocalizationResult | Rejected) -> str:
 
 
 def heading(width: int) -> str:
-    """Of the table whose names are so wide."""
+    """Heading of that table, for names of this width."""
     return f"{'photograph':{width}}  {'x':>9} {'y':>9} {'z':>9}    {'95 % within':>10} {'trust':>6}  {'inliers':>9}"
 
 
 def _outcome(answer: LocalizationResult) -> str:
     if answer.pose_stage == "COARSE":
-        return "coarse pose" if answer.is_final else "coarse pose, the refined one is to come"
+        return "coarse pose" if answer.is_final else "coarse pose, the refined one follows"
     return "localized" if answer.trust is None else f"localized, trust {answer.trust:.3f}"
 
 
 def _support(answer: LocalizationResult) -> str:
-    """What a pose rests on."""
+    """Support of a pose."""
     if answer.pose_stage == "COARSE":
-        return "checked by nothing"
+        return "not verified"
     used = sum(use.inlier_count > 0 for use in answer.diagnostics.references)
     return f"{answer.inlier_count} of {answer.match_count} matches, {used} references"
 
 
 def _checked(check: PriorCheck) -> str:
-    """How an answer compares with a prior, in words."""
+    """How an answer compares with a prior."""
     if check.conflict:
         ignored = "" if check.used else ", not used"
         return f"{check.kind} contradicts the photograph: {check.mahalanobis:.1f} standard deviations{ignored}"
-    return f"{check.kind} agrees, " + ("used" if check.used else "knows less than the photograph, not needed")
+    return f"{check.kind} agrees, " + ("used" if check.used else "less certain than the photograph, not needed")
 
 
 def _radius(accuracy: Accuracy | None, kind: str, unit: str) -> str:

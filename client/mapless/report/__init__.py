@@ -1,7 +1,7 @@
-"""One answer as one HTML file that can be mailed: what was seen, where it is, how far it may be off, or why not.
+"""An answer as one HTML file: matches, pose and accuracy, or the reason of a rejection. Begin with `write_report`.
 
-The file needs nothing else: no scripts, nothing from elsewhere, the photographs are in it. Ask for the answer's debug
-part, else there is nothing to draw.
+The file is self-contained: no scripts, no links, the photographs are in it. Matches are drawn only if the answer was
+requested with `include_debug`.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ def write_report(
     title: str = "",
     down_in_world: ArrayLike | None = None,
 ) -> Path:
-    """Writes the report of one answer, less than 5 MB; gives its path.
+    """Writes the report of one answer, less than 5 MB; returns its path.
 
     Args:
-        answer: what `localize` answered; with `debug`, its matches are drawn.
+        answer: the answer of `localize`; with `debug`, its matches are drawn.
         image: the photograph as it was sent, or a smaller copy of it.
         camera: as it was sent.
-        path: where to; an existing file is replaced.
+        path: the file; an existing one is replaced.
         references: of the scene, for the plan view; the best of those with images are shown beside the photograph.
-        title: what to call the photograph; its name, and the scene's.
-        down_in_world: which way is down in the scene; guessed from the cameras if None.
+        title: for example the names of photograph and scene.
+        down_in_world: direction of gravity in the scene; None to estimate it from the cameras.
 
     Raises:
-        OSError: the file cannot be written, or the photograph not be read.
+        OSError: the file cannot be written, or the photograph cannot be read.
     """
     page = report_html(answer, read_image(image), camera, references, title, down_in_world)
     file = Path(path)

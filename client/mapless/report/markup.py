@@ -1,6 +1,6 @@
-"""The small change of a page: escaped text, numbers with units, tables.
+"""Elements of a page: escaped text, numbers with units, tables.
 
-Whatever comes from outside goes through `text`.
+All external text passes through `text`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def number(value: float) -> str:
 
 
 def length(metres: float) -> str:
-    """A length in the unit that a person would use."""
+    """A length in a unit that suits its size."""
     if not math.isfinite(metres):
         return UNKNOWN
     size = abs(metres)
@@ -42,12 +42,12 @@ def angle(degrees: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time that a call took."""
+    """A duration."""
     return f"{1000 * seconds:.0f} ms" if seconds < 1 else f"{seconds:.2f} s"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """A table of cells that are markup already; numbers stand to the right from the second column on."""
+    """A table of cells, which are markup; all columns but the first are right-aligned."""
     cells = "".join(f"<th>{text(it)}</th>" for it in head)
     body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
     top = f"<thead><tr>{cells}</tr></thead>" if head else ""
@@ -55,11 +55,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") ->
 
 
 def section(title: str, *parts: str) -> str:
-    """A part of the page, without those of its parts that are empty; nothing if all are."""
+    """A section of the non-empty parts; empty if there are none."""
     filled = [part for part in parts if part]
     return f"<section><h2>{text(title)}</h2>{''.join(filled)}</section>" if filled else ""
 
 
 def reference_id(name: str) -> str:
-    """What a reference is called within its scene."""
+    """The id in a reference's name."""
     return name.rpartition("/")[2]

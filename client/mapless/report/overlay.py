@@ -1,4 +1,4 @@
-"""The photograph with what was matched in it: inliers with their residuals, and what does not agree with the pose."""
+"""The photograph with its matches: inliers with residuals, and outliers."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from .pictures import Picture
 PHOTO_ID = "photograph"
 _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100, 200)
 _SEEN_SHARE = 0.006
-"""Of the photograph's width: how long a usual residual is to be drawn."""
+"""Drawn length of a median residual, relative to the photograph's width."""
 _LONGEST_SHARE = 0.06
-"""Of the photograph's width: how far the line from a wrong match to where its point belongs is drawn."""
+"""Longest line of an outlier to its projected point, relative to the photograph's width."""
 
 
 def define(picture: Picture, camera: Camera) -> str:
-    """The photograph, once, for all drawings to use."""
+    """The photograph, stored once for all drawings."""
     image = image_of(picture, camera, f'id="{PHOTO_ID}"')
     return f'<svg class="store" aria-hidden="true"><defs>{image}</defs></svg>'
 
 
 def image_of(picture: Picture, camera: Camera, attributes: str = "") -> str:
-    """A picture stretched over its camera's pixels, or an empty frame: pixel (0, 0) is the centre of the first one."""
+    """A picture scaled to its camera's pixels, or an empty frame; (0, 0) is the centre of the first pixel."""
     place = f'x="-0.5" y="-0.5" width="{camera.width_px}" height="{camera.height_px}"'
     if not picture.uri:
         return f'<rect {attributes} {place} class="empty"/>'
@@ -35,7 +35,7 @@ def image_of(picture: Picture, camera: Camera, attributes: str = "") -> str:
 
 
 def overlay(debug: Debug, camera: Camera, world_from_camera: RigidTransform | None) -> str:
-    """The figure; without a pose it shows where the matches are."""
+    """The figure; without a pose, it has no residuals."""
     dot = camera.width_px / 1000
     inlier = debug.is_inlier
     layers = []
@@ -48,9 +48,9 @@ def overlay(debug: Debug, camera: Camera, world_from_camera: RigidTransform | No
             _layer("inlier residual", _lines(debug.query_px[inlier], factor * residual[inlier]), 1.6 * dot),
         ]
         longer = f", drawn {factor} times as long" if factor > 1 else ""
-        residuals = f"Lines: from where a point is seen to where the pose puts it{longer}."
+        residuals = f"Lines: from a matched pixel to the projection of its point{longer}."
     else:
-        residuals = "The pose that some agree with was not good enough to be answered." if inlier.any() else ""
+        residuals = "The pose of the inliers was rejected." if inlier.any() else ""
     layers += [
         _layer("outlier", _crosses(debug.query_px[~inlier], 3.2 * dot), 1.5 * dot),
         _layer("inlier halo", _dots(debug.query_px[inlier]), 6.4 * dot),
@@ -67,7 +67,7 @@ def overlay(debug: Debug, camera: Camera, world_from_camera: RigidTransform | No
 
 
 def magnification(residual: Array, width_px: int) -> int:
-    """How many times residuals (N, 2) are to be as long, so that a usual one is seen."""
+    """Factor by which residuals (N, 2) are drawn longer, so that a median one is visible."""
     lengths = np.linalg.norm(residual, axis=1)
     lengths = lengths[np.isfinite(lengths)]
     if not len(lengths):
@@ -77,7 +77,7 @@ def magnification(residual: Array, width_px: int) -> int:
 
 
 def histogram(debug: Debug) -> str:
-    """How large the errors are, of inliers and of the rest, as far as most inliers reach and as far again."""
+    """Histogram of the errors of inliers and outliers, up to twice the 95 % quantile of inliers."""
     known = np.isfinite(debug.error_px)
     if not (known & debug.is_inlier).any():
         return ""
@@ -96,7 +96,7 @@ def histogram(debug: Debug) -> str:
         for share, anchor in ((0, "start"), (0.5, "middle"), (1, "end"))
     )
     beyond = int((debug.error_px[known] > limit).sum() + (~known).sum())
-    more = f" {beyond} lie further out or have none." if beyond else ""
+    more = f" {beyond} are larger or undefined." if beyond else ""
     return (
         '<figure class="histogram"><svg viewBox="0 0 320 118" role="img" aria-label="Histogram of the errors">'
         f'{"".join(bars)}<path class="axis" d="M0 100H320"/>{ticks}</svg>'
@@ -106,7 +106,7 @@ def histogram(debug: Debug) -> str:
 
 def _switches(inlier: NDArray[np.bool_]) -> str:
     if not inlier.any():
-        return _switch("outlier", f"{len(inlier)} matches, of which none is known to be right")
+        return _switch("outlier", f"{len(inlier)} matches, none verified")
     return _switch("inlier", f"{inlier.sum()} agree with the pose") + _switch("outlier", f"{(~inlier).sum()} do not")
 
 
@@ -120,7 +120,7 @@ def _layer(kind: str, path: str, width: float) -> str:
 
 
 def _dots(pixels: Array) -> str:
-    """Lines of no length, whose round ends are dots: one element, however many there are."""
+    """Lines of length 0, whose round ends are dots: one element for all of them."""
     return "".join(f"M{number(x)} {number(y)}h0" for x, y in pixels.tolist())
 
 
@@ -135,7 +135,7 @@ def _lines(start: Array, step: Array) -> str:
 
 
 def _shortened(step: NDArray[np.float64], camera: Camera) -> Array:
-    """Vectors (N, 2), none longer than can be drawn without covering the photograph."""
+    """Vectors (N, 2), shortened to the longest that does not cover the photograph."""
     longest = _LONGEST_SHARE * camera.width_px
     lengths = np.linalg.norm(step, axis=1, keepdims=True)
     return np.asarray(step * np.minimum(1.0, longest / np.maximum(lengths, 1e-9)))

@@ -1,4 +1,4 @@
-"""The report of one answer, put together."""
+"""The report of one answer, composed of its sections."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from .plan import plan_view
 
 PHOTOGRAPH_BYTES = 1_800_000
 REFERENCE_BYTES = 450_000
-"""Of pictures in a page, before they become text, which adds a third: with three references, and what is drawn, less
-than 5 MB, which every mailbox takes."""
+"""Limits of pictures before their encoding as text, which adds a third: with three references and all drawings a page
+has less than 5 MB, which any mailbox accepts."""
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-"""What the page may load: nothing from anywhere, and no scripts at all."""
+"""Permits no external resources and no scripts."""
 _REASONS = {
-    "NO_USABLE_REFERENCES": "there were no references to use",
-    "DEGENERATE_REFERENCES": "the references stand at one place",
+    "NO_USABLE_REFERENCES": "there were no usable references",
+    "DEGENERATE_REFERENCES": "all references have the same position",
     "LOW_TEXTURE": "the photograph shows too little",
     "LOW_OVERLAP": "it has nothing in common with the references",
     "SCALE_UNRELIABLE": "the metric scale could not be established",
     "TOO_FEW_MATCHES": "too few matches",
     "PNP_FAILED": "no pose explains the matches",
-    "GATE": "a pose was found, but is not to be trusted",
-    "AMBIGUOUS": "it could have been taken at several places",
-    "PRIOR_CONFLICT": "the pose contradicts what was known beforehand",
+    "GATE": "chance alone could have produced the pose's support",
+    "AMBIGUOUS": "several places fit the photograph",
+    "PRIOR_CONFLICT": "the pose contradicts a prior",
 }
 
 
@@ -91,9 +91,9 @@ def _verdict(answer: LocalizationResult | Rejected) -> str:
 
 def _header(answer: LocalizationResult | Rejected, title: str) -> str:
     kind = "good" if isinstance(answer, LocalizationResult) else "bad"
-    told = [title] if title else []
+    parts = [title] if title else []
     if answer.capture_time is not None:
-        told.append(f"taken {answer.capture_time:%Y-%m-%d %H:%M:%S} UTC")
+        parts.append(f"taken {answer.capture_time:%Y-%m-%d %H:%M:%S} UTC")
     why = ""
     headline = f'<span class="{kind}">{_verdict(answer)}</span>'
     if isinstance(answer, Rejected):
@@ -101,7 +101,7 @@ def _header(answer: LocalizationResult | Rejected, title: str) -> str:
         headline += f": {text(known)}" if known else ""
         why = f'<p class="why">{text(answer.message)} <span class="note">({text(answer.reason)})</span></p>'
     return (
-        f'<header><p class="kicker">{text(" · ".join(told) or "mapless")}</p><h1>{headline}</h1>{why}'
+        f'<header><p class="kicker">{text(" · ".join(parts) or "mapless")}</p><h1>{headline}</h1>{why}'
         f"{sections.cards(answer)}{sections.notices(answer)}</header>"
     )
 
@@ -114,9 +114,9 @@ def _photograph_section(answer: LocalizationResult | Rejected, camera: Camera, p
             "The photograph and its matches", note, overlay(answer.debug, camera, pose), histogram(answer.debug)
         )
     if answer.debug is not None:
-        why = "Nothing in it was matched."
+        why = "It has no matches."
     elif "pnp" in answer.diagnostics.stage_s:
-        why = "The answer carries no matches: they come with include_debug."
+        why = "The answer includes no matches: they need include_debug."
     else:
         why = "The computation ended before it was matched with points of the scene."
     shown = f'<svg viewBox="-0.5 -0.5 {camera.width_px} {camera.height_px}"><use href="#photograph"/></svg>'
@@ -126,7 +126,7 @@ def _photograph_section(answer: LocalizationResult | Rejected, camera: Camera, p
 def _best_reference(
     answer: LocalizationResult | Rejected, references: Mapping[str, Reference], pictures: Mapping[str, Picture]
 ) -> str:
-    """What to point the camera at, where that would help."""
+    """The reference that a hint names."""
     name = _hinted(answer)
     shown = pictures.get(name)
     if shown is None:
@@ -150,7 +150,7 @@ def _whereabouts(answer: LocalizationResult | Rejected) -> str:
 
 
 def _hinted(answer: LocalizationResult | Rejected) -> str:
-    """Name of the reference that a rejection names as the best; empty if there is none."""
+    """Name of the reference in a rejection's hint; empty if there is none."""
     hint = answer.hint if isinstance(answer, Rejected) else None
     return hint.best_reference if hint is not None else ""
 
@@ -178,7 +178,7 @@ def _plan(
 
 
 def _pictures(answer: LocalizationResult | Rejected, references: Mapping[str, Reference]) -> dict[str, Picture]:
-    """Of the references that are shown beside the photograph, and have one."""
+    """Pictures of the references that are shown beside the photograph."""
     found = {}
     for name in {_hinted(answer), *best_references(answer.debug, answer.diagnostics.references)}:
         image = references[name].image if name in references else None

@@ -1,4 +1,4 @@
-"""The photograph beside the references that agree with it most, and lines between what shows the same point."""
+"""The photograph beside its best references, with lines between matched points."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ MAX_PAIRS = 3
 _HEIGHT = 480.0
 _GAP = 16.0
 _MAX_LINES, _MAX_WRONG = 140, 30
-"""More than so many lines hide one another."""
+"""More lines hide one another."""
 
 
 def best_references(debug: Debug | None, uses: Sequence[ReferenceUse]) -> list[str]:
-    """Names of those that agree most, the best first: by inliers, then by matches."""
+    """Names of the best references, by inliers, then by matches."""
     order = sorted(uses, key=lambda use: (-use.inlier_count, -use.match_count))
     shown = order if debug is None else [use for use in order if (_rows(debug, uses, use.name)).any()]
     return [use.name for use in shown[:MAX_PAIRS]]
@@ -35,7 +35,7 @@ def pair(
     name: str,
     picture: Picture,
 ) -> str:
-    """One figure; empty where nothing connects the two."""
+    """One figure; empty without matches."""
     rows = _rows(debug, uses, name)
     if not rows.any():
         return ""
@@ -44,7 +44,7 @@ def pair(
     width = offset + right * reference.camera.width_px
     start = left * (debug.query_px + 0.5)
     end = right * (debug.reference_px + 0.5) + (offset, 0.0)
-    # Without a pose nobody knows which are right.
+    # Without a pose, no match is verified.
     inlier = debug.is_inlier if debug.is_inlier.any() else np.ones(len(debug.is_inlier), bool)
     good, wrong = _some(rows & inlier, start, _MAX_LINES), _some(rows & ~inlier, start, _MAX_WRONG)
     hue = np.argsort(np.argsort(start[good, 0])) * (300 / max(len(good), 1))
@@ -75,7 +75,7 @@ def pairs(
     references: Mapping[str, Reference],
     pictures: Mapping[str, Picture],
 ) -> str:
-    """The figures of the best references among those that are known."""
+    """The figures of the best references that are given."""
     if debug is None:
         return ""
     known = [name for name in best_references(debug, uses) if name in references]
@@ -88,7 +88,7 @@ def _rows(debug: Debug, uses: Sequence[ReferenceUse], name: str) -> np.ndarray:
 
 
 def _some(rows: np.ndarray, start: Array, count: int) -> np.ndarray:
-    """Which of the rows to draw: all, or evenly from left to right."""
+    """The rows to draw: all, or a selection evenly from left to right."""
     found = np.flatnonzero(rows)
     found = found[np.argsort(start[found, 0], kind="stable")]
     if len(found) <= count:

@@ -1,8 +1,7 @@
-"""Photographs inside a page: as they are where they are small, else reduced, and never with what cameras add to them.
+"""Photographs inside a page: unchanged if small, else reduced, and always without metadata.
 
-A viewer turns a picture as its EXIF orientation says, and then nothing would lie where it belongs: intrinsics and
-pixels are those of the raster in the file. So metadata are cut out, and what stands in a file after its picture; a page
-that is mailed does not tell where a phone was, either.
+A viewer rotates a picture by its EXIF orientation, but intrinsics and pixels belong to the raster in the file. So
+metadata, and data after the picture, are removed; with them goes the position that phones record.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ REDUCED_SIDE_PX = 1600
 _SEGMENTS_WITHOUT_LENGTH = {0x01, *range(0xD0, 0xD9)}
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 _KEPT_SEGMENTS = {0xE0: b"JFIF\0", 0xE2: b"ICC_PROFILE\0", 0xEE: b"Adobe"}
-"""What a decoder needs of the application segments, and how it begins: a phone's index of further pictures is an E2."""
+"""Application segments that decoders need, with their first bytes; a phone's index of further pictures is E2, too."""
 _AFTER_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
-"""A marker that ends the coded data of a scan: FF 00 is a byte of them, D0 to D7 begin again within them."""
+"""A marker that ends the coded data of a scan; FF 00 is an escaped byte, D0 to D7 are restarts within the data."""
 _PNG_METADATA = (b"eXIf", b"tEXt", b"zTXt", b"iTXt", b"tIME")
 _WEBP_METADATA = (b"EXIF", b"XMP ")
 _EXIF_AND_XMP = 0x0C
@@ -27,26 +26,26 @@ _EXIF_AND_XMP = 0x0C
 
 @dataclass(frozen=True)
 class Picture:
-    """A photograph as a page carries it; without a `uri` it is left out, and `note` says why."""
+    """A photograph in a page; without a `uri` it is omitted, for the reason in `note`."""
 
     uri: str = ""
     note: str = ""
 
 
 def picture(image: bytes, max_bytes: int) -> Picture:
-    """A JPEG, PNG or WebP for a page, of no more than so many bytes before its encoding as text."""
+    """A JPEG, PNG or WebP for a page, of at most `max_bytes` before its encoding as text."""
     kind = _kind(image)
     if not kind:
-        return Picture(note="The photograph is not a JPEG, PNG or WebP file, and is left out.")
+        return Picture(note="The photograph is not a JPEG, PNG or WebP file, and is omitted.")
     data = _without_metadata(image, kind)
     if data is None:
-        return Picture(note="The photograph's file is damaged, and is left out.")
+        return Picture(note="The photograph's file is damaged, and is omitted.")
     if len(data) > max_bytes:
         reduced = _reduced(data)
         if reduced is None or len(reduced) > max_bytes:
             return Picture(
-                note=f"The photograph has {len(data) / 1e6:.1f} MB, too much for a page that is to be mailed, and is "
-                "left out; with the Python package pillow installed it is reduced."
+                note=f"The photograph has {len(data) / 1e6:.1f} MB, too much for a page, and is "
+                "omitted; with the Python package pillow installed it is reduced."
             )
         kind, data = "jpeg", reduced
     return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}")
@@ -61,7 +60,7 @@ def _kind(image: bytes) -> str:
 
 
 def _without_metadata(image: bytes, kind: str) -> bytes | None:
-    """The file without them; None if it cannot be followed."""
+    """The file without metadata; None if its structure is damaged."""
     cut = {"jpeg": _clean_jpeg, "png": _clean_png, "webp": _clean_webp}[kind]
     try:
         return cut(image)
@@ -70,9 +69,9 @@ def _without_metadata(image: bytes, kind: str) -> bytes | None:
 
 
 def _clean_jpeg(image: bytes) -> bytes:
-    """Up to its end, without application segments and comments but for those that a decoder needs.
+    """The file up to its end, without comments and without application segments that a decoder does not need.
 
-    A file whose end is missing, as decoders take it, is given one.
+    A missing end marker, which decoders accept, is added.
     """
     parts, position = [image[:2]], 2
     while True:
@@ -111,7 +110,7 @@ def _clean_png(image: bytes) -> bytes:
 
 
 def _clean_webp(image: bytes) -> bytes:
-    """The chunks that lie within the size that the file says it has."""
+    """The chunks within the size that the file states."""
     parts, position = [], 12
     image = image[: 8 + int.from_bytes(image[4:8], "little")]
     while position < len(image):
@@ -133,7 +132,7 @@ def _take(data: bytes, position: int, size: int) -> bytes:
 
 
 def _reduced(image: bytes) -> bytes | None:
-    """A smaller JPEG of it; None where nothing is installed that could make one, or it cannot be read."""
+    """A smaller JPEG; None if pillow is not installed or cannot read the image."""
     try:
         from PIL import Image
     except ImportError:

@@ -1,4 +1,4 @@
-"""The scene from above: references, matched points, and where the photograph was taken, with its ellipse."""
+"""The scene from above: references, matched points, and the photograph's pose with its ellipse."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _MARGIN = 46.0
 _WEDGE = 26.0
 """Length of a camera's wedge."""
 CHI2_95_IN_PLANE = -2 * math.log(0.05)
-"""Square of how many standard deviations an ellipse of 95 % reaches in two dimensions."""
+"""Squared radius of a 95 % ellipse in two dimensions, in standard deviations."""
 _SMALL_RADIUS = 9.0
-"""An ellipse of fewer units is drawn enlarged beside."""
+"""A smaller ellipse is drawn enlarged in an inset."""
 _INSET = 132.0
 _ALIKE = 0.7
-"""Length of the mean of the cameras' downward axes from which on it tells which way is down."""
+"""Least length of the mean of the cameras' y axes for which it is used as the direction of gravity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +31,10 @@ class Plan:
     """A view along the vertical.
 
     Attributes:
-        basis: (2, 3) world directions that go right and up on the page.
-        low: (2,) where the page's lower left corner lies along these, metres.
+        basis: (2, 3) world directions to the right and up on the page.
+        low: (2,) coordinates of the page's lower left corner along these, metres.
         scale: units of the page per metre.
-        is_guessed: whether which way is down was guessed from the cameras.
+        is_guessed: whether the direction of gravity was estimated from the cameras.
     """
 
     basis: Array
@@ -57,16 +57,16 @@ def plan_view(
     points: Array,
     down_in_world: ArrayLike | None,
 ) -> str:
-    """The figure; empty where nothing is known to stand anywhere.
+    """The figure; empty without poses.
 
     Args:
         references: by name.
-        used: names of those the answer was computed from.
-        poses: of the photograph, with names; several where they contradict each other.
+        used: names of the references used.
+        poses: poses of the photograph, with names; several if they contradict each other.
         camera: the photograph's.
         covariance: of the first pose.
-        points: (N, 3) that agree with it.
-        down_in_world: which way is down; None guesses it from the cameras.
+        points: (N, 3) points of its inliers.
+        down_in_world: direction of gravity; None to estimate it from the cameras.
     """
     cameras = [it.world_from_camera for it in references.values()] + [pose for _, pose in poses]
     if not cameras:
@@ -87,7 +87,7 @@ def plan_view(
         drawn.append(_ellipse(plan, poses[0][1], covariance))
     drawn.append(_scale_bar(plan))
     drawn.append(_axes(plan))
-    how = " (Which way is down is guessed from the cameras.)" if plan.is_guessed else ""
+    how = " (The direction of gravity is estimated from the cameras.)" if plan.is_guessed else ""
     return (
         f'<figure class="plan"><svg viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" aria-label="The scene from above">'
         f"{''.join(drawn)}</svg><figcaption>From above. {_legend(references, used, poses)}{how}</figcaption></figure>"
@@ -108,7 +108,7 @@ def _legend(
 
 
 def _fit(cameras: Sequence[RigidTransform], points: Array, down_in_world: ArrayLike | None) -> Plan:
-    """A plan that shows all cameras, and of the points those that do not lie far out."""
+    """A plan that shows all cameras, and the points without outliers."""
     is_guessed = down_in_world is None
     basis = _basis(_guess_down(cameras) if down_in_world is None else np.asarray(down_in_world, float))
     flat = np.stack([it.translation for it in cameras]) @ basis.T
@@ -122,7 +122,7 @@ def _fit(cameras: Sequence[RigidTransform], points: Array, down_in_world: ArrayL
 
 
 def _guess_down(cameras: Sequence[RigidTransform]) -> Array:
-    """Where the cameras' y axes point on the whole; where they do not agree, across the plane they stand in."""
+    """The mean of the cameras' y axes; if they disagree, the normal of the plane of their centres."""
     mean = np.mean([it.rotation[:, 1] for it in cameras], axis=0)
     if np.linalg.norm(mean) > _ALIKE:
         return np.asarray(mean)
@@ -131,7 +131,7 @@ def _guess_down(cameras: Sequence[RigidTransform]) -> Array:
 
 
 def _basis(down: Array) -> Array:
-    """Right and up on a page that is looked at from above, along world axes where these lie flat."""
+    """Right and up on the page, seen from above, along horizontal world axes if there are any."""
     up = -down / np.linalg.norm(down)
     flat = np.eye(3) - np.outer(up, up)
     first = flat[int(np.argmax(np.linalg.norm(flat, axis=1) > 0.9))]
@@ -140,7 +140,7 @@ def _basis(down: Array) -> Array:
 
 
 def _wedge(plan: Plan, pose: RigidTransform, camera: Camera, kind: str, name: str, size: float = 1.0) -> str:
-    """A camera: its centre, and how far it sees to both sides; a ring where it looks straight up or down."""
+    """A camera: its centre and horizontal field of view; a ring if it looks straight up or down."""
     x, y = plan.place(pose.translation).tolist()
     title = f"<title>{text(name)}</title>"
     ahead = plan.basis @ pose.rotation[:, 2]
@@ -165,7 +165,7 @@ def _points(plan: Plan, points: Array) -> str:
 
 
 def ellipse_in_plane(basis: Array, covariance: Array) -> tuple[Array, float]:
-    """Radii (2,) of the ellipse that holds 95 % of positions seen along the vertical, metres; its turn, radians."""
+    """Radii (2,) of the 95 % ellipse of the position seen from above, metres, and its rotation, radians."""
     flat = basis @ covariance[:3, :3] @ basis.T
     values, vectors = np.linalg.eigh(flat)
     radii = np.sqrt(np.maximum(values[::-1], 0.0) * CHI2_95_IN_PLANE)
@@ -173,7 +173,7 @@ def ellipse_in_plane(basis: Array, covariance: Array) -> tuple[Array, float]:
 
 
 def _ellipse(plan: Plan, pose: RigidTransform, covariance: Array) -> str:
-    """Where the camera is in 95 % of cases; enlarged at the side where it would not be seen."""
+    """The 95 % ellipse of the position, enlarged in an inset if it is too small."""
     radii, turn = ellipse_in_plane(plan.basis, covariance)
     if not np.isfinite(radii).all():
         return ""
@@ -207,7 +207,7 @@ def _oval(x: float, y: float, radii: Iterable[float], turn: float) -> str:
 
 
 def _round_length(metres: float) -> float:
-    """The largest of 1, 2, 5, 10, ... that is not longer."""
+    """The largest of 1, 2, 5, 10, ... that does not exceed a length."""
     power = 10.0 ** math.floor(math.log10(max(metres, 1e-9)))
     return float(max(step * power for step in (1, 2, 5) if step * power <= metres * 1.000001))
 
@@ -222,7 +222,7 @@ def _scale_bar(plan: Plan) -> str:
 
 
 def _axes(plan: Plan) -> str:
-    """World axes that lie flat enough to have a direction here."""
+    """World axes that are not nearly vertical."""
     x, y = WIDTH - 60, HEIGHT - 60
     parts = []
     for name, axis in zip("xyz", plan.basis.T, strict=True):

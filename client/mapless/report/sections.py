@@ -1,4 +1,4 @@
-"""The page's figures in words and tables."""
+"""Sections of text and tables."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from ..geometry import Array, Camera, Fisheye, RigidTransform
 from .markup import UNKNOWN, angle, duration, length, reference_id, section, table, text
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
-_STAGES = {"REFINED": "refined", "INITIAL": "the reconstruction's own", "COARSE": "coarse, checked by nothing"}
+_STAGES = {"REFINED": "refined", "INITIAL": "the reconstruction's own", "COARSE": "coarse, not verified"}
 
 
 def cards(answer: LocalizationResult | Rejected) -> str:
-    """The figures that matter most."""
+    """The most important numbers."""
     shown: list[tuple[str, str]] = []
     if isinstance(answer, LocalizationResult):
         if answer.accuracy is not None:
@@ -39,10 +39,10 @@ def cards(answer: LocalizationResult | Rejected) -> str:
 
 
 def notices(answer: LocalizationResult | Rejected) -> str:
-    """What would help, what contradicts the answer, and that it is kept."""
+    """Advice, conflicts with priors, and whether the call is captured."""
     parts = []
     if answer.diagnostics.captured:
-        parts.append('<p class="hint">The server is to keep this call for a time, photograph and all.</p>')
+        parts.append('<p class="hint">The server keeps this call for a time, including the photograph.</p>')
     if isinstance(answer, Rejected) and answer.hint is not None:
         hint = answer.hint
         best = f" It shares most with <b>{text(reference_id(hint.best_reference))}</b>." if hint.best_reference else ""
@@ -50,10 +50,10 @@ def notices(answer: LocalizationResult | Rejected) -> str:
         parts.append(f'<p class="hint"><b>What helps.</b> {text(hint.message)}{best}{stage}</p>')
     if isinstance(answer, LocalizationResult):
         if answer.pose_stage == "COARSE":
-            parts.append('<p class="hint conflict">Nothing has checked this pose: there was no time to refine it.</p>')
+            parts.append('<p class="hint conflict">This pose is not verified: there was no time to refine it.</p>')
         parts += [
-            f'<p class="hint conflict">The {text(check.kind.lower())} that was known beforehand contradicts what '
-            f"the photograph shows{'' if check.used else ', and was not used'}.</p>"
+            f'<p class="hint conflict">The {text(check.kind.lower())} prior contradicts '
+            f"the photograph{'' if check.used else ', and was not used'}.</p>"
             for check in answer.prior_checks
             if check.conflict
         ]
@@ -61,7 +61,7 @@ def notices(answer: LocalizationResult | Rejected) -> str:
 
 
 def pose_section(answer: LocalizationResult) -> str:
-    """The pose in all its forms."""
+    """The pose in all requested forms."""
     rows = [*_pose_rows(answer.world_from_camera)]
     rows.append(["which stage gave it", text(_STAGES.get(answer.pose_stage, answer.pose_stage.lower()))])
     if answer.geo_pose is not None:
@@ -106,7 +106,7 @@ def accuracy_section(answer: LocalizationResult) -> str:
 
 
 def hypotheses_section(answer: Rejected) -> str:
-    """Poses that contradict each other."""
+    """Contradictory poses."""
     rows = []
     for letter, it in zip("ABCDEFGH", answer.hypotheses, strict=False):
         t = it.world_from_camera.translation
@@ -116,7 +116,7 @@ def hypotheses_section(answer: Rejected) -> str:
 
 
 def priors_section(checks: Sequence[PriorCheck]) -> str:
-    """What was known beforehand, and how it fits."""
+    """Priors, compared with the answer."""
     rows = [
         [
             text(it.kind.lower()),
@@ -127,12 +127,12 @@ def priors_section(checks: Sequence[PriorCheck]) -> str:
         ]
         for it in checks
     ]
-    head = ("known beforehand", "Mahalanobis distance", "degrees of freedom", "with the photograph", "used")
+    head = ("prior", "Mahalanobis distance", "degrees of freedom", "with the photograph", "used")
     return section("Priors", table(head, rows)) if rows else ""
 
 
 def references_section(diagnostics: Diagnostics) -> str:
-    """What each reference contributed; nothing where none was compared, or is known to resemble the photograph."""
+    """Contribution of each reference; empty if none has matches or a similarity."""
     if not any(it.match_count or it.similarity for it in diagnostics.references):
         return ""
     most = max((it.match_count for it in diagnostics.references), default=0) or 1
@@ -148,7 +148,7 @@ def references_section(diagnostics: Diagnostics) -> str:
 
 
 def timings_section(diagnostics: Diagnostics) -> str:
-    """Where the time went."""
+    """Time by stage."""
     total = max([*diagnostics.stage_s.values(), 1e-9])
     rows = [
         [text(stage), duration(spent), f'<span class="bar" style="width:{120 * spent / total:.0f}px"></span>']
@@ -160,7 +160,7 @@ def timings_section(diagnostics: Diagnostics) -> str:
 
 
 def provenance_section(diagnostics: Diagnostics, camera: Camera) -> str:
-    """What computed it, from what."""
+    """Software, options and inputs."""
     d = diagnostics
     lens = "none"
     if camera.distortion is not None:
@@ -208,7 +208,7 @@ def _deviations(covariance: Array) -> str:
 
 
 def _covariance(covariance: Array) -> str:
-    """The numbers, tinted by how the two vary together."""
+    """The matrix, coloured by correlation."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     correlation = covariance / np.outer(sigma, sigma)
     rows = []
@@ -223,5 +223,5 @@ def _covariance(covariance: Array) -> str:
     return (
         "<h3>Covariance, metres and radians, fixed world axes (ROS's order)</h3>"
         + table(("", *_AXES), rows, "matrix")
-        + '<p class="note">Tinted by how much two of them vary together: blue alike, orange opposed.</p>'
+        + '<p class="note">Coloured by correlation: blue positive, orange negative.</p>'
     )

@@ -26,9 +26,9 @@ if _version_not_supported:
 
 
 class LocalizationServiceStub(object):
-    """Tells where a photograph was taken, from a few posed reference photographs and nothing else.
+    """Localizes photographs, from a few posed reference photographs and nothing else.
 
-    Request metadata, all optional unless the server asks for tokens:
+    Request metadata, all optional unless the server requires tokens:
 
     * `authorization`: "Bearer " and the caller's token. It says which tenant's scenes the caller sees and what it may do
     (read, localize, write). A server without tokens has one tenant and allows everything.
@@ -36,7 +36,7 @@ class LocalizationServiceStub(object):
     makes one up otherwise, and where it is anything else. Diagnostics and errors carry it.
     * `x-client-id`: names the caller, 1 to 64 of the same characters. A tenant's callers share the server fairly, however
     many calls each of them makes; without it, each connection is one caller.
-    * `x-mapless-scene`: "scenes/{scene}", the scene that the call concerns, as the request itself says it. For load balancers
+    * `x-mapless-scene`: "scenes/{scene}", the scene of the call, as in the request itself. For load balancers
     in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless") and, for INVALID_ARGUMENT, a BadRequest that
@@ -78,9 +78,9 @@ class LocalizationServiceStub(object):
 
 
 class LocalizationServiceServicer(object):
-    """Tells where a photograph was taken, from a few posed reference photographs and nothing else.
+    """Localizes photographs, from a few posed reference photographs and nothing else.
 
-    Request metadata, all optional unless the server asks for tokens:
+    Request metadata, all optional unless the server requires tokens:
 
     * `authorization`: "Bearer " and the caller's token. It says which tenant's scenes the caller sees and what it may do
     (read, localize, write). A server without tokens has one tenant and allows everything.
@@ -88,7 +88,7 @@ class LocalizationServiceServicer(object):
     makes one up otherwise, and where it is anything else. Diagnostics and errors carry it.
     * `x-client-id`: names the caller, 1 to 64 of the same characters. A tenant's callers share the server fairly, however
     many calls each of them makes; without it, each connection is one caller.
-    * `x-mapless-scene`: "scenes/{scene}", the scene that the call concerns, as the request itself says it. For load balancers
+    * `x-mapless-scene`: "scenes/{scene}", the scene of the call, as in the request itself. For load balancers
     in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless") and, for INVALID_ARGUMENT, a BadRequest that
@@ -98,7 +98,7 @@ class LocalizationServiceServicer(object):
 
     def Localize(self, request, context):
         """Localizes one photograph. Safe to retry. Stores nothing, unless the server's operator has it capture calls of this and
-        the next three methods: then the answer says so (`Diagnostics.captured`), and its photographs are to be kept for a time.
+        the next three methods: then `Diagnostics.captured` is true, and the server keeps its photographs for a time.
 
         "I could not localize this" is an answer (Rejection), not an error. Errors:
 
@@ -132,9 +132,9 @@ class LocalizationServiceServicer(object):
 
         Errors are Localize's, in the place of the final answer: a DEADLINE_EXCEEDED, for instance, may come after a coarse
         answer, which then is all there is. The call waits, is computed and is charged as Localize is: the coarse answer neither
-        delays the final one nor is delayed by a caller that reads slowly. Whoever needs no more cancels the call, which ends the
-        computation. Without a deadline the server's default for unary calls holds, for both messages together; a message that was
-        made in time may be read for 10 s more, after which the call ends with DEADLINE_EXCEEDED, reason READ_LATE.
+        delays the final one nor is delayed by a caller that reads slowly. Cancelling the call ends the computation. Without a
+        deadline the server's default for unary calls holds, for both messages together; a message that was made in time may be
+        read for 10 s more, after which the call ends with DEADLINE_EXCEEDED, reason READ_LATE.
 
         The request is the same on purpose: either method can be asked the same question.
         buf:lint:ignore RPC_REQUEST_STANDARD_NAME
@@ -162,11 +162,10 @@ class LocalizationServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def WatchQueries(self, request, context):
-        """Shows a scene's calls of Localize, and of LocalizeProgressively by their final answers, as they are answered, with their
-        photographs, until the caller has seen enough: for whoever watches over a scene. Nothing is stored; a watcher that reads
-        too slowly misses answers. Takes the role write. FAILED_PRECONDITION unless the server is configured to allow it;
-        RESOURCE_EXHAUSTED when too many watch; DEADLINE_EXCEEDED, reason READ_LATE, for a watcher that takes longer than a minute
-        to read a message.
+        """Sends the answers of a scene's calls of Localize, and the final answers of LocalizeProgressively, with their photographs,
+        until the caller cancels: for operators of a scene. Nothing is stored; a watcher that reads too slowly misses answers.
+        Takes the role write. FAILED_PRECONDITION unless the server is configured to allow it; RESOURCE_EXHAUSTED if there are too
+        many watchers; DEADLINE_EXCEEDED, reason READ_LATE, for a watcher that takes longer than a minute to read a message.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -209,9 +208,9 @@ def add_LocalizationServiceServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class LocalizationService(object):
-    """Tells where a photograph was taken, from a few posed reference photographs and nothing else.
+    """Localizes photographs, from a few posed reference photographs and nothing else.
 
-    Request metadata, all optional unless the server asks for tokens:
+    Request metadata, all optional unless the server requires tokens:
 
     * `authorization`: "Bearer " and the caller's token. It says which tenant's scenes the caller sees and what it may do
     (read, localize, write). A server without tokens has one tenant and allows everything.
@@ -219,7 +218,7 @@ class LocalizationService(object):
     makes one up otherwise, and where it is anything else. Diagnostics and errors carry it.
     * `x-client-id`: names the caller, 1 to 64 of the same characters. A tenant's callers share the server fairly, however
     many calls each of them makes; without it, each connection is one caller.
-    * `x-mapless-scene`: "scenes/{scene}", the scene that the call concerns, as the request itself says it. For load balancers
+    * `x-mapless-scene`: "scenes/{scene}", the scene of the call, as in the request itself. For load balancers
     in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless") and, for INVALID_ARGUMENT, a BadRequest that

@@ -161,7 +161,7 @@ class ReferenceServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def UpdateScene(self, request, context):
-        """Changes what is known of a scene as a whole: its datum, which way is down, its calibration. INVALID_ARGUMENT for an
+        """Changes properties of a scene: its datum, direction of gravity, calibration. INVALID_ARGUMENT for an
         empty mask or a field that cannot be changed.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
@@ -191,14 +191,14 @@ class ReferenceServiceServicer(object):
 
     def BatchCreateReferences(self, request, context):
         """Adds several references, all or none: the bulk upload. On an error nothing is stored and the BadRequest names the
-        guilty item ("requests[3].reference..."). Send as many as fit into a message.
+        wrong item ("requests[3].reference..."). Send as many as fit into a message.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def GetReference(self, request, context):
-        """Gets a reference, and its photograph when asked for.
+        """Gets a reference, and its photograph if requested.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -236,7 +236,7 @@ class ReferenceServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def CheckCoverage(self, request, context):
-        """Tells whether a photograph taken there would be localized, without one. Takes the role localize.
+        """Predicts whether a photograph at a pose would be localized, without one. Takes the role localize.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
