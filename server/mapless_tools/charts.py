@@ -21,7 +21,7 @@ DASHES = ("-", (0, (6, 2)), (0, (8, 2, 2, 2)), (0, (3, 1.5)))
 INK = "#0c0b0d"
 """Of text and axes; `inline_svg` replaces it by the colour of the text around the chart."""
 _STYLE: dict[Any, Any] = {
-    "font.family": ["DejaVu Sans"],  # comes with matplotlib: nothing is looked for or fetched
+    "font.family": ["DejaVu Sans"],  # comes with matplotlib: no font is searched or fetched
     "font.size": 9,
     "svg.fonttype": "none",
     "svg.hashsalt": "mapless",  # the same chart is the same text
@@ -40,7 +40,7 @@ def new_axes(title: str, x_label: str, y_label: str) -> Axes:
 
 
 def prepared(axes: Axes, title: str, x_label: str, y_label: str) -> Axes:
-    """Axes with titles, a grid, and curves that are told apart without colour."""
+    """Axes with titles, a grid, and curves that differ without colour, too."""
     with rc_context(_STYLE):
         axes.set_title(title, fontweight="bold", loc="left", fontsize=10)
         axes.set_xlabel(x_label)
@@ -107,6 +107,6 @@ def write_figure(figure: Figure, file: Path) -> None:
 def _save(
     figure: Figure, stream: io.StringIO | io.BufferedWriter, facecolor: str = "none", file_format: str = "svg"
 ) -> None:
-    nothing = dict.fromkeys(("Creator", "Date", "Format", "Type")) if file_format == "svg" else None
+    no_metadata = dict.fromkeys(("Creator", "Date", "Format", "Type")) if file_format == "svg" else None
     with rc_context(_STYLE):
-        figure.savefig(stream, format=file_format, facecolor=facecolor, metadata=nothing, dpi=120)
+        figure.savefig(stream, format=file_format, facecolor=facecolor, metadata=no_metadata, dpi=120)

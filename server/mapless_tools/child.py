@@ -114,7 +114,7 @@ def temporary_server() -> Iterator[Client]:
 def child_module(
     module: str, *arguments: str, environment: Mapping[str, str] | None = None, log: Path | None = None
 ) -> Iterator[ChildServer]:
-    """A module that runs as a server and announces itself as ours does; otherwise as `child_server`.
+    """A module that runs as a server and prints its address as `mapless-server serve` does; see `child_server`.
 
     Args:
         module: its name.

@@ -88,7 +88,7 @@ class Dataset:
         refused: frames that are not among `frames`, and why.
         notes: how it was read, for the user: a choice that was made, a unit that is not metres.
         datum: where the world is on the Earth; None if the file does not say.
-        down_in_world: unit vector to where things fall, likewise.
+        down_in_world: unit vector of gravity, likewise.
     """
 
     name: str
@@ -104,7 +104,7 @@ class Dataset:
 
 
 def printable(text: str) -> str:
-    """A text that quotes what others wrote, as a terminal can show it: cut, and with nothing that moves the cursor."""
+    """Text from a file as a terminal can show it: cut, and without characters that move the cursor."""
     text = text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}..."
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
@@ -160,7 +160,7 @@ def read_folder(path: Path, skips_unusable: bool = False) -> Dataset:
 
 
 def read_json(file: Path) -> Any:
-    """What a JSON file holds; ValueError, naming it, if it cannot be read or is none."""
+    """The content of a JSON file; ValueError, naming it, if it cannot be read or is none."""
     try:
         return json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:

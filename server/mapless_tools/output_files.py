@@ -12,7 +12,7 @@ from typing import Any
 
 
 def check_writable(file: Path) -> None:
-    """Raises ValueError if a file cannot be written: before the work, not after it. Makes nothing yet."""
+    """Raises ValueError if a file cannot be written, before the work and without creating it."""
     target = file if file.exists() else file.parent
     if file.is_dir() or not file.parent.is_dir() or not os.access(target, os.W_OK):
         raise ValueError(f"{file} cannot be written")

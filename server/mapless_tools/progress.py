@@ -1,4 +1,4 @@
-"""How far a command is, on standard error: a bar for a person who watches, lines for a log."""
+"""The progress of a command, on standard error: a bar on a terminal, lines in a log."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from rich.progress import (
 from rich.progress import Progress as Bars
 
 LINES = 10
-"""Lines that a step gets where nobody watches, after that of its beginning."""
+"""Lines of a step in a log, after that of its beginning."""
 
 Progress = Callable[[str, int, int], None]
-"""Told a step's name, how much of it is done, and how much there is."""
+"""Called with a step's name, how much of it is done, and how much there is."""
 
 
 @contextmanager
@@ -50,12 +50,12 @@ def progress_bars() -> Iterator[Progress]:
 
 
 def _lines() -> Progress:
-    said: dict[str, int] = {}
+    printed: dict[str, int] = {}
 
     def progress(step: str, done: int, total: int) -> None:
         part = done * LINES // total if total else LINES
-        if part > said.get(step, -1):
+        if part > printed.get(step, -1):
             print(f"{step}: {f'{done} of ' if done else ''}{total}", file=sys.stderr, flush=True)
-            said[step] = part
+            printed[step] = part
 
     return progress

@@ -83,7 +83,7 @@ class Pair:
         k: how many references were asked for.
         query, references: photographs.
         true_pose: of the query; None in another place.
-        priors: what the method is told of the pose.
+        priors: of the pose, for the method.
     """
 
     title: str

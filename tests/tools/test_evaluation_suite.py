@@ -36,7 +36,7 @@ from mapless_tools.evaluate.plan import EvaluationOptions, Method, SuiteOptions,
 from mapless_tools.evaluate.provenance import Provenance
 from mapless_tools.evaluate.references import Matcher, PlannedQuery, paired, pairs_file, read_pairs
 from mapless_tools.evaluate.suite import Failure, Journal, Run, RunSetup, SceneWork, Suite, measure
-from mapless_tools.evaluate.tables import FAILED, NOTHING, OURS, Table, format_median, tables_of, text_lines
+from mapless_tools.evaluate.tables import FAILED, NO_FIGURE, OURS, Table, format_median, tables_of, text_lines
 from mapless_tools.usage import UsageError
 
 CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
@@ -397,7 +397,7 @@ class TestTables:
     def test_our_figures_stand_beside_the_papers(self) -> None:
         (group,) = groups_of(suite({"chess": 0.01, "fire": math.inf}, OPTIONS))
         dense, by_setting, recall, scenes, scales, _ = tables_of(group)
-        assert row(dense, "mapless best") == ("mapless best", "1.00/0.500", FAILED, *5 * [NOTHING], FAILED)
+        assert row(dense, "mapless best") == ("mapless best", "1.00/0.500", FAILED, *5 * [NO_FIGURE], FAILED)
         assert row(dense, "L3 (paper)")[1:3] == ("0.6/0.21", "1.2/0.46")
         assert row(by_setting, "ACE + GS-CPR (paper)")[1:] == ("0.8/0.25", "1.5/0.42", FAILED)
         assert "2 of the paper's 7 scenes" in dense.notes[-1]

@@ -39,7 +39,7 @@ REPEATS, QUICK_REPEATS = 20, 3
 
 
 def bench_network(quick: bool = False, only: Sequence[str] | None = None, output: Path = OUTPUT) -> list[Figure]:
-    """Measures, and prints a table; writes `network.json` and `network.md`, anew after each part.
+    """Measures, and prints a table; writes `network.json` and `network.md`, again after each part.
 
     Args:
         quick: few repetitions and nothing compiled: to see that it runs.

@@ -91,7 +91,7 @@ class Forward:
                 yield
 
     def run(self, work: Work, compiled: bool = False) -> NetworkOutput:
-        """Encodes the last views, the query's the very last, takes the tokens of the others, and reconstructs."""
+        """Encodes the last views, the query's the last of all, takes the tokens of the others, and reconstructs."""
         encode, reconstruct = self._compiled if compiled else (self.network.encode, self.network.reconstruct)
         scene, kept = self.scene, work.views - work.encoded
         with self.kernels():

@@ -1,7 +1,7 @@
 """Accuracy and latency on photographs with known poses, measured through a server of its own.
 
-One's own folder (`command.evaluate_folder`): plan (who is a reference, who a query) > references (which of them a query
-gets) > run (one call a query) > metrics > report.
+A folder (`command.evaluate_folder`): plan (references and queries) > references (those of each query) > run (one call
+a query) > metrics > report.
 
 Benchmarks as in the paper (`command.evaluate_benchmarks`): benchmarks (scenes on the disk) > plan (settings, methods) >
 suite (each run, kept in a journal) > averages > tables, charts, pictures > figures (JSON, CSV), page (HTML).

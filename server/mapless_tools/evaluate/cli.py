@@ -48,7 +48,7 @@ def evaluate_command(
     choose: Annotated[
         str,
         typer.Option(
-            help="Who chooses a query's references: retrieval (the server's), matches (feature matches with all), "
+            help="What chooses a query's references: retrieval (the server's), matches (feature matches with all), "
             "given (all there are)."
         ),
     ] = "retrieval",

@@ -1,4 +1,4 @@
-"""What an evaluation comes to: errors, recall, latency. A query that was not localized counts as infinitely wrong."""
+"""Errors, recall and latency of an evaluation. A query that was not localized counts as infinitely wrong."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RECALL_BARS = {"1cm_1deg": (0.01, 1.0), "5cm_5deg": (0.05, 5.0), "25cm_2deg": (0
 
 @dataclass(frozen=True)
 class QueryResult:
-    """What became of one query; a rejected one has infinite errors.
+    """The result of one query; a rejected one has infinite errors.
 
     Attributes:
         name: of the frame.
@@ -25,13 +25,13 @@ class QueryResult:
         translation_error: distance between true and answered camera centre, the dataset's unit.
         rotation_error_deg: angle between true and answered orientation.
         reference_distance: median distance from the true camera centre to those of its references, the dataset's unit.
-        position_68: the server's own claim, position error not exceeded in 68 % of cases; None without one.
+        position_68: the claimed radius, a position error not exceeded in 68 % of cases; None without one.
         inlier_count, match_count: of the answer; 0 for a rejection.
         rejection: reason; empty if localized.
         message: the rejection's sentence.
         latency_ms: of the call, as the client sees it.
         stage_ms: inside the server, by stage.
-        backend, features: what computed it.
+        backend, features: that computed it.
         best_reference: name of the one with the most inliers; empty for a rejection.
         pose: the answered one, world from camera: x y z and the quaternion x y z w; None for a rejection.
     """

@@ -1,7 +1,7 @@
 """The worst queries as pictures: the photograph beside the reference that served it best, and their matches.
 
 A match is drawn green where it fits the true poses, red where it does not. Red alone: the wrong things were matched.
-Green and a wrong pose: the fault lies after matching. Neither: the two photographs share nothing.
+Green and a wrong pose: the fault lies after matching. Neither: the two photographs do not overlap.
 """
 
 from __future__ import annotations

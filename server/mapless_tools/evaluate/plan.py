@@ -78,8 +78,8 @@ class SuiteOptions:
         k: references that a query is given; the paper's.
         stride: dense, every so many-th training frame is a reference; 1, as in the paper, takes all.
         max_queries: queries of a scene, evenly spread; None, as in the paper, takes all.
-        choice: who chooses a query's references: the server's own "retrieval" as for a caller who names none; feature
-            "matches" counted here; or all are "given", first those taken first, without any ranking.
+        choice: of a query's references: by the server's own "retrieval", as for a request that names none; by feature
+            "matches" counted here; or all are "given", in the order they were taken, without a ranking.
     """
 
     layout: str = "auto"

@@ -1,4 +1,4 @@
-"""What figures come from: code, weights, settings, machine, day. Figures without them cannot be reproduced."""
+"""What figures come from: code, weights, settings, machine, day; without them they cannot be reproduced."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ def provenance_of(settings: Settings) -> Provenance:
         if entry.name in used and stored.status not in (Status.ABSENT, Status.NO_FILE):
             known = stored.status is not Status.UNCHECKED and recorded(stored.path)
             weights[entry.name] = known or "not recorded"
-    told = {
+    figures_of = {
         "backend": settings.backend,
         "features": ", ".join(features),
         "device": device,
         "retrieval": settings.retrieval,
     }
     date = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    return Provenance(__version__, commit_of(ROOT), weights, told, _machine(device), date)
+    return Provenance(__version__, commit_of(ROOT), weights, figures_of, _machine(device), date)
 
 
 def _machine(device: str) -> str:

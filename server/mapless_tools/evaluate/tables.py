@@ -13,7 +13,7 @@ from .plan import Method, setting_name
 from .report import format_stages
 
 OURS, PAPERS, RIVAL = "ours", "paper", "rival"
-NOTHING = "\N{EN DASH}"
+NO_FIGURE = "\N{EN DASH}"
 """Not measured, or not in the paper."""
 FAILED = "failed"
 """A median that is infinite: half of the queries, or more, were not localized."""
@@ -101,7 +101,7 @@ def _by_setting(group: Group) -> Table:
     rows = [_average_row(group, _ours(m), m) for m in group.methods]
     for method in _paper_methods(group):
         if any(setting in method.average for setting in group.settings if setting != DENSE):
-            cells = (_papers(method.average[s], FAILED) if s in method.average else NOTHING for s in group.settings)
+            cells = (_papers(method.average[s], FAILED) if s in method.average else NO_FIGURE for s in group.settings)
             rows.append(_paper_row(method, *cells))
     title = "By number of references: mean over scenes of the median error, cm/°"
     notes: list[str] = []
@@ -122,8 +122,8 @@ def _recall(group: Group) -> Table:
                 rows.append(Row((f"{_ours(method)}, {setting_name(setting)}", *shares, localized), OURS))
     for paper in _paper_methods(group):
         if paper.recall_percent:
-            shares = (f"{paper.recall_percent[bar]:g}" if bar in paper.recall_percent else NOTHING for bar in _BARS)
-            rows.append(_paper_row(paper, *shares, NOTHING, setting=", dense"))
+            shares = (f"{paper.recall_percent[bar]:g}" if bar in paper.recall_percent else NO_FIGURE for bar in _BARS)
+            rows.append(_paper_row(paper, *shares, NO_FIGURE, setting=", dense"))
     head = ("method", *(bar.replace("_", ", ").replace("deg", "°").replace("cm", " cm") for bar in _BARS), "localized")
     return Table("Share of queries within, %", head, tuple(rows), _average_notes(group))
 
@@ -164,7 +164,7 @@ def _timing(group: Group) -> Table:
             f"{summary.latency_p95_ms:.0f}",
             f"{summary.latency_first_ms:.0f}",
             format_stages(summary.stage_share),
-            NOTHING if summary.claim_held is None else f"{100 * summary.claim_held:.0f}",
+            NO_FIGURE if summary.claim_held is None else f"{100 * summary.claim_held:.0f}",
             ", ".join(f"{count} {reason}" for reason, count in summary.rejections.items()) or "none",
         )
         rows.append(Row(cells, OURS))
@@ -204,15 +204,15 @@ def _paper_row(method: PaperMethod, *cells: str, setting: str = "") -> Row:
 
 def _median(summary: Summary | None) -> str:
     if summary is None:
-        return NOTHING
+        return NO_FIGURE
     return format_median(100 * summary.median_translation, summary.median_rotation_deg)
 
 
 def _average(average: Average | None) -> str:
     if average is None:
-        return NOTHING
+        return NO_FIGURE
     return format_median(100 * average.median_translation_m, average.median_rotation_deg)
 
 
-def _papers(median: Median | None, absent: str = NOTHING) -> str:
+def _papers(median: Median | None, absent: str = NO_FIGURE) -> str:
     return absent if median is None else f"{median[0]:g}/{median[1]:g}"

@@ -97,7 +97,7 @@ def poisson_times(rate_per_s: float, duration_s: float, random: np.random.Genera
 def plan_calls(
     rate_per_s: float, duration_s: float, clients: int, requests: Requests, mix: Mix, seed: int
 ) -> list[PlannedCall]:
-    """The calls of several clients who together make `rate_per_s`, in order of time; the same for the same seed.
+    """The calls of several clients, `rate_per_s` together, in order of time; the same for the same seed.
 
     Raises:
         ValueError: no client, a rate or duration that is not above 0, or bad images are asked for and there are none.

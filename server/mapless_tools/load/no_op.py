@@ -45,7 +45,7 @@ class BlindExtractor:
     name = "blind"
 
     def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
-        """A view with nothing in it."""
+        """A view without features."""
         nothing = Features(np.zeros((0, 2), np.float32), np.zeros((0, 4), np.float32), np.zeros(0, np.float32))
         return View(camera.pinhole(), nothing)
 

@@ -104,9 +104,9 @@ def machine_lines(checks: Sequence[Check], load: float, cores: int) -> list[str]
     if load <= cores or all(check.met is not False for check in checks):
         return []
     return [
-        f"Some {load:.1f} threads wanted to run on {cores} cores, load generator and whatever else runs here among "
-        "them. Bars that depend on time (deadlines, the event loop) then say as much of the machine as of the server: "
-        "measure with more cores, nothing else running, or a lower rate.",
+        f"Some {load:.1f} threads wanted to run on {cores} cores, those of the load generator and of other programs "
+        "among them. Bars of time (deadlines, the event loop) then depend on the machine: measure with more cores, "
+        "without other programs, or at a lower rate.",
         "",
     ]
 

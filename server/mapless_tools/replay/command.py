@@ -89,7 +89,7 @@ def _print_call(call: Replayed) -> None:
         return
     print(f"{head}: {call.verdict}, {call.outcome_now}, {call.seconds_then:.2f} s then, {call.seconds_now:.2f} s now")
     if call.found_anew:
-        print(f"    the features of {call.found_anew} references cannot be read by this version, and were found anew")
+        print(f"    this version cannot read the features of {call.found_anew} references, and extracted them again")
     if call.verdict == "identical":
         return
     if call.apart_cm is not None and call.apart_deg is not None:
