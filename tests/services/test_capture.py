@@ -1,4 +1,4 @@
-"""The limits of a capture folder hold at every moment, and nothing outlives what it was made of; by planted files."""
+"""The limits of a capture folder hold at every moment, whatever is in it; with planted files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from mapless_server.services.capture.calls import (
     encode_call,
 )
 from mapless_server.services.capture.files import write_whole
-from mapless_server.services.capture.folder import CaptureFolder, Retention
+from mapless_server.services.capture.folder import CapturedEntry, CaptureFolder, Retention
 from mapless_server.services.capture.opening import open_recorder
 from mapless_server.settings import ConfigError, load_settings
 from mapless_server.store import SceneAttributes, Store
@@ -70,6 +70,15 @@ def files(folder: Path) -> list[Path]:
 
 def opened(path: Path, retention: Retention = ROOM, clock: Callable[[], float] = lambda: NOW_S) -> CaptureFolder:
     return CaptureFolder(path, retention, clock)
+
+
+def write_one(path: Path) -> CapturedEntry:
+    """The one call of a folder, which is closed again."""
+    folder = opened(path)
+    folder.add(a_call(), blobs_of(a_call()))
+    (entry,) = folder.entries()
+    folder.close()
+    return entry
 
 
 def refuse_to_delete(stuck: set[Path], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,7 +177,7 @@ def test_the_limit_of_size_holds_at_every_moment(tmp_path: Path, monkeypatch: py
     folder.close()
 
 
-def test_what_is_too_old_goes_at_the_start_and_while_idle(tmp_path: Path) -> None:
+def test_expired_calls_are_deleted_at_start_and_while_idle(tmp_path: Path) -> None:
     now_s = [NOW_S]
     folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
     for number in range(3):
@@ -184,15 +193,13 @@ def test_what_is_too_old_goes_at_the_start_and_while_idle(tmp_path: Path) -> Non
     assert [it.references for it in folder.entries()] == [{("r2", "key-2")}]
     assert len(files(tmp_path / "c")) == 2
     folder.close()
-    now_s[0] -= 10_000  # the clock is set back: nobody knows how old it is
+    now_s[0] -= 10_000  # the clock is set back: its age is unknown
     folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
     assert files(tmp_path / "c") == []
     folder.close()
 
 
-def test_what_is_too_old_goes_though_the_clock_is_set_meanwhile(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_calls_expire_although_the_clock_is_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Back: what has passed counts. Ahead: the clock does. And a call that was ahead of the clock stays no longer."""
     now_s, passed_s = [NOW_S], [0.0]
     monkeypatch.setattr(folder_module, "time", SimpleNamespace(monotonic=lambda: passed_s[0]))
@@ -212,7 +219,7 @@ def test_what_is_too_old_goes_though_the_clock_is_set_meanwhile(
     folder.close()
 
 
-def test_leftovers_of_a_crash_and_damage_go_at_the_start(tmp_path: Path) -> None:
+def test_leftovers_of_a_crash_are_deleted_at_start(tmp_path: Path) -> None:
     """Unfinished files, blobs without a call, calls without a blob, and calls that are cut; but no foreign files."""
     folder = opened(tmp_path / "c")
     for number in range(3):
@@ -231,7 +238,7 @@ def test_leftovers_of_a_crash_and_damage_go_at_the_start(tmp_path: Path) -> None
     folder.close()
 
 
-def test_what_somebody_deleted_by_hand_is_forgotten(tmp_path: Path) -> None:
+def test_files_deleted_by_hand_are_dropped(tmp_path: Path) -> None:
     folder = opened(tmp_path / "c")
     for number in range(2):
         call = a_call(number, (number,))
@@ -245,7 +252,7 @@ def test_what_somebody_deleted_by_hand_is_forgotten(tmp_path: Path) -> None:
 
 
 def test_one_file_that_cannot_be_deleted_keeps_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither a call nor a blob; it stays counted, is told of, and goes when it can be deleted."""
+    """Neither a call nor a blob; it stays counted, is reported, and is deleted as soon as it can be."""
     now_s = [NOW_S]
     folder = opened(tmp_path / "c", Retention(100.0, 2**20), lambda: now_s[0])
     for number in range(4):
@@ -268,7 +275,7 @@ def test_one_file_that_cannot_be_deleted_keeps_no_other(tmp_path: Path, monkeypa
 
 @pytest.mark.parametrize("content", [b"", IMAGES[f"{0:064x}"][:-1]])
 def test_a_blob_that_was_cut_is_written_anew(tmp_path: Path, content: bytes) -> None:
-    """As a power failure leaves it; what was kept with it cannot be replayed, and goes."""
+    """As after a power failure; calls that need it cannot be replayed, and are deleted."""
     data = IMAGES[f"{0:064x}"]
     name = hashlib.sha256(data).hexdigest()
     part = CapturedPart("image", 7, (replace(reference(0), image_sha256=name),))
@@ -290,7 +297,7 @@ def test_a_blob_that_was_cut_is_written_anew(tmp_path: Path, content: bytes) -> 
     folder.close()
 
 
-def test_a_blob_that_went_meanwhile_is_asked_for_again(tmp_path: Path) -> None:
+def test_a_blob_deleted_meanwhile_is_requested_again(tmp_path: Path) -> None:
     folder = opened(tmp_path / "c")
     call = a_call()
     with pytest.raises(BlobDeleted):
@@ -300,10 +307,8 @@ def test_a_blob_that_went_meanwhile_is_asked_for_again(tmp_path: Path) -> None:
     folder.close()
 
 
-def test_what_cannot_be_read_at_the_start_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = opened(tmp_path / "c")
-    folder.add(a_call(), blobs_of(a_call()))
-    folder.close()
+def test_a_file_unreadable_at_start_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_one(tmp_path / "c")
 
     def refused(path: Path) -> bytes:
         raise PermissionError(13, "Permission denied", str(path))
@@ -357,9 +362,7 @@ def test_undeletable_entries_never_exceed_the_limit(tmp_path: Path, monkeypatch:
 def test_a_folder_left_by_a_kill_or_a_deletion_is_opened(tmp_path: Path, left: str) -> None:
     """And its limits hold again."""
     path = tmp_path / "c"
-    folder = opened(path)
-    folder.add(a_call(), blobs_of(a_call()))
-    folder.close()
+    write_one(path)
     (path / "mapless-capture.json").unlink()
     if left == "nothing":
         (path / "lock").unlink()
@@ -437,7 +440,7 @@ def set_at(place: tuple[Any, ...], value: Any, content: Any) -> None:
 
 
 def test_no_header_keeps_a_call_beyond_its_time(tmp_path: Path) -> None:
-    """Any value of it, changed to anything, by somebody who can make digests: the call goes at once, or on time."""
+    """Any value of it is changed to anything, with a correct digest: the call is deleted at once, or on time."""
     now_s, kept = [NOW_S], 0
     path = tmp_path / "c"
     folder = opened(path)
@@ -472,11 +475,8 @@ def test_no_header_keeps_a_call_beyond_its_time(tmp_path: Path) -> None:
 
 
 def test_a_call_of_another_scene_than_its_place_says_is_deleted(tmp_path: Path) -> None:
-    """Who deletes that scene would not know of it."""
-    folder = opened(tmp_path / "c")
-    folder.add(a_call(), blobs_of(a_call()))
-    (entry,) = folder.entries()
-    folder.close()
+    """It would remain after its scene was deleted."""
+    entry = write_one(tmp_path / "c")
     write_whole(entry.path, with_header(entry.path.read_bytes(), lambda header: header.update(scene_id="other")))
     folder = opened(tmp_path / "c")
     assert files(tmp_path / "c") == []
@@ -492,12 +492,9 @@ def test_calls_of_the_same_moment_do_not_replace_each_other(tmp_path: Path) -> N
         folder.close()
 
 
-def test_what_is_larger_than_all_may_be_is_deleted_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_oversized_file_is_deleted_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It may be larger than the memory."""
-    folder = opened(tmp_path / "c")
-    folder.add(a_call(), blobs_of(a_call()))
-    (entry,) = folder.entries()
-    folder.close()
+    entry = write_one(tmp_path / "c")
     with entry.path.open("r+b") as file:
         file.truncate(ROOM.max_bytes + 1)
     monkeypatch.setattr(folder_module, "decode_call", lambda _: pytest.fail("read"))
@@ -508,14 +505,12 @@ def test_what_is_larger_than_all_may_be_is_deleted_unread(tmp_path: Path, monkey
 
 @pytest.mark.parametrize("place", ["tenants", "tenants/acme", "tenants/acme/blobs", "tenants/acme/calls/hall"])
 @pytest.mark.parametrize("fault", ["link", "locked"])
-def test_what_cannot_be_looked_into_is_refused(
+def test_a_folder_that_cannot_be_read_is_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, fault: str
 ) -> None:
-    """Nobody would see to it that what is in there goes; and what lies elsewhere is not deleted."""
+    """Its calls could not be deleted on time; and files elsewhere are not deleted."""
     path = tmp_path / "c"
-    folder = opened(path)
-    folder.add(a_call(), blobs_of(a_call()))
-    folder.close()
+    write_one(path)
     before = len(files(path))
     if fault == "link":
         (path / place).rename(tmp_path / "elsewhere")
@@ -538,7 +533,7 @@ def test_what_cannot_be_looked_into_is_refused(
     assert len(files(path)) + len(elsewhere) == before
 
 
-def test_folders_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
+def test_folders_that_cannot_be_used_are_rejected(tmp_path: Path) -> None:
     folder = opened(tmp_path / "c")
     with pytest.raises(CaptureError, match="in use by another server"):
         opened(tmp_path / "c")
@@ -560,23 +555,23 @@ def test_folders_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("capture", "data"), [("d/c", "d"), ("d", "d"), ("d", "d/c"), ("d/../d/c", "d")])
-def test_the_store_and_what_is_captured_are_apart(tmp_path: Path, capture: str, data: str) -> None:
+def test_store_and_capture_folder_are_apart(tmp_path: Path, capture: str, data: str) -> None:
     with pytest.raises(ConfigError, match="folders apart"):
         load_settings({"capture_dir": tmp_path / capture, "data_dir": tmp_path / data})
 
 
 @pytest.mark.parametrize("flags", [{"capture_hours": 0}, {"capture_mib": 0}])
-def test_senseless_settings_are_refused(flags: dict[str, object]) -> None:
+def test_limits_of_zero_are_rejected(flags: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         load_settings(flags)
 
 
-def test_what_is_no_tenant_is_refused(tmp_path: Path) -> None:
+def test_an_invalid_tenant_is_rejected(tmp_path: Path) -> None:
     settings = load_settings({"capture_dir": tmp_path / "captured", "capture_tenants": "a,../b"}).settings
     with pytest.raises(CaptureError, match="capture_tenants"), Store.open(tmp_path / "store") as store:
         open_recorder(settings, store, Metrics())
     assert not (tmp_path / "captured").exists()
 
 
-def test_nothing_is_captured_unless_it_is_asked_for() -> None:
+def test_nothing_is_captured_by_default() -> None:
     assert load_settings({}).settings.capture_dir is None

@@ -1,4 +1,4 @@
-"""What a pose rests on, told in the caller's terms, against a planted scene.
+"""A pose's support in pixels of the photographs as sent, against a planted scene.
 
 The points, put through the pose and the intrinsics as they were sent, fall on the pixels.
 """
@@ -32,7 +32,7 @@ def sent(view: View, camera: Camera) -> View:
     """The same view, as what is left of a larger photograph by another lens."""
 
     def read() -> np.ndarray:
-        raise AssertionError("nobody needs the pixels")
+        raise AssertionError("the pixels are not needed")
 
     return replace(view, photograph=Photograph("", camera, read))
 

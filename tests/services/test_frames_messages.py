@@ -43,14 +43,14 @@ def test_a_headset_is_given_all_it_needs_in_its_own_axes() -> None:
 
 
 @pytest.mark.parametrize("axes", Axes)
-def test_what_is_not_known_is_absent_and_not_zero(axes: Axes) -> None:
+def test_unknown_fields_are_absent_and_not_zero(axes: Axes) -> None:
     message = pb.Localization()
     set_frames(message, LOOKS_ALONG_X, None, axes, None, None)
     assert {field.name for field, _ in message.in_axes.ListFields()} == {"axes", "world_from_camera"}
     assert AXES.Name(message.in_axes.axes) == f"AXES_{axes.name}"
 
 
-def test_who_asks_for_no_axes_is_answered_in_opencvs() -> None:
+def test_opencvs_axes_are_the_default() -> None:
     message = pb.Localization()
     axes = axes_from_message(pb.LocalizeOptions())
     set_frames(message, LOOKS_ALONG_X, COVARIANCE, axes, LOOKS_ALONG_X, None)
@@ -82,7 +82,7 @@ def test_a_session_pose_too_far_away_to_add_is_refused(far_m: float) -> None:
     assert caught.value.field == "session_from_camera.translation_m.z"
 
 
-def test_axes_that_there_are_not_are_refused() -> None:
+def test_unknown_axes_are_rejected() -> None:
     for number in (6, -1):
         with pytest.raises(FieldError) as caught:
             axes_from_message(pb.LocalizeOptions(axes=number))  # type: ignore[arg-type]
@@ -91,7 +91,7 @@ def test_axes_that_there_are_not_are_refused() -> None:
     assert names == set(Axes)
 
 
-def test_a_devices_pose_is_read_as_it_is_given() -> None:
+def test_a_session_pose_is_read_as_given() -> None:
     request = pb.LocalizeRequest()
     assert session_from_message(request) is None
     request.session_from_camera.CopyFrom(wire.transform_to_message(LOOKS_ALONG_X))

@@ -1,4 +1,4 @@
-"""Priors in requests: what becomes of them, frames and units; and that each senseless field is refused by its name."""
+"""Priors of requests are converted with frames and units, and each wrong field is rejected by its name."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def vector(x: float | str, y: float | str, z: float | str) -> dict[str, float | 
     return {"x": x, "y": y, "z": z}
 
 
-def test_nothing_said_is_nothing_known() -> None:
+def test_a_request_without_priors_has_none() -> None:
     narrowing, priors = priors_from_message(request(), NOTHING)
     assert narrowing.is_empty
     assert not priors
@@ -123,7 +123,7 @@ def test_without_a_height_only_the_horizontal_counts() -> None:
     assert math.sqrt(priors.position.covariance[2, 2]) == pytest.approx(UNKNOWN_HEIGHT_SIGMA_M, rel=1e-3)
 
 
-def test_a_pose_prior_narrows_both_where_and_whither() -> None:
+def test_a_pose_prior_narrows_position_and_heading() -> None:
     sent = request(posePrior={"worldFromCamera": IDENTITY, "covariance": {"rowMajor": SIX}})
     narrowing, priors = priors_from_message(sent, NOTHING)
     assert priors.pose is not None
@@ -133,7 +133,7 @@ def test_a_pose_prior_narrows_both_where_and_whither() -> None:
     assert behind.tolist() == [True, False]
 
 
-def test_what_is_likely_never_leaves_no_reference_at_all() -> None:
+def test_a_soft_prior_never_excludes_all_references() -> None:
     soft = {"positionM": vector(1e6, 0, 0), "covarianceM2": np.eye(3).ravel().tolist()}
     narrowing, _ = priors_from_message(request(positionPrior=soft), NOTHING)
     assert narrowing.keeps(np.zeros((3, 3)), np.tile([0, 0, 1.0], (3, 1))).all()
@@ -220,7 +220,7 @@ BAD: list[tuple[str, dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("field", "fields"), BAD, ids=[f"{i} {field}" for i, (field, _) in enumerate(BAD)])
-def test_what_is_senseless_is_refused_by_name(field: str, fields: dict[str, Any]) -> None:
+def test_a_wrong_field_is_rejected_by_name(field: str, fields: dict[str, Any]) -> None:
     with pytest.raises(FieldError) as error:
         priors_from_message(request(**fields), ON_EARTH)
     assert error.value.field == field

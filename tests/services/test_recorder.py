@@ -1,4 +1,4 @@
-"""The recorder never delays or fails a call, counts what it drops, and forgets what the store forgets; all planted."""
+"""The recorder never delays or fails a call, counts what it drops, and deletes what the store deletes; all planted."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from mapless_server.store.reader import StoreReader
 
 @dataclass
 class Counts:
-    """Hears what is captured and what is not."""
+    """Counts what is captured and what is not."""
 
     kept: int = 0
     dropped: Counter[str] = field(default_factory=Counter)
@@ -84,7 +84,7 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cl
         yield client, LocalizationServiceStub(channel), folder
 
 
-def test_callers_are_told(served: tuple[Client, LocalizationServiceStub, Path]) -> None:
+def test_a_captured_answer_says_so(served: tuple[Client, LocalizationServiceStub, Path]) -> None:
     _, stub, folder = served
     answer = stub.Localize(localize_request("s"), timeout=30)
     assert answer.diagnostics.captured
@@ -95,7 +95,7 @@ def test_callers_are_told(served: tuple[Client, LocalizationServiceStub, Path]) 
     assert kept.request_id == answer.diagnostics.request_id
 
 
-def test_callers_who_ask_for_the_coarse_pose_first_are_told_too(
+def test_a_captured_final_answer_of_a_stream_says_so(
     served: tuple[Client, LocalizationServiceStub, Path],
 ) -> None:
     _, stub, folder = served
@@ -105,7 +105,7 @@ def test_callers_who_ask_for_the_coarse_pose_first_are_told_too(
     assert decode_call(captured_in(folder)[0].read_bytes()).response == final.SerializeToString()
 
 
-def test_callers_with_several_photographs_are_told_at_each(
+def test_a_captured_group_says_so_at_each_photograph(
     served: tuple[Client, LocalizationServiceStub, Path],
 ) -> None:
     _, stub, folder = served
@@ -125,7 +125,7 @@ def test_callers_with_several_photographs_are_told_at_each(
 
 
 @pytest.mark.parametrize("deleted", ["scene", "reference", "scene made anew"])
-def test_what_was_made_of_a_deleted_scene_or_reference_goes(
+def test_calls_of_deleted_scenes_and_references_are_deleted(
     served: tuple[Client, LocalizationServiceStub, Path], deleted: str
 ) -> None:
     client, _, folder = served
@@ -178,7 +178,7 @@ def a_view() -> View:
     return View(CAMERA, Features(*(np.zeros(shape, np.float32) for shape in ((1, 2), (1, 4), (1,)))))
 
 
-def test_a_slow_disk_holds_up_nobody(tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_disk_delays_no_call(tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """What does not fit into the queue is dropped at once, and counted."""
     counts = Counts()
     with recording(tmp_path, store, counts) as recorder:
@@ -210,7 +210,7 @@ def test_the_queue_is_bounded_in_bytes(tmp_path: Path, store: Store, monkeypatch
 def test_a_full_disk_pauses_and_fails_no_call(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """What waits already is not tried either, and the log tells of the fault once."""
+    """Queued calls are not tried either, and the log has the fault once."""
     counts, tries, let_go = Counts(), [0], threading.Event()
 
     def full(*_: object) -> bool:
@@ -229,7 +229,7 @@ def test_a_full_disk_pauses_and_fails_no_call(
     assert caplog.text.count("nothing is captured for 60 s: [Errno 28] No space left on device") == 1
 
 
-def test_a_fault_that_nobody_thought_of_is_told_of_once(
+def test_an_unexpected_fault_is_logged_once(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     counts = Counts()
@@ -246,10 +246,10 @@ def test_a_fault_that_nobody_thought_of_is_told_of_once(
     assert [it.request_id for it in caplog.records if hasattr(it, "request_id")] == ["id"]
 
 
-def test_what_still_waits_at_the_closing_limit_is_counted(
+def test_calls_queued_at_the_closing_limit_are_counted(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A disk so slow that it has written one call by then; the log tells of the others."""
+    """A disk so slow that it has written one call by then; the log counts the others."""
     monkeypatch.setattr(recorder_module, "CLOSING_LIMIT_S", 0.0)
     counts, began = Counts(), threading.Event()
     with recording(tmp_path, store, counts) as recorder:
@@ -269,7 +269,7 @@ def test_what_still_waits_at_the_closing_limit_is_counted(
 
 
 @pytest.mark.parametrize(("times", "dropped"), [(2, {}), (3, {"fault": 1})])
-def test_a_call_whose_blobs_go_meanwhile_is_gathered_again(
+def test_a_call_whose_blobs_are_deleted_is_collected_again(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, times: int, dropped: dict[str, int]
 ) -> None:
     """Not for ever."""
@@ -289,7 +289,7 @@ def test_a_call_whose_blobs_go_meanwhile_is_gathered_again(
 
 
 @pytest.mark.parametrize("deleted", ["scene", "scene made anew", "reference"])
-def test_what_is_deleted_while_its_call_waits_is_not_kept(
+def test_a_call_deleted_while_queued_is_not_captured(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, deleted: str
 ) -> None:
     """Of a scene that is made anew neither: a call that used no reference is one of the scene before."""
@@ -313,7 +313,7 @@ def test_what_is_deleted_while_its_call_waits_is_not_kept(
 
 
 @pytest.mark.parametrize("fault", [Unavailable("the store is away"), DataLoss("damaged")])
-def test_what_the_store_cannot_say_is_counted(
+def test_faults_of_the_store_are_counted(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, fault: Exception
 ) -> None:
     counts = Counts()
@@ -328,7 +328,7 @@ def test_what_the_store_cannot_say_is_counted(
 
 
 @pytest.mark.parametrize("stuck", ["call", "blob"])
-def test_an_undeletable_file_keeps_nothing_of_other_scenes(
+def test_an_undeletable_file_keeps_no_other_scene(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, stuck: str
 ) -> None:
     """A folder stands in its place, as an operator may have it."""
@@ -358,8 +358,8 @@ def test_an_undeletable_file_keeps_nothing_of_other_scenes(
 
 def test_only_the_tenants_that_are_named_are_captured(tmp_path: Path, store: Store) -> None:
     with recording(tmp_path, store, Counts(), tenants=frozenset({"acme"})) as recorder:
-        told = [answer(recorder, tenant).diagnostics.captured for tenant in ("default", "acme", "other")]
-    assert told == [False, True, False]
+        captured = [answer(recorder, tenant).diagnostics.captured for tenant in ("default", "acme", "other")]
+    assert captured == [False, True, False]
     assert [decode_call(it.read_bytes()).tenant for it in captured_in(tmp_path / "captured")] == ["acme"]
 
 
@@ -367,7 +367,7 @@ def test_only_the_tenants_that_are_named_are_captured(tmp_path: Path, store: Sto
 def test_the_time_limit_holds_whatever_the_store_does(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, fault: str
 ) -> None:
-    """A fault that nobody thought of, at every check; and a database that does not answer, with a call that waits."""
+    """An unexpected fault at every check; and a database that does not answer, with a call that waits."""
     counts, checks, let_go = Counts(), [0], threading.Event()
     with recording(tmp_path, store, counts, keep_s=0.5) as recorder:
         answer(recorder)
@@ -394,7 +394,7 @@ def test_the_time_limit_holds_whatever_the_store_does(
 def test_a_fault_of_the_store_ends_no_check(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """What was deleted goes when the store is well again; the log tells of the fault once."""
+    """Deleted scenes are found when the store works again; the log has the fault once."""
     monkeypatch.setattr(deletion_module, "STORE_CHECK_S", 0.01)
     counts, checks = Counts(), [0]
 
@@ -428,7 +428,7 @@ def test_the_start_waits_for_no_store_and_retries_each_round(
             answer(recorder, tenant)
     assert len(captured_in(tmp_path / "captured")) == 3
     monkeypatch.setattr(StoreReader, "get_scene", away)
-    with recording(tmp_path, store, Counts()) as recorder:  # returns, although nobody lets the store go
+    with recording(tmp_path, store, Counts()) as recorder:  # returns, although the store does not answer
         wait_until(lambda: asked[0] == 1)
         assert len(recorder.folder.entries()) == 3
         let_go.set()
@@ -451,7 +451,7 @@ class CountingStore:
 
 
 def test_an_unchanged_scene_is_asked_for_references_once(tmp_path: Path) -> None:
-    """However many calls come and go; and what is not there is found out all the same."""
+    """However many calls are written and deleted; a missing reference is found all the same."""
     folder, counting = CaptureFolder(tmp_path / "c", Retention(3600.0, 2**24)), CountingStore({"r0": "k0", "r1": "k1"})
     stale_calls = StaleCalls(cast(Store, counting))
 
@@ -472,8 +472,8 @@ def test_an_unchanged_scene_is_asked_for_references_once(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("fault", [DataLoss("damaged"), RuntimeError("no such column"), Unavailable("away")])
-def test_what_is_wrong_with_one_scene_keeps_nothing_of_another(tmp_path: Path, fault: Exception) -> None:
-    """A damaged scene is there; of what nobody thought of the caller hears, when all others have been looked at."""
+def test_a_fault_of_one_scene_keeps_no_other_scene(tmp_path: Path, fault: Exception) -> None:
+    """A damaged scene exists; an unexpected fault is raised after all other scenes have been checked."""
     folder = CaptureFolder(tmp_path / "c", Retention(3600.0, 2**20))
     for scene_id in ("a", "b", "c"):
         folder.add(CapturedCall(scene_id, time.time(), "Localize", "acme", scene_id, 0), {})
@@ -522,7 +522,7 @@ def test_stored_data_is_not_read_again_and_queries_keep_memory(tmp_path: Path, m
         assert hits_and_misses == 5 * 5
 
 
-def test_what_waits_holds_no_features(tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_queued_calls_hold_no_features(tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """A reference's view that was used is free as soon as the call is answered, however long the disk takes."""
     let_go = threading.Event()
     with recording(tmp_path, store, Counts()) as recorder:

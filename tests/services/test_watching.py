@@ -1,4 +1,4 @@
-"""Who watches a scene sees its answers and no other scene's, a few at most, and nothing once it is over."""
+"""A watcher receives the answers of its scene and of no other, a few at most, and none after its end."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def test_an_answer_reaches_watchers_with_photo_and_matches() -> None:
     asyncio.run(run())
 
 
-def test_what_waits_for_a_watcher_keeps_no_more_of_the_request() -> None:
-    """A part of a message keeps the whole message, so that each photograph would be held twice."""
+def test_a_waiting_answer_keeps_no_more_of_the_request() -> None:
+    """A part of a message keeps the whole message, so that each photograph would be in memory twice."""
 
     async def run() -> None:
         watchers = Watchers(True)
@@ -109,7 +109,7 @@ def test_a_slow_reader_misses_the_oldest_and_learns_how_many() -> None:
     asyncio.run(run())
 
 
-def test_nothing_is_kept_when_nobody_watches() -> None:
+def test_nothing_is_kept_without_watchers() -> None:
     async def run() -> None:
         watchers = Watchers(True)
         assert not watchers.is_watched(HALL)
@@ -129,7 +129,7 @@ def test_nothing_is_kept_when_nobody_watches() -> None:
     asyncio.run(run())
 
 
-def test_it_ends_when_the_server_stops_in_any_state() -> None:
+def test_watching_ends_when_the_server_stops() -> None:
     async def run() -> None:
         watchers = Watchers(True)
         idle, late = watchers.watch(HALL), watchers.watch(HALL)
@@ -149,7 +149,7 @@ def test_it_ends_when_the_server_stops_in_any_state() -> None:
     asyncio.run(run())
 
 
-def test_it_has_to_be_allowed() -> None:
+def test_watching_has_to_be_allowed() -> None:
     watchers = Watchers(False)
     with pytest.raises(FailedPrecondition, match="allow_watching") as refused:
         watchers.watch(HALL)
@@ -172,7 +172,7 @@ def test_one_tenant_cannot_keep_the_others_from_watching() -> None:
     asyncio.run(run())
 
 
-def test_there_is_a_limit_for_all() -> None:
+def test_all_tenants_share_a_limit() -> None:
     async def run() -> None:
         watchers = Watchers(True)
         watches = [watchers.watch(key_of(f"tenant-{i}", "hall")) for i in range(MAX_WATCHERS)]

@@ -83,7 +83,7 @@ class StaleCalls:
         return [it for it in calls if it.scene_created_us != created_us or not it.references <= existing]
 
     def _existing(self, scene: SceneRecord, wanted: References) -> References:
-        """A superset of the wanted references that still exist; each is asked for once a generation."""
+        """References that exist, all of the wanted ones that do among them; each is looked up once a generation."""
         generation, existing = self._known.get(scene.scene_key, (scene.generation, References()))
         if generation != scene.generation:
             existing = References()
