@@ -85,8 +85,7 @@ class Client:
         asyncio.get_running_loop()
         self.options = options or ConnectOptions()
         self._channel = self.options.aio_channel(address)
-        self._metadata = self.options.metadata()
-        self._methods = Methods(self._channel)
+        self._methods = Methods(self._channel, self.options.metadata())
 
     async def __aenter__(self) -> Client:
         return self
@@ -175,20 +174,16 @@ class Client:
             yield end.value
 
     async def _attempt(self, attempt: Attempt) -> Message | MaplessError:
-        method = self._methods.of(attempt.call)
-        metadata = self._metadata + attempt.call.metadata
         try:
-            response: Message = await method(attempt.call.request, timeout=attempt.timeout_s, metadata=metadata)
+            response: Message = await self._methods.start(attempt)
         except grpc.RpcError as error:
             return from_rpc_error(error)
         return response
 
     async def _messages(self, attempt: Attempt, reader: StreamReader) -> AsyncGenerator[Message, None]:
         """The messages of a stream; the call is cancelled when the caller stops reading."""
-        method = self._methods.of(attempt.call)
         reader.begin(attempt.call)
-        metadata = self._metadata + attempt.call.metadata
-        stream = method(attempt.call.request, timeout=attempt.timeout_s, metadata=metadata)
+        stream = self._methods.start(attempt)
         try:
             async for message in stream:
                 yield message

@@ -75,8 +75,7 @@ class Client:
         """
         self.options = options or ConnectOptions()
         self._channel = self.options.channel(address)
-        self._metadata = self.options.metadata()
-        self._methods = Methods(self._channel)
+        self._methods = Methods(self._channel, self.options.metadata())
         self._closed = threading.Event()
 
     def __enter__(self) -> Client:
@@ -178,20 +177,16 @@ class Client:
             raise pause.error
 
     def _attempt(self, attempt: Attempt) -> Message | MaplessError:
-        method = self._methods.of(attempt.call)
-        metadata = self._metadata + attempt.call.metadata
         try:
-            response: Message = method(attempt.call.request, timeout=attempt.timeout_s, metadata=metadata)
+            response: Message = self._methods.start(attempt)
         except grpc.RpcError as error:
             return from_rpc_error(error)
         return response
 
     def _messages(self, attempt: Attempt, reader: StreamReader) -> Iterator[Message]:
         """The messages of a stream; the call is cancelled when the caller stops reading."""
-        method = self._methods.of(attempt.call)
         reader.begin(attempt.call)
-        metadata = self._metadata + attempt.call.metadata
-        stream = method(attempt.call.request, timeout=attempt.timeout_s, metadata=metadata)
+        stream = self._methods.start(attempt)
         try:
             yield from stream
         except grpc.RpcError as error:

@@ -99,12 +99,14 @@ class Pause:
 class Methods:
     """The methods of a channel, blocking or asynchronous, made when a call first needs them."""
 
-    def __init__(self, channel: Any) -> None:
+    def __init__(self, channel: Any, metadata: tuple[tuple[str, str], ...]) -> None:
         self._channel = channel
+        self._metadata = metadata
         self._by_name: dict[str, Callable[..., Any]] = {}
 
-    def of(self, call: Call) -> Callable[..., Any]:
-        """The function that executes the call: takes the request, `timeout` in seconds and `metadata`."""
+    def start(self, attempt: Attempt) -> Any:
+        """The response of an attempt: a message or a stream, to be awaited if the channel is asynchronous."""
+        call = attempt.call
         if call.method not in self._by_name:
             make = self._channel.unary_unary if call.early is None else self._channel.unary_stream
             self._by_name[call.method] = make(
@@ -112,7 +114,8 @@ class Methods:
                 request_serializer=type(call.request).SerializeToString,
                 response_deserializer=call.response_type.FromString,
             )
-        return self._by_name[call.method]
+        metadata = self._metadata + call.metadata
+        return self._by_name[call.method](call.request, timeout=attempt.timeout_s, metadata=metadata)
 
 
 @dataclass
