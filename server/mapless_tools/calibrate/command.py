@@ -54,8 +54,10 @@ def calibrate_command(
     itself; the factors by which its answers' radii are wrong are stored with it, and from then on its answers are
     calibrated. Exit code 1 when there is nothing to calibrate from.
     """
+    from mapless_tools.evaluate.plan import EvaluationOptions
     from mapless_tools.usage import UsageError, failures_end_command, usage_errors
 
+    from .findings import RightRule
     from .run import CalibrateOptions, calibrate, clear_calibration
 
     with failures_end_command("interrupted; nothing is stored"):
@@ -69,12 +71,8 @@ def calibrate_command(
             options = CalibrateOptions(
                 scene=scene,
                 layout=layout,
-                reference_count=references,
-                query_count=query_count,
-                k=k,
-                variant=variant,
-                right_m=right_cm / 100,
-                right_deg=right_deg,
+                evaluation=EvaluationOptions(references, query_count, k, variant),
+                right=RightRule(right_cm / 100, right_deg),
                 dry_run=dry_run,
             )
         calibrated = calibrate(folder, options, connection, output)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rich.console import Console
@@ -42,38 +42,24 @@ class CalibrateOptions:
     Attributes:
         scene: the scene to calibrate; empty for the folder by itself.
         layout: of the folder.
-        reference_count, query_count, k, variant: as EvaluationOptions has them.
-        right_m, right_deg: what counts as a right answer.
+        evaluation: how the folder is split and its photographs are localized.
+        right: what counts as a right answer.
         dry_run: whether to store nothing.
     """
 
     scene: str = ""
     layout: str = "auto"
-    reference_count: int | None = None
-    query_count: int | None = None
-    k: int = 10
-    variant: str = "best"
-    right_m: float = 0.10
-    right_deg: float = 5.0
+    evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)
+    right: RightRule = field(default_factory=RightRule)
     dry_run: bool = False
 
     def __post_init__(self) -> None:
         if self.scene:
             check_id(self.scene)
-            if self.reference_count is not None:
+            if self.evaluation.reference_count is not None:
                 raise ValueError("--references: only without --scene, which has its own")
         elif self.dry_run:
             raise ValueError("--dry-run: only with --scene, nothing is stored without one")
-        self.evaluation()
-        self.right()
-
-    def evaluation(self) -> EvaluationOptions:
-        """How the folder is split."""
-        return EvaluationOptions(self.reference_count, self.query_count, self.k, self.variant)
-
-    def right(self) -> RightRule:
-        """What counts as right."""
-        return RightRule(self.right_m, self.right_deg)
 
 
 def clear_calibration(folder: Path | None, scene: str, connection: Connection) -> None:
@@ -129,13 +115,13 @@ def _measure_folder(
     dataset: Dataset, options: CalibrateOptions, _: Connection, settings: Settings, progress: Progress
 ) -> CalibrationReport:
     """The folder by itself, as `evaluate` splits it, on a server of its own."""
-    plan = plan_for(dataset, options.evaluation(), settings, progress)
+    plan = plan_for(dataset, options.evaluation, settings, progress)
     with temporary_server() as client:
         store_references(client, OWN_SCENE, plan.references, progress)
-        outcomes = _localize_all(client, OWN_SCENE, planned_queries(plan.queries), options, None, progress)
+        outcomes = _localize_all(client, OWN_SCENE, planned_queries(plan.queries), options.evaluation, None, progress)
     stored = "not stored: no --scene was given"
     return CalibrationReport(
-        dataset, "", len(plan.references), options.k, options.right(), stored, find(outcomes, options.right())
+        dataset, "", len(plan.references), options.evaluation.k, options.right, stored, find(outcomes, options.right)
     )
 
 
@@ -143,19 +129,21 @@ def _measure_scene(
     dataset: Dataset, options: CalibrateOptions, connection: Connection, settings: Settings, progress: Progress
 ) -> CalibrationReport:
     """A stored scene; its calibration is replaced by the factors that were found, except in a dry run."""
-    frames = evenly_spread(dataset.frames, options.query_count)
+    frames = evenly_spread(dataset.frames, options.evaluation.query_count)
     check_images(frames, image_limits(settings))
     with _connected(connection, settings) as client:
         scene = client.get_scene(options.scene)
         before = Factors.of(scene.calibration) if scene.calibration else None
         queries = scene_queries(client, options.scene, frames, progress)
-        outcomes = _localize_all(client, options.scene, queries, options, before, progress)
+        outcomes = _localize_all(client, options.scene, queries, options.evaluation, before, progress)
         other = other_world(outcomes)
         if other is not None:
             raise UsageError(str(other))
-        found = find(outcomes, options.right())
+        found = find(outcomes, options.right)
         stored = _store(client, options, found, scene.calibration)
-    return CalibrationReport(dataset, options.scene, scene.reference_count, options.k, options.right(), stored, found)
+    return CalibrationReport(
+        dataset, options.scene, scene.reference_count, options.evaluation.k, options.right, stored, found
+    )
 
 
 def _store(client: Client, options: CalibrateOptions, found: Findings, before: Calibration | None) -> str:
@@ -191,7 +179,7 @@ def _localize_all(
     client: Client,
     scene: str,
     queries: Sequence[Query],
-    options: CalibrateOptions,
+    options: EvaluationOptions,
     scaled: Factors | None,
     progress: Progress,
 ) -> list[Outcome]:

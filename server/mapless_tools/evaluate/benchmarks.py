@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapless_tools.ingest.formats import cambridge, cameras, seven_scenes, twelve_scenes
+from mapless_tools.ingest.formats import fits
 from mapless_tools.usage import UsageError
 
 from .paper import CAMBRIDGE, SEVEN_SCENES, TWELVE_SCENES, PaperTables
@@ -80,12 +80,6 @@ BENCHMARKS = {
     )
 }
 
-_FITS = {
-    "7scenes": seven_scenes.fits,
-    "12scenes": twelve_scenes.fits,
-    "cambridge": cambridge.fits,
-    "cameras": cameras.fits,
-}
 _MARKS = {
     "7scenes": "seq-01 and so on with TrainSplit.txt and TestSplit.txt",
     "12scenes": "data, info.txt and split.txt",
@@ -155,7 +149,7 @@ def _search(folder: Path, wanted: tuple[str, ...], depth: int) -> tuple[list[tup
 
 def _layout(folder: Path, wanted: tuple[str, ...]) -> str:
     """The layout that a folder has, of the wanted ones if it has several; empty if it has none."""
-    found = [layout for layout, fits in _FITS.items() if fits(folder)]
+    found = [layout for layout in _MARKS if fits(folder, layout)]
     return next((layout for layout in found if layout in wanted), next(iter(found), ""))
 
 

@@ -16,7 +16,7 @@ from mapless_tools.dataset import Dataset, printable
 from .. import FORMATS
 from .options import Intrinsics, ReadOptions
 
-__all__ = ["Intrinsics", "ReadOptions", "read_dataset", "recognize"]
+__all__ = ["Intrinsics", "ReadOptions", "fits", "read_dataset", "recognize"]
 
 
 def recognize(path: Path) -> str:
@@ -27,12 +27,17 @@ def recognize(path: Path) -> str:
     """
     if not path.is_dir():
         raise ValueError(f"{path} is not a folder")
-    found = [name for name in FORMATS if _module(name).fits(path)]
+    found = [name for name in FORMATS if fits(path, name)]
     if not found:
         raise ValueError(f"{path} has no layout that is known ({', '.join(FORMATS)}); name one with --format")
     if len(found) > 1:
         raise ValueError(f"{path} has several layouts: {', '.join(found)}; name one with --format")
     return found[0]
+
+
+def fits(path: Path, format: str) -> bool:
+    """Whether a folder has a layout, one of FORMATS."""
+    return bool(_module(format).fits(path))
 
 
 def read_dataset(path: Path, format: str = "auto", options: ReadOptions | None = None) -> Dataset:
