@@ -9,7 +9,6 @@ from collections.abc import AsyncGenerator, Callable, Sequence
 from functools import partial
 from typing import Any
 
-from mapless import wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES, GroupResult, localize_each
@@ -20,7 +19,6 @@ from mapless_server.method.rejection import Rejection
 from mapless_server.method.results import MetricScale
 from mapless_server.observability.metrics import LOCALIZED, Metrics
 from mapless_server.rpc import Call
-from mapless_server.security import key_of
 from mapless_server.store import SceneAttributes, Store
 
 from .capture.calls import Request, Response
@@ -36,7 +34,7 @@ from .messages.groups import (
     session_poses_from_message,
 )
 from .messages.priors import needs_attributes
-from .messages.queries import query_from_message
+from .messages.queries import query_from_message, scene_key_from_name
 from .progressive import coarse_then_final
 from .watching import Watcher, Watchers
 
@@ -81,10 +79,12 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
 
     async def _query(self, request: pb.LocalizeRequest, call: Call) -> tuple[Query, AnswerFrames]:
         """The query of a request; FieldError or RequestError names what is wrong with it."""
-        options = self._engine().options
-        frames = answer_frames_of(request)
-        attributes = await self._attributes(request, call.principal.tenant)
-        query = query_from_message(request, call.principal.tenant, options, attributes)
+        options, tenant = self._engine().options, call.principal.tenant
+        frames, attributes = answer_frames_of(request), SceneAttributes()
+        if needs_attributes(request):
+            scene_key = scene_key_from_name(request.scene, "scene", tenant)
+            attributes = await asyncio.to_thread(self._store.get_attributes, scene_key)
+        query = query_from_message(request, tenant, options, attributes)
         call.note(scene=query.scene_key, references=len(query.reference_ids))
         return query, frames
 
@@ -166,18 +166,11 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
 
     async def WatchQueries(self, request: pb.WatchQueriesRequest, call: Call) -> Watcher:
         """Implements LocalizationService.WatchQueries."""
-        scene_key = key_of(call.principal.tenant, wire.scene_id_from_name(request.scene, "scene"))
+        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
         call.note(scene=scene_key)
         self._watchers.check(call.principal.tenant)
         await asyncio.to_thread(self._store.get_scene, scene_key)
         return self._watchers.watch(scene_key)
-
-    async def _attributes(self, request: pb.LocalizeRequest, tenant: str) -> SceneAttributes:
-        """The scene's attributes, read only if the request's priors need them."""
-        if not needs_attributes(request):
-            return SceneAttributes()
-        scene_key = key_of(tenant, wire.scene_id_from_name(request.scene, "scene"))
-        return await asyncio.to_thread(self._store.get_attributes, scene_key)
 
     def _finish_group(
         self,
