@@ -19,6 +19,7 @@ from support.stores import (
     Place,
     Shared,
     assert_same_view,
+    faults_of,
     make_reference,
     place_on,
     view_of,
@@ -87,18 +88,11 @@ def assert_same_contents(store: Store, skipped: int = 0) -> None:
                 assert codec.encode_descriptor(indexed.descriptor) == codec.encode_descriptor(made.descriptors["vlad"])
 
 
-def look_at(place: Place) -> SqliteDatabase | PostgresqlDatabase:
-    if isinstance(place, Shared):
-        return PostgresqlDatabase.open_as_is(place.url)
-    assert isinstance(place, Folder)
-    return SqliteDatabase.open_as_is(place.data_dir / DATABASE_FILE)
-
-
 @pytest.mark.parametrize("destination", DATABASES)
 def test_either_database_comes_back_as_either(place: Place, destination: str, backup: Path, tmp_path: Path) -> None:
     with place.open() as store:
         fill(store)
-        with closing(look_at(place)) as database:
+        with closing(place.open_as_is()) as database:
             made = back_up(database, backup)
         assert_same_contents(store)
     assert (made.faults, made.counts["reference"]) == ((), 9)
@@ -129,7 +123,7 @@ def test_a_backup_is_its_owners_alone(
     try:
         with place.open() as store:
             fill(store)
-            with closing(look_at(place)) as database:
+            with closing(place.open_as_is()) as database:
                 back_up(database, backup, look)
     finally:
         os.umask(before)
@@ -187,7 +181,7 @@ def test_damage_is_named_kept_and_not_restored(
         fill(store)
     key = "SELECT key FROM reference WHERE scene_id = 'office' AND reference_id = ?"
     place.execute(statement % key, b"wrong", named)
-    with closing(look_at(place)) as database:
+    with closing(place.open_as_is()) as database:
         with database.read() as connection:
             found = verify(connection)
         made = back_up(database, backup)
@@ -204,16 +198,14 @@ def test_a_wrong_count_is_found(place: Place) -> None:
     with place.open() as store:
         fill(store)
     place.execute("UPDATE scene SET reference_count = 7 WHERE scene_id = 'acme/hall'")
-    with closing(look_at(place)) as database, database.read() as connection:
-        assert verify(connection).faults == ("tenant 'acme', scene 'hall': its count of references is wrong",)
+    assert faults_of(place) == ("tenant 'acme', scene 'hall': its count of references is wrong",)
 
 
 def test_damage_of_what_is_known_of_a_scene_is_found(place: Place) -> None:
     with place.open() as store:
         fill(store)
     place.execute("UPDATE scene SET attributes_sha256 = ? WHERE scene_id = 'acme/hall'", "0" * 64)
-    with closing(look_at(place)) as database, database.read() as connection:
-        assert verify(connection).faults == ("tenant 'acme', scene 'hall': its datum, down and calibration",)
+    assert faults_of(place) == ("tenant 'acme', scene 'hall': its datum, down and calibration",)
 
 
 def test_a_damaged_file_is_no_backup(backup: Path, tmp_path: Path) -> None:

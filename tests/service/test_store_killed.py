@@ -14,14 +14,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 from support import postgres
-from support.stores import DATABASES, Folder, Place, Shared
+from support.stores import DATABASES, Folder, Place, Shared, faults_of
 from support.waiting import wait_until
 
 from mapless.geometry import Camera, RigidTransform
@@ -29,10 +29,7 @@ from mapless_server import errors
 from mapless_server.method.views import Features, View
 from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import (
-    DATABASE_FILE,
     NewReference,
-    PostgresqlDatabase,
-    SqliteDatabase,
     Store,
     StoreError,
     deletion,
@@ -306,12 +303,7 @@ def kill_and_check(database: str, folder: Path, rounds: int) -> None:
         finally:
             nursery.end()
         assert ledger.acknowledged >= rounds
-        address = place.url if isinstance(place, Shared) else ""
-        looked_at = (
-            PostgresqlDatabase.open_as_is(address) if address else SqliteDatabase.open_as_is(folder / DATABASE_FILE)
-        )
-        with closing(looked_at), looked_at.read() as connection:
-            assert verify(connection).faults == ()
+        assert faults_of(place) == ()
 
 
 @pytest.mark.parametrize("database", DATABASES)

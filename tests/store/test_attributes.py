@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import datetime, timezone
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy import Connection, Row
-from support.stores import DATABASES, EXTRACTOR, Place, Shared, make_reference, place_on
+from support.stores import EXTRACTOR, Place, Shared, make_reference
 
 from mapless.geodesy import Datum, enu_from_y_up
 from mapless.geometry import Quaternion, rotation_from_vector
@@ -28,17 +26,6 @@ DATUM = Datum(47.1 / 3, -8.1 / 3, 400.1 / 3, Quaternion(0.0, 0.0, 0.6, 0.8))
 DOWN = unit_vector(0.01, -0.02, -1.0)
 CALIBRATION = Calibration(1.1 / 3, 2.2 / 3, 3.1, 4.1, 40, "sift-2048", "geometric", "BEST", "0.1.0")
 BEFORE = datetime.now(timezone.utc)
-
-
-@pytest.fixture(params=DATABASES)
-def place(request: pytest.FixtureRequest, tmp_path: Path) -> Place:
-    return place_on(request.param, lambda: tmp_path)
-
-
-@pytest.fixture
-def store(place: Place) -> Iterator[Store]:
-    with place.open() as store:
-        yield store
 
 
 def known_of(store: Store, key: SceneKey) -> SceneAttributes:
@@ -192,10 +179,8 @@ def test_damage_is_reported_and_repairable_while_serving(place: Place, damage: s
         assert known_of(store, OFFICE) == SceneAttributes(DATUM)
 
 
-def test_the_next_call_sees_what_another_server_changed() -> None:
-    place = place_on("postgresql", Path)
-    assert isinstance(place, Shared)
-    with place.open() as one, place.open() as other:
+def test_the_next_call_sees_what_another_server_changed(shared: Shared) -> None:
+    with shared.open() as one, shared.open() as other:
         one.create_scene(OFFICE)
         for datum in (DATUM, None, replace(DATUM, height_m=1.0)):
             one.update_scene(OFFICE, datum=datum)

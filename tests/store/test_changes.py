@@ -1,22 +1,21 @@
-"""Who follows a scene by its changes knows at each moment what who reads it as a whole does; on either database."""
+"""A scene that is followed by its changes is at each moment what is read as a whole; on either database."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.stores import (
-    DATABASES,
     EXTRACTOR,
     Place,
     assert_same_bits,
+    faults_of,
     make_descriptor,
     make_reference,
     place_on,
@@ -25,26 +24,10 @@ from support.stores import (
 
 from mapless_server import errors
 from mapless_server.security import SceneKey
-from mapless_server.store import IndexedReference, NewReference, Store, verify
+from mapless_server.store import IndexedReference, NewReference, Store
 
 OFFICE, HALL = SceneKey("office"), SceneKey("hall")
 NAME = "vlad"
-
-
-@pytest.fixture(scope="session", params=DATABASES)
-def database(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-@pytest.fixture
-def place(database: str, tmp_path: Path) -> Place:
-    return place_on(database, lambda: tmp_path)
-
-
-@pytest.fixture
-def store(place: Place) -> Iterator[Store]:
-    with place.open() as store:
-        yield store
 
 
 class Follower:
@@ -185,17 +168,6 @@ def test_a_new_life_and_a_generation_yet_to_come_are_read_whole(store: Store) ->
     assert not store.list_changes(OFFICE, generation, NAME).is_whole
 
 
-def test_tombstones_go_with_their_scene(place: Place) -> None:
-    with place.open() as store:
-        for key in (OFFICE, HALL):
-            store.create_scene(key)
-            store.add_references(key, [described("a")])
-            store.delete_reference(key, "a")
-        assert place.fetch("SELECT count(*) FROM removed_reference") == [(2,)]
-        store.delete_scene(OFFICE)
-        assert place.fetch("SELECT scene_id FROM removed_reference") == [("hall",)]
-
-
 def test_a_descriptor_goes_with_its_reference(place: Place) -> None:
     with place.open() as store:
         store.create_scene(OFFICE)
@@ -297,5 +269,4 @@ def test_who_comes_after_deletions_are_forgotten_reads_all(place: Place, monkeyp
             follower.follow(store)
             assert contents(follower.known) == whole
         assert [it.wholes for it in followers] == [2] * 8 + [1] * 4
-        with store.database.read() as connection:
-            assert verify(connection).faults == ()
+    assert faults_of(place) == ()

@@ -1,4 +1,4 @@
-"""A large scene is deleted in portions, and nobody ever sees a part of it, not even after a crash in the middle."""
+"""A large scene is deleted in portions, and no reader ever sees a part of it, not even after a crash in the middle."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection
 from support.stores import (
-    DATABASES,
     EXTRACTOR,
     Folder,
     Place,
     Shared,
     assert_same_view,
+    faults_of,
     make_reference,
-    place_on,
     view_of,
 )
 
@@ -28,7 +27,6 @@ from mapless_server import errors
 from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import (
     DATABASE_FILE,
-    PostgresqlDatabase,
     SqliteDatabase,
     Store,
     back_up,
@@ -36,19 +34,18 @@ from mapless_server.store import (
     postgresql,
     reader,
     restore,
-    verify,
 )
 from mapless_server.store.deletion import PendingDeletions
 
 OFFICE, HALL = SceneKey("office"), SceneKey("hall")
 TABLES = ("reference", "image", "features", "global_descriptor", "removed_reference")
+EMPTY = dict.fromkeys((*TABLES, "scene"), 0)
 COUNT = 10
 
 
-@pytest.fixture(params=DATABASES)
-def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Place:
+@pytest.fixture(autouse=True)
+def few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(deletion, "REFERENCES_AT_A_TIME", 3)
-    return place_on(request.param, lambda: tmp_path)
 
 
 def fill(store: Store, key: SceneKey, count: int = COUNT) -> list[str]:
@@ -153,14 +150,8 @@ def test_a_crash_midway_leaves_what_the_next_delete_removes(
         store.add_references(OFFICE, [make_reference(f"r{it}", 100 + it, dimension=8) for it in range(COUNT)])
         assert store.get_scene(OFFICE).reference_count == COUNT
         assert not {it.key for it in store.list_references(OFFICE, 100)} & set(keys)
-        with store.database.read() as connection:
-            assert verify(connection).faults == ()
-        source: Any = (
-            PostgresqlDatabase.open_as_is(place.url)
-            if isinstance(place, Shared)
-            else SqliteDatabase.open_as_is(tmp_path / "data" / DATABASE_FILE)
-        )
-        with closing(source):
+        assert faults_of(place) == ()
+        with closing(place.open_as_is()) as source:
             assert back_up(source, tmp_path / "backup").faults == ()
         store.create_scene(HALL)
         store.delete_scene(HALL)
@@ -180,7 +171,7 @@ def test_what_is_left_is_deleted_by_who_deletes_the_scene_again(place: Place, mo
     leave_alone(monkeypatch)
     with place.open() as store, pytest.raises(errors.NotFound):
         store.delete_scene(OFFICE)
-    assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+    assert row_counts(place) == EMPTY
 
 
 def test_remains_are_deleted_in_the_background_after_opening(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -192,7 +183,7 @@ def test_remains_are_deleted_in_the_background_after_opening(place: Place, monke
             assert store.list_scenes(DEFAULT_TENANT, 10) == []
             opened.set()
             wait_for_thread(store)
-    assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+    assert row_counts(place) == EMPTY
     with place.open() as store:
         assert store._pending_deletions._thread is None
 
@@ -210,7 +201,7 @@ def test_closing_ends_it_after_a_portion_and_a_start_goes_on(place: Place, monke
     monkeypatch.setattr(deletion, "PAUSE_S", 0.0)
     with place.open() as store:
         wait_for_thread(store)
-    assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+    assert row_counts(place) == EMPTY
 
 
 @pytest.mark.parametrize("broken", ["is_pending", "next_portion"])
@@ -250,7 +241,7 @@ def test_a_portion_is_bounded_by_its_bytes_and_has_one_at_least(
         before_each_portion(monkeypatch, lambda: seen.append(row_counts(place)["reference"]))
         store.delete_scene(OFFICE)
     assert seen == list(expected)
-    assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+    assert row_counts(place) == EMPTY
 
 
 def test_between_portions_others_may_write(place: Place) -> None:
@@ -304,7 +295,7 @@ class TestFullDisk:
             tried = self.fill_up(monkeypatch, 1)
             store.delete_scene(OFFICE)
         assert tried == [3] + [1] * COUNT
-        assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+        assert row_counts(place) == EMPTY
 
     def test_without_room_for_one_it_is_said_until_there_is(
         self, place: Place, monkeypatch: pytest.MonkeyPatch
@@ -319,7 +310,7 @@ class TestFullDisk:
             assert tried == [3, 1] * 2
             with pytest.raises(errors.NotFound):
                 store.delete_scene(OFFICE)
-        assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+        assert row_counts(place) == EMPTY
 
 
 class TestMemory:
@@ -380,14 +371,12 @@ def test_servers_that_delete_at_the_same_time_help_one_another(place: Place, mon
 
         before_each_portion(monkeypatch, delete_the_other)
         one.delete_scene(OFFICE)
-        assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+        assert row_counts(place) == EMPTY
 
 
-def test_a_statement_s_limit_does_not_keep_a_scene_alive(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(deletion, "REFERENCES_AT_A_TIME", 3)
-    place = place_on("postgresql", lambda: tmp_path)
+def test_a_statement_s_limit_does_not_keep_a_scene_alive(shared: Shared, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(postgresql._SESSION_OPTIONS, "statement_timeout", "300ms")
-    with place.open() as store:
+    with shared.open() as store:
         fill(store, OFFICE, 20)
         with store.database.write() as connection:
             connection.exec_driver_sql(
@@ -398,4 +387,4 @@ def test_a_statement_s_limit_does_not_keep_a_scene_alive(monkeypatch: pytest.Mon
                 "CREATE TRIGGER slow BEFORE UPDATE OR DELETE ON reference FOR EACH ROW EXECUTE FUNCTION slow()"
             )
         store.delete_scene(OFFICE)
-        assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 0)
+        assert row_counts(shared) == EMPTY

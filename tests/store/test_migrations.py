@@ -11,14 +11,12 @@ from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import Connection, insert, text
 from support.stores import (
-    DATABASES,
     EXTRACTOR,
     Folder,
     Place,
     Shared,
     assert_same_view,
     make_reference,
-    place_on,
     view_of,
 )
 
@@ -26,9 +24,7 @@ from mapless_server.security import SceneKey
 from mapless_server.store import (
     DATABASE_FILE,
     SCHEMA_VERSION,
-    PostgresqlDatabase,
     SceneAttributes,
-    SqliteDatabase,
     Store,
     StoreError,
     back_up,
@@ -39,11 +35,6 @@ from mapless_server.store.migrations import migrate, run_steps
 from mapless_server.store.tables import features, image, metadata, reference, scene_generation
 
 OFFICE = SceneKey("office")
-
-
-@pytest.fixture(params=DATABASES)
-def place(request: pytest.FixtureRequest, tmp_path: Path) -> Place:
-    return place_on(request.param, lambda: tmp_path)
 
 
 class Raw:
@@ -121,7 +112,7 @@ def test_a_store_of_the_second_release_has_no_attributes(place: Place, tmp_path:
         connection.execute(insert(scene_generation).values(scene_id="hall", generation=1))
     place.execute(create, "office")
     if isinstance(place, Folder):
-        with closing(SqliteDatabase.open_as_is(place.data_dir / DATABASE_FILE)) as database:
+        with closing(place.open_as_is()) as database:
             assert back_up(database, tmp_path / "backup").faults == ()
         with Store.open(tmp_path / "other") as store:
             assert restore(tmp_path / "backup", store.database).faults == ()
@@ -190,21 +181,16 @@ def test_a_step_that_fails_changes_nothing(place: Place, monkeypatch: pytest.Mon
 
 def test_looking_changes_nothing(place: Place) -> None:
     make_version_1(place)
-    if isinstance(place, Shared):
-        PostgresqlDatabase.open_as_is(place.url).close()
-    else:
-        assert isinstance(place, Folder)
-        SqliteDatabase.open_as_is(place.data_dir / DATABASE_FILE).close()
+    place.open_as_is().close()
     assert place.fetch("SELECT schema_version FROM store_version") == [(1,)]
 
 
 @pytest.mark.parametrize("is_empty", [True, False])
-def test_of_servers_that_start_at_once_one_migrates(is_empty: bool) -> None:
-    place = place_on("postgresql", Path)
+def test_of_servers_that_start_at_once_one_migrates(shared: Shared, is_empty: bool) -> None:
     if not is_empty:
-        make_version_1(place)
+        make_version_1(shared)
     with ThreadPoolExecutor(6) as pool:
-        stores: list[Store] = list(pool.map(lambda _: place.open(), range(6)))
+        stores: list[Store] = list(pool.map(lambda _: shared.open(), range(6)))
     try:
         if is_empty:
             stores[0].create_scene(OFFICE)
@@ -212,4 +198,4 @@ def test_of_servers_that_start_at_once_one_migrates(is_empty: bool) -> None:
     finally:
         for store in stores:
             store.close()
-    assert place.fetch("SELECT schema_version FROM store_version") == [(SCHEMA_VERSION,)]
+    assert shared.fetch("SELECT schema_version FROM store_version") == [(SCHEMA_VERSION,)]

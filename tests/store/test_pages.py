@@ -5,15 +5,14 @@ Features and descriptors here are large enough to lie on pages of their own. A p
 
 from __future__ import annotations
 
-from contextlib import closing
 from pathlib import Path
 
 import pytest
-from support.stores import EXTRACTOR, make_reference, view_of
+from support.stores import EXTRACTOR, Folder, faults_of, make_reference, view_of
 
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
 from mapless_server.security import SceneKey
-from mapless_server.store import DATABASE_FILE, SqliteDatabase, Store, deletion, verify
+from mapless_server.store import DATABASE_FILE, deletion
 
 SCENE = SceneKey("office")
 IDS = ["a", "b", "c"]
@@ -22,15 +21,16 @@ MADE = {it: make_reference(it, seed, count=100, dimension=6000) for seed, it in 
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    with Store.open(tmp_path) as store:
+def folder(tmp_path: Path) -> Folder:
+    folder = Folder(tmp_path)
+    with folder.open() as store:
         store.create_scene(SCENE)
         store.add_references(SCENE, list(MADE.values()))
-    return tmp_path
+    return folder
 
 
-def lose_page_with(folder: Path, content: bytes) -> None:
-    path = folder / DATABASE_FILE
+def lose_page_with(folder: Folder, content: bytes) -> None:
+    path = folder.data_dir / DATABASE_FILE
     at = path.read_bytes().find(content)
     assert at > 0
     with path.open("r+b") as file:
@@ -38,7 +38,7 @@ def lose_page_with(folder: Path, content: bytes) -> None:
         file.write(bytes(PAGE_BYTES))
 
 
-def lose(folder: Path, what: str, reference_id: str) -> None:
+def lose(folder: Folder, what: str, reference_id: str) -> None:
     made = MADE[reference_id]
     stored = {
         "image": made.image[4000:4016],
@@ -48,14 +48,9 @@ def lose(folder: Path, what: str, reference_id: str) -> None:
     lose_page_with(folder, stored[what])
 
 
-def faults_of(folder: Path) -> tuple[str, ...]:
-    with closing(SqliteDatabase.open_as_is(folder / DATABASE_FILE)) as database, database.read() as connection:
-        return verify(connection).faults
-
-
-def test_lost_features_name_their_reference_and_others_load(folder: Path) -> None:
+def test_lost_features_name_their_reference_and_others_load(folder: Folder) -> None:
     lose(folder, "features", "b")
-    with Store.open(folder) as store:
+    with folder.open() as store:
         for asked in (IDS, ["b"], ["c", "b"], None):
             with pytest.raises(DataLoss, match="'b' is damaged"):
                 store.load_references(SCENE, asked, EXTRACTOR)
@@ -63,9 +58,9 @@ def test_lost_features_name_their_reference_and_others_load(folder: Path) -> Non
         assert [it.record.reference_id for it in loaded] == ["c", "a"]
 
 
-def test_an_image_that_is_lost_names_its_reference(folder: Path) -> None:
+def test_an_image_that_is_lost_names_its_reference(folder: Folder) -> None:
     lose(folder, "image", "b")
-    with Store.open(folder) as store:
+    with folder.open() as store:
         (loaded,) = store.load_references(SCENE, ["b"], EXTRACTOR).references
         with pytest.raises(DataLoss, match="'b' is damaged"):
             store.read_image(SCENE, "b")
@@ -74,21 +69,21 @@ def test_an_image_that_is_lost_names_its_reference(folder: Path) -> None:
         assert store.read_image(SCENE, "a") == MADE["a"].image
 
 
-def test_a_lost_descriptor_leaves_its_reference_unindexed(folder: Path) -> None:
+def test_a_lost_descriptor_leaves_its_reference_unindexed(folder: Folder) -> None:
     lose(folder, "descriptor", "b")
-    with Store.open(folder) as store:
+    with folder.open() as store:
         changes = store.list_changes(SCENE, None, "vlad")
         assert [it.reference_id for it in changes.added] == ["a", "c"]
         assert changes.damaged == ("b",)
 
 
 @pytest.mark.parametrize("what", ["image", "features", "descriptor"])
-def test_any_loss_is_reported_and_the_reference_can_be_replaced(folder: Path, what: str) -> None:
+def test_any_loss_is_reported_and_the_reference_can_be_replaced(folder: Folder, what: str) -> None:
     lose(folder, what, "b")
     named = [fault for fault in faults_of(folder) if "reference" in fault]
     assert named
     assert all("'b'" in fault for fault in named)
-    with Store.open(folder) as store:
+    with folder.open() as store:
         with pytest.raises(AlreadyExists):
             store.add_references(SCENE, [MADE["b"]])
         store.delete_reference(SCENE, "b")
@@ -103,11 +98,13 @@ def test_any_loss_is_reported_and_the_reference_can_be_replaced(folder: Path, wh
 
 
 @pytest.mark.parametrize("at_a_time", [1, 2, 100])
-def test_a_scene_with_lost_pages_can_be_deleted(folder: Path, at_a_time: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_with_lost_pages_can_be_deleted(
+    folder: Folder, at_a_time: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(deletion, "REFERENCES_AT_A_TIME", at_a_time)
     lose(folder, "features", "b")
     lose(folder, "features", "c")
-    with Store.open(folder) as store:
+    with folder.open() as store:
         store.delete_scene(SCENE)
         with pytest.raises(NotFound):
             store.get_scene(SCENE)
@@ -116,15 +113,13 @@ def test_a_scene_with_lost_pages_can_be_deleted(folder: Path, at_a_time: int, mo
         assert store.get_scene(SCENE).reference_count == 3
         store.delete_scene(SCENE)
         assert store.list_scenes("default", 10) == []
-    with closing(SqliteDatabase.open_as_is(folder / DATABASE_FILE)) as database, database.read() as connection:
-        left = connection.exec_driver_sql("SELECT count(*) FROM reference").scalar()
-    assert left == 2, "of those that cannot be deleted"
+    assert folder.fetch("SELECT count(*) FROM reference") == [(2,)], "of those that cannot be deleted"
 
 
-def test_a_lost_table_of_references_names_no_reference(folder: Path) -> None:
-    with Store.open(folder) as store:
+def test_a_lost_table_of_references_names_no_reference(folder: Folder) -> None:
+    with folder.open() as store:
         key = store.get_reference(SCENE, "a").key
     lose_page_with(folder, f"{key}office".encode())
-    with Store.open(folder) as store, pytest.raises(DataLoss, match="the store is damaged"):
+    with folder.open() as store, pytest.raises(DataLoss, match="the store is damaged"):
         store.load_references(SCENE, IDS, EXTRACTOR)
     assert any(fault.startswith("database: ") for fault in faults_of(folder))

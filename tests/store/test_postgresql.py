@@ -1,4 +1,4 @@
-"""Several servers share one PostgreSQL: what one writes, the others see at once; and it may go away and come back."""
+"""Several servers on one PostgreSQL: each sees at once what another writes; the database may go away and come back."""
 
 from __future__ import annotations
 
@@ -21,13 +21,8 @@ NAME = "vlad"
 
 
 @pytest.fixture
-def place() -> Shared:
-    return Shared(postgres.shared_cluster().fresh_url())
-
-
-@pytest.fixture
-def both(place: Shared) -> Iterator[tuple[Store, Store]]:
-    with place.open() as one, place.open() as other:
+def both(shared: Shared) -> Iterator[tuple[Store, Store]]:
+    with shared.open() as one, shared.open() as other:
         yield one, other
 
 
@@ -64,44 +59,42 @@ class TestSharing:
         with pytest.raises(errors.NotFound, match="office"):
             one.list_changes(OFFICE, loaded.generation, NAME)
 
-    def test_a_repeated_load_reads_no_features(self, both: tuple[Store, Store], place: Shared) -> None:
+    def test_a_repeated_load_reads_no_features(self, both: tuple[Store, Store], shared: Shared) -> None:
         one, other = both
         one.create_scene(OFFICE)
         one.add_references(OFFICE, [make_reference("a")])
         first = other.load_references(OFFICE, ["a"], EXTRACTOR)
-        place.execute("UPDATE features SET data = ?", b"wrong")
+        shared.execute("UPDATE features SET data = ?", b"wrong")
         one.add_references(OFFICE, [make_reference("b")])
         again = other.load_references(OFFICE, ["a"], EXTRACTOR)
         assert again.references[0] is first.references[0]
         assert again.generation == first.generation + 1
 
-    def test_one_server_gets_an_id(self, both: tuple[Store, Store]) -> None:
-        both[0].create_scene(OFFICE)
+    @pytest.mark.parametrize("what", ["scene", "reference", "features"])
+    def test_one_of_many_changes_wins(self, both: tuple[Store, Store], what: str) -> None:
+        if what != "scene":
+            both[0].create_scene(OFFICE)
+        keys = [it.key for it in both[0].add_references(OFFICE, [make_reference("a")])] if what == "features" else []
 
-        def add(number: int) -> bool:
+        def change(number: int) -> bool:
+            store = both[number % 2]
             try:
-                both[number % 2].add_references(OFFICE, [make_reference("mine", number), make_reference(f"n{number}")])
+                if what == "scene":
+                    store.create_scene(OFFICE)
+                elif what == "reference":
+                    store.add_references(OFFICE, [make_reference("mine", number), make_reference(f"n{number}")])
+                else:
+                    store.add_features(keys[0], "other", view_of(make_reference("a", number)))
             except errors.AlreadyExists:
                 return False
             return True
 
         with ThreadPoolExecutor(8) as pool:
-            won = list(pool.map(add, range(16)))
-        assert sum(won) == 1
+            assert sum(pool.map(change, range(16))) == 1
         scene = both[1].get_scene(OFFICE)
-        assert (scene.reference_count, scene.generation) == (2, 2)
-
-    def test_one_server_gets_a_scene(self, both: tuple[Store, Store]) -> None:
-        def create(number: int) -> bool:
-            try:
-                both[number % 2].create_scene(OFFICE)
-            except errors.AlreadyExists:
-                return False
-            return True
-
-        with ThreadPoolExecutor(8) as pool:
-            assert sum(pool.map(create, range(16))) == 1
-        assert both[0].get_scene(OFFICE).generation == 1
+        assert (scene.reference_count, scene.generation) == {"scene": (0, 1), "reference": (2, 2), "features": (1, 2)}[
+            what
+        ]
 
     def test_writers_of_one_scene_wait_and_nothing_is_lost(self, both: tuple[Store, Store]) -> None:
         both[0].create_scene(OFFICE)
@@ -120,20 +113,6 @@ class TestSharing:
         scene = both[0].get_scene(OFFICE)
         assert (scene.reference_count, scene.generation) == (8 * 3, 1 + 8 * 7)
         assert len(both[1].list_references(OFFICE, 100)) == 24
-
-    def test_one_server_describes_a_reference(self, both: tuple[Store, Store]) -> None:
-        both[0].create_scene(OFFICE)
-        (record,) = both[0].add_references(OFFICE, [make_reference("a")])
-
-        def describe(number: int) -> bool:
-            try:
-                both[number % 2].add_features(record.key, "other", view_of(make_reference("a", number)))
-            except errors.AlreadyExists:
-                return False
-            return True
-
-        with ThreadPoolExecutor(8) as pool:
-            assert sum(pool.map(describe, range(16))) == 1
 
     def test_a_scene_deleted_during_additions_is_gone_or_whole(self, both: tuple[Store, Store]) -> None:
         one, other = both
@@ -187,7 +166,7 @@ class TestGoingAway:
                 name = f"r{life}"
                 store.add_references(OFFICE, [make_reference("a", 9)] if life == 0 else [make_reference(name, life)])
                 acknowledged.append("a" if life == 0 else name)
-                with ThreadPoolExecutor(4) as pool:  # connections to be thrown away
+                with ThreadPoolExecutor(4) as pool:  # so that there are connections to drop
                     list(pool.map(lambda _: store.get_scene(OFFICE), range(8)))
                 cluster.stop(how)
                 for operation in operations(store):
@@ -202,8 +181,8 @@ class TestGoingAway:
                 assert_same_view(loaded.view, view_of(make_reference("a", 9)))
                 assert store.get_scene(OFFICE).reference_count == len(acknowledged)
 
-    def test_a_connection_that_is_ended_is_one_error_at_most(self, place: Shared) -> None:
-        with place.open() as store:
+    def test_a_connection_that_is_ended_is_one_error_at_most(self, shared: Shared) -> None:
+        with shared.open() as store:
             store.create_scene(OFFICE)
             for _ in range(3):
                 with postgres.shared_cluster().connect() as connection:
@@ -213,8 +192,8 @@ class TestGoingAway:
                     )
                 assert store.get_scene(OFFICE).generation == 1  # a dead connection is noticed before it is used
 
-    def test_a_change_cut_off_in_its_middle_leaves_nothing(self, place: Shared) -> None:
-        with place.open() as store:
+    def test_a_change_cut_off_in_its_middle_leaves_nothing(self, shared: Shared) -> None:
+        with shared.open() as store:
             store.create_scene(OFFICE)
 
             def change() -> None:
@@ -232,12 +211,12 @@ class TestGoingAway:
 
 class TestLimits:
     def test_who_waits_too_long_for_a_lock_is_told_to_come_back(
-        self, place: Shared, monkeypatch: pytest.MonkeyPatch
+        self, shared: Shared, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setitem(postgresql._SESSION_OPTIONS, "lock_timeout", "50ms")
-        with place.open() as store:
+        with shared.open() as store:
             store.create_scene(OFFICE)
-            with psycopg.connect(place.url) as other:
+            with psycopg.connect(shared.url) as other:
                 other.execute("SELECT * FROM scene_generation FOR UPDATE")
                 with pytest.raises(errors.Unavailable, match="busy"):
                     store.add_references(OFFICE, [make_reference("a")])
@@ -245,11 +224,11 @@ class TestLimits:
             store.add_references(OFFICE, [make_reference("a")])
 
     def test_more_threads_than_connections_wait_or_are_told(
-        self, place: Shared, monkeypatch: pytest.MonkeyPatch
+        self, shared: Shared, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(postgresql, "CONNECTIONS_AT_MOST", 4)
         monkeypatch.setattr(postgresql, "CONNECTION_WAIT_S", 0.05)
-        with place.open() as store:
+        with shared.open() as store:
             store.create_scene(OFFICE)
             with ThreadPoolExecutor(16) as pool:  # they hold one for less than that
                 monkeypatch.setattr(postgresql, "CONNECTION_WAIT_S", 5.0)
@@ -262,7 +241,7 @@ class TestLimits:
                     it.__exit__(None, None, None)
                 assert len({it.generation for it in pool.map(lambda _: store.get_scene(OFFICE), range(4))}) == 1
 
-    def test_settings_of_every_connection(self, place: Shared) -> None:
+    def test_settings_of_every_connection(self, shared: Shared) -> None:
         expected = {
             "synchronous_commit": "on",
             "statement_timeout": "1min",
@@ -270,7 +249,7 @@ class TestLimits:
             "idle_in_transaction_session_timeout": "1min",
             "application_name": "mapless-server",
         }
-        with place.open() as store:
+        with shared.open() as store:
             for transaction, isolation in (
                 (store.database.read(), "repeatable read"),
                 (store.database.write(), "read committed"),
@@ -281,8 +260,8 @@ class TestLimits:
             with store.database.read() as connection, pytest.raises(Exception, match="read-only"):
                 connection.exec_driver_sql("DELETE FROM scene")
 
-    def test_an_operator_may_be_stricter(self, place: Shared) -> None:
-        url = place.url + "%20-csynchronous_commit%3Dremote_apply&application_name=mine"
+    def test_an_operator_may_be_stricter(self, shared: Shared) -> None:
+        url = shared.url + "%20-csynchronous_commit%3Dremote_apply&application_name=mine"
         with Store.connect(url) as store, store.database.read() as connection:
             assert connection.exec_driver_sql("SHOW synchronous_commit").scalar() == "remote_apply"
             assert connection.exec_driver_sql("SHOW application_name").scalar() == "mine"

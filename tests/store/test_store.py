@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import struct
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy.exc import IntegrityError
 from support.stores import (
-    DATABASES,
     EXTRACTOR,
+    CountingStoreObserver,
     Folder,
     Place,
     assert_same_bits,
@@ -48,22 +48,6 @@ DENIALS = {
 """Makes a transaction fail in its middle, and ends that."""
 
 OFFICE, HALL, SCENE, NOWHERE = map(SceneKey, ("office", "hall", "scene", "nowhere"))
-
-
-@pytest.fixture(scope="session", params=DATABASES)
-def database(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-@pytest.fixture
-def place(database: str, tmp_path: Path) -> Place:
-    return place_on(database, lambda: tmp_path)
-
-
-@pytest.fixture
-def store(place: Place) -> Iterator[Store]:
-    with place.open() as store:
-        yield store
 
 
 class TestScenes:
@@ -99,16 +83,6 @@ class TestScenes:
             with pytest.raises(errors.NotFound, match="nowhere") as caught:
                 call()
             assert caught.value.field == "scene"
-
-    def test_deleted_scene_takes_its_references_along(self, store: Store, place: Place) -> None:
-        store.create_scene(OFFICE)
-        store.create_scene(HALL)
-        store.add_references(OFFICE, [make_reference("a")])
-        store.add_references(HALL, [make_reference("a")])
-        store.delete_scene(OFFICE)
-        assert [scene.scene_id for scene in store.list_scenes(DEFAULT_TENANT, 10)] == ["hall"]
-        for table in ("reference", "image", "features"):
-            assert place.fetch(f"SELECT count(*) FROM {table}") == [(1,)], table
 
 
 class TestGenerations:
@@ -430,9 +404,44 @@ class TestMemory:
         assert len(store.load_references(SceneKey("kept"), None, EXTRACTOR).references) == 2
         assert store.reference_cache.evictions == 0
 
+    @pytest.mark.parametrize("forgotten", [[], ["b"], ["a", "b"]])
+    def test_hits_and_misses_are_counted_once_per_reference(self, store: Store, forgotten: list[str]) -> None:
+        store.create_scene(OFFICE)
+        records = store.add_references(OFFICE, [make_reference(it) for it in "ab"])
+        cache = store.reference_cache
+        store.load_references(OFFICE, ["a", "b"], EXTRACTOR)
+        assert (cache.hits, cache.misses) == (0, 2)
+        for record in records:
+            if record.reference_id in forgotten:
+                del cache._entries[record.key, EXTRACTOR]
+        loaded = store.load_references(OFFICE, ["a", "b"], EXTRACTOR)
+        assert [it.record.reference_id for it in loaded.references] == ["a", "b"]
+        assert (cache.hits, cache.misses) == (2 - len(forgotten), 2 + len(forgotten))
+
     def test_negative_capacity_is_refused(self) -> None:
         with pytest.raises(ValueError, match="negative"):
             LruCache(-1)
+
+
+class TestObserver:
+    """Faults: see test_sqlite."""
+
+    def test_every_operation_is_observed(self) -> None:
+        methods = {name for name, _ in inspect.getmembers(Store, inspect.isfunction) if not name.startswith("_")}
+        observed = {name for name in methods if hasattr(getattr(Store, name), "__wrapped__")}
+        assert methods - observed == {"open", "connect", "close", "uncached"}
+
+    def test_each_operation_is_reported_once_and_misuse_is_no_fault(self, store: Store) -> None:
+        store.observer = observer = CountingStoreObserver()
+        store.create_scene(HALL)
+        store.add_references(HALL, [make_reference("a")])
+        store.load_references(HALL, ["a"], EXTRACTOR)
+        with pytest.raises(errors.AlreadyExists):
+            store.create_scene(HALL)
+        with pytest.raises(errors.NotFound):
+            store.get_reference(HALL, "b")
+        expected = ["create_scene", "add_references", "load_references", "create_scene", "get_reference"]
+        assert (observer.operations, observer.failures) == (expected, 0)
 
 
 class TestThreads:

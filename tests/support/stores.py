@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,7 +13,16 @@ import psycopg
 
 from mapless.geometry import Camera, Distortion, RigidTransform, rotation_from_vector
 from mapless_server.method.views import Features, View
-from mapless_server.store import NewReference, Store, sqlite
+from mapless_server.store import (
+    DATABASE_FILE,
+    Database,
+    NewReference,
+    PostgresqlDatabase,
+    SqliteDatabase,
+    Store,
+    sqlite,
+    verify,
+)
 from mapless_server.store.store import DEFAULT_CACHE_BYTES
 from support import postgres
 
@@ -22,10 +31,14 @@ DATABASES = ("sqlite", "postgresql")
 
 
 class Place(Protocol):
-    """A database that stores are opened on, and that can be reached into behind their backs."""
+    """A database that stores are opened on, and that tests can read and change without them."""
 
     def open(self, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
         """A store on it."""
+        ...
+
+    def open_as_is(self) -> Database:
+        """Its database, not migrated."""
         ...
 
     def fetch(self, statement: str, *parameters: object) -> list[tuple[Any, ...]]:
@@ -47,6 +60,10 @@ class Folder:
         """Implements Place."""
         return Store.open(self.data_dir, cache_bytes)
 
+    def open_as_is(self) -> SqliteDatabase:
+        """Implements Place."""
+        return SqliteDatabase.open_as_is(self.data_dir / DATABASE_FILE)
+
     def fetch(self, statement: str, *parameters: object) -> list[tuple[Any, ...]]:
         """Implements Place."""
         with closing(self.connect()) as connection:
@@ -59,7 +76,7 @@ class Folder:
 
     def connect(self) -> Any:
         """With the store's own library: another one in the same process would neither see nor keep its locks."""
-        return sqlite.choose_library().connect(self.data_dir / sqlite.DATABASE_FILE, timeout=0)
+        return sqlite.choose_library().connect(self.data_dir / DATABASE_FILE, timeout=0)
 
 
 @dataclass(frozen=True)
@@ -72,6 +89,10 @@ class Shared:
         """Implements Place."""
         return Store.connect(self.url, cache_bytes)
 
+    def open_as_is(self) -> PostgresqlDatabase:
+        """Implements Place."""
+        return PostgresqlDatabase.open_as_is(self.url)
+
     def fetch(self, statement: str, *parameters: object) -> list[tuple[Any, ...]]:
         """Implements Place."""
         with psycopg.connect(self.url) as connection:
@@ -83,11 +104,34 @@ class Shared:
             assert connection.execute(_in_psycopg(statement), parameters).rowcount != 0, "nothing was changed"
 
 
+@dataclass
+class CountingStoreObserver:
+    """Keeps what it receives."""
+
+    operations: list[str] = field(default_factory=list)
+    failures: int = 0
+
+    def stored(self, operation: str, seconds: float) -> None:
+        """Implements StoreObserver."""
+        assert seconds >= 0
+        self.operations.append(operation)
+
+    def store_failed(self) -> None:
+        """Implements StoreObserver."""
+        self.failures += 1
+
+
 def place_on(database: str, new_folder: Callable[[], Path]) -> Place:
     """An empty place; skips the test where there is no such database."""
     if database == "sqlite":
         return Folder(new_folder() / "data")
     return Shared(postgres.shared_cluster().fresh_url())
+
+
+def faults_of(place: Place) -> tuple[str, ...]:
+    """What verification finds."""
+    with closing(place.open_as_is()) as database, database.read() as connection:
+        return verify(connection).faults
 
 
 def make_reference(
