@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import grpc
 import pytest
@@ -59,3 +60,33 @@ def test_a_connection_that_cannot_be_made_is_told_in_words(
 def test_what_the_server_itself_says_stays(addresses: dict[str, str]) -> None:
     with Client(addresses["plain"]) as client, pytest.raises(MaplessError, match="UNIMPLEMENTED: Method not found!"):
         client.is_serving()
+
+
+def test_neither_token_nor_key_is_shown() -> None:
+    options = ConnectOptions(tls=True, client_certificate=b"cert", client_key=b"SECRET", token="SECRET")
+    assert "SECRET" not in repr(options)
+    assert options.metadata() == (("authorization", "Bearer SECRET"),)
+
+
+def test_without_token_and_client_id_nothing_is_sent() -> None:
+    assert ConnectOptions().metadata() == ()
+    assert ConnectOptions(client_id="r7").metadata() == (("x-client-id", "r7"),)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "complaint"),
+    [
+        ({"client_certificate": b"x"}, "go together"),
+        ({"client_key": b"x", "tls": True}, "go together"),
+        ({"client_certificate": b"x", "client_key": b"x"}, "needs tls"),
+        ({"token": "SECRET\n"}, "token must be"),
+        ({"token": ""}, "token must be"),
+        ({"token": "SECRET\N{BULLET}"}, "token must be"),
+        ({"client_id": "a b"}, "client_id must be"),
+        ({"client_id": "a\n"}, "client_id must be"),
+    ],
+)
+def test_a_malformed_secret_is_rejected_without_showing_it(wrong: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint) as caught:
+        ConnectOptions(**wrong)
+    assert "SECRET" not in str(caught.value)

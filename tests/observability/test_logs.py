@@ -60,7 +60,7 @@ def written(message: object = "m", /, *args: object, **fields: Any) -> dict[str,
     return read
 
 
-def test_a_line_says_when_what_and_who() -> None:
+def test_a_line_has_time_level_logger_and_message() -> None:
     record = record_of("%s of %d", "one", 2, scene="hall", inlier_count=90)
     record.created = datetime(2026, 11, 21, 8, 30, 15, 123456, timezone.utc).timestamp()
     assert json.loads(JsonFormatter().format(record)) == {
@@ -119,7 +119,7 @@ def test_any_message_and_any_fields_are_one_object_on_one_line(message: str, fie
         ("half a character \ud800", "half a character \ud800"),
     ],
 )
-def test_odd_values_are_told_in_words_that_json_has(value: object, shown: object) -> None:
+def test_every_value_has_a_form_in_json(value: object, shown: object) -> None:
     line = written(value=value)["value"]
     assert line == shown if shown is not None else line
 
@@ -136,20 +136,20 @@ def test_a_list_that_holds_itself_and_large_ones_are_cut() -> None:
     assert len(written("x" * 10**6)["message"]) < MAX_TEXT + 100
 
 
-def test_fields_cannot_pass_for_what_every_line_has() -> None:
+def test_fields_cannot_replace_those_of_every_line() -> None:
     line = written("m", level="fake", ts="fake", logger="fake", name="scene", message="x", args="y", exception="z")
     assert (line["level"], line["logger"], line["message"]) == ("info", "a.b", "m")
     assert (line["level_"], line["name_"], line["message_"], line["exception_"]) == ("fake", "scene", "x", "z")
 
 
 @pytest.mark.parametrize("formatter", [JsonFormatter(), TextFormatter()])
-def test_what_a_library_marks_records_with_is_no_field(formatter: logging.Formatter) -> None:
+def test_marks_of_other_libraries_are_no_fields(formatter: logging.Formatter) -> None:
     line = formatter.format(record_of("m", scene="hall", _mark_of_a_library=1))
     assert "hall" in line
     assert "_mark_of_a_library" not in line
 
 
-def test_arguments_that_do_not_fit_are_shown_as_they_are() -> None:
+def test_arguments_that_do_not_fit_the_message_are_shown() -> None:
     assert written("%d of %d", "one")["message"] == "%d of %d ['one']"
     assert written("%s", Unshowable())["message"] == "%s ['<Unshowable that raises RuntimeError>']"
 
@@ -172,7 +172,7 @@ def test_an_exception_belongs_to_its_line(formatter: logging.Formatter) -> None:
     assert isinstance(formatter, TextFormatter) or len(lines) == 1
 
 
-def test_text_shows_fields_and_forges_nothing() -> None:
+def test_text_shows_fields_and_escapes_line_breaks() -> None:
     text = TextFormatter().format(record_of("a\nb", scene="x y\n", count=3, escape="\x1b[2J"))
     first, second = text.split("\n")
     assert first.endswith(" INFO a.b: a")
@@ -238,7 +238,7 @@ def untouched_root() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("untouched_root")
-def test_everything_that_is_logged_is_one_object_a_line() -> None:
+def test_every_log_is_one_object_a_line() -> None:
     stream = io.StringIO()
     configure_logging(Settings(log_level="info", log_format="json"), stream)
     log = logging.getLogger("somewhere.else")

@@ -161,7 +161,7 @@ def metrics() -> Metrics:
     return Metrics()
 
 
-def test_names_types_and_labels_are_those_that_dashboards_know(metrics: Metrics) -> None:
+def test_names_types_and_labels_match_the_dashboards(metrics: Metrics) -> None:
     count_everything(metrics)
     families = {f.name: f for f in text_string_to_metric_families(generate_latest(metrics.registry).decode())}
     ours = {name: family for name, family in families.items() if name.startswith(("mapless", "grpc"))}
@@ -183,7 +183,7 @@ def test_names_types_and_labels_are_those_that_dashboards_know(metrics: Metrics)
     assert all(family.documentation for family in ours.values())
 
 
-def test_metrics_that_nobody_moved_yet_are_described(metrics: Metrics) -> None:
+def test_metrics_without_events_are_described(metrics: Metrics) -> None:
     families = {f.name for f in text_string_to_metric_families(generate_latest(metrics.registry).decode())}
     assert families >= {name.removesuffix("_total") for name in COUNTERS} | set(GAUGES) | set(HISTOGRAMS)
 
@@ -209,7 +209,7 @@ def test_an_event_is_counted_once_and_was_zero_before(
     assert changed(before, samples_of(metrics)) == {key: 1}
 
 
-def test_watching_is_counted_as_a_call_without_latency(metrics: Metrics) -> None:
+def test_watching_is_counted_without_a_latency(metrics: Metrics) -> None:
     before, watch = samples_of(metrics), "/mapless.v1.LocalizationService/WatchQueries"
     metrics.call_started(watch)
     metrics.call_handled(watch, "CANCELLED", 3600.0, "ab" * 16)
@@ -231,7 +231,7 @@ def test_a_stream_has_a_latency_and_a_first_answer_latency(metrics: Metrics) -> 
     assert sums == {"mapless_coarse_answer_seconds_sum": 0.25, "grpc_server_handling_seconds_sum": 0.5}
 
 
-def test_a_batch_adds_to_size_time_and_business(metrics: Metrics) -> None:
+def test_a_batch_adds_to_size_time_and_busy_seconds(metrics: Metrics) -> None:
     before = samples_of(metrics)
     metrics.computed("coarse", "392x518x10", 3, 0.25)
     changes = changed(before, samples_of(metrics))
@@ -263,7 +263,7 @@ def test_stages_of_stronger_features_are_a_tier_not_a_name(metrics: Metrics) -> 
         ("mapless_inliers", 50.0),
     ],
 )
-def test_there_is_an_edge_where_something_is_promised(metrics: Metrics, histogram: str, edge: float) -> None:
+def test_buckets_have_an_edge_at_each_limit(metrics: Metrics, histogram: str, edge: float) -> None:
     edges = {
         float(dict(labels)["le"])
         for name, labels in samples_of(metrics)
@@ -273,7 +273,7 @@ def test_there_is_an_edge_where_something_is_promised(metrics: Metrics, histogra
     assert math.inf in edges
 
 
-def test_series_do_not_grow_with_what_is_told(metrics: Metrics) -> None:
+def test_series_are_bounded_whatever_is_counted(metrics: Metrics) -> None:
     count_everything(metrics)
     for i in range(100):
         metrics.computed(f"stage-{i}", f"bucket-{i}", 1, 0.1)
@@ -298,7 +298,7 @@ def test_series_do_not_grow_with_what_is_told(metrics: Metrics) -> None:
     assert batches[other] > 1900
 
 
-def test_quality_that_is_not_known_or_not_a_number_is_left_out(metrics: Metrics) -> None:
+def test_unknown_or_infinite_quality_is_not_counted(metrics: Metrics) -> None:
     metrics.answered(
         LOCALIZED, inlier_count=10, match_count=0, reprojection_error_px=math.nan, scale_deviation=math.inf
     )
@@ -313,14 +313,14 @@ def test_quality_that_is_not_known_or_not_a_number_is_left_out(metrics: Metrics)
     assert samples["mapless_scale_deviation_count", frozenset()] == 0
 
 
-def test_two_servers_in_one_process_count_for_themselves() -> None:
+def test_two_servers_in_one_process_count_separately() -> None:
     first, second = Metrics(), Metrics()
     first.failed_fatally()
     assert samples_of(first)["mapless_fatal_total", frozenset()] == 1
     assert samples_of(second)["mapless_fatal_total", frozenset()] == 0
 
 
-def test_caches_are_read_when_somebody_asks(metrics: Metrics) -> None:
+def test_caches_are_read_at_every_scrape(metrics: Metrics) -> None:
     count_everything(metrics)
     samples = samples_of(metrics)
     assert samples["mapless_reference_cache_hits_total", frozenset()] == 1
@@ -333,9 +333,7 @@ def test_caches_are_read_when_somebody_asks(metrics: Metrics) -> None:
     assert samples_of(metrics)["mapless_reference_cache_hits_total", frozenset()] == 17
 
 
-def test_one_that_cannot_be_read_blinds_nobody_to_the_others(
-    metrics: Metrics, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_failing_source_does_not_hide_other_metrics(metrics: Metrics, caplog: pytest.LogCaptureFixture) -> None:
     count_everything(metrics)
 
     def broken() -> LruCache[str]:
@@ -383,7 +381,7 @@ def ask(port: int, path: str) -> tuple[int, str]:
             return error.code, error.read().decode()
 
 
-def test_the_port_is_ready_exactly_while_health_says_serving(metrics: Metrics, server: MetricsServer) -> None:
+def test_ready_is_200_exactly_while_health_is_serving(metrics: Metrics, server: MetricsServer) -> None:
     assert ask(server.port, "/ready") == (503, "not serving\n")  # starting
     metrics.set_serving(True)
     assert ask(server.port, "/ready") == (200, "serving\n")
@@ -417,7 +415,7 @@ def test_nothing_else_is_on_the_port(metrics: Metrics, server: MetricsServer, pa
     assert ask(server.port, path) == (404, "there are /metrics, /ready and /live\n")
 
 
-def test_the_port_serves_exemplars_to_who_asks_for_open_metrics(metrics: Metrics, server: MetricsServer) -> None:
+def test_the_port_serves_exemplars_as_open_metrics(metrics: Metrics, server: MetricsServer) -> None:
     metrics.call_handled(LOCALIZE, "OK", 0.25, "0af7651916cd43dd8448eb211c80319c")
     request = urllib.request.Request(
         f"http://127.0.0.1:{server.port}/metrics", headers={"Accept": "application/openmetrics-text; version=1.0.0"}
@@ -447,7 +445,7 @@ def test_closing_frees_the_port_and_ends_connection_threads(metrics: Metrics) ->
     again.close()
 
 
-def test_idle_connections_take_few_threads_and_keep_nobody_out(server: MetricsServer) -> None:
+def test_idle_connections_take_few_threads_and_block_no_scrape(server: MetricsServer) -> None:
     idle = [socket.create_connection(("127.0.0.1", server.port), 10) for _ in range(10 * MAX_CONNECTIONS)]
     try:
         for connection in idle:
@@ -475,7 +473,7 @@ def test_a_silent_connection_is_closed(metrics: Metrics, monkeypatch: pytest.Mon
 @pytest.mark.parametrize(
     "nonsense", [b"\x00\xff\xfe\r\n\r\n", b"POST /metrics HTTP/1.1\r\n\r\n", b"GET " + b"a" * 70000]
 )
-def test_nonsense_is_refused_and_the_next_is_served(server: MetricsServer, nonsense: bytes) -> None:
+def test_malformed_http_is_rejected_and_the_next_served(server: MetricsServer, nonsense: bytes) -> None:
     with socket.create_connection(("127.0.0.1", server.port), 30) as connection:
         connection.sendall(nonsense)
         connection.shutdown(socket.SHUT_WR)

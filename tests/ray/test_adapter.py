@@ -66,7 +66,7 @@ async def called(server: Any, method: str) -> Any:
 
 
 @pytest.mark.parametrize("service", SERVICE_NAMES)
-def test_without_a_replica_every_method_says_when_to_retry(service: str) -> None:
+def test_without_a_replica_every_method_is_unavailable(service: str) -> None:
     (found,) = [it for it in ingress._SERVICES if it.full_name == service]
 
     async def run() -> list[Any]:
@@ -82,7 +82,7 @@ def test_without_a_replica_every_method_says_when_to_retry(service: str) -> None
 
 
 @pytest.mark.parametrize("service", ["", *SERVICE_NAMES])
-def test_where_there_is_no_replica_health_says_so(service: str) -> None:
+def test_without_a_replica_health_is_not_serving(service: str) -> None:
     async def run() -> Any:
         server: Any = gRPCGenericServer(no_way_of_serves)
         add_services(None, server)
@@ -134,7 +134,7 @@ async def test_a_server_that_serve_stops_is_drained_first(settings: Settings) ->
     assert told == [("drained", 0.0, 7.0), "stopped"]
 
 
-async def test_tls_is_the_gateways(settings: Settings) -> None:
+async def test_tls_is_rejected_behind_serve(settings: Settings) -> None:
     with pytest.raises(StartupError, match="tls_certificate"):
         Ingress(settings, None, grpc.ssl_server_credentials([(b"", b"")]))  # type: ignore[arg-type]
 
@@ -165,7 +165,7 @@ def test_the_limit_of_messages_is_that_of_the_settings(tmp_path: Path) -> None:
         check_environment(larger, variables())
 
 
-def test_each_replica_of_a_machine_claims_its_own_metrics_port(settings: Settings) -> None:
+def test_each_replica_of_a_machine_has_its_own_metrics_port(settings: Settings) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

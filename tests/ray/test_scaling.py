@@ -46,7 +46,7 @@ def context(reported: dict[str, dict[str, float]] | None, target: int = 3, **mor
 
 
 @given(shares)
-def test_the_same_work_shared_by_more_replicas_asks_for_as_many(busy: list[float]) -> None:
+def test_sharing_the_same_work_does_not_change_the_count(busy: list[float]) -> None:
     """So that adding some changes nothing of what is asked for, and the loop is open."""
     shared = [sum(busy) / (2 * len(busy))] * (2 * len(busy))
     assert replicas_for([0.0], shared) == pytest.approx(replicas_for([0.0], busy))
@@ -69,7 +69,7 @@ def test_full_queues_ask_for_several_times_as_many() -> None:
 
 
 @pytest.mark.parametrize("reported", [None, {}, {BUSY: {"a": 0.1}}, {QUEUED: {}}])
-def test_silence_changes_nothing(reported: dict[str, dict[str, float]] | None) -> None:
+def test_no_report_changes_nothing(reported: dict[str, dict[str, float]] | None) -> None:
     assert by_device_seconds(context(reported)) == (3, {})
 
 
@@ -182,7 +182,7 @@ CONFIG = AutoscalingConfig(min_replicas=2, max_replicas=40, upscale_delay_s=10, 
 
 
 @pytest.mark.parametrize("load", [1.0, 5.6, 12.0])
-def test_under_constant_load_it_settles_with_time_to_spare(load: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_constant_load_settles_at_the_target(load: float, monkeypatch: pytest.MonkeyPatch) -> None:
     targets = Fleet(CONFIG).run(poisson(load, 2400), monkeypatch)
     settled = targets[900:]
     needed = max(math.ceil(load / TARGET_BUSY), 2)
@@ -190,7 +190,7 @@ def test_under_constant_load_it_settles_with_time_to_spare(load: float, monkeypa
     assert max(settled) <= needed + 1
 
 
-def test_a_load_that_grows_tenfold_is_taken_up_and_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tenfold_load_adds_replicas_and_removes_them(monkeypatch: pytest.MonkeyPatch) -> None:
     fleet = Fleet(CONFIG)
     targets = fleet.run([*poisson(1.0, 300), *poisson(10.0, 600)], monkeypatch)
     refused_s = fleet.refused_s
@@ -201,7 +201,7 @@ def test_a_load_that_grows_tenfold_is_taken_up_and_given_back(monkeypatch: pytes
     assert turns(targets) <= 2 * len(targets) / CONFIG.downscale_delay_s  # at most one up and down in that time
 
 
-def test_a_swing_that_is_faster_than_the_delays_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_load_faster_than_the_delays_causes_no_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A minute up, a minute down: replicas that come when they are not needed any more help nobody."""
     minutes = [poisson(load, 60, seed=i) for i, load in enumerate([2.0, 5.0] * 20)]
     targets = Fleet(CONFIG).run(chain.from_iterable(minutes), monkeypatch)

@@ -353,7 +353,7 @@ async def check_health(channel: Channel) -> None:
     assert answer.status == health_pb2.HealthCheckResponse.SERVING
 
 
-async def test_public_streams_are_few_and_keep_no_probe_out(counted: Counted, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_open_streams_are_limited_and_block_no_probe(counted: Counted, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(receiving, "MAX_OPEN_STREAMS", 2)
     async with serving(echo, counted) as channel:
         stub = health_pb2_grpc.HealthStub(channel)
@@ -508,7 +508,7 @@ async def test_cancellation_inside_a_servicer_is_no_cancelled_call(counted: Coun
     assert counted.codes == ["UNAVAILABLE"]
 
 
-async def test_a_thousand_calls_that_end_in_any_way_are_counted_once(counted: Counted) -> None:
+async def test_a_thousand_calls_are_each_counted_once(counted: Counted) -> None:
     arrived: set[str] = set()
 
     async def answer(request: Any, call: Call) -> Any:

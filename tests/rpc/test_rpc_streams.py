@@ -214,7 +214,7 @@ async def test_it_outlasts_other_deadlines_and_ends_at_its_own() -> None:
         await until(lambda: len(counted.handled) == 2)
 
 
-async def test_a_missing_message_is_reported_without_a_deadline_too() -> None:
+async def test_a_missing_message_ends_an_endless_call_too() -> None:
     counted = Counted()
     async with serving(Numbers(0), counted, default_deadline_s=0.2) as (channel, _):
         call = channel.stream_stream(METHOD)()

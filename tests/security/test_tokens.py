@@ -1,4 +1,4 @@
-"""Tokens: what the file keeps, what it refuses, that changes are taken over while serving, and who may call what."""
+"""Tokens: the file and its errors, changes while serving, and which role may call which method."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class TestFile:
         found = {name: read_tokens(path).find(token) for name, token in made.items()}
         assert [name for name, token in found.items() if token] == ["a", "c"]
 
-    def test_what_a_person_wrote_about_tenants_survives_a_change(self, path: Path) -> None:
+    def test_the_limits_of_tenants_survive_a_change(self, path: Path) -> None:
         path.write_text('{"tokens": [], "tenants": {"acme": {"rate_ms": 250}, "other": {}}}')
         create_token(path, "a", "acme", "read", None)
         tokens = read_tokens(path)
@@ -104,7 +104,7 @@ class TestFile:
             ("a", "t", "admin", "role"),
         ],
     )
-    def test_names_and_roles_that_are_none_are_refused(
+    def test_malformed_names_and_roles_are_rejected(
         self, path: Path, name: str, tenant: str, role: str, what: str
     ) -> None:
         with pytest.raises(SecurityError, match=f"^{what}: "):
@@ -169,7 +169,7 @@ class TestReloading:
         with pytest.raises(SecurityError, match="No such file"):
             self.make(path)
 
-    def test_changes_are_taken_over_and_nothing_is_read_without_one(self, path: Path) -> None:
+    def test_a_changed_file_is_read_and_an_unchanged_one_is_not(self, path: Path) -> None:
         token = create_token(path, "a", "t", "read", None)
         source = self.make(path)
         first = source.value
@@ -222,7 +222,7 @@ class TestReloading:
         assert source.refresh()
         assert source.value.find(token) == source.value.tokens[0]
 
-    def test_a_file_unreadable_for_a_moment_is_read_again(self, path: Path) -> None:
+    def test_a_file_is_read_again_after_a_failure(self, path: Path) -> None:
         path.write_text("{}")
         failing = [False]
 
@@ -259,8 +259,8 @@ class TestReloading:
         assert threading.main_thread() not in threads
 
 
-class TestWhoMayCallWhat:
-    def test_the_table_names_every_method_there_is_and_no_other(self) -> None:
+class TestAccess:
+    def test_the_table_has_every_method_and_no_other(self) -> None:
         services = [
             service
             for file in (localization_service_pb2, reference_service_pb2)
@@ -287,7 +287,7 @@ class TestWhoMayCallWhat:
             assert (role is Role.WRITE) == takes_much, method
 
     @pytest.mark.parametrize(("method", "role"), list(product(METHOD_ROLES, ("read", "localize", "write"))))
-    def test_each_role_may_do_what_it_is_for_and_nothing_above(self, method: str, role: str) -> None:
+    def test_each_role_may_call_its_methods_and_no_others(self, method: str, role: str) -> None:
         caller = authenticator(entry(role=role))
         if Role[role.upper()] >= METHOD_ROLES[method]:
             assert caller.authenticate(bearer("secret"), method) == Principal("acme", Role[role.upper()], "robot")
@@ -300,7 +300,7 @@ class TestWhoMayCallWhat:
     @pytest.mark.parametrize(
         "method", ["/mapless.v1.ReferenceService/New", "/other.Service/Do", "", *sorted(OPEN_METHODS)]
     )
-    def test_a_method_that_is_not_in_the_table_is_refused(self, method: str, asks: bool) -> None:
+    def test_a_method_without_a_role_is_rejected(self, method: str, asks: bool) -> None:
         caller = authenticator(entry(role="write")) if asks else Authenticator(None)
         with pytest.raises(PermissionDenied):
             caller.authenticate(bearer("secret"), method)
@@ -321,7 +321,7 @@ class TestWhoMayCallWhat:
             (bearer("late"), "TOKEN_EXPIRED"),
         ],
     )
-    def test_callers_without_a_good_token_are_told_why(self, metadata: Any, reason: str) -> None:
+    def test_a_missing_or_wrong_token_has_a_reason(self, metadata: Any, reason: str) -> None:
         late = entry(name="late", sha256=sha256_of("late"), expires=NOW.isoformat())
         with pytest.raises(Unauthenticated) as caught:
             authenticator(entry(), late).authenticate(metadata, READ)
@@ -349,7 +349,7 @@ class TestWhoMayCallWhat:
         assert caught.value.reason == "TOKEN_EXPIRED"
 
     @given(st.text(st.characters(codec="utf-8"), max_size=30))
-    def test_no_other_text_opens_the_door(self, text: str) -> None:
+    def test_no_other_text_is_accepted_as_a_token(self, text: str) -> None:
         with pytest.raises(Unauthenticated):
             authenticator(entry(sha256=sha256_of("secret" * 3))).authenticate((("authorization", text),), READ)
 
@@ -409,17 +409,12 @@ class TestCommand:
         assert (found_code, printed, said.count("\n")) == (code, "", 1)
         assert complaint in said
 
-    def test_the_server_ignores_the_clients_token_variable(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_the_setting_names_the_file(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The client's variable MAPLESS_TOKEN is no setting, and no error."""
         monkeypatch.setenv("MAPLESS_TOKEN", "mapless_x")
-        create_token(path, "a", "t", "read", None)
-        assert self.run("list", path=path)[0] == 0
-
-    def test_without_a_file_it_says_how_to_name_one(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv("MAPLESS_TOKENS_FILE", raising=False)
         result = CliRunner().invoke(command.token_app, ["list"])
         assert (result.exit_code, "MAPLESS_TOKENS_FILE" in result.stderr) == (2, True)
-
-    def test_the_servers_setting_names_the_file(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         create_token(path, "a", "t", "read", None)
         monkeypatch.setenv("MAPLESS_TOKENS_FILE", str(path))
         result = CliRunner().invoke(command.token_app, ["list"])

@@ -45,7 +45,7 @@ def test_auto_begins_with_features_that_need_nothing(tmp_path: Path) -> None:
     ("missing", "told"),
     [("weights", "weights fetch aliked"), ("package", "mapless-absent is not installed: pip install")],
 )
-def test_auto_serves_with_what_is_there_and_says_so_in_one_line(
+def test_auto_leaves_out_what_is_missing_and_logs_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, missing: str, told: str
 ) -> None:
     def without_package(name: str, *arguments: object) -> object:
@@ -65,7 +65,7 @@ def test_auto_serves_with_what_is_there_and_says_so_in_one_line(
     assert record.getMessage().startswith("features auto: sift serves without aliked: ")
 
 
-def test_what_is_asked_for_by_name_is_never_replaced(tmp_path: Path) -> None:
+def test_features_named_in_the_settings_are_never_replaced(tmp_path: Path) -> None:
     with Store.open(tmp_path / "data") as store:
         for features, told in (("aliked", "weights fetch aliked"), ("nonesuch", "nonesuch")):
             with pytest.raises(StartupError, match=told):
@@ -93,7 +93,7 @@ def test_on_a_gpu_the_strong_features_answer_alone() -> None:
     assert feature_names("auto", "cuda") == ("aliked",)
 
 
-def test_a_device_that_is_not_there_is_said(tmp_path: Path) -> None:
+def test_a_missing_device_ends_the_start(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     absent = f"cuda:{torch.cuda.device_count()}"
     with Store.open(tmp_path / "data") as store, pytest.raises(StartupError, match=f"no device {absent}"):
@@ -101,7 +101,7 @@ def test_a_device_that_is_not_there_is_said(tmp_path: Path) -> None:
     assert choose_device("cpu") == "cpu"
 
 
-def test_light_glue_is_for_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_light_glue_is_used_on_gpus_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     looked_for: list[str] = []
 
     def find(name: str, weights_dir: Path) -> Path:

@@ -44,5 +44,5 @@ def test_every_extra_brings_its_packages() -> None:
         (ImportError("libGL.so.1: cannot open"), "libGL.so.1: cannot open"),
     ],
 )
-def test_a_hint_tells_what_is_wrong_and_what_to_run(error: ImportError, hint: str) -> None:
+def test_a_hint_names_the_fault_and_the_command(error: ImportError, hint: str) -> None:
     assert install_hint(error) == hint

@@ -67,7 +67,7 @@ def test_the_file_may_be_named_by_the_environment(config: Path, monkeypatch: pyt
         ('log_level = "loud"', "log_level (file)"),
     ],
 )
-def test_faults_in_the_file(tmp_path: Path, text: str, told: str) -> None:
+def test_an_error_in_the_file_names_setting_and_origin(tmp_path: Path, text: str, told: str) -> None:
     path = tmp_path / "mapless.toml"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
@@ -75,12 +75,12 @@ def test_faults_in_the_file(tmp_path: Path, text: str, told: str) -> None:
     assert told in str(caught.value)
 
 
-def test_a_missing_file(tmp_path: Path) -> None:
+def test_a_missing_settings_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file"):
         load_settings({}, tmp_path / "absent.toml")
 
 
-def test_a_misspelt_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_misspelt_variable_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MAPLESS_WORKER", "3")
     with pytest.raises(ConfigError, match="MAPLESS_WORKER is not a setting"):
         load_settings({})
