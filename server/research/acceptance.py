@@ -16,8 +16,7 @@ from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import StageOptions
 from mapless_server.method.rejection import RejectionReason
-from mapless_server.method.trust.evidence import evidence_of
-from mapless_server.method.trust.judge import trust_of
+from mapless_server.method.trust.judge import evidence_of, trust_of
 from mapless_tools.calibrate.findings import Operating, auroc, risk_coverage
 
 from .places import METRIC, OTHERS, Measured, answered, cross_pairs, read_places, right_pairs

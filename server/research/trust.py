@@ -31,8 +31,7 @@ from mapless_server.method.features import make_extractor
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import StageOptions
 from mapless_server.method.rejection import RejectionReason
-from mapless_server.method.trust.evidence import FEATURES, Evidence, evidence_of
-from mapless_server.method.trust.judge import LEVELS, JudgeOptions, trust_of
+from mapless_server.method.trust.judge import FEATURES, LEVELS, Evidence, JudgeOptions, evidence_of, trust_of
 from mapless_server.method.views import Features
 from mapless_tools.dataset import read_folder
 

@@ -13,9 +13,9 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.adjust import AdjustOptions, adjust_pose, pose_problem
+from mapless_server.method.perturbation import moved
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.priors.known import NO_PRIORS, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
-from mapless_server.method.priors.pose_only import moved
 from mapless_server.method.results import PointMatches, PoseEstimate, Structure
 
 DOWN = np.array([0.0, 1.0, 0.0])

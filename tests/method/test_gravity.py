@@ -12,10 +12,11 @@ from support.scenes import CAMERA, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.observations import ONE_PIXEL
+from mapless_server.method.perturbation import moved
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.priors.gravity import GravityOptions, ransac_with_gravity, solve_pairs
 from mapless_server.method.priors.known import NO_PRIORS, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
-from mapless_server.method.priors.pose_only import PoseOnlyOptions, moved, refine_pose
+from mapless_server.method.priors.pose_only import PoseOnlyOptions, refine_pose
 from mapless_server.method.results import PointMatches, PoseEstimate, PoseStage, Structure
 from mapless_server.method.tracks import Tracks
 from mapless_server.method.views import Features, View

@@ -14,8 +14,16 @@ from support.scenes import SceneOptions, make_scene, random_for
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
-from mapless_server.method.trust.evidence import FEATURES, Evidence, evidence_of
-from mapless_server.method.trust.judge import LEVELS, JudgeOptions, judge, score_of, trust_of
+from mapless_server.method.trust.judge import (
+    FEATURES,
+    LEVELS,
+    Evidence,
+    JudgeOptions,
+    evidence_of,
+    judge,
+    score_of,
+    trust_of,
+)
 
 OPTIONS = JudgeOptions()
 INLIER_PX = PnpOptions().inlier_px

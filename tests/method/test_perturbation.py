@@ -1,6 +1,8 @@
-"""Errors of a pose in three coordinates: derivatives by differences, covariances by drawn errors."""
+"""Pose errors in world coordinates: derivatives by finite differences, covariances and radii by sampling."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
@@ -8,29 +10,18 @@ from support.jacobians import assert_jacobian, finite_differences
 from support.scenes import CAMERA, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.rigid import rotation_vector
-from mapless_server.method.uncertainty.perturbation import (
-    Perturbation,
+from mapless_server.method.perturbation import (
     motion_jacobian,
+    moved,
+    perturbed,
     pose_hessian,
+    rotation_vector,
     world_covariance,
     world_jacobian,
 )
+from mapless_server.method.uncertainty.covariance import TAIL_95, accuracy_from_covariance, error_radius
 
 POSE = RigidTransform(rotation_from_vector([0.7, -1.1, 0.4]), np.array([3.0, -2.0, 1.5]))
-EVERY_WAY = pytest.mark.parametrize("perturbation", list(Perturbation))
-
-
-def perturbed(perturbation: Perturbation, error: Array) -> RigidTransform:
-    """world_from_camera after an error (v, w) of camera_from_world, by the definition of each."""
-    given, turn = POSE.inverse(), rotation_from_vector(error[3:])
-    if perturbation is Perturbation.SE3_LEFT:  # up to a factor of v that is one to first order
-        moved = RigidTransform(turn, error[:3]).compose(given)
-    elif perturbation is Perturbation.DECOUPLED_LEFT:
-        moved = RigidTransform(turn @ given.rotation, given.translation + error[:3])
-    else:
-        moved = RigidTransform(given.rotation @ turn, given.translation + error[:3])
-    return moved.inverse()
 
 
 def error_in_world(pose: RigidTransform) -> Array:
@@ -38,54 +29,43 @@ def error_in_world(pose: RigidTransform) -> Array:
     return np.concatenate([pose.translation - POSE.translation, rotation_vector(pose.rotation @ POSE.rotation.T)])
 
 
-@EVERY_WAY
-def test_the_jacobian_is_the_derivative_of_the_world_error(perturbation: Perturbation) -> None:
+def perturbed_camera(error: Array) -> RigidTransform:
+    """world_from_camera after an error (v, w) of camera_from_world."""
+    return perturbed(POSE.inverse(), error).inverse()
+
+
+def test_world_jacobian_is_the_derivative_of_the_world_error() -> None:
     assert_jacobian(
-        world_jacobian(POSE, perturbation),
-        lambda error: error_in_world(perturbed(perturbation, error)),
-        np.zeros(6),
-        tolerance=1e-7,
+        world_jacobian(POSE), lambda error: error_in_world(perturbed_camera(error)), np.zeros(6), tolerance=1e-7
     )
 
 
-@EVERY_WAY
-def test_the_covariance_is_that_of_drawn_errors(perturbation: Perturbation) -> None:
+def test_covariance_is_that_of_drawn_errors() -> None:
     """Monte Carlo, 2000 errors of millimetres and tenths of a degree that go together: within a tenth."""
-    random = random_for("perturbations", perturbation.value)
+    random = random_for("perturbations", "se3_left")
     mixing = random.normal(size=(6, 6)) * np.repeat([0.003, 0.002], 3)[:, None]
     drawn = random.normal(size=(2000, 6)) @ mixing.T
-    errors = np.stack([error_in_world(perturbed(perturbation, error)) for error in drawn])
-    expected = np.cov(errors.T)
-    covariance = world_covariance(np.linalg.inv(mixing @ mixing.T), POSE, perturbation)
+    expected = np.cov(np.stack([error_in_world(perturbed_camera(error)) for error in drawn]).T)
+    covariance = world_covariance(np.linalg.inv(mixing @ mixing.T), POSE)
     assert np.linalg.norm(covariance - expected) < 0.1 * np.linalg.norm(expected)
-
-
-def test_taking_one_for_another_is_no_small_error() -> None:
-    """The lever arm of a camera 3.9 m from the origin is in two of them and not in the third."""
-    information = np.diag([1e6, 1e6, 1e6, 1e5, 1e5, 1e5])
-    ours, left, right = (world_covariance(information, POSE, it) for it in Perturbation)
-    for other in (left, right):
-        assert np.trace(other[:3, :3]) > 10 * np.trace(ours[:3, :3])
-    np.testing.assert_allclose(left[:3, :3], right[:3, :3], rtol=0.2, atol=3e-5)
 
 
 def test_motion_jacobian() -> None:
     for x in random_for("motion").normal(size=(5, 3)):
 
-        def moved(motion: Array, x: Array = x) -> Array:
+        def moved_point(motion: Array, x: Array = x) -> Array:
             return np.asarray(rotation_from_vector(motion[3:]) @ x + motion[:3])
 
-        assert_jacobian(motion_jacobian(x), moved, np.zeros(6), tolerance=1e-7)
+        assert_jacobian(motion_jacobian(x), moved_point, np.zeros(6), tolerance=1e-7)
 
 
-def test_the_covariance_is_that_of_errors_in_the_world() -> None:
-    """The inverse of J^T J, where J is by differences in the very coordinates that the covariance is told in."""
+def test_covariance_from_projections_is_in_world_axes() -> None:
+    """The inverse of J^T J, with J by finite differences in the coordinates of the covariance."""
     pose = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
     x_in_world = random_for("covariance").normal(size=(60, 3))
 
     def projections(error: Array) -> Array:
-        moved = RigidTransform(rotation_from_vector(error[3:]) @ pose.rotation, pose.translation + error[:3])
-        return CAMERA.project(moved.inverse().apply(x_in_world)).ravel()
+        return CAMERA.project(moved(pose, error).inverse().apply(x_in_world)).ravel()
 
     jacobian = finite_differences(projections, np.zeros(6))
     covariance = world_covariance(pose_hessian(CAMERA, pose, x_in_world) / 0.5**2, pose)
@@ -93,3 +73,27 @@ def test_the_covariance_is_that_of_errors_in_the_world() -> None:
     np.testing.assert_allclose(covariance, expected, atol=1e-5 * np.abs(expected).max())
     np.testing.assert_array_equal(covariance, covariance.T)
     assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+@pytest.mark.parametrize(
+    "eigenvalues", [(1, 1, 1), (1, 0, 0), (1, 1, 0), (1, 0.1, 0.1), (1, 0.5, 0.01), (1, 1e-3, 1e-6), (4, 4, 0.1)]
+)
+@pytest.mark.parametrize("probability", [0.68, 0.95])
+def test_radius_against_sampling(eigenvalues: tuple[float, ...], probability: float) -> None:
+    rng = np.random.default_rng(7)
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    errors = np.sqrt((rng.normal(size=(200_000, 3)) ** 2 * eigenvalues).sum(axis=1))
+    covariance = axes @ np.diag(eigenvalues) @ axes.T
+    assert error_radius(covariance, probability) == pytest.approx(np.quantile(errors, probability), rel=0.04)
+
+
+def test_position_and_rotation_radii_are_separate() -> None:
+    covariance = np.diag([0.04, 0.04, 0.04, 1e-6, 1e-6, 1e-6])
+    radii = accuracy_from_covariance(covariance)
+    assert radii.position_95_m == pytest.approx(TAIL_95 * 0.2 * 2.7955, rel=1e-3)
+    assert radii.rotation_95_deg == pytest.approx(TAIL_95 * math.degrees(1e-3 * 2.7955), rel=1e-3)
+    assert radii.position_68_m == pytest.approx(0.2 * 1.8724, rel=1e-3)  # the tail is heavier, the middle is not
+
+
+def test_no_uncertainty_is_no_radius() -> None:
+    assert error_radius(np.zeros((3, 3)), 0.95) == 0.0

@@ -14,7 +14,8 @@ from support.scenes import CAMERA, SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method import pnp
-from mapless_server.method.pnp import PnpOptions, ransac, reprojection_errors_px, solve_pose
+from mapless_server.method.perturbation import reprojection_errors_px
+from mapless_server.method.pnp import PnpOptions, ransac, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, PoseStage
 

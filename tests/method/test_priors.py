@@ -11,6 +11,7 @@ from support.jacobians import assert_jacobian
 from support.scenes import random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.method.perturbation import moved, rotation_vector
 from mapless_server.method.priors.known import (
     NO_PRIORS,
     GravityPrior,
@@ -22,8 +23,6 @@ from mapless_server.method.priors.known import (
     Priors,
     conflict_threshold,
 )
-from mapless_server.method.priors.pose_only import moved
-from mapless_server.method.rigid import rotation_vector
 
 POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
 DOWN = np.array([0.0, 0.0, -1.0])

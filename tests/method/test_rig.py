@@ -11,8 +11,8 @@ from support.scenes import SceneOptions, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.groups.rig import RigEstimate, RigFreedom, RigOptions, solve_rig
+from mapless_server.method.perturbation import perturbed, rotation_vector
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.rigid import perturbed, rotation_vector
 
 WORLD_FROM_RIG = RigidTransform(rotation_from_vector([0.1, 0.2, -0.1]), np.array([0.3, 0.1, -3.8]))
 CAMERAS = looking((-0.5, 0, -4), (0.2, -0.1, -4.2), (0.6, 0.2, -3.9))

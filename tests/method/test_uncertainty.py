@@ -16,11 +16,10 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity
 from mapless_server.method.adjust import AdjustOptions, adjust_pose
+from mapless_server.method.perturbation import rotation_vector
 from mapless_server.method.pnp import PnpOptions, solve_pose
-from mapless_server.method.pose_covariance import pose_covariance
 from mapless_server.method.results import PoseEstimate, PoseStage, Structure, Support
-from mapless_server.method.rigid import rotation_vector
-from mapless_server.method.uncertainty.covariance import UncertaintyOptions, scale_covariance
+from mapless_server.method.uncertainty.covariance import UncertaintyOptions, pose_covariance, scale_covariance
 
 POSITION, ROTATION = slice(0, 3), slice(3, 6)
 PLAIN = UncertaintyOptions(shrinkage=0.0, shared_matches=1e9, position_factor=1.0, rotation_factor=1.0)

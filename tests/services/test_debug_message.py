@@ -14,7 +14,8 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 
 from mapless.geometry import Array, Camera, Fisheye, RadialTangential, RigidTransform
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.method.pnp import PnpOptions, reprojection_errors_px
+from mapless_server.method.perturbation import reprojection_errors_px
+from mapless_server.method.pnp import PnpOptions
 from mapless_server.method.results import PoseEstimate, PoseStage, Support
 from mapless_server.method.views import Photograph, PosedView, View
 from mapless_server.services.messages.debug import MAX_MATCHES, debug_to_message

@@ -19,7 +19,7 @@ from mapless_server.method import localize as method
 from mapless_server.method import pipeline
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.context import StageContext
-from mapless_server.method.groups.tracked import tracked_support
+from mapless_server.method.groups.images import tracked_support
 from mapless_server.method.hints import hinted
 from mapless_server.method.pipeline import Coarse, Prepared
 from mapless_server.method.rejection import Rejection, RejectionReason

@@ -15,7 +15,7 @@ import numpy as np
 from mapless.geometry import rotation_angle_deg
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.uncertainty.accuracy import Accuracy, accuracy_from_covariance
+from mapless_server.method.uncertainty.covariance import Accuracy, accuracy_from_covariance
 
 from .query import Result
 

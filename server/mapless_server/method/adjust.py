@@ -24,11 +24,12 @@ from mapless.geometry import RigidTransform
 from .bundle import Bundle, BundleProblem, bundle_of, reference_information
 from .optimize import MinimizeOptions, minimize
 from .options import check_bounds
-from .pnp import reprojection_errors_px
+from .perturbation import reprojection_errors_px
 from .priors.known import NO_PRIORS, Priors
 from .results import PointMatches, PoseEstimate, PoseStage, Structure
+from .structure import tracks_with_query
 from .uncertainty.covariance import UncertaintyOptions, one_match_covariance, uncertainty_of
-from .uncertainty.linearization import jackknife_input, tracks_with_query
+from .uncertainty.dispersion import jackknife_input
 from .views import PosedView, View
 
 

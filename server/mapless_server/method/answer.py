@@ -12,24 +12,24 @@ from mapless.geometry import Array, RigidTransform
 from .priors.known import PriorCheck
 from .rejection import Rejection
 from .results import MetricScale, PoseEstimate, PoseStage, Support
-from .uncertainty.accuracy import accuracy_from_covariance
+from .uncertainty.covariance import accuracy_from_covariance
 
 
 @dataclass(frozen=True, eq=False)
 class Localization:
-    """Where the query was taken.
+    """The pose of a query.
 
     Attributes:
         world_from_camera: metric.
-        covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians; None for a pose that was never
-            to be refined (`Variant.COARSE`) or could not be in time (`PoseStage.COARSE`).
-        pose_stage: whether the refined or the initial pose is answered.
-        inlier_count: 2D-3D matches that agree with it.
-        match_count: 2D-3D matches tried.
+        covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians; None for a pose without
+            refinement, by request (`Variant.COARSE`) or for lack of time (`PoseStage.COARSE`).
+        pose_stage: the stage that gave the pose.
+        inlier_count: number of 2D-3D matches that are inliers.
+        match_count: number of 2D-3D matches.
         reprojection_error_px: median of the inliers, pixels of the processed image.
-        prior_checks: how the pose compares with each prior.
-        trust: 0 to 1, share of right answers that look at most as good (see `judge`); None for a pose that nothing has
-            checked, like its covariance.
+        prior_checks: comparison of the pose with each prior.
+        trust: 0 to 1, share of right answers whose score is at most as high (see `judge`); None for a pose without
+            refinement.
     """
 
     world_from_camera: RigidTransform
@@ -43,7 +43,7 @@ class Localization:
 
     @classmethod
     def of(cls, estimate: PoseEstimate, match_count: int, trust: float) -> Localization:
-        """The answer that an accepted estimate is."""
+        """The localization of an accepted estimate."""
         return cls(
             estimate.world_from_camera,
             estimate.covariance,
@@ -58,15 +58,15 @@ class Localization:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What the method says of one query.
+    """The answer to one query.
 
     Attributes:
-        outcome: the pose, or why there is none.
-        scale: None if that stage was not reached.
+        outcome: the pose, or the reason for a rejection.
+        scale: the metric scale; None if that stage was not reached.
         stage_seconds: time of each stage that ran, in order.
         reference_match_counts: per reference, feature matches with the query.
         reference_inlier_counts: per reference, inliers on points that it observes.
-        support: what the pose rests on, or would have; None where it did not come so far.
+        support: structure, matches and estimate; None if those stages were not reached.
     """
 
     outcome: Localization | Rejection
@@ -78,7 +78,7 @@ class Answer:
 
 
 def shifted(answer: Answer, offset: Array) -> Answer:
-    """The answer in a world in which everything lies `offset` (3,) further."""
+    """The answer in a world whose coordinates are larger by `offset` (3,)."""
     outcome, scale = answer.outcome, answer.scale
     if isinstance(outcome, Localization):
         outcome = replace(outcome, world_from_camera=outcome.world_from_camera.shifted(offset))
@@ -94,16 +94,16 @@ def shifted(answer: Answer, offset: Array) -> Answer:
 
 
 def is_better(wide: Answer, strict: Answer, max_radius_ratio: float) -> bool:
-    """Whether the answer from wide correspondences is the better one; its radius may be `max_radius_ratio` as large."""
+    """Whether the answer from wide correspondences is better; its radius may be `max_radius_ratio` times as large."""
     if isinstance(wide.outcome, Rejection) or isinstance(strict.outcome, Rejection):
         return isinstance(wide.outcome, Localization)
     if wide.outcome.inlier_count <= strict.outcome.inlier_count:
         return False
-    return _claimed_radius_m(wide) <= max_radius_ratio * _claimed_radius_m(strict)
+    return _position_radius_m(wide) <= max_radius_ratio * _position_radius_m(strict)
 
 
-def _claimed_radius_m(answer: Answer) -> float:
-    """Within which the position lies in 68 % of cases, by its covariance; infinite where there is none."""
+def _position_radius_m(answer: Answer) -> float:
+    """Position radius of 68 % by the covariance; infinite without one."""
     if isinstance(answer.outcome, Rejection) or answer.outcome.covariance is None:
         return math.inf
     return accuracy_from_covariance(answer.outcome.covariance).position_68_m

@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 
 from .arrays import invert_symmetric
-from .observations import Observations
+from .observations import Linearization, Observations, linearize
 from .optimize import solve_step
 from .priors.known import NO_PRIORS, Priors
 from .results import Structure
 from .robust import cauchy_cost
 from .structure import observe
 from .tracks import Tracks
-from .uncertainty.linearization import Linearization, linearize
 from .views import PosedView
 
 

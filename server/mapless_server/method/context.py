@@ -1,4 +1,4 @@
-"""The context of one computation: whether its result is still wanted, and where its time goes."""
+"""The context of one computation: cancellation between stages, and the time of each stage."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 Check = Callable[[], None]
-"""Called between the steps of a computation; raises when its result is no longer wanted."""
+"""Called between the steps of a computation; raises to cancel it."""
 
 
 def never_cancelled() -> None:
@@ -20,7 +20,7 @@ class StageContext:
     """A computation that can be cancelled between its stages, which are timed.
 
     Attributes:
-        check: raises when the result is no longer wanted.
+        check: raises to cancel the computation.
         stage_seconds: time of each stage so far, in order; a stage that runs twice counts twice.
     """
 
@@ -29,7 +29,7 @@ class StageContext:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Checks, then times a stage, however it ends."""
+        """Calls `check`, then times a stage, also one that raises."""
         self.check()
         start_s = time.perf_counter()
         try:
@@ -38,5 +38,5 @@ class StageContext:
             self.add(name, time.perf_counter() - start_s)
 
     def add(self, name: str, seconds: float) -> None:
-        """Counts time that was spent elsewhere, such as a share of a batch."""
+        """Adds time that was measured elsewhere, such as that of a batch."""
         self.stage_seconds[name] = self.stage_seconds.get(name, 0.0) + seconds

@@ -1,7 +1,7 @@
 """The method, on one screen: correspond > coarse > scale > structure > match > pnp (the paper), then adjust (ours).
 
-`localize` calls its three parts in order, for one query; the worker queue calls each of them by itself:
-`prepare` (correspond), `reconstruct` (coarse and scale, of many queries in one go; in `pipeline`), `refine` (the rest).
+`localize` calls the three parts in order for one query. The queue calls each part separately: `prepare` (correspond),
+`reconstruct` (coarse and scale of a batch of queries; in `pipeline`), `refine` (the rest).
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from .match import match_points
 from .options import LocalizeOptions, Variant
 from .pipeline import Coarse, Pipeline, Prepared, reconstruct, with_wide_correspondences
 from .pnp import solve_pose
-from .pose_covariance import pose_covariance
 from .priors.known import NO_PRIORS, Priors
 from .reconstruction import Reconstruction
 from .rejection import Rejection, RejectionReason
@@ -24,6 +23,7 @@ from .results import MetricScale, PointMatches, Structure, Support
 from .structure import build_structure
 from .trust.gate import doubts
 from .trust.judge import judge
+from .uncertainty.covariance import pose_covariance
 from .views import Matches, PosedView, View
 
 MIN_FEATURES = 12
@@ -40,7 +40,7 @@ def localize(
 ) -> Answer:
     """Localizes a query among posed references, the most similar first; priors are in the references' world.
 
-    "No pose" is an answer, too, with the first stage that could not do its work. Raises what the context's check does.
+    A rejection is an answer too; it names the first stage that failed. Raises whatever the context's check raises.
     """
     prepared = prepare(query, references, pipeline, options, context or StageContext(), priors=priors)
     if isinstance(prepared, Answer):
@@ -60,10 +60,10 @@ def prepare(
     query_matches: Sequence[Matches] | None = None,
     priors: Priors = NO_PRIORS,
 ) -> Prepared | Answer:
-    """The correspondences of a query; an answer if there is nothing to go on with.
+    """Matches the query with its references and these with one another; an answer if the query is rejected here.
 
-    `query_matches` with each reference are taken as they are, where the references were chosen by them. Raises
-    ValueError if a view lacks what the coarse backend looks at.
+    `query_matches` with each reference, if given, are used as they are: the references were chosen by them. Raises
+    ValueError if a view lacks input of the coarse backend.
     """
     if not references:
         return Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, "no references"))
@@ -80,9 +80,9 @@ def prepare(
 
 
 def refine(coarse: Coarse) -> Answer:
-    """Structure, matches and pose; and where that gives little, all again from wide correspondences.
+    """Structure, matches and pose; if the result is weak, all again from wide correspondences.
 
-    Where all that is not enough for a pose to be accepted, its agreement with gravity or heading may be.
+    If the gate still rejects the pose, its agreement with gravity or heading is counted as evidence for it.
     """
     answer = _strict_then_wide(coarse, counts_agreement=False)
     is_gated = isinstance(answer.outcome, Rejection) and answer.outcome.reason is RejectionReason.GATE
@@ -101,7 +101,7 @@ def _strict_then_wide(coarse: Coarse, counts_agreement: bool) -> Answer:
 
 
 def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
-    """From the metric scale to an accepted pose; agreement with gravity and heading is evidence for it if counted."""
+    """From the metric scale to an accepted pose; `counts_agreement` with gravity and heading as evidence for it."""
     prepared, scale, stage = coarse.prepared, coarse.scale, coarse.prepared.context.stage
     if isinstance(scale, Rejection):
         return coarse.answer(scale)
@@ -135,7 +135,7 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
 
 
 def _structure_and_matches(coarse: Coarse, scale: MetricScale) -> tuple[Structure, PointMatches]:
-    """They came with the scale from a device, or are computed here."""
+    """Computed on the device together with the scale, or else here."""
     if coarse.structure is not None and coarse.matches is not None:
         return coarse.structure, coarse.matches
     prepared, reconstruction = coarse.prepared, coarse.reconstruction

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapless.geometry import Array
+
 from .arrays import (
     AnyArray,
     apply,
@@ -22,8 +24,9 @@ from .arrays import (
     solve_symmetric,
 )
 from .optimize import minimize_each
+from .perturbation import motion_jacobian
 from .results import KeypointNoise
-from .robust import soft_l1, soft_l1_weight
+from .robust import cauchy_weight, soft_l1, soft_l1_weight
 from .tracks import Grouping
 
 ONE_PIXEL = KeypointNoise(1.0, 0.0)
@@ -185,3 +188,30 @@ def estimate_noise(observations: Observations, x_in_world: AnyArray, noise: Keyp
 
 def _cost(observations: Observations, residuals: AnyArray, loss_scale_sigma: float) -> AnyArray:
     return observations.sum_by_point(soft_l1((residuals**2).sum(-1), loss_scale_sigma))
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """Row o is one observation; residuals and derivatives in standard deviations.
+
+    Attributes:
+        residual: (O, 2).
+        weight: (O,) of its square, by the Cauchy loss.
+        by_point: (O, 2, 3) derivative by the point, per metre.
+        by_pose: (O, 2, 6) derivative by a left perturbation (v, w) of camera_from_world.
+    """
+
+    residual: Array
+    weight: Array
+    by_point: Array
+    by_pose: Array
+
+
+def linearize(observations: Observations, x_in_world: Array, loss_scale_sigma: float) -> Linearization:
+    """Of points (P, 3), with a Cauchy loss of this scale."""
+    x_in_camera = observations.in_camera(x_in_world)
+    residual = observations.camera_residuals(x_in_camera)
+    weight = cauchy_weight((residual**2).sum(axis=1), loss_scale_sigma)
+    by_camera_point = observations.camera_jacobians(x_in_camera)
+    by_point = by_camera_point @ observations.rotation
+    return Linearization(residual, weight, by_point, by_camera_point @ motion_jacobian(x_in_camera))

@@ -1,6 +1,6 @@
-"""What a request chooses of the method, and how options check themselves.
+"""Options of a request, and how options check themselves.
 
-The options of the stages stand with the stages; `pipeline.StageOptions` has them together.
+The options of each stage are in its module; `pipeline.StageOptions` combines them.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ _HOLDS = {"above": operator.gt, "at_least": operator.ge, "below": operator.lt, "
 
 
 def check_bounds(options: object, names: str, **bounds: float) -> None:
-    """Checks fields of a dataclass; of a tuple, every number. NaN is within no bounds.
+    """Checks fields of a dataclass, every number of a tuple. NaN is out of bounds.
 
     Args:
         options: the dataclass.
-        names: of the fields, separated by spaces.
+        names: names of the fields, separated by spaces.
         bounds: any of above, at_least, below and at_most.
 
     Raises:
-        ValueError: a number is outside.
+        ValueError: a number is out of bounds.
     """
     for name in names.split():
         value = getattr(options, name)
@@ -32,20 +32,20 @@ def check_bounds(options: object, names: str, **bounds: float) -> None:
 
 
 class Variant(str, Enum):
-    """Forms of the method; all but `BEST` are the paper's."""
+    """Variants of the method; all but `BEST` are the paper's."""
 
     COARSE = "coarse"
     """The reconstruction's own pose at metric scale."""
     NO_STRUCTURE = "no_structure"
-    """PnP on predicted points."""
+    """PnP on the points that the reconstruction predicts."""
     FULL = "full"
     """The paper's method."""
     BEST = "best"
-    """Tracks over all references, keypoints weighted by their noise, a final adjustment of everything."""
+    """Tracks over all references, keypoints weighted by their noise, a final bundle adjustment."""
 
 
 class ScaleStrategy(str, Enum):
-    """Which stages may give the scale."""
+    """The stages that estimate the scale."""
 
     TRIANGULATION = "triangulation"
     TRAJECTORY = "trajectory"
@@ -54,12 +54,12 @@ class ScaleStrategy(str, Enum):
 
 @dataclass(frozen=True)
 class LocalizeOptions:
-    """Choices of a request; the defaults are the best we know.
+    """Options of a request; the defaults are the most accurate ones measured.
 
     Attributes:
-        variant: form of the method.
-        scale_strategy: how the metric scale is found.
-        coverage: share of right answers to accept; more, and more wrong ones are accepted too (see `trust.judge`).
+        variant: variant of the method.
+        scale_strategy: how the metric scale is estimated.
+        coverage: share of right answers to accept; a larger share accepts more wrong answers too (see `trust.judge`).
     """
 
     variant: Variant = Variant.BEST

@@ -15,13 +15,12 @@ import poselib
 from mapless.geometry import Array, Camera, RigidTransform
 
 from .options import check_bounds
+from .perturbation import pose_hessian, reprojection_errors_px, world_covariance
 from .priors.informed import InformedOptions, informed_pose
 from .priors.known import NO_PRIORS, Priors
 from .priors.pose_only import PoseOnlyOptions
-from .priors.pose_only import reprojection_errors_px as reprojection_errors_px
 from .rejection import Rejection, RejectionReason
 from .results import PointMatches, PoseEstimate, PoseStage, Structure
-from .uncertainty.perturbation import pose_hessian, world_covariance
 from .views import View
 
 

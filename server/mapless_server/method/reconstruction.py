@@ -1,4 +1,4 @@
-"""What the coarse stage gives: query and references in one local frame, up to one common scale."""
+"""Reconstruction, the result of the coarse stage: query and references in one local frame, up to one common scale."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ class ReconstructedView:
     def cells(
         self, pixels: NDArray[np.floating], camera: Camera
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
-        """Rows and columns (N,) of the maps' cells that hold pixels (N, 2) of the view's camera, and which exist."""
+        """Rows and columns (N,) of the maps' cells at pixels (N, 2) of the view's camera, and which lie in the maps."""
         return map_cells(self.camera, pixels, camera)
 
 
 def map_cells(
     map_camera: Camera, pixels: NDArray[np.floating], camera: Camera
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
-    """Rows and columns (N,) of the cells of one camera's maps that hold pixels (N, 2) of another; and which exist."""
+    """Rows and columns (N,) of the cells of one camera's maps at pixels (N, 2) of another; and which lie inside."""
     mapped = np.rint(map_camera.project(camera.rays(pixels)))
     inside = np.asarray(((mapped >= 0) & (mapped < (map_camera.width_px, map_camera.height_px))).all(axis=1))
     columns, rows = np.where(inside[:, None], mapped, 0).astype(np.intp).T
@@ -56,8 +56,8 @@ class Reconstruction:
     """Query and references in one local frame whose scale is unknown.
 
     Attributes:
-        query: the query's part.
-        references: one for each reference, in their order.
+        query: the query.
+        references: the references, in order.
     """
 
     query: ReconstructedView

@@ -1,4 +1,4 @@
-"""The answer "I could not localize this": a result, not an error."""
+"""Rejections: a photograph that cannot be localized is a result, not an error."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mapless.geometry import RigidTransform
 
 
 class RejectionReason(str, Enum):
-    """Why, one for each stage that can fail, in the order of the stages."""
+    """Reasons of rejections, in the order of the stages."""
 
     NO_USABLE_REFERENCES = "no_usable_references"
     DEGENERATE_REFERENCES = "degenerate_references"
@@ -19,40 +19,40 @@ class RejectionReason(str, Enum):
     TOO_FEW_MATCHES = "too_few_matches"
     PNP_FAILED = "pnp_failed"
     GATE = "gate"
-    """A pose that is not to be trusted: chance, or repeated structure, could support it as well."""
+    """A pose without enough evidence: chance, or repeated structure, could support it as well."""
     AMBIGUOUS = "ambiguous"
     """Two places explain the photograph about as well."""
     PRIOR_CONFLICT = "prior_conflict"
-    """A pose outside what is known of the camera."""
+    """A pose outside the hard priors."""
 
 
 class Advice(str, Enum):
-    """What would help."""
+    """What would help after a rejection."""
 
     ADD_REFERENCES = "add_references"
     """Name references, or add some to the scene."""
     SPREAD_REFERENCES = "spread_references"
-    """References that stand apart from one another, so that depth can be seen."""
+    """Use references at different places, so that points can be triangulated."""
     RETAKE_PHOTOGRAPH = "retake_photograph"
-    """More light, less blur, something with texture."""
+    """Retake it with more light, less blur, more texture."""
     LOOK_AT_REFERENCE = "look_at_reference"
     """Point the camera at what the best reference shows."""
     CHOOSE_OTHER_REFERENCES = "choose_other_references"
-    """References that show what the photograph shows; or the scene where it was taken."""
+    """Use references that show the same as the photograph; or the scene in which it was taken."""
     CHECK_CALIBRATION = "check_calibration"
-    """Much is matched and little agrees: the intrinsics of the photograph, or the references' poses, do not fit."""
+    """Many matches and few inliers: check the intrinsics of the photograph and the references' poses."""
     TELL_PLACES_APART = "tell_places_apart"
-    """A prior, or a photograph that shows what tells the places apart."""
+    """Use a prior, or a photograph that shows what distinguishes the places."""
     CHECK_PRIOR = "check_prior"
-    """What was said of the camera contradicts the photograph, or leaves no reference."""
+    """The prior contradicts the photograph, or leaves no reference."""
 
 
 @dataclass(frozen=True)
 class Hint:
-    """What to do about a rejection.
+    """What would help after a rejection.
 
     Attributes:
-        stage: of the method that could not do its work, as the timings call it; empty if none began.
+        stage: the stage that failed, named as in the timings; empty if none began.
         advice: for programs.
         message: one sentence for a person.
         best_reference: name of the reference that overlaps most with the photograph; None if none does.
@@ -66,12 +66,12 @@ class Hint:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A place where the photograph may have been taken.
+    """One of several poses that explain the photograph.
 
     Attributes:
         world_from_camera: metric.
-        inlier_count: keypoints of the photograph whose matches with any reference agree with it.
-        references: names of the references that support it rather than another hypothesis.
+        inlier_count: keypoints of the photograph with an inlier match with any reference.
+        references: names of the references that support it more than the other hypothesis.
     """
 
     world_from_camera: RigidTransform
@@ -86,9 +86,9 @@ class Rejection:
     Attributes:
         reason: for programs.
         message: one sentence for a person, with the numbers that decided.
-        hint: what to do about it; None where nobody has asked (see `hints`).
-        tried: matches with points of the references that it was judged by; None where none were made.
-        hypotheses: the places between which nothing decides, the better supported first; empty unless AMBIGUOUS.
+        hint: what would help; None until `hints` has added it.
+        tried: number of 2D-3D matches that were used; None if there are none yet.
+        hypotheses: the poses that explain it, the better supported first; empty unless AMBIGUOUS.
     """
 
     reason: RejectionReason

@@ -15,9 +15,8 @@ import numpy as np
 from mapless.geometry import Array, Camera, RigidTransform, normalize, normalize_jacobian
 
 from .optimize import damped_step
-from .rigid import perturbed
+from .perturbation import motion_jacobian, perturbed
 from .robust import cauchy_cost, cauchy_weight
-from .uncertainty.perturbation import motion_jacobian
 
 
 @dataclass(frozen=True, eq=False)

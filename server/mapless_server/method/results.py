@@ -1,4 +1,4 @@
-"""What the stages give one another: scale, structure, matches, pose. Data only; made in the stage of its name."""
+"""Results that stages pass on: scale, structure, matches, pose. Data only; computed by the stage of the same name."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from .arrays import (
     AnyArray,
 )
 from .priors.known import PriorCheck
-from .priors.pose_only import reprojection_errors_px as reprojection_errors_px
 from .tracks import Tracks
 from .views import PosedView, View
 
 
 class ScaleStage(str, Enum):
-    """Which stage gave it."""
+    """The stage that gave the scale."""
 
     TRIANGULATION = "triangulation"
     TRAJECTORY = "trajectory"
@@ -32,7 +31,7 @@ class MetricScale:
 
     Attributes:
         metres_per_unit: S, above 0; metres per unit of the reconstruction.
-        stage: which stage gave it.
+        stage: the stage that gave it.
         deviation: d of this scale, 0 and above.
         anchor: index of the reference whose pose ties the local frame to the world.
         world_from_local: the reconstruction's frame in the world, metres.
@@ -49,13 +48,13 @@ class MetricScale:
 
 @dataclass(frozen=True)
 class KeypointNoise:
-    """How far keypoints lie from where they should: sigma^2 = level^2 + (slope * size)^2.
+    """Localization noise of keypoints: sigma^2 = level^2 + (slope * size)^2.
 
     Attributes:
-        level_px: what all keypoints share: detection, and what errors of poses and lenses look like in pixels. While it
+        level_px: noise common to all keypoints: detection, and the effect of pose and lens errors in pixels. While it
             is being estimated, an array of that one number.
-        slope: error per diameter of the patch; a blob of 20 px is found to a pixel, one of 3 px to a fifth. Measured on
-            photographs with surveyed poses.
+        slope: noise per diameter of the patch; a blob of 20 px is localized to a pixel, one of 3 px to a fifth.
+            Measured on photographs with surveyed poses.
     """
 
     level_px: float
@@ -68,12 +67,12 @@ class KeypointNoise:
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Points and the tracks they come from.
+    """Points and their tracks.
 
     Attributes:
         x_in_world: (P, 3) metres.
-        tracks: of these points over the references, in the order of the points.
-        noise: of the keypoints, as estimated from the residuals.
+        tracks: observations of these points by the references, in the order of the points.
+        noise: noise of the keypoints, estimated from the residuals.
     """
 
     x_in_world: Array
@@ -83,13 +82,13 @@ class Structure:
 
 @dataclass(frozen=True, eq=False)
 class PointMatches:
-    """2D-3D matches; no point and no keypoint stands twice.
+    """2D-3D matches; each point and each keypoint occurs at most once.
 
     Attributes:
         point: (M,) index into the structure.
         keypoint: (M,) index into the query's keypoints.
-        guided: (M,) whether the match was searched for near its projection, rather than found in the whole image.
-        radius_px: how near.
+        guided: (M,) whether the match was searched near the point's projection, rather than in the whole image.
+        radius_px: radius of that search.
     """
 
     point: NDArray[np.intp]
@@ -102,22 +101,22 @@ class PointMatches:
 
 
 class PoseStage(str, Enum):
-    """Which stage gave the pose."""
+    """The stage that gave the pose."""
 
     INITIAL = "initial"
     REFINED = "refined"
     COARSE = "coarse"
-    """The initial one, because there was no time to refine it."""
+    """The initial pose, because there was no time to refine it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What is known of a pose's error.
+    """Covariance of a pose by the jackknife over its references.
 
     Attributes:
         covariance: (6, 6) of world_from_camera, order x y z rx ry rz, fixed world axes, metres and radians.
-        motions: (K, 6) how the pose would move, in the same coordinates, without each of its references.
-        inflation: i, by how much the references' errors exceed those of independent matches.
+        motions: (K, 6) change of the pose, in the same coordinates, when each reference is left out.
+        inflation: i, ratio of the references' errors to those of independent matches.
     """
 
     covariance: Array
@@ -127,18 +126,18 @@ class Uncertainty:
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """A pose, believed or not.
+    """A pose, before it is accepted or rejected.
 
     Attributes:
         world_from_camera: metric.
-        stage: whether it is the refined or the initial pose.
-        inliers: (M,) which of the matches agree with it.
+        stage: the stage that gave it.
+        inliers: (M,) which of the matches are inliers.
         errors_px: (M,) reprojection errors; NaN for points behind the camera.
         covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians.
-        prior_checks: of each prior.
-        uncertainty: what the covariance was computed from, before priors sharpened it; None where it is from the
-            residuals alone, and errors that go together are not in it yet (see `pose_covariance`).
-        without_priors: the estimate before priors were used; None where none were.
+        prior_checks: comparison with each prior.
+        uncertainty: the jackknife covariance without priors; None if the covariance is from the residuals alone and
+            leaves out correlated errors (see `pose_covariance`).
+        without_priors: the estimate before priors were used; None if none was used.
     """
 
     world_from_camera: RigidTransform
@@ -153,18 +152,17 @@ class PoseEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """The matches of a query with the points of its references.
+    """The data that a pose is estimated from, and the estimate.
 
-    Everything is in a world in which the first reference stands at the origin; `origin` says where that is in the
-    caller's.
+    Everything is in a world whose origin is the camera centre of the first reference.
 
     Attributes:
         query: the photograph.
-        references: in the order that the structure's tracks number them.
-        structure: metric points and the references' keypoints that show them.
+        references: in the order of the structure's tracks.
+        structure: metric points and the references' keypoints that observe them.
         matches: of the query with the points.
-        estimate: the pose and which matches agree with it; None where there is none.
-        origin: (3,) metres.
+        estimate: pose and inliers; None without a pose.
+        origin: (3,) that origin in the caller's world, metres.
     """
 
     query: View

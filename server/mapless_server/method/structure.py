@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
@@ -201,3 +202,27 @@ def predicted_points(
     depth = keypoint_depths(reconstruction, references)
     points: Array = back_project(centre[first], ray[first], scale.metres_per_unit * depth[first])
     return points
+
+
+def tracks_with_query(
+    structure: Structure, point: NDArray[np.intp], keypoint: NDArray[np.intp], view: int
+) -> tuple[Tracks, NDArray[np.bool_]]:
+    """Tracks over the references and the query, of the points that the query is matched with.
+
+    Args:
+        structure: of P points.
+        point: (M,) of each match, none twice.
+        keypoint: (M,) of the query.
+        view: number that the query gets.
+
+    Returns:
+        The tracks, and which points (P,) they are of.
+    """
+    chosen = np.zeros(len(structure.x_in_world), bool)
+    chosen[point] = True
+    seen = structure.tracks.select(chosen)
+    points = np.concatenate([seen.point, np.cumsum(chosen)[point] - 1])
+    views = np.concatenate([seen.view, np.full(len(point), view)])
+    keypoints = np.concatenate([seen.keypoint, keypoint])
+    order = np.lexsort((views, points))
+    return Tracks(points[order], views[order], keypoints[order]), chosen

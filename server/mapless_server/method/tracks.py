@@ -154,7 +154,7 @@ def build_tracks(
 
 
 def keypoint_depths(reconstruction: Reconstruction, references: Sequence[PosedView]) -> Array:
-    """Predicted depth (N,) at the references' keypoints, reconstruction units; NaN where there is none."""
+    """Predicted depth (N,) at the references' keypoints, reconstruction units; NaN where unknown."""
     depths = [
         prediction.depth_at(reference.view.features.keypoints, reference.view.camera)
         for prediction, reference in zip(reconstruction.references, references, strict=True)
@@ -164,18 +164,18 @@ def keypoint_depths(reconstruction: Reconstruction, references: Sequence[PosedVi
 
 
 def positive(depth: AnyArray) -> AnyArray:
-    """Depths (N,), NaN for those that are none: not finite, or not above 0."""
+    """Depths (N,), with NaN for those that are not finite or not above 0."""
     xp = namespace(depth)
     return xp.where(xp.isfinite(depth) & (depth > 0), depth, np.nan)
 
 
 def keypoint_offsets(references: Sequence[PosedView]) -> NDArray[np.intp]:
-    """Where (K + 1,) the keypoints of each reference begin when they are counted through all."""
+    """Offsets (K + 1,) of each reference's keypoints when those of all references are concatenated."""
     return np.cumsum([0] + [len(reference.view.features) for reference in references])
 
 
 def keypoint_rays(references: Sequence[PosedView]) -> tuple[Array, Array]:
-    """Of the references' keypoints, camera centres (N, 3) and viewing rays (N, 3) of depth 1, in the world."""
+    """Camera centres (N, 3) and viewing rays (N, 3) of depth 1, world frame, of the references' keypoints."""
     poses = [reference.world_from_camera for reference in references]
     counts = [len(reference.view.features) for reference in references]
     rays = [r.view.camera.rays(r.view.features.keypoints) @ r.world_from_camera.rotation.T for r in references]

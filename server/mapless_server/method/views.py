@@ -1,4 +1,4 @@
-"""What the pipeline works on: photographs reduced to a pinhole camera and local features."""
+"""Views: photographs reduced to a pinhole camera and local features."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """The picture behind a view, for whoever looks at pixels. Reading it may mean a database and a decoder.
+    """The image of a view, for stages that use pixels. Reading it may involve a database and a decoder.
 
     Attributes:
-        sha256: of the encoded image, hexadecimal; what caches of anything computed from the pixels are keyed by.
-        camera: in pixels of the picture, with its lens distortion.
-        read: gives the pixels, (H, W, 3) uint8 RGB, of the camera's size.
+        sha256: of the encoded image, hexadecimal; key for caches of anything computed from the pixels.
+        camera: in pixels of the image, with its lens distortion.
+        read: returns the pixels, (H, W, 3) uint8 RGB, of the camera's size.
     """
 
     sha256: str
@@ -56,12 +56,12 @@ class Photograph:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A photograph as the pipeline sees it: processed size, no distortion.
+    """A photograph as the method uses it: processed size, no distortion.
 
     Attributes:
         camera: pinhole, in pixels of the processed (reduced) image.
         features: in the same pixels.
-        photograph: the picture itself; None where nothing looks at it.
+        photograph: the image itself; None if no stage needs it.
     """
 
     camera: Camera
@@ -71,11 +71,11 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class PosedView:
-    """A reference as the pipeline sees it.
+    """A reference as the method uses it.
 
     Attributes:
-        key: identifies the stored reference for good (references never change, keys are never reused): what caches of
-            anything computed from it are keyed by.
+        key: permanent identifier of the stored reference (references never change, keys are never reused); key for
+            caches of anything computed from it.
         name: "scenes/{scene}/references/{reference}".
         view: camera and features.
         world_from_camera: its pose, metric.

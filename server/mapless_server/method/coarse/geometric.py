@@ -19,7 +19,8 @@ from ..correspond import Correspondences
 from ..match import vote
 from ..observations import FIRST_GUESS, adjust_points, triangulate
 from ..options import check_bounds
-from ..pnp import PnpOptions, ransac, reprojection_errors_px
+from ..perturbation import reprojection_errors_px
+from ..pnp import PnpOptions, ransac
 from ..priors.informed import informed_pose
 from ..priors.known import NO_PRIORS, Priors
 from ..reconstruction import ReconstructedView, Reconstruction

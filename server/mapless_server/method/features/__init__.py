@@ -7,8 +7,14 @@ anything that changes the features must change the name. The learned ones import
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Protocol
 
-from .extractor import FeatureExtractor
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Camera
+
+from ..views import View
 from .image import MAX_INCIDENCE_DEG, reduce_image, undistort_pixels
 from .sift import SiftExtractor, SiftOptions
 
@@ -25,6 +31,31 @@ __all__ = [
 
 FEATURES = ("sift", "aliked", "xfeat", "superpoint")
 """The kinds there are; the setting may also be `auto`. All but the first need weights of the same name."""
+
+
+class FeatureExtractor(Protocol):
+    """Finds local features.
+
+    Attributes:
+        name: identifies the extractor and everything that changes its output; the key of stored features.
+    """
+
+    @property
+    def name(self) -> str:
+        """See the class."""
+        ...
+
+    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+        """The view of a photograph.
+
+        Args:
+            image: (H, W, 3) uint8, RGB, as stored in the file.
+            camera: its camera, of the same size.
+
+        Returns:
+            The view, possibly with no keypoints at all (a blank wall); that is for the caller to judge.
+        """
+        ...
 
 
 def make_extractor(name: str, weights: Path | None = None, device: str = "cpu") -> FeatureExtractor:

@@ -20,7 +20,7 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, Similarity, cross_matrix
 
 from ..options import check_bounds
-from ..rigid import perturbed, rotation_vector
+from ..perturbation import perturbed, rotation_vector
 from ..robust import cauchy_cost, cauchy_weight
 
 _MEDIAN_SQUARE = 5.35

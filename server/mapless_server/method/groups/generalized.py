@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform, Similarity
 
-from ..pnp import PnpOptions, reprojection_errors_px
+from ..perturbation import reprojection_errors_px
+from ..pnp import PnpOptions
 
 _libc = ctypes.CDLL(None)
 _rand_lock = threading.Lock()

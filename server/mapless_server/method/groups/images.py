@@ -14,9 +14,13 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..answer import Answer, Localization
-from ..match import MatchOptions, search
+from ..match import MatchOptions, search, vote
+from ..observations import triangulate
+from ..pipeline import Prepared
 from ..rejection import Rejection, RejectionReason
 from ..results import PointMatches, Structure, Support
+from ..structure import StructureOptions, observe, refine_points, tracks_of
+from ..tracks import Tracks
 from ..trust.gate import GateOptions, false_alarms, findable_count, format_false_alarms, hull_share
 from ..views import PosedView, View
 from .generalized import CameraMatches
@@ -176,3 +180,25 @@ def _searched_area(matched: PosedImage, guided: bool) -> float:
         return matched.matches.radius_px**2
     camera = matched.source.query.camera
     return camera.width_px * camera.height_px / np.pi
+
+
+def tracked_support(prepared: Prepared) -> Support | None:
+    """What a pose of the photograph could rest on, found more widely; None where there is nothing."""
+    query, references, check = prepared.query, prepared.references, prepared.context.check
+    if len(references) < 2:
+        return None
+    known = prepared.correspondences.query_matches
+    correspondences = prepared.pipeline.matcher.correspond(query, references, True, check, known)
+    check()
+    options = StructureOptions()
+    tracks = tracks_of(references, correspondences, options)
+    if not tracks.point_count:
+        return None
+    observations = observe(tracks, references, options.first_noise)
+    refined = refine_points(observations, triangulate(observations), options)
+    noise = replace(refined.noise, level_px=float(refined.noise.level_px))
+    left = refined.observations.tracks
+    assert isinstance(left, Tracks)
+    structure = Structure(refined.x_in_world[refined.trusted], left.select(refined.trusted), noise)
+    matches = vote(structure, [len(r.view.features) for r in references], correspondences)
+    return Support(query, references, structure, matches, None, prepared.origin) if len(matches) else None

@@ -19,7 +19,7 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform
 
 from ..optimize import MinimizeOptions, minimize
-from ..pnp import reprojection_errors_px
+from ..perturbation import reprojection_errors_px
 from ..results import PointMatches
 from .images import MatchedImage, PosedImage
 from .problem import F, Freedom, GroupProblem, JointOptions

@@ -16,10 +16,10 @@ from ..adjust import AdjustOptions
 from ..bundle import Bundle, BundleProblem, NormalEquations, Poses, bundle_of, reference_information
 from ..optimize import solve_step
 from ..options import check_bounds
-from ..pnp import reprojection_errors_px
+from ..perturbation import reprojection_errors_px
 from ..results import PointMatches
+from ..structure import tracks_with_query
 from ..tracks import Tracks
-from ..uncertainty.linearization import tracks_with_query
 from ..views import PosedView
 from .images import MatchedImage
 

@@ -15,9 +15,9 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
 from ..options import check_bounds
+from ..perturbation import perturbed
 from ..pnp import PnpOptions
 from ..rejection import Rejection, RejectionReason
-from ..rigid import perturbed
 from ..trust.gate import GateOptions
 from .generalized import inlier_count, rig_ransac
 from .images import GroupImage, MatchedImage, PosedImage, group_doubts, matched_images_of, rejection_without_matches

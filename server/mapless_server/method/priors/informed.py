@@ -16,9 +16,10 @@ import numpy as np
 from mapless.geometry import Array, Camera, RigidTransform
 
 from ..options import check_bounds
+from ..perturbation import reprojection_errors_px
 from .gravity import ransac_with_gravity
 from .known import NO_PRIORS, PriorCheck, Priors
-from .pose_only import PoseOnlyOptions, information, refine_pose, reprojection_errors_px
+from .pose_only import PoseOnlyOptions, information, refine_pose
 
 SOMEWHERE = np.diag([1e-6] * 3 + [1e-2] * 3)
 """Information of a pose of which nothing is known: within kilometres, turned in any way."""

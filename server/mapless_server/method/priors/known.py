@@ -25,7 +25,7 @@ from scipy.special import chdtri
 
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
-from ..rigid import rotation_vector
+from ..perturbation import rotation_vector
 
 CONFLICT_PROBABILITY = 1e-4
 """A prior is in conflict if so few consistent ones are as far from the photograph's pose."""

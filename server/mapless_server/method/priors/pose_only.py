@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian, rotation_from_vector
+from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
 
 from ..optimize import MinimizeOptions, damped_step, minimize
 from ..options import check_bounds
+from ..perturbation import moved
 from ..robust import cauchy_cost, cauchy_weight
 from .known import NO_PRIORS, Priors
 
@@ -71,21 +72,6 @@ def information(
     in_front = world_from_camera.inverse().apply(x_in_world)[:, 2] > 0
     problem = _Problem(camera, x_in_world[in_front], pixels[in_front], NO_PRIORS, options)
     return problem.linearize(world_from_camera)[1]
-
-
-def reprojection_errors_px(
-    camera: Camera, world_from_camera: RigidTransform, x_in_world: Array, pixels: Array
-) -> Array:
-    """Distances (M,) between pixels (M, 2) and where the points (M, 3) project; NaN behind the camera."""
-    projected = camera.project(world_from_camera.inverse().apply(x_in_world))
-    return np.asarray(np.linalg.norm(projected - pixels, axis=1))
-
-
-def moved(world_from_camera: RigidTransform, error: Array) -> RigidTransform:
-    """The pose after a shift and a turn (6,), x y z rx ry rz about fixed world axes."""
-    return RigidTransform(
-        rotation_from_vector(error[3:]) @ world_from_camera.rotation, world_from_camera.translation + error[:3]
-    )
 
 
 class _Problem:

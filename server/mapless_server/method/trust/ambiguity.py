@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, RigidTransform, rotation_angle_deg
 
 from ..options import check_bounds
-from ..pnp import PnpOptions, ransac, reprojection_errors_px
+from ..perturbation import pose_hessian, reprojection_errors_px, world_covariance
+from ..pnp import PnpOptions, ransac
 from ..rejection import Hypothesis
 from ..results import Support
-from ..uncertainty.accuracy import Accuracy, accuracy_from_covariance
-from ..uncertainty.perturbation import pose_hessian, world_covariance
+from ..uncertainty.covariance import Accuracy, accuracy_from_covariance
 from ..views import Matches
 from .gate import false_alarms
 

@@ -43,6 +43,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
+from ..observations import Linearization
+
 MIN_DETERMINANT = 1e-10
 """Of a point's information, by the cube of its largest diagonal element: below, the point is unknown in some direction
 and tells nothing."""
@@ -251,3 +253,41 @@ def _times(matrices: Array, vectors: Array) -> Array:
     xx, yy, zz, xy, xz, yz = matrices
     x, y, z = vectors
     return np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
+
+
+def jackknife_input(
+    rows: Linearization,
+    point: NDArray[np.intp],
+    view: NDArray[np.intp],
+    max_matches: int,
+    motions: Array | None = None,
+) -> JackknifeInput:
+    """What the last view's pose rests on.
+
+    Args:
+        rows: of all observations.
+        point: (O,) of each.
+        view: (O,) of each; the references, in their order, and last the photograph whose pose is asked for.
+        max_matches: of its observations; more are thinned evenly.
+        motions: (V, 6) left perturbations that brought the cameras from their given poses to those that `rows` is
+            linearized at; None if they are at their given poses.
+    """
+    asked = int(view.max())
+    is_asked = view == asked
+    thinning = -(-int(is_asked.sum()) // max_matches)
+    if thinning > 1:
+        taken = np.zeros(int(point.max()) + 1, bool)
+        taken[point[is_asked][::thinning]] = True
+        kept = taken[point]
+        rows = Linearization(rows.residual[kept], rows.weight[kept], rows.by_point[kept], rows.by_pose[kept])
+        point, view, is_asked = point[kept], view[kept], is_asked[kept]
+    residual = rows.residual
+    if motions is not None:
+        residual = residual - (rows.by_pose * motions[view][:, None, :]).sum(axis=2)
+
+    def some(chosen: NDArray[np.bool_]) -> LinearizedObservations:
+        return LinearizedObservations(point[chosen], rows.by_point[chosen], residual[chosen], rows.weight[chosen])
+
+    return JackknifeInput(
+        some(is_asked), rows.by_pose[is_asked], some(~is_asked), view[~is_asked], asked, max(thinning, 1)
+    )

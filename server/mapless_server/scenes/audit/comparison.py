@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless_server.method.perturbation import world_covariance
 from mapless_server.method.pnp import PnpOptions, ransac
 from mapless_server.method.trust.gate import false_alarms
-from mapless_server.method.uncertainty.perturbation import world_covariance
 from mapless_server.method.views import PosedView
 
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood, match_points
