@@ -235,7 +235,6 @@ def test_a_store_that_remembers_nothing_hears_of_every_change(place: Place) -> N
         assert [it.used for it in (other._described, other._resolved, other._attributes)] == [0, 0, 0]
 
 
-finite = st.floats(allow_nan=False, allow_infinity=False)
 factor = st.floats(0.01, 1000)
 vector = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 quaternion = vector.map(lambda it: Quaternion.from_matrix(rotation_from_vector(it)))
@@ -259,19 +258,3 @@ def test_every_bit_comes_back(datum: Datum | None, calibration: Calibration | No
         data = codec.encode_attributes(attributes)
         sha256 = None if data is None else codec.sha256_for("x", data)
         assert codec.decode_attributes("x", data, sha256) == attributes
-
-
-@settings(deadline=None)
-@given(st.tuples(finite, finite, finite))
-def test_directions_are_of_unit_length_whatever_they_were(vector: tuple[float, float, float]) -> None:
-    """Also of vectors whose squares are no numbers."""
-    if not any(vector):
-        with pytest.raises(ValueError, match="some length"):
-            unit_vector(*vector)
-        return
-    found = np.array(unit_vector(*vector))
-    assert np.linalg.norm(found) == pytest.approx(1)
-    largest = np.abs(vector).max()
-    np.testing.assert_allclose(
-        found * np.linalg.norm(np.array(vector) / largest), np.array(vector) / largest, atol=1e-12
-    )
