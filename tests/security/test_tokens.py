@@ -411,6 +411,7 @@ class TestCommand:
 
     def test_the_setting_names_the_file(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """The client's variable MAPLESS_TOKEN is no setting, and no error."""
+        assert command.DEFAULT_TENANT == DEFAULT_TENANT
         monkeypatch.setenv("MAPLESS_TOKEN", "mapless_x")
         monkeypatch.delenv("MAPLESS_TOKENS_FILE", raising=False)
         result = CliRunner().invoke(command.token_app, ["list"])

@@ -14,6 +14,9 @@ from mapless_server.serve.command import fail
 
 token_app = typer.Typer(help="Tokens that callers must have: create, list and revoke them.", no_args_is_help=True)
 
+DEFAULT_TENANT = "default"
+"""That of `mapless_server.security`, whose import takes too long for --help; a test compares."""
+
 TokensFile = Annotated[Path | None, typer.Option(help="The file of tokens; default: the server's setting.")]
 
 
@@ -21,16 +24,13 @@ TokensFile = Annotated[Path | None, typer.Option(help="The file of tokens; defau
 def create_command(
     name: Annotated[str, typer.Option(help="Name of the holder; unique, and the caller's name in the log.")],
     role: Annotated[str, typer.Option(help="Rights of the holder: read, localize (and read), or write (everything).")],
-    tenant: Annotated[
-        str | None, typer.Option(help="Tenant whose scenes the holder can access; default: default.")
-    ] = None,
+    tenant: Annotated[str, typer.Option(help="Tenant whose scenes the holder can access.")] = DEFAULT_TENANT,
     expires: Annotated[str | None, typer.Option(help="When it ends, 2027-01-01T00:00:00Z; default: never.")] = None,
     tokens_file: TokensFile = None,
 ) -> None:
     """Create a token and print it, once: the file has only its hash."""
-    from mapless_server.security import DEFAULT_TENANT, create_token
+    from mapless_server.security import create_token
 
-    tenant = tenant or DEFAULT_TENANT
     with _tokens_file(tokens_file) as path:
         token = create_token(path, name, tenant, role, _read_time(expires) if expires else None)
     typer.echo(f"the token {name!r} of tenant {tenant!r}; it is not shown again:", err=True)
