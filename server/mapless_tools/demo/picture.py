@@ -76,7 +76,7 @@ def draw(
     else:
         found = replace(query, world_from_camera=world_from_query)
         _show(left, (query.image * 0.72).astype(np.uint8), f"{query.name}: drawn with the found pose")
-        _add_lines(left, found.project(scenery.visible_outline), color=AMBER, linewidth=1.6)
+        _add_lines(left, found.project(scenery.visible_outline), color=AMBER, linewidth=2.2)
         lines.append(_add_points(left, found, scenery.points))
     _show(right, (nearest.image * 0.72).astype(np.uint8), f"{nearest.name}: the reference that agrees most")
     _add_points(right, nearest, scenery.points)
@@ -126,7 +126,7 @@ def _add_points(axes: Axes, shot: Shot, points: SparsePoints) -> str:
     depth = shot.world_from_camera.inverse().apply(points.x_in_world[inside])[:, 2]
     rank = np.argsort(np.argsort(-depth))  # not the depth itself: every step of it shall be seen
     x, y = pixels[inside].T
-    axes.scatter(x, y, c=rank, cmap="turbo", s=11, linewidths=0)
+    axes.scatter(x, y, c=rank, cmap="turbo", vmin=-0.18 * len(x), vmax=1.05 * len(x), s=20, linewidths=0)
     indices, observed = find_in(points, shot, MAX_OFFSET_PX)
     if len(indices) == 0:
         return "no drawn point was recognized in the photograph"
