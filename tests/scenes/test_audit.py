@@ -1,4 +1,4 @@
-"""The audit names the planted fault, with its kind and amount, and leaves the others in peace."""
+"""The audit reports a planted fault with its kind and size, and nothing else."""
 
 from __future__ import annotations
 
@@ -229,7 +229,7 @@ def test_an_option_out_of_range_is_named() -> None:
 
 
 def test_one_among_many_faulty_ones_is_never_consistent(references: list[PosedView], pairs: PairMatches) -> None:
-    """Every second pose is wrong by as much: who is right cannot be told, and that is what is said."""
+    """Every second pose is wrong by as much: which ones are right is not decidable."""
     many = [moved(r, (0.1 * (i - 2), 0.15, 0.0)) if i % 2 else r for i, r in enumerate(references)]
     audits = audit(many, pairs)
     assert all(a.verdict is not AuditVerdict.CONSISTENT for i, a in enumerate(audits) if i % 2)

@@ -1,4 +1,4 @@
-"""What is foretold of a place: many matches among the references, none away from them."""
+"""Coverage predicts many matches among the references, none away from them."""
 
 from __future__ import annotations
 

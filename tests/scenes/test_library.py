@@ -1,8 +1,7 @@
-"""References reach the pipeline with the features asked for, described once, and with photographs nobody read yet."""
+"""References are loaded with the requested features, described once, and with photographs that are read when used."""
 
 from __future__ import annotations
 
-import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from support.images import encode, textured
 from support.planted_damage import damage
 from support.servers import CAMERA, StandInExtractor, pose
+from support.stores import Folder
 
 from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, RequestError
@@ -26,8 +26,7 @@ from mapless_server.method.views import View
 from mapless_server.scenes import FeaturesMissing, Loaded, ReferenceLibrary, load_usable
 from mapless_server.scenes import library as library_module
 from mapless_server.security import SceneKey
-from mapless_server.store import DATABASE_FILE, NewReference, Store
-from mapless_server.store.sqlite import choose_library
+from mapless_server.store import NewReference, Store
 
 SCENE = SceneKey("s")
 IDS = [f"r{i}" for i in range(4)]
@@ -70,10 +69,10 @@ def store(tmp_path: Path) -> Iterator[CountingStore]:
 
 
 class Abandoned(Exception):
-    """Nobody wants the result any more."""
+    """The result is not wanted any more."""
 
 
-def turn(seconds: float = 60.0, is_abandoned: Callable[[], bool] = lambda: False) -> StageContext:
+def context(seconds: float = 60.0, is_abandoned: Callable[[], bool] = lambda: False) -> StageContext:
     deadline_s = time.monotonic() + seconds
 
     def check() -> None:
@@ -83,16 +82,9 @@ def turn(seconds: float = 60.0, is_abandoned: Callable[[], bool] = lambda: False
     return StageContext(check)
 
 
-def execute(data_dir: Path, statement: str) -> None:
-    connection: sqlite3.Connection = choose_library().connect(data_dir / DATABASE_FILE)
-    with connection:
-        assert connection.execute(statement).rowcount > 0
-    connection.close()
-
-
 class TestPhotographs:
     def test_are_read_when_somebody_looks_and_not_before(self, store: CountingStore) -> None:
-        generation, references = ReferenceLibrary(store).load(SCENE, IDS[::-1], OLD, turn())
+        generation, references = ReferenceLibrary(store).load(SCENE, IDS[::-1], OLD, context())
         assert generation == store.get_scene(SCENE).generation
         assert [it.name for it in references] == [f"scenes/s/references/{it}" for it in IDS[::-1]]
         assert store.images_read == 0
@@ -107,13 +99,13 @@ class TestPhotographs:
     def test_nothing_holds_pixels_after_they_were_looked_at(self, store: CountingStore) -> None:
         library = ReferenceLibrary(store)
         for count in (1, 2):
-            (reference,) = library.load(SCENE, ["r0"], OLD, turn())[1]
+            (reference,) = library.load(SCENE, ["r0"], OLD, context())[1]
             assert reference.view.photograph is not None
             reference.view.photograph.read()
             assert store.images_read == count
 
     def test_stay_those_of_the_reference_while_the_scene_changes(self, store: CountingStore) -> None:
-        _, (kept, gone) = ReferenceLibrary(store).load(SCENE, ["r0", "r1"], OLD, turn())
+        _, (kept, gone) = ReferenceLibrary(store).load(SCENE, ["r0", "r1"], OLD, context())
         assert kept.view.photograph is not None
         assert gone.view.photograph is not None
         store.delete_reference(SCENE, "r1")
@@ -124,8 +116,8 @@ class TestPhotographs:
             gone.view.photograph.read()
 
     def test_damaged_ones_are_data_loss(self, store: CountingStore, tmp_path: Path) -> None:
-        _, (reference,) = ReferenceLibrary(store).load(SCENE, ["r0"], OLD, turn())
-        execute(tmp_path, "UPDATE image SET data = zeroblob(5000)")
+        _, (reference,) = ReferenceLibrary(store).load(SCENE, ["r0"], OLD, context())
+        Folder(tmp_path).execute("UPDATE image SET data = zeroblob(5000)")
         assert reference.view.photograph is not None
         with pytest.raises(DataLoss, match="'r0'"):
             reference.view.photograph.read()
@@ -133,7 +125,7 @@ class TestPhotographs:
     def test_undecodable_references_are_data_loss_and_no_misuse(self, store: CountingStore) -> None:
         view = OLD.extract(PIXELS["r0"], CAMERA)
         store.add_references(SCENE, [NewReference("odd", b"no image", CAMERA, pose(0.0), {"old": view})])
-        _, (reference,) = ReferenceLibrary(store).load(SCENE, ["odd"], OLD, turn())
+        _, (reference,) = ReferenceLibrary(store).load(SCENE, ["odd"], OLD, context())
         assert reference.view.photograph is not None
         with pytest.raises(DataLoss, match="'odd'"):
             reference.view.photograph.read()
@@ -152,7 +144,7 @@ class TestDescribing:
         new.seen.clear()
         for ids, described in ((["r2"], 1), (["r2", "r1"], 2), (IDS, 4), (IDS[::-1], 4)):
             library = ReferenceLibrary(store)  # what is known is in the store
-            call = turn()
+            call = context()
             found, references = library.load(SCENE, ids, new, call)
             assert found == generation == store.get_scene(SCENE).generation, "features are no change of the scene"
             assert [it.name.rpartition("/")[2] for it in references] == ids
@@ -174,11 +166,11 @@ class TestDescribing:
         new, library = Picky("new"), ReferenceLibrary(store)
         for _ in range(3):
             with pytest.raises(FeaturesMissing):
-                library.load(SCENE, IDS, new, turn(), waits=False)
+                library.load(SCENE, IDS, new, context(), waits=False)
         others = [it for it in IDS if it != "r1"]
         for _ in range(500):
             with suppress(FeaturesMissing):
-                library.load(SCENE, others, new, turn(), waits=False)
+                library.load(SCENE, others, new, context(), waits=False)
                 break
             time.sleep(0.01)
         library.close()
@@ -191,7 +183,7 @@ class TestDescribing:
 
         def load(order: int) -> list[str]:
             together.wait()
-            _, references = library.load(SCENE, IDS[::order], new, turn())
+            _, references = library.load(SCENE, IDS[::order], new, context())
             return sorted(it.name for it in references)
 
         with ThreadPoolExecutor(6) as pool:
@@ -209,12 +201,12 @@ class TestDescribing:
                 raise MemoryError("planted")
 
         with ThreadPoolExecutor(2) as pool:
-            failing = pool.submit(library.load, SCENE, ["r0"], Failing("new"), turn())
+            failing = pool.submit(library.load, SCENE, ["r0"], Failing("new"), context())
             assert entered.wait(20)
             good = StandInExtractor("new")
-            waiting = pool.submit(library.load, SCENE, ["r0"], good, turn())
+            waiting = pool.submit(library.load, SCENE, ["r0"], good, context())
             with pytest.raises(Abandoned):
-                library.load(SCENE, ["r0"], good, turn(0.05))
+                library.load(SCENE, ["r0"], good, context(0.05))
             assert not good.seen
             fail.set()
             with pytest.raises(MemoryError):
@@ -231,9 +223,9 @@ class TestDescribing:
                 return super().extract(*arguments)
 
         with pytest.raises(Abandoned):
-            library.load(SCENE, IDS, Abandoning("new"), turn(is_abandoned=begun.is_set))
+            library.load(SCENE, IDS, Abandoning("new"), context(is_abandoned=begun.is_set))
         assert len(store.load_references(SCENE, IDS, "new").references) == 1
-        library.load(SCENE, IDS, new, turn())
+        library.load(SCENE, IDS, new, context())
         assert len(new.seen) == len(IDS) - 1
 
     def test_a_reference_that_goes_meanwhile_is_not_found(self, store: CountingStore) -> None:
@@ -243,22 +235,22 @@ class TestDescribing:
                 return super().extract(*arguments)
 
         with pytest.raises(NotFound):
-            ReferenceLibrary(store).load(SCENE, IDS, Deleting("new"), turn())
+            ReferenceLibrary(store).load(SCENE, IDS, Deleting("new"), context())
 
 
 class TestUsable:
-    """Those that cannot be had are left out, in the order asked for; what nobody expects is let through."""
+    """Those that cannot be loaded are omitted; unexpected errors are raised."""
 
     def load(
         self, store: CountingStore, ids: list[str], unusable: tuple[type[RequestError], ...], scene: SceneKey = SCENE
     ) -> tuple[list[str], list[str]]:
-        library, told = ReferenceLibrary(store), list[str]()
+        library, omitted = ReferenceLibrary(store), list[str]()
 
         def load(reference_ids: Sequence[str]) -> Loaded:
-            return library.load(scene, reference_ids, OLD, turn())
+            return library.load(scene, reference_ids, OLD, context())
 
-        _, references = load_usable(load, ids, unusable, lambda reference_id, _: told.append(reference_id))
-        return [it.name.rpartition("/")[2] for it in references], told
+        _, references = load_usable(load, ids, unusable, lambda reference_id, _: omitted.append(reference_id))
+        return [it.name.rpartition("/")[2] for it in references], omitted
 
     def test_the_damaged_and_the_deleted_are_left_out_and_told(self, store: CountingStore) -> None:
         damage(store, SCENE, "r1", "features")

@@ -149,16 +149,6 @@ def test_entries_stay_as_they_were() -> None:
     assert now.reference(now.rows({"id-7"})[0])[1] == "key-1000"
 
 
-def test_an_id_used_again_is_the_old_one_in_older_entries() -> None:
-    index = SceneIndex(DIMENSION)
-    index.apply(whole(*(reference(i) for i in range(10))))
-    before = index.entries()
-    index.apply(change(2, (reference(50, name="id-3"),), frozenset({"key-3"})))
-    assert before.reference(before.rows({"id-3"})[0])[1] == "key-3"
-    assert index.entries().reference(index.entries().rows({"id-3"})[0])[1] == "key-50"
-    assert len(index.entries()) == 10
-
-
 def test_readers_see_one_generation_whole_during_changes() -> None:
     """Of every generation there are ten references that stand at x = generation; never some of them."""
     index = SceneIndex(DIMENSION)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from support.scenes import random_for, unit_rows
+from support.scenes import random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.scenes import Cone, Narrowing, RankedReference, RankOptions, Selection, Sphere, rank_references
@@ -222,24 +222,6 @@ def slow_spread(
             break
         chosen.append(max(left, key=lambda i: (worth(i), -i)))
     return chosen
-
-
-def test_a_removed_reference_is_never_ranked() -> None:
-    random = random_for("removed")
-    vectors = unit_rows(random.standard_normal((200, DIMENSION))).astype(np.float32)
-    pose = RigidTransform.identity()
-    index = SceneIndex(DIMENSION)
-    added = tuple(IndexedReference(str(i), str(i), pose, vector) for i, vector in enumerate(vectors))
-    index.apply(SceneChanges(1, added, frozenset(), True))
-    left = set(map(str, range(200)))
-    while left:
-        best = rank(index.entries(), vectors[0], 20)
-        assert {it.reference_id for it in best} <= left
-        assert len(best) == min(20, len(left))
-        gone = frozenset(it.reference_id for it in best)
-        left -= gone
-        index.apply(SceneChanges(index.generation + 1, (), gone, False))
-    assert rank(index.entries(), vectors[0], 20) == []
 
 
 @pytest.mark.parametrize(

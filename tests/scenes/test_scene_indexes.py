@@ -1,4 +1,4 @@
-"""Scenes in memory: one damaged reference costs itself and no other, and memory is kept count of."""
+"""Scenes in memory: a damaged reference affects no other one, and memory is counted."""
 
 from __future__ import annotations
 
@@ -41,10 +41,6 @@ def indexes_of(store: Store, capacity_bytes: int = 2**30) -> SceneIndexes:
     return SceneIndexes(store, ReferenceLibrary(store), DESCRIPTOR, EXTRACTOR, capacity_bytes)
 
 
-def turn() -> StageContext:
-    return StageContext(lambda: None)
-
-
 class TestDamage:
     def test_one_that_cannot_be_described_is_tried_and_told_once(
         self, store: Store, caplog: pytest.LogCaptureFixture
@@ -53,7 +49,7 @@ class TestDamage:
         damage(store, SCENE, "r1", "features")
         indexes = indexes_of(store)
         with caplog.at_level(logging.INFO):
-            entries = [indexes.entries(SCENE, turn()) for _ in range(3)][-1]
+            entries = [indexes.entries(SCENE, StageContext()) for _ in range(3)][-1]
         assert len(entries) == 3
         assert [reference_id for reference_id, _ in entries.undescribed()] == ["r1"]
         assert [it.getMessage() for it in caplog.records if it.levelno >= logging.ERROR] == [
@@ -67,19 +63,19 @@ class TestDamage:
         store.add_references(SCENE, [new(i, is_described=True) for i in range(3)])
         damage(store, SCENE, "r1", what)
         indexes = indexes_of(store)
-        entries = indexes.entries(SCENE, turn())
+        entries = indexes.entries(SCENE, StageContext())
         assert [it in entries for it in ("r0", "r1", "r2")] == [True, False, True]
-        assert [indexes.is_damaged(SCENE, it) for it in ("r0", "r1", "r2", "nobody")] == [False, True, False, False]
+        assert [indexes.is_damaged(SCENE, it) for it in ("r0", "r1", "r2", "absent")] == [False, True, False, False]
 
     def test_a_deleted_one_is_no_longer_damaged_and_may_return(self, store: Store) -> None:
         store.add_references(SCENE, [new(i, is_described=True) for i in range(3)])
         damage(store, SCENE, "r1", "descriptor")
         indexes = indexes_of(store)
-        indexes.entries(SCENE, turn())
+        indexes.entries(SCENE, StageContext())
         store.delete_reference(SCENE, "r1")
         assert not indexes.is_damaged(SCENE, "r1")
         store.add_references(SCENE, [new(1, is_described=True)])
-        assert "r1" in indexes.entries(SCENE, turn())
+        assert "r1" in indexes.entries(SCENE, StageContext())
         assert not indexes.is_damaged(SCENE, "r1")
 
 
@@ -90,24 +86,24 @@ class TestMemory:
         indexes = indexes_of(store)
         for key in keys:
             store.create_scene(key)
-            indexes.entries(key, turn())
+            indexes.entries(key, StageContext())
         store.add_references(keys[0], [new(i, is_described=True) for i in range(3)])
-        indexes.entries(keys[0], turn())
+        indexes.entries(keys[0], StageContext())
         store.delete_scene(keys[1])
         with pytest.raises(NotFound):
-            indexes.entries(keys[1], turn())
+            indexes.entries(keys[1], StageContext())
         assert set(indexes._cached) == {keys[0], keys[2], keys[3]}
         assert indexes.size_bytes == sum(held.index.size_bytes for held in indexes._cached.values())
 
     def test_one_that_was_deleted_takes_none(self, store: Store) -> None:
         store.add_references(SCENE, [new(0, is_described=True)])
         indexes = indexes_of(store)
-        indexes.entries(SCENE, turn())
+        indexes.entries(SCENE, StageContext())
         assert indexes.size_bytes > 0
         for _ in range(2):  # a second time there is nothing to forget
             indexes.forget(SCENE)
             assert indexes.size_bytes == 0
-        assert "r0" in indexes.entries(SCENE, turn())  # as if it were asked for the first time
+        assert "r0" in indexes.entries(SCENE, StageContext())  # as if it were asked for the first time
 
     @pytest.mark.parametrize("is_described", [True, False])
     def test_one_that_is_deleted_while_it_is_asked_takes_none(
@@ -126,10 +122,10 @@ class TestMemory:
 
         monkeypatch.setattr(store, "list_changes", read_then_delete)
         if is_described:
-            assert len(indexes.entries(SCENE, turn())) == 3
+            assert len(indexes.entries(SCENE, StageContext())) == 3
         else:
             with pytest.raises(NotFound):
-                indexes.entries(SCENE, turn())
+                indexes.entries(SCENE, StageContext())
         assert not indexes.is_damaged(SCENE, "r0")
         indexes.report_damaged(SCENE, "r0", DataLoss("lost"))
         assert (indexes.size_bytes, dict(indexes._cached)) == (0, {})
@@ -139,13 +135,13 @@ class TestMemory:
         for key in keys:
             store.create_scene(key)
         one = indexes_of(store)
-        one.entries(keys[0], turn())
+        one.entries(keys[0], StageContext())
         two = indexes_of(store, capacity_bytes=2 * one.size_bytes)
         for key in (*keys, keys[2]):
-            two.entries(key, turn())
+            two.entries(key, StageContext())
         assert list(two._cached) == [keys[3], keys[2]]
         assert two.size_bytes == 2 * one.size_bytes
         none = indexes_of(store, capacity_bytes=0)
         for key in keys:
-            none.entries(key, turn())
+            none.entries(key, StageContext())
         assert list(none._cached) == [keys[3]]

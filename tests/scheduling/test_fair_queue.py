@@ -1,4 +1,4 @@
-"""Deficit round robin: shares are equal whatever is sent, tenants before their clients, and nobody starves."""
+"""Deficit round robin: shares are equal whatever is sent, tenants before their clients, and no caller starves."""
 
 from __future__ import annotations
 

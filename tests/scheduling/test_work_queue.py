@@ -437,7 +437,7 @@ class TestEndOfAll:
                 raise PlantedError(event)
 
         async with Toy() as toy:
-            asyncio.get_running_loop().set_exception_handler(lambda *_: None)  # the loop may be told, too
+            asyncio.get_running_loop().set_exception_handler(lambda *_: None)  # which may be called, too
             setattr(toy.observer, event, raise_if_broken)
             calls = await toy.waiting(range(3))
             broken.set()

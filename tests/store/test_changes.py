@@ -115,7 +115,7 @@ def test_each_change_is_told_once(store: Store) -> None:
     assert (changes.removed, changes.is_whole) == (frozenset({a.key}), False)
     after = store.list_changes(OFFICE, changes.generation, NAME)
     assert (after.generation, after.added, after.removed) == (changes.generation, (), frozenset())
-    # One that came and went in between is never told of as there.
+    # One that came and went in between is never listed as added.
     store.add_references(OFFICE, [described("d")])
     store.delete_reference(OFFICE, "d")
     assert store.list_changes(OFFICE, after.generation, NAME).added == ()

@@ -220,7 +220,7 @@ class TestLimits:
                 other.execute("SELECT * FROM scene_generation FOR UPDATE")
                 with pytest.raises(errors.Unavailable, match="busy"):
                     store.add_references(OFFICE, [make_reference("a")])
-                assert store.get_scene(OFFICE).generation == 1  # who reads does not wait
+                assert store.get_scene(OFFICE).generation == 1  # readers do not wait
             store.add_references(OFFICE, [make_reference("a")])
 
     def test_more_threads_than_connections_wait_or_are_told(

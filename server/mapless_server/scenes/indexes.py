@@ -65,7 +65,7 @@ class SceneIndexes:
             NotFound: there is no such scene (field "scene").
             Abandoned: the context is cancelled.
         """
-        # Even if the scene is evicted meanwhile, this call goes on with the same index.
+        # Even if the scene is evicted meanwhile, this call continues with the same index.
         cached = self._get(scene_key)
         entries = self._refresh(scene_key, cached)
         while undescribed := cached.describable(entries):

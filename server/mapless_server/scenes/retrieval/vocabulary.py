@@ -73,7 +73,7 @@ def dataless(dimension: int) -> Vocabulary:
     """One for unit descriptors of any kind, from seeded random numbers: they are taken to point anywhere."""
     random = np.random.default_rng([SEED, dimension])
     projection = random.standard_normal((dimension, REDUCED)) / np.sqrt(dimension)
-    # Centroids of what is spread evenly lie close to the middle: it is their directions that tell the cells apart.
+    # Centroids of evenly distributed descriptors are close to the mean; their directions distinguish the cells.
     words = random.standard_normal((WORDS, REDUCED))
     words *= 0.5 / np.linalg.norm(words, axis=1, keepdims=True)
     arrays = (np.zeros(dimension), projection, words)
