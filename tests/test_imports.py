@@ -37,11 +37,13 @@ def modules_of(package: str) -> dict[str, Path]:
     return {".".join(path.relative_to(base).with_suffix("").parts).removesuffix(".__init__"): path for path in paths}
 
 
-def imports_of(module: str, path: Path, known: dict[str, Path], *, deferred: bool) -> Iterator[str]:
-    """The modules of `known` that a module imports; `deferred` ones too, which stand in functions."""
+def imports_of(
+    module: str, path: Path, known: dict[str, Path], *, deferred: bool, typing: bool = True
+) -> Iterator[str]:
+    """The modules of `known` that a module imports; those in functions if `deferred`, for type checkers if `typing`."""
     tree = ast.parse(path.read_text())
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    for node in ast.walk(tree) if deferred else _at_import(tree):
+    for node in ast.walk(tree) if deferred else _at_import(tree, typing):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in known)
         elif isinstance(node, ast.ImportFrom):
@@ -53,12 +55,16 @@ def imports_of(module: str, path: Path, known: dict[str, Path], *, deferred: boo
                     yield name if name in known else base
 
 
-def _at_import(node: ast.AST) -> Iterator[ast.AST]:
+def _at_import(node: ast.AST, typing: bool) -> Iterator[ast.AST]:
     """What runs when a module is imported, or is read by a type checker: everything outside functions."""
     for child in ast.iter_child_nodes(node):
-        if not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+        is_for_types = (
+            isinstance(child, ast.If) and isinstance(child.test, ast.Name) and child.test.id == "TYPE_CHECKING"
+        )
+        is_function = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        if not is_function and (typing or not is_for_types):
             yield child
-            yield from _at_import(child)
+            yield from _at_import(child, typing)
 
 
 def graph(*packages: str, deferred: bool) -> dict[str, set[str]]:
@@ -169,3 +175,17 @@ def test_rooms_below_rpc_know_neither_grpc_nor_messages(room: str) -> None:
 
 def test_the_queue_needs_nothing_but_the_standard_library() -> None:
     assert {name.split(".")[0] for name in packages_of("scheduling")} <= sys.stdlib_module_names | {"mapless_server"}
+
+
+def test_services_load_little_of_what_computes() -> None:
+    """What a reader of the services has to know at most: all that loading them loads."""
+    known = {name: path for package in SOURCES for name, path in modules_of(package).items()}
+    loaded, waiting = set[str](), [name for name in known if name.startswith("mapless_server.services")]
+    while waiting:
+        name = waiting.pop()
+        if name not in loaded:
+            loaded.add(name)
+            waiting += imports_of(name, known[name], known, deferred=False, typing=False)
+    server = [known[name] for name in loaded if name.startswith("mapless_server")]
+    assert len(server) <= 110
+    assert sum(len(path.read_text().splitlines()) for path in server) <= 16_000

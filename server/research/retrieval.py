@@ -23,9 +23,9 @@ from mapless_server.method.answer import Localization
 from mapless_server.method.features import FEATURES, make_extractor
 from mapless_server.method.views import Features, View
 from mapless_server.networks.weights import find_weights
-from mapless_server.scenes import RankOptions, Selection, VladDescriptor, rank_references
+from mapless_server.scenes import RankOptions, Selection, rank_references
 from mapless_server.scenes.retrieval.index import Entries, SceneIndex
-from mapless_server.scenes.retrieval.vlad import DIMENSION
+from mapless_server.scenes.retrieval.vlad import DIMENSION, VladDescriptor
 from mapless_server.store import IndexedReference, SceneChanges
 from mapless_tools.dataset import read_folder
 from mapless_tools.evaluate.metrics import pose_error

@@ -18,8 +18,9 @@ from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features import make_extractor
 from mapless_server.method.views import PosedView
-from mapless_server.scenes import AuditVerdict, CoverageVerdict, PairMatches, ReferenceAudit
+from mapless_server.scenes import AuditVerdict, CoverageVerdict, ReferenceAudit
 from mapless_server.scenes.audit.coverage import check_coverage
+from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.resection import with_focal
 from mapless_tools.dataset import Dataset, read_folder
 

@@ -10,8 +10,9 @@ import pytest
 
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features import SiftExtractor
-from mapless_server.scenes import RankedReference, RankOptions, Selection, Vector, VladDescriptor, rank_references
+from mapless_server.scenes import RankedReference, RankOptions, Selection, Vector, rank_references
 from mapless_server.scenes.retrieval.index import SceneIndex
+from mapless_server.scenes.retrieval.vlad import VladDescriptor
 from mapless_server.store import IndexedReference, SceneChanges
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.evaluate.metrics import pose_error

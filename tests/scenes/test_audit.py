@@ -12,9 +12,10 @@ from support.scenes import SceneOptions, make_scene
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.views import Features, PosedView
-from mapless_server.scenes import AuditVerdict, PairMatches, ReferenceAudit
+from mapless_server.scenes import AuditVerdict, ReferenceAudit
 from mapless_server.scenes.audit.auditor import Auditor
 from mapless_server.scenes.audit.finder import ReferenceGone
+from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.options import AuditOptions
 from mapless_server.scenes.audit.resection import with_focal
 

@@ -10,8 +10,9 @@ from support.audits import finder_of
 from support.scenes import SceneOptions, SyntheticScene, look_at, make_scene
 
 from mapless.geometry import RigidTransform
-from mapless_server.scenes import Coverage, CoverageVerdict, PairMatches
+from mapless_server.scenes import Coverage, CoverageVerdict
 from mapless_server.scenes.audit.coverage import CoverageOptions, check_coverage
+from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.visibility import VisibilityOptions
 
 

@@ -23,8 +23,8 @@ from mapless_server.errors import DataLoss, NotFound, RequestError
 from mapless_server.images import ImageLimits
 from mapless_server.method.context import StageContext
 from mapless_server.method.views import View
-from mapless_server.scenes import FeaturesMissing, Loaded, ReferenceLibrary, load_usable
 from mapless_server.scenes import library as library_module
+from mapless_server.scenes.library import FeaturesMissing, Loaded, ReferenceLibrary, load_usable
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store
 

@@ -16,16 +16,11 @@ from support.scenes import SceneOptions, make_scene
 from mapless.geometry import RigidTransform
 from mapless_server.errors import NotFound, Unavailable
 from mapless_server.method.views import PosedView, View
-from mapless_server.scenes import (
-    AuditTools,
-    AuditVerdict,
-    CoverageVerdict,
-    PairMatches,
-    ReferenceLibrary,
-    SceneAuditor,
-    SceneIndexes,
-    Viewpoint,
-)
+from mapless_server.scenes import AuditVerdict, CoverageVerdict, Viewpoint
+from mapless_server.scenes.audit.neighbourhood import PairMatches
+from mapless_server.scenes.audit.scene_auditor import AuditTools, SceneAuditor
+from mapless_server.scenes.indexes import SceneIndexes
+from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store
 

@@ -15,7 +15,8 @@ from support.servers import CAMERA, StandInDescriptor, StandInExtractor, pose
 
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.context import StageContext
-from mapless_server.scenes import ReferenceLibrary, SceneIndexes
+from mapless_server.scenes.indexes import SceneIndexes
+from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, SceneChanges, Store
 

@@ -48,8 +48,10 @@ from mapless_server.method.views import PosedView, View
 from mapless_server.serve import running
 from mapless_server.serve.store_health import watch_store
 from mapless_server.services.handlers import SERVICE_NAMES
-from mapless_server.store import DATABASE_FILE, SqliteDatabase, StoreError, verify
+from mapless_server.store import StoreError
 from mapless_server.store.folder_lock import LOCK_FILE
+from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
+from mapless_server.store.verification import verify
 
 ONCE = ConnectOptions(max_attempts=1, timeout_s=30)
 LARGE = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)

@@ -28,21 +28,11 @@ from typer.testing import CliRunner
 
 from mapless.geodesy import Datum
 from mapless_server.security import DEFAULT_TENANT, SceneKey, key_of
-from mapless_server.store import (
-    DATABASE_FILE,
-    PostgresqlDatabase,
-    SceneAttributes,
-    SqliteDatabase,
-    Store,
-    StoreError,
-    back_up,
-    codec,
-    restore,
-    tables,
-    verify,
-)
-from mapless_server.store.backup import GENERATIONS_SKIPPED
-from mapless_server.store.sqlite import choose_library
+from mapless_server.store import SceneAttributes, Store, StoreError, codec, tables
+from mapless_server.store.backup import GENERATIONS_SKIPPED, back_up, restore
+from mapless_server.store.postgresql import PostgresqlDatabase
+from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase, choose_library
+from mapless_server.store.verification import verify
 from mapless_tools.cli.store import store_app
 
 OFFICE = SceneKey("office")

@@ -28,13 +28,8 @@ from mapless.geometry import Camera, RigidTransform
 from mapless_server import errors
 from mapless_server.method.views import Features, View
 from mapless_server.security import DEFAULT_TENANT, SceneKey
-from mapless_server.store import (
-    NewReference,
-    Store,
-    StoreError,
-    deletion,
-    verify,
-)
+from mapless_server.store import NewReference, Store, StoreError, deletion
+from mapless_server.store.verification import verify
 
 SCENE = SceneKey("office")
 EXTRACTOR, DESCRIPTOR = "sift", "vlad"

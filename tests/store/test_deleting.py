@@ -25,17 +25,10 @@ from support.stores import (
 
 from mapless_server import errors
 from mapless_server.security import DEFAULT_TENANT, SceneKey
-from mapless_server.store import (
-    DATABASE_FILE,
-    SqliteDatabase,
-    Store,
-    back_up,
-    deletion,
-    postgresql,
-    reader,
-    restore,
-)
+from mapless_server.store import Store, deletion, postgresql, reader
+from mapless_server.store.backup import back_up, restore
 from mapless_server.store.deletion import PendingDeletions
+from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 
 OFFICE, HALL = SceneKey("office"), SceneKey("hall")
 TABLES = ("reference", "image", "features", "global_descriptor", "removed_reference")

@@ -21,18 +21,11 @@ from support.stores import (
 )
 
 from mapless_server.security import SceneKey
-from mapless_server.store import (
-    DATABASE_FILE,
-    SCHEMA_VERSION,
-    SceneAttributes,
-    Store,
-    StoreError,
-    back_up,
-    restore,
-    rows,
-)
+from mapless_server.store import SceneAttributes, Store, StoreError, rows
+from mapless_server.store.backup import back_up, restore
 from mapless_server.store.migrations import migrate, run_steps
-from mapless_server.store.tables import features, image, metadata, reference, scene_generation
+from mapless_server.store.sqlite import DATABASE_FILE
+from mapless_server.store.tables import SCHEMA_VERSION, features, image, metadata, reference, scene_generation
 
 OFFICE = SceneKey("office")
 

@@ -12,7 +12,8 @@ from support.stores import EXTRACTOR, Folder, faults_of, make_reference, view_of
 
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
 from mapless_server.security import SceneKey
-from mapless_server.store import DATABASE_FILE, deletion
+from mapless_server.store import deletion
+from mapless_server.store.sqlite import DATABASE_FILE
 
 SCENE = SceneKey("office")
 IDS = ["a", "b", "c"]

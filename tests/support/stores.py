@@ -13,17 +13,12 @@ import psycopg
 
 from mapless.geometry import Camera, Distortion, RigidTransform, rotation_from_vector
 from mapless_server.method.views import Features, View
-from mapless_server.store import (
-    DATABASE_FILE,
-    Database,
-    NewReference,
-    PostgresqlDatabase,
-    SqliteDatabase,
-    Store,
-    sqlite,
-    verify,
-)
+from mapless_server.store import NewReference, Store, sqlite
+from mapless_server.store.database import Database
+from mapless_server.store.postgresql import PostgresqlDatabase
+from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 from mapless_server.store.store import DEFAULT_CACHE_BYTES
+from mapless_server.store.verification import verify
 from support import postgres
 
 EXTRACTOR = "sift"

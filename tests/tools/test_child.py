@@ -10,7 +10,7 @@ import pytest
 from pydantic import SecretStr
 
 from mapless import Client
-from mapless_server.store import DATABASE_FILE
+from mapless_server.store.sqlite import DATABASE_FILE
 from mapless_tools import child
 
 

@@ -12,17 +12,10 @@ from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import Photograph, View
-from mapless_server.scenes import (
-    AuditTools,
-    Choice,
-    GlobalDescriptor,
-    Loaded,
-    ReferenceLibrary,
-    SceneAuditor,
-    SceneIndexes,
-    Selection,
-    rank_references,
-)
+from mapless_server.scenes import Choice, GlobalDescriptor, Selection, rank_references
+from mapless_server.scenes.audit.scene_auditor import AuditTools, SceneAuditor
+from mapless_server.scenes.indexes import SceneIndexes
+from mapless_server.scenes.library import Loaded, ReferenceLibrary
 from mapless_server.security import SceneKey, scene_id_of
 from mapless_server.store import SceneAttributes
 

@@ -26,7 +26,8 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.retrieve import spread_choice
 from mapless_server.method.views import Matches, PosedView, View
-from mapless_server.scenes import Choice, FeaturesMissing, Loaded, Narrowing, RankOptions, Selection, load_usable
+from mapless_server.scenes import Choice, Narrowing, RankOptions, Selection
+from mapless_server.scenes.library import FeaturesMissing, Loaded, load_usable
 from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Job, Next, StageResult, Step
 from mapless_server.store import SceneAttributes
 

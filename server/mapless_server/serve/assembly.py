@@ -22,14 +22,12 @@ from mapless_server.method.features import FEATURES, FeatureExtractor, make_extr
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.networks.weights import CATALOGUE, WeightsError, WeightsMissing, find_weights
 from mapless_server.observability.metrics import Metrics
-from mapless_server.scenes import (
-    AuditTools,
-    GlobalDescriptor,
-    PairMatches,
-    ReferenceLibrary,
-    SceneIndexes,
-    VladDescriptor,
-)
+from mapless_server.scenes import GlobalDescriptor
+from mapless_server.scenes.audit.neighbourhood import PairMatches
+from mapless_server.scenes.audit.scene_auditor import AuditTools
+from mapless_server.scenes.indexes import SceneIndexes
+from mapless_server.scenes.library import ReferenceLibrary
+from mapless_server.scenes.retrieval.vlad import VladDescriptor
 from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
 from mapless_server.security import RateLimiter
 from mapless_server.settings import Settings, available_cores

@@ -5,10 +5,8 @@ schema. Rows become values in `rows` and `codec`, which check every byte. `sqlit
 `backup` and `verify` are what the `store` commands do.
 """
 
-from .backup import back_up, restore
 from .cache import LruCache
-from .database import Database, StoreError
-from .postgresql import PostgresqlDatabase
+from .database import StoreError
 from .records import (
     ContradictingDown,
     DescribedReference,
@@ -21,33 +19,20 @@ from .records import (
     SceneSnapshot,
 )
 from .rows import time_us
-from .sqlite import DATABASE_FILE, SqliteDatabase
 from .store import Store
-from .tables import SCHEMA_VERSION
-from .verification import Progress, Verification, verify
 
 __all__ = [
-    "DATABASE_FILE",
-    "SCHEMA_VERSION",
     "ContradictingDown",
-    "Database",
     "DescribedReference",
     "IndexedReference",
     "LruCache",
     "NewReference",
-    "PostgresqlDatabase",
-    "Progress",
     "ReferenceRecord",
     "SceneAttributes",
     "SceneChanges",
     "SceneRecord",
     "SceneSnapshot",
-    "SqliteDatabase",
     "Store",
     "StoreError",
-    "Verification",
-    "back_up",
-    "restore",
     "time_us",
-    "verify",
 ]

@@ -12,7 +12,8 @@ import typer
 from mapless_server.serve.command import fail
 
 if TYPE_CHECKING:
-    from mapless_server.store import Database, Progress, Verification
+    from mapless_server.store.database import Database
+    from mapless_server.store.verification import Progress, Verification
 
 store_app = typer.Typer(help="The store: bring it up to date, check it, back it up, restore it.", no_args_is_help=True)
 
@@ -26,7 +27,7 @@ DataDir = Annotated[Path | None, typer.Option(help="Folder of the store; default
 def migrate_command(config: Config = None, data_dir: DataDir = None) -> None:
     """Bring the store to this program's schema, as the server does when it starts; makes one where there is none."""
     with _store_errors(), closing(_open(config, data_dir)) as database:
-        from mapless_server.store import SCHEMA_VERSION
+        from mapless_server.store.tables import SCHEMA_VERSION
 
         print(f"database {database.name} has schema version {SCHEMA_VERSION}")
 
@@ -38,7 +39,8 @@ def verify_command(
     data_dir: DataDir = None,
 ) -> None:
     """Read every row of the store or of a backup and report damage; exit code 1 if there is any."""
-    from mapless_server.store import SqliteDatabase, verify
+    from mapless_server.store.sqlite import SqliteDatabase
+    from mapless_server.store.verification import verify
 
     with (
         _store_errors(),
@@ -58,7 +60,7 @@ def backup_command(
     data_dir: DataDir = None,
 ) -> None:
     """Copy the store to one file, whether it is served or not; exit code 1 if something in the store is damaged."""
-    from mapless_server.store import back_up
+    from mapless_server.store.backup import back_up
 
     with _store_errors(), _progress() as on_progress, closing(_look(config, data_dir)) as database:
         found = back_up(database, file, on_progress)
@@ -72,7 +74,8 @@ def restore_command(
     data_dir: DataDir = None,
 ) -> None:
     """Check a backup and copy it into the store, which must be empty: all of it or nothing."""
-    from mapless_server.store import SqliteDatabase, restore
+    from mapless_server.store.backup import restore
+    from mapless_server.store.sqlite import SqliteDatabase
 
     with _store_errors(), _progress() as on_progress:
         SqliteDatabase.open_as_is(file).close()  # before a store is made for it
@@ -83,7 +86,8 @@ def restore_command(
 
 def _open(config: Path | None, data_dir: Path | None) -> Database:
     """The settings' store, brought up to date; created if missing."""
-    from mapless_server.store import PostgresqlDatabase, SqliteDatabase
+    from mapless_server.store.postgresql import PostgresqlDatabase
+    from mapless_server.store.sqlite import SqliteDatabase
 
     url, folder = _settings(config, data_dir)
     return PostgresqlDatabase.open(url) if url else SqliteDatabase.open(folder)
@@ -91,7 +95,8 @@ def _open(config: Path | None, data_dir: Path | None) -> Database:
 
 def _look(config: Path | None, data_dir: Path | None) -> Database:
     """The settings' store, read-only, while others may use it."""
-    from mapless_server.store import DATABASE_FILE, PostgresqlDatabase, SqliteDatabase
+    from mapless_server.store.postgresql import PostgresqlDatabase
+    from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 
     url, folder = _settings(config, data_dir)
     return PostgresqlDatabase.open_as_is(url) if url else SqliteDatabase.open_as_is(folder / DATABASE_FILE)

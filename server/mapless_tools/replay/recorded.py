@@ -18,7 +18,8 @@ from mapless_server.images import decode_image
 from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import Photograph, PosedView, View
-from mapless_server.scenes import STORED_IMAGES, Choice, Loaded, Selection
+from mapless_server.scenes import Choice, Selection
+from mapless_server.scenes.library import STORED_IMAGES, Loaded
 from mapless_server.security import SceneKey, scene_id_of
 from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CapturedReference, DamagedCapture
 from mapless_server.services.capture.files import blob_path

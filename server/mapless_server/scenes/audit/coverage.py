@@ -10,7 +10,6 @@ Occlusion, light and blur are not known: the prediction is for a good photograph
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum
 
 import numpy as np
 
@@ -22,15 +21,8 @@ from mapless_server.method.uncertainty.covariance import accuracy_from_covarianc
 
 from .finder import ReferenceFinder
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood
+from .verdict import Coverage, CoverageVerdict
 from .visibility import VisibilityOptions, Visible, visible_points
-
-
-class CoverageVerdict(str, Enum):
-    """Whether a photograph would be localized."""
-
-    LOCALIZABLE = "localizable"
-    DOUBTFUL = "doubtful"
-    NOT_LOCALIZABLE = "not_localizable"
 
 
 @dataclass(frozen=True)
@@ -77,27 +69,6 @@ class CoverageOptions:
         check_bounds(self, "neighbour_count", at_least=2)
         check_bounds(self, "repeatability enough_image_share", above=0, at_most=1)
         check_bounds(self, "least_matches", above=0, at_most=self.enough_matches)
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """The prediction for one pose.
-
-    Attributes:
-        verdict: see there.
-        message: the verdict as a sentence, with the numbers.
-        expected_match_count: matches that agree with the pose.
-        image_share: share of the image's cells in which at least one is expected.
-        position_68_m: position error that is not exceeded in 68 % of cases; None where no pose is expected.
-        references: names of those that would be used, those with the most matches first.
-    """
-
-    verdict: CoverageVerdict
-    message: str
-    expected_match_count: int
-    image_share: float
-    position_68_m: float | None
-    references: tuple[str, ...]
 
 
 def check_coverage(

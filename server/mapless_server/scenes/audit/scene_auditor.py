@@ -9,7 +9,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from mapless.geometry import Camera, RigidTransform
 from mapless.names import parse_reference_name, reference_name
 from mapless_server.errors import DataLoss, NotFound, RequestError, Unavailable
 from mapless_server.method.context import StageContext
@@ -23,11 +22,11 @@ from ..retrieval.descriptor import GlobalDescriptor
 from ..retrieval.index import Entries, Rows
 from ..retrieval.ranking import RankOptions, Selection, rank_references
 from .auditor import Auditor
-from .coverage import Coverage, check_coverage
+from .coverage import check_coverage
 from .finder import ReferenceFinder, ReferenceGone
 from .neighbourhood import PairMatches
 from .options import AuditOptions
-from .verdict import AuditVerdict, ReferenceAudit
+from .verdict import AuditVerdict, Coverage, ReferenceAudit, Viewpoint
 
 ResultT = TypeVar("ResultT")
 
@@ -66,14 +65,6 @@ class AuditTools:
     descriptor: GlobalDescriptor
     extractor: FeatureExtractor
     pairs: PairMatches
-
-
-@dataclass(frozen=True, eq=False)
-class Viewpoint:
-    """A camera and its pose: world_from_camera, metric."""
-
-    camera: Camera
-    world_from_camera: RigidTransform
 
 
 class SceneAuditor:

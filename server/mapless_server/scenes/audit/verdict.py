@@ -1,9 +1,11 @@
-"""The result of an audit: a verdict on each reference, with numbers and a sentence."""
+"""What an audit finds of a reference, and what a coverage check expects of a camera at a viewpoint."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+
+from mapless.geometry import Camera, RigidTransform
 
 
 class AuditVerdict(str, Enum):
@@ -73,3 +75,40 @@ class ReferenceAudit:
     focal_ratio: float | None = None
     changed_share: float | None = None
     other: str = ""
+
+
+class CoverageVerdict(str, Enum):
+    """Whether a photograph would be localized."""
+
+    LOCALIZABLE = "localizable"
+    DOUBTFUL = "doubtful"
+    NOT_LOCALIZABLE = "not_localizable"
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """The prediction for one pose.
+
+    Attributes:
+        verdict: see there.
+        message: the verdict as a sentence, with the numbers.
+        expected_match_count: matches that agree with the pose.
+        image_share: share of the image's cells in which at least one is expected.
+        position_68_m: position error that is not exceeded in 68 % of cases; None where no pose is expected.
+        references: names of those that would be used, those with the most matches first.
+    """
+
+    verdict: CoverageVerdict
+    message: str
+    expected_match_count: int
+    image_share: float
+    position_68_m: float | None
+    references: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A camera and its pose: world_from_camera, metric."""
+
+    camera: Camera
+    world_from_camera: RigidTransform
