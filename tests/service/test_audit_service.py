@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 from support.images import encode
 from support.planted_damage import damage
-from support.servers import listening
+from support.servers import serving_really
 from support.wall import wall
 
 from mapless import Camera, Client, InvalidArgument, NewReference, NotFound, RigidTransform
 from mapless_server.security import SceneKey
-from mapless_server.serve.assembly import make_engine
-from mapless_server.settings import Settings
 from mapless_server.store import Store
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
@@ -25,12 +23,7 @@ MOVED, BY_M = 3, np.array([0.06, 0.0, 0.08])
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
-    folder: Path = tmp_path_factory.mktemp("data")
-    settings = Settings(host="127.0.0.1", port=0, data_dir=folder, workers=2, metrics=False, warm_up=False)
-    with (
-        listening(settings, Store.open(folder), make_engine) as (running, _),
-        Client(running.address) as client,
-    ):
+    with serving_really(tmp_path_factory.mktemp("data")) as address, Client(address) as client:
         client.create_scene("wall")
         for i, (pixels, pose) in enumerate(SHOTS):
             given = RigidTransform(pose.rotation, pose.translation + BY_M) if i == MOVED else pose
@@ -79,9 +72,8 @@ def test_what_is_wrong_with_an_audit_is_named(client: Client) -> None:
 
 @pytest.mark.parametrize("what", ["features", "descriptor", "pose"])
 def test_a_damaged_reference_is_reported_by_page_and_by_name(tmp_path: Path, what: str) -> None:
-    settings = Settings(host="127.0.0.1", port=0, data_dir=tmp_path, workers=2, metrics=False, warm_up=False)
     store = Store.open(tmp_path)
-    with listening(settings, store, make_engine) as (running, _), Client(running.address) as client:
+    with serving_really(tmp_path, store) as address, Client(address) as client:
         client.create_scene("s")
         news = [NewReference(f"r{i}", encode(".png", pixels), CAMERA, pose) for i, (pixels, pose) in enumerate(SHOTS)]
         client.add_references("s", news[:4])

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from support.images import encode, textured
+from support.layouts import write_cameras
 from support.servers import CAMERA, COVARIANCE, RunningServer, pose, serving
 from support.wall import wall
 from typer.testing import CliRunner
@@ -44,14 +45,7 @@ def moved(i: int) -> RigidTransform:
 
 def write_folder(folder: Path, poses: Sequence[RigidTransform], suffix: str = ".webp") -> Path:
     """Photographs 0, 1, ... with these poses."""
-    (folder / "images").mkdir(parents=True)
-    frames = []
-    for i, it in enumerate(poses):
-        (folder / f"images/{i}{suffix}").write_bytes(encode(suffix, picture(i)))
-        camera = {"width": CAMERA.width_px, "height": CAMERA.height_px, "K": CAMERA.matrix().tolist(), "dist": None}
-        frames.append({"image": f"images/{i}{suffix}", "world_from_camera": it.matrix().tolist()} | camera)
-    (folder / "cameras.json").write_text(json.dumps({"metric": True, "source": "planted", "frames": frames}))
-    return folder
+    return write_cameras(folder, ((picture(i), it) for i, it in enumerate(poses)), CAMERA, suffix)
 
 
 def fill(client: Client, scene: str, count: int = COUNT) -> str:
@@ -263,13 +257,7 @@ def test_wrong_folders_are_one_line(server: RunningServer, tmp_path: Path) -> No
 def test_a_folder_by_itself(tmp_path: Path) -> None:
     """Through a server of its own, with the real method: right answers, and claims that were counted."""
     camera = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
-    (tmp_path / "walk" / "images").mkdir(parents=True)
-    frames = []
-    for i, (image, where) in enumerate(wall(camera, 11)):
-        (tmp_path / f"walk/images/{i}.png").write_bytes(encode(".png", image))
-        size = {"width": camera.width_px, "height": camera.height_px, "K": camera.matrix().tolist(), "dist": None}
-        frames.append({"image": f"images/{i}.png", "world_from_camera": where.matrix().tolist()} | size)
-    (tmp_path / "walk" / "cameras.json").write_text(json.dumps({"metric": True, "frames": frames}))
+    write_cameras(tmp_path / "walk", wall(camera, 11), camera)
     done = CliRunner().invoke(app, ["calibrate", str(tmp_path / "walk"), "--output", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
     figures = json.loads((tmp_path / "out/report.json").read_text())

@@ -25,16 +25,24 @@ HEALTHY = "SERVING\nLocalizationService SERVING\nReferenceService SERVING\n"
 CLIENT = Path(mapless.__file__).parents[1]
 
 
-def run(server: RunningServer, capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, Any, str]:
-    """Exit code, what was printed (as JSON if it is), and what was complained about."""
-    with pytest.raises(SystemExit) as caught:
-        main(["--address", server.address, *arguments])
-    printed = capsys.readouterr()
-    try:
-        output = json.loads(printed.out)
-    except json.JSONDecodeError:
-        output = printed.out
-    return int(caught.value.code or 0), output, printed.err
+Run = Callable[..., tuple[int, Any, str]]
+
+
+@pytest.fixture
+def run(server: RunningServer, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs the command: exit code, what was printed (as JSON if it is), and what was complained about."""
+
+    def run(*arguments: object) -> tuple[int, Any, str]:
+        with pytest.raises(SystemExit) as caught:
+            main(["--address", server.address, *map(str, arguments)])
+        printed = capsys.readouterr()
+        try:
+            output = json.loads(printed.out)
+        except json.JSONDecodeError:
+            output = printed.out
+        return int(caught.value.code or 0), output, printed.err
+
+    return run
 
 
 @pytest.fixture
@@ -44,45 +52,39 @@ def camera_json(tmp_path: Path) -> str:
     return str(path)
 
 
-def test_from_an_empty_server_to_a_pose(
-    server: RunningServer, capsys: pytest.CaptureFixture[str], tmp_path: Path, camera_json: str
-) -> None:
+def test_from_an_empty_server_to_a_pose(run: Run, tmp_path: Path, camera_json: str) -> None:
     photo = tmp_path / "view-1.png"
     photo.write_bytes(PHOTO)
     pose_json = json_format.MessageToJson(wire.transform_to_message(pose(1.0)))
 
-    assert run(server, capsys, "health") == (0, HEALTHY, "")
-    assert run(server, capsys, "scene", "create", "kitchen")[1]["scene_id"] == "kitchen"
+    assert run("health") == (0, HEALTHY, "")
+    assert run("scene", "create", "kitchen")[1]["scene_id"] == "kitchen"
     localize = ("localize", "kitchen", str(photo), "--camera", camera_json)
-    code, answer, _ = run(server, capsys, *localize)
+    code, answer, _ = run(*localize)
     assert (code, answer["reason"]) == (3, "NO_USABLE_REFERENCES")
-    code, reference, _ = run(
-        server, capsys, "reference", "add", "kitchen", str(photo), "--camera", camera_json, "--pose", pose_json
-    )
+    code, reference, _ = run("reference", "add", "kitchen", str(photo), "--camera", camera_json, "--pose", pose_json)
     assert (code, reference["reference_id"], reference["camera"]["width_px"]) == (0, "view-1", 96)
-    code, answer, _ = run(server, capsys, *localize, "--reference", "view-1", "--near", "1", "2", "-1", "0.5")
+    code, answer, _ = run(*localize, "--reference", "view-1", "--near", "1", "2", "-1", "0.5")
     assert code == 0
     assert answer["world_from_camera"]["translation_m"] == {"x": 1.0, "y": 2.0, "z": -1.0}
     assert np.shape(answer["covariance"]) == (6, 6)
-    assert [r["reference_id"] for r in run(server, capsys, "reference", "list", "kitchen")[1]] == ["view-1"]
-    assert run(server, capsys, "reference", "delete", "kitchen", "view-1")[0] == 0
-    assert run(server, capsys, "scene", "get", "kitchen")[1]["reference_count"] == 0
-    assert run(server, capsys, "scene", "delete", "kitchen")[0] == 0
-    assert run(server, capsys, "scene", "list")[1] == []
+    assert [r["reference_id"] for r in run("reference", "list", "kitchen")[1]] == ["view-1"]
+    assert run("reference", "delete", "kitchen", "view-1")[0] == 0
+    assert run("scene", "get", "kitchen")[1]["reference_count"] == 0
+    assert run("scene", "delete", "kitchen")[0] == 0
+    assert run("scene", "list")[1] == []
 
 
-def test_complaints(
-    server: RunningServer, capsys: pytest.CaptureFixture[str], tmp_path: Path, camera_json: str
-) -> None:
-    code, _, complaint = run(server, capsys, "scene", "get", "absent")
+def test_complaints(run: Run, tmp_path: Path, camera_json: str) -> None:
+    code, _, complaint = run("scene", "get", "absent")
     assert code == 1
     assert complaint.startswith("mapless: NOT_FOUND: ")
     photo = str(tmp_path / "absent.jpg")
-    code, _, complaint = run(server, capsys, "localize", "s", photo, "--camera", camera_json)
+    code, _, complaint = run("localize", "s", photo, "--camera", camera_json)
     assert (code, "absent.jpg" in complaint) == (2, True)
-    code, _, complaint = run(server, capsys, "localize", "s", photo, "--camera", '{"width": 3}')
+    code, _, complaint = run("localize", "s", photo, "--camera", '{"width": 3}')
     assert (code, "width" in complaint) == (2, True)
-    code, _, complaint = run(server, capsys, "localize", "s", photo, "--camera", '{"width_px": 3}')
+    code, _, complaint = run("localize", "s", photo, "--camera", '{"width_px": 3}')
     assert (code, "camera.width_px" in complaint) == (2, True)
 
 
@@ -108,24 +110,20 @@ def lines_of(printed: str) -> list[Any]:
 
 @pytest.mark.parametrize("parallel", ["1", "3"])
 def test_a_folder_gives_one_json_line_per_photograph_in_order(
-    server: RunningServer, capsys: pytest.CaptureFixture[str], scene: str, folder: Path, parallel: str
+    run: Run, scene: str, folder: Path, parallel: str
 ) -> None:
-    code, printed, told = run(server, capsys, "localize", scene, str(folder), "--parallel", parallel)
+    code, printed, told = run("localize", scene, folder, "--parallel", parallel)
     answers = lines_of(printed)
     assert (code, told) == (0, "2 of 2 localized\n")
     assert [answer["photo"] for answer in answers] == ["images/2.png", "images/0.png"]
     assert all("world_from_camera" in answer for answer in answers)
 
 
-def test_a_call_that_fails_does_not_end_the_others(
-    server: RunningServer, capsys: pytest.CaptureFixture[str], scene: str, folder: Path, tmp_path: Path
-) -> None:
+def test_a_call_that_fails_does_not_end_the_others(run: Run, scene: str, folder: Path, tmp_path: Path) -> None:
     """Four numbers take the size of the image from each file; a file that has none fails by its call alone."""
     written = tmp_path / "answers.jsonl"
     camera = json_format.MessageToJson(wire.camera_to_message(CAMERA))
-    code, printed, told = run(
-        server, capsys, "localize", scene, str(folder / "images"), "--camera", camera, "--output", str(written)
-    )
+    code, printed, told = run("localize", scene, folder / "images", "--camera", camera, "--output", written)
     assert (code, printed, told) == (
         1,
         "",
@@ -139,34 +137,28 @@ def test_a_call_that_fails_does_not_end_the_others(
     )
     assert first["inlier_count"] == third["inlier_count"] == 90
     (folder / "images" / "1.png").unlink()
-    assert run(server, capsys, "localize", scene, str(folder / "images"), "--camera", FOUR_NUMBERS)[0] == 0
+    assert run("localize", scene, folder / "images", "--camera", FOUR_NUMBERS)[0] == 0
 
 
-def test_a_folder_with_unlocalized_photographs_ends_with_3(
-    server: RunningServer, capsys: pytest.CaptureFixture[str], folder: Path
-) -> None:
-    assert run(server, capsys, "scene", "create", "bare")[0] == 0
-    code, printed, told = run(server, capsys, "localize", "bare", str(folder))
+def test_a_folder_with_unlocalized_photographs_ends_with_3(run: Run, folder: Path) -> None:
+    assert run("scene", "create", "bare")[0] == 0
+    code, printed, told = run("localize", "bare", folder)
     assert (code, told) == (3, "0 of 2 localized, 2 not localized (2 NO_USABLE_REFERENCES)\n")
     assert {answer["reason"] for answer in lines_of(printed)} == {"NO_USABLE_REFERENCES"}
 
 
-def test_a_photograph_beside_a_cameras_json_needs_no_camera(
-    server: RunningServer, capsys: pytest.CaptureFixture[str], scene: str, folder: Path
-) -> None:
-    code, answer, told = run(server, capsys, "localize", scene, str(folder / "images" / "0.png"))
+def test_a_photograph_beside_a_cameras_json_needs_no_camera(run: Run, scene: str, folder: Path) -> None:
+    code, answer, told = run("localize", scene, folder / "images" / "0.png")
     assert (code, answer["inlier_count"], told) == (0, 90, "")
-    code, _, complaint = run(server, capsys, "localize", scene, str(folder / "images" / "1.png"))
+    code, _, complaint = run("localize", scene, folder / "images" / "1.png")
     assert (code, "does not list" in complaint) == (2, True)
     (folder / "cameras.json").unlink()
-    code, _, complaint = run(server, capsys, "localize", scene, str(folder / "images" / "0.png"))
+    code, _, complaint = run("localize", scene, folder / "images" / "0.png")
     assert (code, "give --camera" in complaint) == (2, True)
 
 
-def test_what_would_fail_for_all_ends_at_once(
-    server: RunningServer, capsys: pytest.CaptureFixture[str], folder: Path
-) -> None:
-    code, printed, complaint = run(server, capsys, "localize", "nowhere", str(folder))
+def test_what_would_fail_for_all_ends_at_once(run: Run, folder: Path) -> None:
+    code, printed, complaint = run("localize", "nowhere", folder)
     assert (code, printed) == (1, "")
     assert complaint.startswith("mapless: NOT_FOUND: ")
 
@@ -184,34 +176,30 @@ class TestOnATerminal:
 
     def test_a_photograph_is_a_few_lines(
         self,
-        server: RunningServer,
-        capsys: pytest.CaptureFixture[str],
+        run: Run,
         scene: str,
         folder: Path,
         terminal: Callable[[], None],
     ) -> None:
         terminal()
         photo = str(folder / "images" / "0.png")
-        code, printed, _ = run(server, capsys, "localize", scene, photo, "--camera", str(folder / "cameras.json"))
+        code, printed, _ = run("localize", scene, photo, "--camera", folder / "cameras.json")
         assert code == 0
         assert printed.startswith("localized")
         assert "position  0.000  2.000  -1.000 m   within" in printed
         assert "90 of 120 matches" in printed
         assert len(printed.splitlines()) <= 6
-        assert (
-            run(server, capsys, "localize", scene, photo, "--camera", FOUR_NUMBERS, "--json")[1]["inlier_count"] == 90
-        )
+        assert run("localize", scene, photo, "--camera", FOUR_NUMBERS, "--json")[1]["inlier_count"] == 90
 
     def test_a_folder_is_a_table_and_a_bar(
         self,
-        server: RunningServer,
-        capsys: pytest.CaptureFixture[str],
+        run: Run,
         scene: str,
         folder: Path,
         terminal: Callable[[], None],
     ) -> None:
         terminal()
-        code, printed, told = run(server, capsys, "localize", scene, str(folder))
+        code, printed, told = run("localize", scene, folder)
         assert code == 0
         assert [line.split()[0] for line in printed.splitlines()] == ["photograph", "images/2.png", "images/0.png"]
         assert "[........................] 0/2" in told
@@ -219,42 +207,36 @@ class TestOnATerminal:
         assert "[########################] 2/2" in told
         assert told.endswith("\r\x1b[K2 of 2 localized\n")
 
-    def test_one_that_is_not_localized_says_why(
-        self, server: RunningServer, capsys: pytest.CaptureFixture[str], folder: Path, terminal: Callable[[], None]
-    ) -> None:
+    def test_one_that_is_not_localized_says_why(self, run: Run, folder: Path, terminal: Callable[[], None]) -> None:
         terminal()
-        run(server, capsys, "scene", "create", "nothing")
+        run("scene", "create", "nothing")
         photo = str(folder / "images" / "0.png")
-        code, printed, _ = run(server, capsys, "localize", "nothing", photo, "--camera", FOUR_NUMBERS)
+        code, printed, _ = run("localize", "nothing", photo, "--camera", FOUR_NUMBERS)
         assert code == 3
         assert printed.startswith("not localized: NO_USABLE_REFERENCES\n  ")
 
 
-def test_drawings_are_one_page_each_and_debug_goes_by_name(
-    server: RunningServer, capsys: pytest.CaptureFixture[str], scene: str, folder: Path, tmp_path: Path
-) -> None:
+def test_drawings_are_one_page_each_and_debug_goes_by_name(run: Run, scene: str, folder: Path, tmp_path: Path) -> None:
     pages = tmp_path / "pages"
-    code, printed, told = run(server, capsys, "localize", scene, str(folder), "--draw", str(pages))
+    code, printed, told = run("localize", scene, folder, "--draw", pages)
     assert (code, told) == (0, f"2 of 2 localized\npages to look at are in {pages}\n")
     assert all(answer["debug"] is None for answer in lines_of(printed))
     assert sorted(page.name for page in pages.iterdir()) == ["images_0.png.html", "images_2.png.html"]
     assert "images/0.png" in (pages / "images_0.png.html").read_text()
 
 
-def test_a_scene_has_its_place_on_the_earth(server: RunningServer, capsys: pytest.CaptureFixture[str]) -> None:
-    code, made, _ = run(
-        server, capsys, "scene", "create", "placed", "--datum", "47.5", "8.25", "-3", "--down", "0", "0", "-2"
-    )
+def test_a_scene_has_its_place_on_the_earth(run: Run) -> None:
+    code, made, _ = run("scene", "create", "placed", "--datum", "47.5", "8.25", "-3", "--down", "0", "0", "-2")
     assert (code, made["datum"]["latitude_deg"], made["datum"]["height_m"]) == (0, 47.5, -3.0)
     assert made["down_in_world"] == [0.0, 0.0, -1.0]
     turned = ("--datum", "47.5", "8.25", "0", "--enu-from-world", "0", "0", "-1", "0")
-    code, changed, _ = run(server, capsys, "scene", "update", "placed", *turned, "--forget", "down_in_world")
+    code, changed, _ = run("scene", "update", "placed", *turned, "--forget", "down_in_world")
     assert (code, changed["datum"]["enu_from_world"]["z"]) == (0, -1.0)
     assert changed["generation"] == made["generation"] + 1
-    code, got, _ = run(server, capsys, "scene", "get", "placed")
+    code, got, _ = run("scene", "get", "placed")
     assert got == changed
-    assert run(server, capsys, "scene", "update", "placed")[0] == 2
-    assert run(server, capsys, "scene", "create", "x", "--enu-from-world", "0", "0", "0", "1")[0] == 2
+    assert run("scene", "update", "placed")[0] == 2
+    assert run("scene", "create", "x", "--enu-from-world", "0", "0", "0", "1")[0] == 2
 
 
 @pytest.mark.parametrize(
@@ -272,9 +254,9 @@ def test_a_scene_has_its_place_on_the_earth(server: RunningServer, capsys: pytes
     ],
 )
 def test_what_is_wrong_is_said_before_anything_is_asked(
-    server: RunningServer, capsys: pytest.CaptureFixture[str], folder: Path, arguments: list[str], told: str
+    run: Run, folder: Path, arguments: list[str], told: str
 ) -> None:
-    code, printed, complaint = run(server, capsys, "localize", "s", str(folder / "images"), *arguments)
+    code, printed, complaint = run("localize", "s", folder / "images", *arguments)
     assert (code, printed) == (2, "")
     assert told in complaint
     assert "Traceback" not in complaint

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.images import encode
+from support.layouts import write_cameras
 from support.wall import wall
 from typer.testing import CliRunner
 
@@ -25,23 +25,7 @@ CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine photographs, 0.35 m apart."""
-    path = tmp_path_factory.mktemp("wall")
-    (path / "images").mkdir()
-    frames = []
-    for i, (image, pose) in enumerate(wall(CAMERA)):
-        (path / "images" / f"{i}.png").write_bytes(encode(".png", image))
-        frames.append(
-            {
-                "image": f"images/{i}.png",
-                "width": CAMERA.width_px,
-                "height": CAMERA.height_px,
-                "K": CAMERA.matrix().tolist(),
-                "dist": None,
-                "world_from_camera": pose.matrix().tolist(),
-            }
-        )
-    (path / "cameras.json").write_text(json.dumps({"metric": True, "source": "rendered", "frames": frames}))
-    return path
+    return write_cameras(tmp_path_factory.mktemp("wall") / "photographs", wall(CAMERA), CAMERA)
 
 
 def command(*arguments: object) -> list[str]:

@@ -16,7 +16,7 @@ from support.corner import photograph
 from support.corner import pose as corner_pose
 from support.images import encode
 from support.messages import set_field
-from support.servers import CAMERA, PHOTO, Stubs, failure_of, pose, serving
+from support.servers import CAMERA, PHOTO, Stubs, failure_of, pose, serving, serving_really
 
 from mapless import (
     Camera,
@@ -37,7 +37,6 @@ from mapless.geometry import rotation_from_vector
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_tools.child import child_server
 
 CORNER = Camera(320, 240, 280.0, 280.0, 160.3, 118.9)
 STANDPOINTS = [corner_pose(-15.0 + 6 * i, height_m=-1.6 + 0.05 * (i % 2)) for i in range(6)]
@@ -47,10 +46,7 @@ BLANK = encode(".png", np.full((240, 320, 3), 90, np.uint8))
 
 @pytest.fixture(scope="module")
 def corner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
-    with (
-        child_server(tmp_path_factory.mktemp("corner"), {"--workers": "1"}) as server,
-        Client(server.address) as client,
-    ):
+    with serving_really(tmp_path_factory.mktemp("corner"), workers=1) as address, Client(address) as client:
         client.create_scene("corner")
         client.add_references(
             "corner", [NewReference(f"p{i}", photograph(it, CORNER), CORNER, it) for i, it in enumerate(STANDPOINTS)]

@@ -14,8 +14,7 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 import typer
-from support.images import encode
-from support.layouts import CAMERA, assert_same_camera, assert_same_pose, truth, write_image
+from support.layouts import CAMERA, assert_same_camera, assert_same_pose, truth, write_cameras, write_image
 from support.servers import RunningServer
 from support.wall import wall
 from typer.testing import CliRunner, Result
@@ -129,14 +128,7 @@ def test_a_dry_run_needs_no_server_and_stores_nothing(folder: Path, tmp_path: Pa
 def write_wall(folder: Path) -> Path:
     """Photographs of a wall."""
     camera = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
-    frames: list[dict[str, Any]] = []
-    (folder / "images").mkdir(parents=True)
-    for i, (image, pose) in enumerate(wall(camera)):
-        (folder / "images" / f"{i}.png").write_bytes(encode(".png", image))
-        frames.append({"image": f"images/{i}.png", "width": 480, "height": 360, "K": camera.matrix().tolist()})
-        frames[-1]["world_from_camera"] = pose.matrix().tolist()
-    (folder / "cameras.json").write_text(json.dumps({"frames": frames}))
-    return folder
+    return write_cameras(folder, wall(camera), camera)
 
 
 def test_the_epipolar_error_of_rendered_photographs_is_printed(tmp_path: Path) -> None:
@@ -186,7 +178,7 @@ def test_poses_that_do_not_fit_are_not_stored_unless_told_to(
     server: RunningServer, client: Client, scene: str, tmp_path: Path
 ) -> None:
     """A script sees it by the exit code."""
-    folder = write_wall(tmp_path)
+    folder = write_wall(tmp_path / "wall")
     file = folder / "cameras.json"
     content = json.loads(file.read_text())
     for frame in content["frames"]:

@@ -22,11 +22,11 @@ from support.servers import (
     PHOTO,
     RunningServer,
     StandInMethod,
-    listening,
     localize_request,
     make_scene,
     pose,
     serving,
+    serving_really,
     whole,
 )
 from support.waiting import wait_until
@@ -40,9 +40,6 @@ from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseStage
 from mapless_server.scheduling import Abandoned
-from mapless_server.serve.assembly import make_engine
-from mapless_server.settings import Settings
-from mapless_server.store import Store
 
 LIMIT_S = 30.0
 COARSE_X_M = 7.0
@@ -209,15 +206,13 @@ ANGLES_DEG = (-24, -16, -8, 0, 8, 16, 24)
 @pytest.fixture(scope="module")
 def corner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalizationServiceStub]:
     """A server as it is shipped, with a scene of a papered corner."""
-    folder = tmp_path_factory.mktemp("corner")
-    settings = Settings(host="127.0.0.1", port=0, data_dir=folder, workers=1, metrics=False, warm_up=False)
-    with listening(settings, Store.open(folder), make_engine) as (running, _), Client(running.address) as client:
+    with serving_really(tmp_path_factory.mktemp("corner"), workers=1) as address, Client(address) as client:
         client.create_scene("s")
         poses = [corner_pose(angle) for angle in ANGLES_DEG]
         client.add_references(
             "s", [NewReference(f"r{i}", photograph(it), CORNER_CAMERA, it) for i, it in enumerate(poses)]
         )
-        with grpc.insecure_channel(running.address) as channel:
+        with grpc.insecure_channel(address) as channel:
             yield LocalizationServiceStub(channel)
 
 
@@ -304,7 +299,7 @@ def test_a_cancelled_stream_frees_its_place_and_ends_refining(server: Serving) -
 
 
 def test_a_deadline_after_the_coarse_pose_is_a_detailed_error(server: Serving) -> None:
-    call = asking(server, timeout=1.0)
+    call = asking(server, timeout=2.0)
     assert not next(call).is_final
     failure = ending(call)
     assert (failure.code, failure.reason) == ("DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED")
@@ -313,7 +308,7 @@ def test_a_deadline_after_the_coarse_pose_is_a_detailed_error(server: Serving) -
 
 
 def test_where_a_coarse_pose_suffices_the_deadline_ends_it(server: Serving) -> None:
-    first, last = asking(server, timeout=1.0, options=pb.LocalizeOptions(allow_coarse=True))
+    first, last = asking(server, timeout=2.0, options=pb.LocalizeOptions(allow_coarse=True))
     assert (first.is_final, last.is_final) == (False, True)
     assert last.answer.localization == first.answer.localization
     assert last.answer.localization.pose_stage == pb.POSE_STAGE_COARSE

@@ -6,10 +6,13 @@ axes or half a pixel that is wrong shows.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_tools.dataset import Dataset, Frame
@@ -39,6 +42,20 @@ def write_image(file: Path, seed: int = 0, width: int = 96, height: int = 64) ->
     """A small photograph that no other has the pixels of."""
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(encode(file.suffix, textured(width, height, seed=seed)))
+
+
+def write_cameras(
+    folder: Path, shots: Iterable[tuple[NDArray[np.uint8], RigidTransform]], camera: Camera, suffix: str = ".png"
+) -> Path:
+    """A folder of photographs images/0.png, images/1.png and so on, with a cameras.json in metres."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for i, (image, pose) in enumerate(shots):
+        (folder / f"images/{i}{suffix}").write_bytes(encode(suffix, image))
+        size = {"width": camera.width_px, "height": camera.height_px, "K": camera.matrix().tolist(), "dist": None}
+        frames.append({"image": f"images/{i}{suffix}", "world_from_camera": pose.matrix().tolist()} | size)
+    (folder / "cameras.json").write_text(json.dumps({"metric": True, "source": "planted", "frames": frames}))
+    return folder
 
 
 def opengl(pose: RigidTransform) -> np.ndarray:

@@ -33,7 +33,7 @@ from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security import RateLimiter
-from mapless_server.serve.assembly import MakeEngine, engine_options, engine_over
+from mapless_server.serve.assembly import MakeEngine, engine_options, engine_over, make_engine
 from mapless_server.serve.running import Running, running_server
 from mapless_server.settings import Settings
 from mapless_server.store import Store
@@ -262,6 +262,15 @@ def serving(
             )
         finally:
             stand_in.gate.set()
+
+
+@contextmanager
+def serving_really(data_dir: Path, store: Store | None = None, **options: Any) -> Iterator[str]:
+    """The address of a server with the real features and the real method, until the block is left."""
+    defaults = {"port": 0, "workers": 2, "metrics": False, "warm_up": False}
+    settings = Settings(host="127.0.0.1", data_dir=data_dir, **(defaults | options))
+    with listening(settings, store or Store.open(data_dir), make_engine) as (running, _):
+        yield running.address
 
 
 def make_scene(client: Client, scene_id: str = "s", count: int = 1) -> str:
