@@ -1,4 +1,4 @@
-"""The client as a robot installs it: at its floors and with the newest of everything, without the server's packages."""
+"""The client with the oldest and the newest versions of its dependencies, without the server's packages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a caller who allows a coarse pose sends, and what it makes of one."""
+"""How the client asks for a coarse pose and how it reads one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The manifests with Envoy in front are what Kubernetes takes, and fit servers, settings and Envoy's configuration."""
+"""The manifests with Envoy are valid for Kubernetes and match the servers, their settings and Envoy's configuration."""
 
 from __future__ import annotations
 

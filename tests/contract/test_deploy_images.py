@@ -1,4 +1,4 @@
-"""The images and the compose files say what the code says: ports, settings, times, folders; and nothing is left open.
+"""The images and the compose files match the code: ports, settings, times, folders; and nothing is left unprotected.
 
 No container engine is needed: the files are read. What is true of an image holds for every target of the Dockerfile.
 """

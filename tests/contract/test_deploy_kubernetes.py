@@ -1,4 +1,4 @@
-"""The manifests are what Kubernetes takes, fit together, and say what the code says: ports, services, times, settings.
+"""The manifests are valid for Kubernetes and match one another and the code: ports, services, times, settings.
 
 Each file by itself, and what kustomize makes of them, where kubectl is there to make it; no cluster is asked.
 """

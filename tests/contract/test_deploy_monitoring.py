@@ -1,4 +1,4 @@
-"""Dashboard and alerts ask for what the server tells: every selector finds a series, every label is one it has.
+"""Dashboard and alerts query what the server reports: every selector finds a series, every label exists.
 
 The series are those of a `Metrics` to which everything happened once. An alert or a panel that asks for what is not
 there stays empty for ever, and nobody notices.

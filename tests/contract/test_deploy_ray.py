@@ -1,4 +1,4 @@
-"""The manifests for Ray are what KubeRay and Serve take, name what exists, and let nobody in but the gateway.
+"""The manifests for Ray are valid for KubeRay and Serve, name what exists, and admit only the gateway.
 
 KubeRay's own schema is too large to be kept here. When these manifests were written they were checked against all of it
 (KubeRay 1.7, ray-operator/config/crd/bases/ray.io_rayservices.yaml); what remains is the list of the fields they use.

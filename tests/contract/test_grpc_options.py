@@ -1,4 +1,4 @@
-"""Every option of a channel or a server is one that gRPC knows: it passes over misspelt ones without a word."""
+"""Every option of a channel or a server is known to gRPC, which ignores misspelt ones silently."""
 
 from __future__ import annotations
 

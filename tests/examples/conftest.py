@@ -1,4 +1,4 @@
-"""The examples, importable by their names as they are when they are run."""
+"""Makes the examples importable by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The robot's loop runs: a real video, a real server that goes away and comes back."""
+"""The example of a robot's loop, on a real video and with a server that stops and returns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ROS messages without ROS: what has the fields of a message is one; and the node, on a rclpy that only hands on."""
+"""The ROS example without ROS: objects with the fields of messages, and the node on a stand-in for rclpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fuzzes all targets, each in a process of its own, and tells what came of it: `python -m fuzz.campaign`, `make fuzz`.
+"""Fuzzes all targets, each in a process of its own, and reports the results: `python -m fuzz.campaign`, `make fuzz`.
 
 Written to the output folder: a table for people and one for programs, and for each target its log, its corpus, which
 the next campaign begins with, and what broke a law: `python -m fuzz.run TARGET --input FILE` tries one again.

@@ -1,4 +1,4 @@
-"""Store text: what an operator writes: the file of settings, the environment, the address of the database.
+"""Text of operators: the file of settings, the environment, the address of the database.
 
 Laws: a setting is read or refused with a ConfigError of printable lines; what is accepted is finite, within bounds; an
 address of a database is refused in a line that could not hold it, since it may hold a password.

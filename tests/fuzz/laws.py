@@ -1,4 +1,4 @@
-"""Laws of what was accepted, which hold wherever it came from."""
+"""Laws of accepted values, shared by the targets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Request validation: what comes beside a message (ids, tokens, deadlines, certificates), and the file of tokens.
+"""Request validation: a call's metadata (ids, tokens, deadlines, certificates), and the file of tokens.
 
 Laws: every call ends once, answered or with a status that a caller can act on, and with one line in the log, a JSON
 object; only a token of the file opens anything; a file of tokens that is accepted is the same after it was written.

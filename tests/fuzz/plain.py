@@ -1,4 +1,4 @@
-"""Mutations of bytes without atheris, for machines that have none and for tests that must run everywhere."""
+"""Mutations of bytes without atheris, which is not available everywhere."""
 
 from __future__ import annotations
 

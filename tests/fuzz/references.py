@@ -1,4 +1,4 @@
-"""Request validation: ReferenceService as it is, before an engine and a store that look at what comes.
+"""Request validation: ReferenceService with an engine and a store that check their arguments.
 
 Laws: a refusal names a field that the request has; what the store gets has keys of the caller's tenant and legal ids,
 can be written down, and reads back as it was; a page begins after a legal id.

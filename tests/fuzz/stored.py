@@ -1,4 +1,4 @@
-"""Store text: what is written into the database's columns of bytes, and what is read from them.
+"""Encoding and decoding of the database's columns of bytes.
 
 Laws: whatever is encoded comes back to the bit; bytes that are not what was stored, or that belong to another row, are
 Damaged, and so is what has the right checksum and another form; nothing else is raised.

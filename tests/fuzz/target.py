@@ -1,4 +1,4 @@
-"""What a fuzz target is, and which there are."""
+"""The interface of a fuzz target, and the list of targets."""
 
 from __future__ import annotations
 

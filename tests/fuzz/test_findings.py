@@ -1,4 +1,4 @@
-"""Inputs that fuzzing found something wrong with, each as small as it could be made."""
+"""Regressions: inputs with which fuzzing found an error, each as small as possible."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Laws of what reads the inputs of strangers, over inputs made on purpose: images, requests, importers, stored text."""
+"""Properties of the code that reads untrusted input: images, requests, importers, stored text."""
 
 from __future__ import annotations
 

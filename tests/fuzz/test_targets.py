@@ -1,4 +1,4 @@
-"""No input breaks a law of a fuzz target: a short campaign of each, and the same targets with mutations nothing guides.
+"""No input breaks a law of a fuzz target: a short guided campaign of each, and random mutations without guidance.
 
 The long campaign is `make fuzz`. What either finds becomes a test of its own (`test_findings.py`).
 """

@@ -1,4 +1,4 @@
-"""LightGlue on a GPU: as on the CPU, also while a network runs beside it."""
+"""LightGlue on a GPU gives the CPU's matches, also while a network runs."""
 
 from __future__ import annotations
 

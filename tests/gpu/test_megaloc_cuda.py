@@ -1,4 +1,4 @@
-"""MegaLoc on a GPU: the vectors are the CPU's but for rounding."""
+"""MegaLoc on a GPU gives the CPU's vectors up to rounding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The network's backend where tokens really leave the device and memory really runs out."""
+"""The network backend on a GPU: tokens move to the host and memory runs out."""
 
 from __future__ import annotations
 

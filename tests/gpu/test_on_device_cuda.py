@@ -1,4 +1,4 @@
-"""The stages on a CUDA device: what the host gives, and no synchronization on the way."""
+"""The stages on a CUDA device give the host's results without synchronization."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Ray adapter without a cluster: what it puts on Serve's gRPC server, what it checks, and the sample config."""
+"""The Ray adapter without a cluster: methods on Serve's gRPC server, checks, and the sample configuration."""
 
 from __future__ import annotations
 

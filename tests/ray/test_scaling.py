@@ -1,4 +1,4 @@
-"""How many replicas: the policy's laws, and that it settles when Serve's own rules are around it, in simulated time."""
+"""The number of replicas: the policy's laws, and that it settles under Serve's own rules, in simulated time."""
 
 from __future__ import annotations
 

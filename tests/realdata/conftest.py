@@ -1,4 +1,4 @@
-"""Photographs that are not part of the repository: beside it, or in the folder of TEST_DATA."""
+"""Photographs from outside the repository: beside it, or in the folder of TEST_DATA."""
 
 from __future__ import annotations
 

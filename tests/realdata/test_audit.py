@@ -1,4 +1,4 @@
-"""The audit on real photographs: planted faults are named with kind and amount, and nothing else is.
+"""The audit on real photographs: planted faults are reported with kind and size, and nothing else is.
 
 Each fault is planted in several references in turn. Whatever is not its victim must be found consistent.
 """

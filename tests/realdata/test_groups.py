@@ -1,4 +1,4 @@
-"""Rigs and sequences on real photographs: never worse than single photographs, and found where those are lost."""
+"""Rigs and sequences on real photographs: no worse than single photographs, and localized where those are not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Learned features on real photographs: what they are for, and that the strong ones are asked only where they must."""
+"""Learned features on real photographs: they localize what cheap features lose, and are used only then."""
 
 from __future__ import annotations
 

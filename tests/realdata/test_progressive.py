@@ -1,4 +1,4 @@
-"""Coarse first, refined after, on photographs with known poses: what each answer is worth, by the shipped server."""
+"""Accuracy of coarse and refined answers on photographs with known poses, by the shipped server."""
 
 from __future__ import annotations
 

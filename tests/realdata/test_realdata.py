@@ -1,4 +1,4 @@
-"""The whole service on real photographs: what it promises of accuracy, and that it does not find what is not there."""
+"""The whole service on real photographs: accuracy, and rejection of photographs of other places."""
 
 from __future__ import annotations
 

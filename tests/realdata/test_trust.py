@@ -1,4 +1,4 @@
-"""What is accepted at a stated coverage, on real photographs: the right answers, and next to nothing else."""
+"""Acceptance at a stated coverage on real photographs: right answers, and almost nothing else."""
 
 from __future__ import annotations
 

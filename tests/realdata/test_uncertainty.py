@@ -1,4 +1,4 @@
-"""Claimed radii on real photographs with known poses: held about as often as they say."""
+"""Reported radii on real photographs with known poses hold about as often as they state."""
 
 from __future__ import annotations
 

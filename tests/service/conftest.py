@@ -1,4 +1,4 @@
-"""A server that tests of a file share."""
+"""A server shared by the tests of a module."""
 
 from __future__ import annotations
 

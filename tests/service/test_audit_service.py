@@ -1,4 +1,4 @@
-"""Through the service: planted faults are named, page by page, and coverage is foretold where references look."""
+"""The audit through a real server: planted faults are reported, page by page, and coverage is predicted."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A disk that is full, read-only, slow or damaged; two servers on one file; a scene that is deleted while it is asked.
 
-What can be answered is answered, what cannot says why, nothing is mixed up, and when the fault is gone all works again
-without a restart.
+What can be answered is answered, what cannot says why, and everything works again without a restart when the fault is
+gone.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The wall clock jumps by hours, as after a wrong time was set: only what is about dates notices.
+"""The wall clock jumps by hours, as after a wrong time was set: only dates are affected.
 
-A real server runs with a library that moves its wall clock alone (`tests/wall_clock.c`). Deadlines, queues, rates and
-the watch over what hangs must go by the monotonic one, which a system leaves alone, too.
+A real server runs with a library that moves its wall clock alone (`tests/support/wall_clock.c`). Deadlines, queues,
+rates and the detection of hanging stages must use the monotonic clock, which the system never sets.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A PostgreSQL that is killed under load, has no connection or no room left: callers are told, and nothing is lost."""
+"""PostgreSQL is killed under load, or has no connection or no room left: callers are informed, nothing is lost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every call has: a bound, a deadline, a request id, and errors that say what the caller may know."""
+"""What every call has: a limit, a deadline, a request id, and errors with what the caller may know."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The blocking client and the asynchronous one: the same tests, the same server, the same answers."""
+"""The blocking and the asynchronous client: the same tests with the same server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two servers behind a real Envoy, configured as deployed: who answers, and that callers notice nothing else of it."""
+"""Two servers behind a real Envoy, configured as deployed: routing, and answers as without it."""
 
 from __future__ import annotations
 

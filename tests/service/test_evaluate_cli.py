@@ -1,4 +1,4 @@
-"""`mapless-server evaluate` as a person runs it, on a rendered wall."""
+"""`mapless-server evaluate` as a user runs it, on a rendered wall."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`mapless-server export`: what is written reads back, and images are bit by bit what was stored."""
+"""`mapless-server export`: folders can be read again, and images are those stored, bit for bit."""
 
 from __future__ import annotations
 

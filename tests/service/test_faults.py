@@ -1,6 +1,6 @@
-"""Clients that vanish, misbehave or flood; methods that raise, hang or give nonsense; processes that are killed.
+"""Clients that disappear, misbehave or flood; methods that raise, hang or return nonsense; processes that are killed.
 
-Whatever one of them does, the others are answered, each call ends in one way, and what was acknowledged is there.
+The other callers are answered, each call ends once, and what was acknowledged is stored.
 """
 
 from __future__ import annotations

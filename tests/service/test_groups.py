@@ -1,4 +1,4 @@
-"""LocalizeRig and LocalizeSequence through a real server: what is asked, what comes back, and what is refused."""
+"""LocalizeRig and LocalizeSequence through a real server: requests, answers, refusals."""
 
 from __future__ import annotations
 

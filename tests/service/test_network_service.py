@@ -1,4 +1,4 @@
-"""The whole service on a small network with random weights: it says nothing true, and must do so without an error."""
+"""The whole service on a small network with random weights: its poses are meaningless, but no call fails."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""More calls than the server can take: some are refused at once and told when to come again, the others are answered.
+"""More calls than the server can compute: some are refused at once and told when to retry, the others are answered.
 
-And every one of them is in the books, of the caller and of the server, once.
+The caller and the server count each of them once.
 """
 
 from __future__ import annotations

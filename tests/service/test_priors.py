@@ -1,4 +1,4 @@
-"""Soft priors through a real server: what the scene must say for them, and what they narrow."""
+"""Soft priors through a real server: the scene attributes that they need, and how they narrow the choice."""
 
 from __future__ import annotations
 

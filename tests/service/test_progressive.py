@@ -1,4 +1,4 @@
-"""Coarse first, refined after, through a real server: what comes when, what it is worth, and how it ends."""
+"""LocalizeProgressively through a real server: the order of messages, their content, and how a stream ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the clients make of streams: what is told early is told once, broken calls are made again, errors come last."""
+"""Streams in the clients: one coarse answer, retries of broken calls, errors last."""
 
 from __future__ import annotations
 

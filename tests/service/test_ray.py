@@ -1,4 +1,4 @@
-"""mapless on a real Ray cluster with Serve's real ingress and a real PostgreSQL: what holds for one server holds here.
+"""mapless on a real Ray cluster with Serve's ingress and a real PostgreSQL behaves like one server.
 
 Two replicas. They answer as the plain server does, bit for bit, with its errors and limits, and callers with the
 client's usual retries notice nothing when replicas are replaced, killed, or broken.

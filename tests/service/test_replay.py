@@ -1,4 +1,4 @@
-"""What is captured can be computed again, exactly: a real server's answers, and another process that has the folder.
+"""Captured calls can be computed again exactly: answers of a real server, replayed by another process.
 
 The law: with the same program and settings every replayed answer is the answer, to the last bit; whatever was planted
 into the folder is found, and named.

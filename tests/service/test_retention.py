@@ -1,4 +1,4 @@
-"""What callers send is kept nowhere, unless the operator asks for it: in no file, no database and no log.
+"""What callers send is stored nowhere, unless the operator asks for it: in no file, no database and no log.
 
 Photographs with planted contents go through every method that takes one, answered and refused, to a server in its own
 process, which has a home, a folder for temporary files and a working folder of its own. Then whatever it could write is

@@ -1,4 +1,4 @@
-"""The server finds references by what they look like: by themselves, for Localize, and among those that are named."""
+"""Retrieval through a real server: by RetrieveReferences, for Localize, and among named references."""
 
 from __future__ import annotations
 

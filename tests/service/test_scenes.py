@@ -1,4 +1,4 @@
-"""What is known of a scene as a whole, through a real server: said, changed, forgotten, and refused by its field."""
+"""A scene's attributes through a real server: set, changed, cleared, and refused by field."""
 
 from __future__ import annotations
 

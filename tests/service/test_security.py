@@ -1,4 +1,4 @@
-"""Callers without a good token, of another tenant, without a certificate or over their rate, at a real server."""
+"""Callers without a valid token or certificate, of another tenant, or over their rate, at a real server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several servers on one PostgreSQL are one service: what is done through one is seen through the others at once."""
+"""Several servers on one PostgreSQL are one service: a change through one is visible through the others at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A backup shows one moment of a store that is being changed, is checked, and leads from one database to the other."""
+"""A backup is one moment of a store that is being changed, is verified, and moves a store between databases."""
 
 from __future__ import annotations
 

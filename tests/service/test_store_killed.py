@@ -1,8 +1,8 @@
-"""A server, or the database itself, killed at any moment loses nothing acknowledged and leaves nothing half-written.
+"""A server or a database that is killed at any moment loses nothing acknowledged, leaves nothing half-written.
 
-Run as a program, this file is the nursery: for each line it reads it forks a victim, which changes a store as fast as
-it can and prints a line for each change before it is made (``try``), when it is acknowledged (``done``), and where its
-fate is unknown because the database went away (``lost``). Victims are forked since Python takes long to start.
+Run as a program, this file forks writers: one for each line that it reads. A writer changes a store as fast as it can
+and prints a line for each change before it is made (``try``), when it is acknowledged (``done``), and when its result
+is unknown because the database went away (``lost``). Writers are forked because Python takes long to start.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ COUNTS = (
 )
 WAIT_S = 30.0
 DATABASE_IS_KILLED_EVERY = 8
-"""Rounds; in between it is the server."""
+"""Rounds; in the others the server is killed."""
 DELETES = "deletes"
-"""What the names of those begin with that delete scenes."""
+"""Prefix of the names of writers that delete scenes."""
 REFERENCES_OF_A_SCENE = 6
-DIES_YOUNG_EVERY = 5
-"""Rounds: before it has opened the store."""
+EARLY_KILL_EVERY = 5
+"""Rounds: killed before it has opened the store."""
 
 
 def make_reference(reference_id: str) -> NewReference:
@@ -83,7 +83,7 @@ def change_until_killed(address: str, prefix: str) -> None:
             else:
                 verb, ids = "add", [f"{prefix}-{index}-{item}" for item in range(1 + index % 5)]
             change = " ".join([verb, *ids])
-            say(f"try {change}")
+            report(f"try {change}")
             try:
                 if verb == "add":
                     store.add_references(SCENE, [make_reference(it) for it in ids])
@@ -91,10 +91,10 @@ def change_until_killed(address: str, prefix: str) -> None:
                 else:
                     store.delete_reference(SCENE, ids[0])
             except errors.Unavailable:
-                say(f"lost {change}")
+                report(f"lost {change}")
                 time.sleep(0.01)
             else:
-                say(f"done {change}")
+                report(f"done {change}")
 
 
 def delete_until_killed(address: str, prefix: str) -> None:
@@ -105,34 +105,34 @@ def delete_until_killed(address: str, prefix: str) -> None:
             scene = SceneKey(f"{prefix}-{index}")
             store.create_scene(scene)
             store.add_references(scene, [make_reference(f"r{it}") for it in range(REFERENCES_OF_A_SCENE)])
-            say(f"try {scene}")
+            report(f"try {scene}")
             store.delete_scene(scene)
-            say(f"done {scene}")
+            report(f"done {scene}")
 
 
-def say(line: str) -> None:
+def report(line: str) -> None:
     """At once, and as a whole."""
     os.write(1, f"{line}\n".encode())
 
 
-def nurse(address: str) -> None:
-    import psycopg  # noqa: F401 # so that no victim spends its life importing
+def fork_writers(address: str) -> None:
+    import psycopg  # noqa: F401 # so that no writer has to import it
 
     with TemporaryDirectory() as folder, Store.open(Path(folder)) as store:
         store.create_scene(SCENE)
         store.add_references(SCENE, [make_reference("first")])
     for line in sys.stdin:
-        victim = os.fork()
-        if victim == 0:
-            live = delete_until_killed if line.startswith(DELETES) else change_until_killed
-            live(address, line.strip())
-        say(f"born {victim}")
-        _, status = os.waitpid(victim, 0)
-        say(f"ended {os.waitstatus_to_exitcode(status)}")
+        writer = os.fork()
+        if writer == 0:
+            write = delete_until_killed if line.startswith(DELETES) else change_until_killed
+            write(address, line.strip())
+        report(f"started {writer}")
+        _, status = os.waitpid(writer, 0)
+        report(f"ended {os.waitstatus_to_exitcode(status)}")
 
 
-class Nursery:
-    """Bears one victim at a time."""
+class WriterFactory:
+    """A process that forks one writer at a time."""
 
     def __init__(self, address: str) -> None:
         paths = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
@@ -146,21 +146,21 @@ class Nursery:
             start_new_session=True,
         )
 
-    def bear(self, prefix: str) -> int:
+    def start(self, prefix: str) -> int:
         assert self._process.stdin is not None
         self._process.stdin.write(f"{prefix}\n")
         self._process.stdin.flush()
-        self.said: list[str] = []
-        return int(self._read_until("born "))
+        self.lines: list[str] = []
+        return int(self._read_until("started "))
 
     def wait_for_work(self) -> None:
-        self.said.append(f"try {self._read_until('try ')}")
+        self.lines.append(f"try {self._read_until('try ')}")
 
-    def bury(self, victim: int) -> list[str]:
-        """What it said in its life."""
-        os.kill(victim, signal.SIGKILL)
-        assert self._read_until("ended ") == "-9", "the victim ended by itself"
-        return self.said
+    def kill(self, writer: int) -> list[str]:
+        """The lines that it printed."""
+        os.kill(writer, signal.SIGKILL)
+        assert self._read_until("ended ") == "-9", "the writer ended by itself"
+        return self.lines
 
     def end(self) -> None:
         os.killpg(self._process.pid, signal.SIGKILL)
@@ -171,12 +171,12 @@ class Nursery:
         for line in self._process.stdout:
             if line.startswith(start):
                 return line.removeprefix(start).strip()
-            self.said.append(line.strip())
-        raise AssertionError(f"the nursery died: {self.said[-3:]}")
+            self.lines.append(line.strip())
+        raise AssertionError(f"the factory ended: {self.lines[-3:]}")
 
 
 class Ledger:
-    """What must be there, may be there, and was checked already."""
+    """What must be stored, what may be stored, and what was checked already."""
 
     def __init__(self) -> None:
         self.stored: set[str] = set()
@@ -184,7 +184,7 @@ class Ledger:
         self.generation: int | None = None
 
     def note(self, lines: list[str]) -> list[str]:
-        """Takes in what was acknowledged; the changes whose fate is unknown."""
+        """Records what was acknowledged; the changes whose result is unknown."""
         unknown: list[str] = []
         for line in lines:
             outcome, change = line.split(" ", 1)
@@ -254,12 +254,12 @@ def kill_database(cluster: postgres.Cluster, moments: random.Random) -> None:
         return
     with cluster.connect() as connection:
         found = connection.execute("SELECT pid FROM pg_stat_activity WHERE application_name = 'mapless-server'")
-        victims = [int(str(row[0])) for row in found]
-    for victim in victims[:1]:
-        os.kill(victim, signal.SIGKILL)
+        backends = [int(str(row[0])) for row in found]
+    for backend in backends[:1]:
+        os.kill(backend, signal.SIGKILL)
 
 
-def wait_for_the_dead(cluster: postgres.Cluster) -> None:
+def wait_for_disconnection(cluster: postgres.Cluster) -> None:
     """PostgreSQL finishes what a killed server has sent it, so that it may still happen for a moment."""
     give_up = time.monotonic() + WAIT_S
     while time.monotonic() < give_up:
@@ -271,7 +271,7 @@ def wait_for_the_dead(cluster: postgres.Cluster) -> None:
             if count == (0,):
                 return
         time.sleep(0.01)
-    raise AssertionError("the dead server's connections do not end")
+    raise AssertionError("the killed server's connections do not end")
 
 
 def kill_and_check(database: str, folder: Path, rounds: int) -> None:
@@ -280,23 +280,23 @@ def kill_and_check(database: str, folder: Path, rounds: int) -> None:
     with place_of_its_own(database, folder) as (place, cluster):
         with place.open() as store:
             store.create_scene(SCENE)
-        nursery = Nursery(place.url if isinstance(place, Shared) else str(folder))
+        factory = WriterFactory(place.url if isinstance(place, Shared) else str(folder))
         try:
             for number in range(rounds):
-                victim = nursery.bear(f"round{number}")
-                if number % DIES_YOUNG_EVERY:
-                    nursery.wait_for_work()
+                writer = factory.start(f"round{number}")
+                if number % EARLY_KILL_EVERY:
+                    factory.wait_for_work()
                 time.sleep(moments.uniform(0.005, 0.15))
                 if cluster is not None and number % DATABASE_IS_KILLED_EVERY == DATABASE_IS_KILLED_EVERY - 1:
                     kill_database(cluster, moments)
                     time.sleep(moments.uniform(0.1, 0.3))  # the server goes on by itself
-                unknown = ledger.note(nursery.bury(victim))
+                unknown = ledger.note(factory.kill(writer))
                 if cluster is not None:
-                    wait_for_the_dead(cluster)
+                    wait_for_disconnection(cluster)
                 with place.open() as store:
                     ledger.check(place, store, unknown)
         finally:
-            nursery.end()
+            factory.end()
         assert ledger.acknowledged >= rounds
         assert faults_of(place) == ()
 
@@ -325,18 +325,18 @@ def test_killed_while_scenes_are_deleted(database: str, tmp_path: Path) -> None:
     moments = random.Random(21)
     with place_of_its_own(database, tmp_path) as (place, cluster):
         place.open().close()
-        nursery = Nursery(place.url if isinstance(place, Shared) else str(tmp_path))
+        factory = WriterFactory(place.url if isinstance(place, Shared) else str(tmp_path))
         try:
             for number in range(3):
-                victim = nursery.bear(f"{DELETES}{number}")
-                nursery.wait_for_work()
+                writer = factory.start(f"{DELETES}{number}")
+                factory.wait_for_work()
                 time.sleep(moments.uniform(0.0, 0.1))
-                nursery.bury(victim)
+                factory.kill(writer)
                 if cluster is not None:
-                    wait_for_the_dead(cluster)
+                    wait_for_disconnection(cluster)
                 check_scenes(place)
         finally:
-            nursery.end()
+            factory.end()
 
 
 @pytest.mark.nightly
@@ -346,4 +346,4 @@ def test_killed_two_hundred_times(database: str, tmp_path: Path) -> None:
 
 
 if __name__ == "__main__":
-    nurse(sys.argv[1])
+    fork_writers(sys.argv[1])

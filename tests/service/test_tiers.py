@@ -1,4 +1,4 @@
-"""A server of two tiers: what is stored, what is computed, and what an answer says of it."""
+"""A server with two tiers: what is stored, what is computed, and what an answer reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Watching a scene's queries through a real server: who sees what, who may, and how it ends."""
+"""WatchQueries through a real server: events, permission, and how a stream ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`mapless-server weights` as a person runs it; no network is reached."""
+"""`mapless-server weights` as a user runs it, without network access."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Certificates made on the spot: an authority, and what it signs for servers and clients."""
+"""Certificates for tests: an authority, and what it signs for servers and clients."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A real browser without a screen, driven over its DevTools protocol: enough to load a page, look at it, and click.
+"""A real browser without a screen, controlled by its DevTools protocol: loads a page, takes a picture, and clicks.
 
 `TEST_CHROMIUM=required` makes its absence a failure. WebGL is computed on the CPU, so machines without a GPU draw too.
 """

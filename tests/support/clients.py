@@ -1,4 +1,4 @@
-"""The asynchronous client as the blocking one, so that one test asks both; and a server that fails as it is told."""
+"""The asynchronous client with a blocking interface, so that one test uses both; and a server with planted failures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Disks of a few megabytes for tests, which get full, or can only be read from some moment on."""
+"""Disks of a few megabytes for tests, which become full or read-only."""
 
 from __future__ import annotations
 

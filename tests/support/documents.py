@@ -1,4 +1,4 @@
-"""The pages that people read, and what stands in them as code."""
+"""The pages of the documentation, and the code blocks in them."""
 
 from __future__ import annotations
 

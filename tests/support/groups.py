@@ -1,4 +1,4 @@
-"""Groups of photographs with a planted truth: several cameras in one synthetic scene, and what is known of each."""
+"""Groups of photographs with a planted truth: several cameras in one synthetic scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Image files as the world sends them, made byte by byte where no encoder at hand makes them."""
+"""Image files of unusual kinds, made byte by byte where no available encoder makes them."""
 
 from __future__ import annotations
 

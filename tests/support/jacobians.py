@@ -1,4 +1,4 @@
-"""One check of analytic derivatives, shared by the tests of all costs."""
+"""A check of analytic derivatives against differences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a stage would be handed if all stages before it were perfect: matches, tracks, structure, scale."""
+"""The input of a stage if all earlier stages were perfect: matches, tracks, structure, scale."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damage to what is stored, as a bad disk would do it: bytes that are not those that were stored."""
+"""Damage to stored data, as by a bad disk."""
 
 from __future__ import annotations
 

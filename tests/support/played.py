@@ -1,4 +1,4 @@
-"""An exchange driven without a server, by a clock that is told how late it is."""
+"""An exchange without a server, with a clock that the test sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A real PostgreSQL for tests, from the system's package: started once a test run, and ended with it however it ends.
+"""A real PostgreSQL for tests, from the system's package: one for each test run, which ends with the run.
 
 Each test gets a schema of its own, which costs milliseconds where a database costs a tenth of a second.
 """

@@ -1,4 +1,4 @@
-"""Servers as processes of their own, the real command or one whose method does as it is told.
+"""Servers as processes of their own: the real command, or one whose method the test controls.
 
 Run as a program, this file is the latter: everything is the real thing but the features and the method, which first
 appends a line to the file "began" and goes on when there is a file "gate". So tests hold it where they want it.

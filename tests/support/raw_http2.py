@@ -1,4 +1,4 @@
-"""HTTP/2 by hand (RFC 9113, 7541), for clients no library would be: they never read, or never send, what they began."""
+"""HTTP/2 by hand (RFC 9113, 7541), for clients that no library allows: they never read, or never finish sending."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Replicas for tests: everything is the real thing but the features and the method.
+"""Replicas for tests: everything is real except the features and the method.
 
 How the method behaves is in the position of the query's first reference: x is how long it takes, seconds; y is how it
 ends, see `FAILS`. Which process answered is what it claims for inliers.

@@ -1,4 +1,4 @@
-"""Safetensors files written plainly, right ones and wrong ones."""
+"""Valid and invalid safetensors files."""
 
 from __future__ import annotations
 

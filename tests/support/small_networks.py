@@ -1,4 +1,4 @@
-"""Small networks with random weights that say something, and photographs to show them."""
+"""Small networks with random weights, and photographs for them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a store can be, for tests that hold on every database, and references that follow from a seed."""
+"""Databases for tests that hold on each of them, and references that follow from a seed."""
 
 from __future__ import annotations
 
