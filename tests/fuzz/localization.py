@@ -145,7 +145,7 @@ def _check_prior(prior: Prior) -> None:
     assert np.isfinite(gradient).all()
     assert np.isfinite(information).all()
     assert term.squared_distance(COVARIANCE) >= 0
-    assert np.isfinite(term.news(COVARIANCE))
+    assert np.isfinite(term.relative_information(COVARIANCE))
 
 
 def _check_finite(message: Any) -> None:

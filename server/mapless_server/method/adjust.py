@@ -1,14 +1,14 @@
-"""Adjustment: our own last refinement, a bundle adjustment of the query, its points and, a little, the references.
+"""Adjustment: a last refinement, not in the paper: bundle adjustment of the query, its points and the references.
 
-The paper fixes the points before it solves for the query, and fixes the references for good. But the query sees the
-points too, and reference poses are never exact: they carry noise of their own, and an imperfect lens model acts like
-more. So here everything moves at once,
+The paper fixes the points before it solves for the query, and never moves the references. But the query observes the
+points too, and reference poses are never exact: they have noise, and errors of the lens model add to it. So here all
+are adjusted together,
 
     min  sum_obs rho(|r_o|^2 / sigma_o^2) + sum_i |xi_i|^2 / sigma_prior^2,
 
-over the query's pose, the points it sees and a small motion xi_i of every reference, which a prior holds to its given
-pose. What is known of the query's own pose beforehand adds its terms too, if the photograph alone does not contradict
-it. The points are eliminated (Schur complement), leaving a dense system of 6 unknowns per camera.
+over the query's pose, its points and a small motion xi_i of every reference, which a prior holds to its given pose.
+Priors on the query's pose add their terms, unless the photograph alone contradicts them. The points are eliminated (see
+`bundle`).
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ class AdjustOptions:
     """Options of the adjustment.
 
     Attributes:
-        loss_scale_sigma: of the Cauchy loss, which forgets gross errors rather than merely bounding them.
-        prior_share: how far references may move: the standard deviation of the prior, in image pixels, as a share of
-            the noise level found in the structure. What the residuals show is an upper bound of what poses are off.
-        error_inflation: by how much standard deviations from the sum over residuals are too small, as a
-            rule: it decides what priors weigh. The answer's covariance does not rest on it (see `uncertainty`).
-        inlier_px: as of the pose solver; the inliers of the answer are those of its own pose.
-        min_kept_share: an adjustment that loses more of the inliers has run off, and is not answered.
-        max_error_px: matches further from the pose found so far take no part.
+        loss_scale_sigma: of the Cauchy loss, under which the influence of outliers vanishes.
+        prior_share: standard deviation of the prior on reference poses, in image pixels, as a share of the noise level
+            of the structure. The residuals are an upper bound of the effect of pose errors.
+        error_inflation: factor by which standard deviations from the sum over residuals are typically too small; it
+            sets the weight of priors. The answer's covariance does not use it (see `uncertainty`).
+        inlier_px: as in the pose solver; the inliers of the answer are those of its own pose.
+        min_kept_share: an adjustment that keeps a smaller share of the inliers has diverged and is not used.
+        max_error_px: matches with a larger error under the initial pose are not used.
         iterations: at most so many Levenberg-Marquardt steps.
         min_decrease: stop when a step lowers the cost by a smaller share.
         uncertainty: of the answer's covariance.
@@ -75,26 +75,26 @@ def adjust_pose(
     options: AdjustOptions,
     priors: Priors = NO_PRIORS,
 ) -> PoseEstimate:
-    """Refines an estimate together with the points it rests on and, within their noise, the references.
+    """Refines an estimate together with its points and, within their noise, the references.
 
     Args:
         query: the query.
         references: in the order that the structure's tracks number them.
         structure: metric points.
         matches: of the query with them.
-        estimate: the pose so far; its errors decide which matches take part.
+        estimate: the initial pose; its errors select the matches.
         options: see there.
-        priors: what is known of the query's pose. Each is checked against the pose that the photograph alone gives;
-            those that are consistent with it take part, and the others do not.
+        priors: on the query's pose. Each is checked against the pose from the photograph alone; only consistent ones
+            are used.
 
     Returns:
-        The estimate with another pose and covariance; unchanged when there is nothing to gain.
+        The estimate with a refined pose and its covariance; unchanged if the adjustment fails.
     """
 
     def adjusted(start: PoseEstimate, active: Priors) -> PoseEstimate | None:
         return _adjusted(query, references, structure, matches, start, options, active)
 
-    # Where priors turn out not to be used, the answer is, to the last bit, the one without them.
+    # If no prior is used, the answer is bit-identical to the one without priors.
     without_priors = estimate.without_priors or estimate
     alone = adjusted(without_priors, NO_PRIORS)
     if not priors:
@@ -114,7 +114,7 @@ def _adjusted(
     options: AdjustOptions,
     priors: Priors,
 ) -> PoseEstimate | None:
-    """The estimate at the optimum with priors; None if there is none nearby, or too few matches for any."""
+    """The estimate at the optimum with priors; None if it diverges or has too few matches."""
     used = np.flatnonzero(estimate.errors_px < options.max_error_px)
     if len(used) < 3:  # two equations each, for six unknowns
         return None
@@ -137,7 +137,7 @@ def _conclude(
     bundle: Bundle,
     options: AdjustOptions,
 ) -> PoseEstimate | None:
-    """The estimate at the optimum, its covariance without priors; None if it has run off."""
+    """The estimate at the optimum, its covariance without priors; None if it has diverged."""
     pose = bundle.world_from_query
     pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
     points = structure.x_in_world.copy()
@@ -167,7 +167,7 @@ def pose_problem(
     world_from_query: RigidTransform,
     options: AdjustOptions,
 ) -> tuple[BundleProblem, Bundle]:
-    """The problem of one query without priors, and where it begins; `used` are the matches that take part."""
+    """The problem of one query without priors, and its start; `used` are the indices of the matches to use."""
     views = [*references, PosedView("", "", query, world_from_query)]
     tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(references))
     observations, start, depth_m = bundle_of(tracks, views, structure, chosen)

@@ -1,10 +1,10 @@
-"""Arrays say where they are computed.
+"""Functions for NumPy arrays and torch tensors alike.
 
-The equations of scale and structure are written once, for NumPy's arrays on the host and torch's tensors on a device.
-Most of them are operators, methods and indexing, which both have. For the rest, `namespace(array)` is NumPy or torch,
-whose functions agree in names and order of arguments, if not in keywords. Here stands what does not agree.
+The equations of scale and structure are written once, for NumPy arrays on the host and torch tensors on a device. Most
+of them use operators, methods and indexing, which both libraries have. For the rest, `namespace(array)` is NumPy or
+torch, whose functions agree in names and order of arguments, if not in keywords. This module has what does not agree.
 
-On a device nothing here waits for it: no value is looked at, no shape depends on one.
+Nothing here synchronizes with a device: no value is read, and no shape depends on one.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ def namespace(array: AnyArray) -> Any:
 
 
 def median(values: AnyArray, where: AnyArray) -> AnyArray:
-    """Median of the `values` (N,) that are chosen by the mask `where` (N,), NaN if none is."""
+    """Median of the `values` (N,) selected by the mask `where` (N,); NaN if none is selected."""
     xp = namespace(values)
     if xp is np:
         return np.median(values[where]) if where.any() else np.float64(np.nan)
-    # To select would be to wait for their number. The infinity at the end is for the index of none.
+    # Selecting them would synchronize, since their number is unknown. The final infinity is for the index of none.
     count = where.sum()
     ordered = xp.sort(xp.cat([values.masked_fill(~where, np.inf), values.new_full((1,), np.inf)])).values
     middle = ordered[xp.stack([(count - 1).clip(0) // 2, count // 2])]
@@ -41,7 +41,7 @@ def median(values: AnyArray, where: AnyArray) -> AnyArray:
 
 
 def identity(like: AnyArray) -> AnyArray:
-    """The identity (3, 3) of the kind and type of `like`, and where it is."""
+    """The identity (3, 3) with the library, dtype and device of `like`."""
     xp = namespace(like)
     return np.eye(3, dtype=like.dtype) if xp is np else xp.eye(3, dtype=like.dtype, device=like.device)
 
@@ -54,7 +54,7 @@ def length(vectors: AnyArray) -> AnyArray:
 def apply(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
     """Many small matrices (N, I, J) times vectors (N, J), (N, I).
 
-    NumPy's own product takes three times as long. A GPU's library launches a group of threads for each matrix.
+    NumPy's matmul takes three times as long; on a GPU, matmul launches a group of threads for each matrix.
     """
     if namespace(matrices) is np:
         return np.einsum("nij,nj->ni", matrices, vectors)

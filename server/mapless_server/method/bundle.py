@@ -1,10 +1,10 @@
-"""Bundle adjustment: cameras, and the points that they see, moved at once.
+"""Bundle adjustment of cameras and points.
 
     min  sum_obs rho(|r_o|^2 / sigma_o^2) + sum_i |xi_i|^2 / sigma_prior^2      (Cauchy's loss)
 
 over the poses of all cameras and the points; xi_i is the motion of a reference away from its given pose. The last
-camera is the query, of whose own pose something may be known. The points are eliminated (Schur complement), leaving a
-dense system of 6 unknowns per camera.
+camera is the query, whose pose may have priors. The points are eliminated (Schur complement), which leaves a dense
+system of 6 unknowns per camera.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Poses:
 
     @staticmethod
     def of(world_from_camera: Iterable[RigidTransform]) -> Poses:
-        """The inverses of these."""
+        """From world_from_camera."""
         poses = [it.inverse() for it in world_from_camera]
         if not poses:
             return Poses(np.empty((0, 3, 3)), np.empty((0, 3)))
@@ -48,7 +48,7 @@ class Poses:
         return Poses(self.rotation[chosen], self.translation[chosen])
 
     def and_last(self, camera_from_world: RigidTransform) -> Poses:
-        """With one more at the end."""
+        """With another pose appended."""
         return Poses(
             np.concatenate([self.rotation, camera_from_world.rotation[None]]),
             np.concatenate([self.translation, camera_from_world.translation[None]]),
@@ -60,7 +60,7 @@ class Poses:
         return Poses(turn @ self.rotation, (turn @ self.translation[:, :, None])[..., 0] + motion[:, :3])
 
     def motion_from(self, given: Poses) -> Array:
-        """(V, 6): the left perturbations that lead here, small ones."""
+        """(V, 6): the left perturbations from `given` to these poses, if small."""
         turn = self.rotation @ np.swapaxes(given.rotation, 1, 2)
         shift = self.translation - (turn @ given.translation[:, :, None])[..., 0]
         skew = (turn - np.swapaxes(turn, 1, 2)) / 2
@@ -69,7 +69,7 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Poses of the references, then of the query, and points (P, 3)."""
+    """Poses of the references, then the query, and points (P, 3)."""
 
     poses: Poses
     points: Array
@@ -89,13 +89,13 @@ class BundleProblem:
     """The cost and its derivatives; see `optimize.Problem`.
 
     Attributes:
-        observations: of the points in all views; their own poses are not looked at.
+        observations: of the points in all views; their poses are not used.
         view: (O,) of each.
         given: poses of the references.
-        information: (V - 1, 6) by which they are held to these; 0 leaves them free.
+        information: (V - 1, 6) of the prior that holds them there; 0 leaves them free.
         loss_scale_sigma: of the Cauchy loss.
-        priors: what is known of the query's pose.
-        prior_weight: of what is known of it, next to what the observations say.
+        priors: on the query's pose.
+        prior_weight: factor on their cost, relative to that of the observations.
     """
 
     observations: Observations
@@ -112,7 +112,7 @@ class BundleProblem:
         return np.asarray((self.view == np.arange(len(self.information) + 1)[:, None]).astype(float))
 
     def at(self, bundle: Bundle) -> Observations:
-        """The observations from these poses."""
+        """The observations by cameras at these poses."""
         return self.observations.moved(bundle.poses.rotation[self.view], bundle.poses.translation[self.view])
 
     def reference_motion(self, bundle: Bundle) -> Array:
@@ -148,7 +148,7 @@ class BundleProblem:
             pose_gradient[-1] += known_gradient
             pose_block[-1] += known
         cross = np.zeros((len(bundle.points), len(pose_block), 6, 3))
-        cross[self.observations.point, self.view] = weighted_pose @ by_point  # a point is seen once in a view
+        cross[self.observations.point, self.view] = weighted_pose @ by_point  # one observation per point and view
         return NormalEquations(
             pose_block,
             pose_gradient.ravel(),
@@ -214,13 +214,13 @@ class NormalEquations:
 def bundle_of(
     tracks: Tracks, views: Sequence[PosedView], structure: Structure, chosen: NDArray[np.bool_] | NDArray[np.intp]
 ) -> tuple[Observations, Bundle, float]:
-    """The observations of some points of a structure, their bundle at the start, and the points' median depth.
+    """The observations of points of a structure, the initial bundle, and the points' median depth in metres.
 
     Args:
         tracks: of these points over the views.
         views: the references, then the query.
-        structure: of the references.
-        chosen: which of its points these are.
+        structure: the points.
+        chosen: mask or indices of the points to use.
     """
     observations = observe(tracks, views, structure.noise)
     bundle = Bundle(Poses.of(view.world_from_camera for view in views), structure.x_in_world[chosen])
@@ -228,9 +228,9 @@ def bundle_of(
 
 
 def reference_information(level_px: float, focal_px: float, depth_m: float) -> Array:
-    """(6,): the inverse variance of a left perturbation that moves what is seen by `level_px`, each component alone.
+    """(6,): inverse variance of a left perturbation, each component of which moves the image by `level_px`.
 
-    Noise of a pixel is a turn of 1 / f, or a shift of depth / f.
+    A pixel is a rotation of 1 / f, or a shift of depth / f.
     """
-    turn = level_px / focal_px
-    return np.repeat([turn * depth_m, turn], 3) ** -2.0
+    angle = level_px / focal_px
+    return np.repeat([angle * depth_m, angle], 3) ** -2.0

@@ -1,13 +1,12 @@
-"""Which keypoints of different photographs show the same thing.
+"""Correspondences: matches of keypoints between photographs.
 
-Between references, whose poses are known, a match must also lie on the epipolar line; these matches depend on nothing
-but the two stored references, so they are remembered. Matches of the query with each reference have no such help: they
-come from descriptors alone, or from a network that looks at both photographs' keypoints together. That is a seam,
-`QueryMatching`.
+Matches between references, whose poses are known, must also satisfy the epipolar constraint; they depend only on the
+two stored references and are cached. Matches of the query with each reference come from descriptors alone, or from a
+network that compares all keypoints of both photographs: implementations of `QueryMatching`.
 
-Where references stand far apart, few matches survive the comparison with all keypoints of the other photograph. A wide
-correspondence adds those that survive the comparison along the epipolar line: many more, and more of them wrong, so it
-serves queries that are lost otherwise.
+Between distant references few matches pass the ratio test over all keypoints. Wide correspondences add matches that
+pass it among the keypoints along the epipolar line: many more, of which more are wrong, so they are used only for
+queries that fail otherwise.
 """
 
 from __future__ import annotations
@@ -32,17 +31,17 @@ from .views import Features, Matches, PosedView, View
 
 @dataclass(frozen=True)
 class CorrespondOptions:
-    """Options of matching. What depends on the descriptor is here, and `OPTIONS` has a set for each extractor.
+    """Options of matching, all that depend on the descriptor; `OPTIONS` has a set for each extractor.
 
     Attributes:
-        reference_ratio: a match between references is kept when the nearest descriptor is at most this share of the
-            second-nearest's distance away (Lowe's ratio); loose, because the epipolar line filters too.
+        reference_ratio: Lowe's ratio, the largest distance of the nearest descriptor over that of the second-nearest,
+            between references; loose, because the epipolar constraint filters too.
         query_ratio: the same for matches with the query, which have no other filter.
-        epipolar_px: greatest distance from the epipolar line, in both images; keypoints are good to about a pixel.
-        wide_ratio: the ratio among the keypoints along the line, which are few, so it must be stricter.
+        epipolar_px: largest distance from the epipolar line, in both images; keypoints are accurate to about a pixel.
+        wide_ratio: the ratio among the keypoints along the line; stricter, because they are few.
         wide_similarity: smallest cosine of descriptors of a match along the line, for the same reason.
-        guided_similarity: smallest cosine of descriptors of a match that is searched for near a point's projection.
-        remembered_pairs: how many pairs of references are remembered, about 8 KiB each.
+        guided_similarity: smallest cosine of descriptors of a match that is searched near a point's projection.
+        remembered_pairs: number of cached pairs of references, about 8 KiB each.
     """
 
     reference_ratio: float = 0.9
@@ -68,14 +67,14 @@ OPTIONS: Mapping[str, CorrespondOptions] = {
     "sift": CorrespondOptions(),
     "aliked": _ALIKED,
     "xfeat": replace(_ALIKED, wide_similarity=0.84, guided_similarity=0.86),
-    # Not measured: the weights were not to be had. The cosine is that of a distance of 0.7, which is usual.
+    # Not measured, for lack of the weights. The cosine is that of a distance of 0.7, which is usual.
     "superpoint": replace(_ALIKED, query_ratio=0.9, wide_similarity=0.755, guided_similarity=0.755),
 }
 """For each extractor that a setting can name.
 
-Distances of learned descriptors crowd together: at ALIKED's ratio of 0.95 a pair of kitchen photographs has 243 true
-matches and 36 false ones, at 0.85 only 119 and 2, where SIFT has 125 and 56. Between references the ratio would cost a
-third of the true matches for nothing, because the epipolar line removes nearly all false ones.
+Distances of learned descriptors differ less: at ALIKED's ratio of 0.95 a pair of kitchen photographs has 243 true
+matches and 36 false ones, at 0.85 only 119 and 2, where SIFT has 125 and 56. Between references the ratio test would
+cost a third of the true matches without benefit, because the epipolar constraint removes nearly all false ones.
 """
 
 
@@ -93,18 +92,18 @@ class Correspondences:
 
 
 class QueryMatching(Protocol):
-    """Matches a query with its references: the seam for networks that match."""
+    """Matches a query with its references; implemented by nearest neighbours and by LightGlue."""
 
     def match(self, query: View, references: Sequence[PosedView], check: Callable[[], None]) -> Sequence[Matches]:
-        """Matches (query keypoint, reference keypoint) with each reference; none of a keypoint twice in one of them.
+        """Matches (query keypoint, reference keypoint) with each reference; each keypoint occurs at most once in them.
 
-        Calls `check` between its steps, and lets what it raises through.
+        Calls `check` between its steps and does not catch what it raises.
         """
         ...
 
 
 class NearestNeighbours:
-    """Mutual nearest neighbours that pass the ratio test; whatever the descriptor."""
+    """Mutual nearest neighbours that pass the ratio test, for any descriptor."""
 
     def __init__(self, ratio: float, pool: ThreadPoolExecutor) -> None:
         self.ratio = ratio
@@ -121,10 +120,10 @@ class NearestNeighbours:
 
 
 class Matcher:
-    """Matches views; remembers pairs of references. Safe to use from several threads.
+    """Matches views and caches the matches of references. Thread-safe.
 
-    A query's pairs are shared out over `threads`: alone it is answered in half the time on two, and among others it
-    takes no more processor time, because every product is computed by one thread.
+    A query's pairs are distributed over `threads`: a single query takes half the time on two threads, and concurrent
+    queries take no more processor time, because each product is computed by one thread.
     """
 
     def __init__(
@@ -147,10 +146,10 @@ class Matcher:
         check: Callable[[], None] = lambda: None,
         query_matches: Sequence[Matches] | None = None,
     ) -> Correspondences:
-        """Matches between all pairs of references, widely if so asked, and between the query and each.
+        """Matches between all pairs of references, wide ones on request, and between the query and each reference.
 
-        Calls `check` before each pair, and lets what it raises through. `query_matches` that are known already, from
-        `match_query` or another call with the same references, are taken as they are.
+        Calls `check` before each pair and does not catch what it raises. `query_matches`, if known already from
+        `match_query` or another call with the same references, are used as they are.
         """
 
         def of_pair(pair: tuple[int, int]) -> Matches:
@@ -188,7 +187,7 @@ class Matcher:
         return matches
 
     def forget(self, keys: Collection[str]) -> None:
-        """Forgets the pairs of references that nobody will ask for any more. Looks at each."""
+        """Removes the pairs of deleted references from the cache, in time linear in its size."""
         with self._lock:
             for pair in [it for it in self._remembered if it[0] in keys or it[1] in keys]:
                 del self._remembered[pair]
@@ -198,7 +197,7 @@ class Matcher:
         return matches[epipolar_distance_px(first, second, matches) < self.options.epipolar_px]
 
     def _match_widely(self, first: PosedView, second: PosedView) -> Matches:
-        """The strict matches, and those along the line of keypoints that have none."""
+        """The strict matches, and matches along the epipolar lines of the other keypoints."""
         strict = self.match_references(first, second)
         similarity = first.view.features.descriptors @ second.view.features.descriptors.T
         similarity[epipolar_distances_px(first, second) >= self.options.epipolar_px] = -1.0
@@ -217,7 +216,7 @@ def make_matcher(features: str, threads: int = 1, weights: Path | None = None, d
         device: "cpu" or a CUDA device, for LightGlue.
 
     Raises:
-        ValueError: unknown name, or features that no LightGlue is known for.
+        ValueError: unknown name, or features without a LightGlue.
         CheckpointError: the weights do not fit.
         ImportError: a package that LightGlue needs is not installed.
     """
@@ -243,7 +242,7 @@ def mutual_matches(first: Features, second: Features, ratio: float) -> Matches:
 
 
 def best_of_both(similarity: NDArray[np.float32], ratio: float, smallest: float = -1.0) -> Matches:
-    """Where a matrix of cosines (N, M) is the best of its row and column, above `smallest` and clear of its row's rest.
+    """Entries of a matrix of cosines (N, M) that are mutual maxima, above `smallest`, and pass the ratio test by row.
 
     Overwrites the matrix.
     """
@@ -252,7 +251,7 @@ def best_of_both(similarity: NDArray[np.float32], ratio: float, smallest: float 
     rows = np.arange(len(similarity))
     nearest = similarity.argmax(axis=1)
     best = similarity[rows, nearest]
-    # Best of its column too: compared by value, because an argmax along columns costs ten times the maximum.
+    # The maximum of its column too: compared by value, because an argmax along columns takes ten times as long.
     mutual = best >= similarity.max(axis=0)[nearest]
     similarity[rows, nearest] = -1.0
     second_best = similarity.max(axis=1)
@@ -263,7 +262,7 @@ def best_of_both(similarity: NDArray[np.float32], ratio: float, smallest: float 
 def epipolar_distance_px(first: PosedView, second: PosedView, matches: Matches) -> Array:
     """Distance (M,) of matches from the epipolar lines of the known poses, the larger of both images.
 
-    0 if both stand at one place, where there is no such line.
+    0 without a baseline, where there is no such line.
     """
     fundamental = fundamental_matrix(first, second)
     x_first = _homogeneous(first.view.features.keypoints[matches[:, 0]])
@@ -274,7 +273,7 @@ def epipolar_distance_px(first: PosedView, second: PosedView, matches: Matches) 
 
 
 def epipolar_distances_px(first: PosedView, second: PosedView) -> NDArray[np.float32]:
-    """The same (N, M) for every keypoint of the first with every one of the second."""
+    """The same (N, M) for every keypoint of the first view with every keypoint of the second."""
     fundamental = fundamental_matrix(first, second)
     x_first, x_second = (_homogeneous(v.view.features.keypoints) for v in (first, second))
     in_first = x_first.astype(np.float32) @ _lines(x_second @ fundamental.T).T.astype(np.float32)
@@ -283,7 +282,7 @@ def epipolar_distances_px(first: PosedView, second: PosedView) -> NDArray[np.flo
 
 
 def fundamental_matrix(first: PosedView, second: PosedView) -> Array:
-    """F (3, 3) of the known poses, x_first^T F x_second = 0 in homogeneous pixels; zero if both stand at one place."""
+    """F (3, 3) of the known poses, x_first^T F x_second = 0 in homogeneous pixels; zero without a baseline."""
     first_from_second = first.world_from_camera.inverse().compose(second.world_from_camera)
     if np.linalg.norm(first_from_second.translation) < 1e-6:
         return np.zeros((3, 3))

@@ -1,11 +1,11 @@
-"""How well matches of two photographs agree with the poses and cameras that are said to be theirs.
+"""Agreement of matches of two photographs with their given poses and cameras.
 
-The measure is the Sampson distance from the epipolar constraint, x_first' F x_second = 0: to first order how far both
-keypoints together must be moved to satisfy it, in pixels. Whether a match is right must not be asked of the poses that
-it shall judge, so matches are filtered by a fundamental matrix of their own.
+The measure is the Sampson distance from the epipolar constraint, x_first' F x_second = 0: to first order, how far both
+keypoints together must be moved to satisfy it, in pixels. The matches are filtered by a fundamental matrix estimated
+from them alone, not by the poses that they are used to check.
 
-Scale cannot be seen in it: poses in feet satisfy it like poses in metres. Nor can what changes no relative pose, such
-as another choice of the world's axes.
+The measure does not depend on scale: poses in feet satisfy it like poses in metres. Nor does it depend on the choice of
+world axes, which changes no relative pose.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from .views import Matches, PosedView, View
 
 @dataclass(frozen=True)
 class EpipolarOptions:
-    """Options of finding matches that belong together.
+    """Options of finding consistent matches.
 
     Attributes:
-        ratio: Lowe's; strict, since few right matches serve better than many of which some are wrong.
-        fundamental_px: greatest distance from the fundamental matrix's lines; keypoints are good to about a pixel.
-        min_matches: fewer that agree prove nothing: any eight satisfy some fundamental matrix.
+        ratio: Lowe's ratio; strict, since few right matches are better here than many with some wrong ones.
+        fundamental_px: largest distance from the epipolar lines; keypoints are accurate to about a pixel.
+        min_matches: fewer inliers are no evidence: any eight matches satisfy some fundamental matrix.
     """
 
     ratio: float = 0.8
@@ -43,7 +43,7 @@ class EpipolarOptions:
 
 
 def consistent_matches(first: View, second: View, options: EpipolarOptions | None = None) -> Matches:
-    """Matches that one fundamental matrix explains, without looking at poses; none if too few agree."""
+    """Inlier matches of one fundamental matrix, without use of poses; none if they are too few."""
     options = options or EpipolarOptions()
     matches = mutual_matches(first.features, second.features, options.ratio)
     if len(matches) < options.min_matches:
@@ -59,7 +59,7 @@ def consistent_matches(first: View, second: View, options: EpipolarOptions | Non
 
 
 def sampson_px(first: PosedView, second: PosedView, matches: Matches) -> Array:
-    """Sampson distances (M,) of matches, pixels; NaN if both stand at one place, where there is no such line."""
+    """Sampson distances (M,) of matches, pixels; NaN without a baseline, where F is not defined."""
     fundamental = fundamental_matrix(first, second)
     x_first, x_second = (
         np.column_stack([view.view.features.keypoints[matches[:, side]], np.ones(len(matches))])
@@ -72,5 +72,5 @@ def sampson_px(first: PosedView, second: PosedView, matches: Matches) -> Array:
 
 
 def pair_error_px(first: PosedView, second: PosedView, matches: Matches) -> float:
-    """Median Sampson distance of matches, pixels; NaN if there are none, or both stand at one place."""
+    """Median Sampson distance of matches, pixels; NaN without matches or without a baseline."""
     return float(np.median(sampson_px(first, second, matches))) if len(matches) else float("nan")

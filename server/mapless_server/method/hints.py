@@ -1,7 +1,6 @@
-"""What to do about a rejection: which stage could not do its work, what it lacked, and where to look.
+"""Hints: what would help after a rejection.
 
-A hint is read off the answer's own numbers: how many features the photograph has, how many of them each reference
-shares, how many of these agree on a pose.
+A hint follows from the numbers of the answer: features of the photograph, matches with each reference, inliers.
 """
 
 from __future__ import annotations
@@ -36,8 +35,9 @@ class HintOptions:
 
     Attributes:
         few_features: a photograph with fewer is dark, blurred or shows nothing; sharp ones have 500 to 2048.
-        few_matches: references of another place share fewer features with a photograph by chance.
-        many_matches: so many with one reference are no chance; if they still agree on no pose, numbers are wrong.
+        few_matches: references of another place have fewer matches with a photograph by chance.
+        many_matches: so many with one reference are not chance; if they have no common pose, intrinsics or poses are
+            wrong.
     """
 
     few_features: int = 200
@@ -51,17 +51,17 @@ class HintOptions:
 
 @dataclass(frozen=True)
 class _Case:
-    """What a hint is read off.
+    """The numbers that a hint follows from.
 
     Attributes:
-        rejection: what was answered.
-        features: of the photograph.
-        matches: of the best reference with it.
-        inliers: of all its matches with points, those that agree on a pose.
-        tried: matches with points; None where none were made.
+        rejection: of the query.
+        features: number of features of the photograph.
+        matches: number of matches with the best reference.
+        inliers: number of inliers among all 2D-3D matches.
+        tried: number of 2D-3D matches; None if there are none yet.
         best: name of the reference with most matches; None if none has any.
-        reference_count: how many were used.
-        has_prior: whether the caller said where the camera is.
+        reference_count: number of references used.
+        has_prior: whether the request has a prior.
     """
 
     rejection: Rejection
@@ -81,13 +81,13 @@ def hinted(
     has_prior: bool = False,
     options: HintOptions | None = None,
 ) -> Answer:
-    """The answer, with a hint if it is a rejection that has none yet.
+    """Adds a hint to a rejection without one.
 
     Args:
         answer: of the method.
         query: the photograph.
-        references: that were used, in the order of the answer's counts.
-        has_prior: whether the caller said where the camera is, or which way it looks.
+        references: used for the query, in the order of the answer's counts.
+        has_prior: whether the request has a prior on position or heading.
         options: see there.
     """
     rejection = answer.outcome
@@ -144,7 +144,7 @@ def _advice(case: _Case, options: HintOptions) -> tuple[Advice, str]:
 
 
 def _of_overlap(case: _Case, options: HintOptions) -> tuple[Advice, str]:
-    """The photograph and the references are usable by themselves, but do not come together."""
+    """The photograph and the references are usable, but have too little in common."""
     shared = f"the best reference shares {case.matches} of the photograph's {case.features} features"
     if case.features < options.few_features:
         return Advice.RETAKE_PHOTOGRAPH, _retake(case)

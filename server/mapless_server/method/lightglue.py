@@ -1,4 +1,4 @@
-"""Matching by LightGlue, a network that looks at all keypoints of both photographs (see `networks.lightglue`)."""
+"""Matching by LightGlue, a network that compares all keypoints of both photographs (see `networks.lightglue`)."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class LightGlueOptions:
     """Options of matching by LightGlue.
 
     Attributes:
-        min_score: a match's least probability; the authors'.
-        max_keypoints: of each photograph the first so many are matched, and extractors put the strongest first. The
+        min_score: least probability of a match; the authors' value.
+        max_keypoints: the first so many of each photograph are matched; extractors return the strongest first. The
             time is quadratic in it.
-        pairs_at_once: pairs that go through the network together; a query's K on a GPU. A CPU gains nothing from it.
+        pairs_at_once: batch size; all pairs of a query on a GPU. A CPU does not gain from batches.
         half: compute in float16, as the authors do on a GPU.
     """
 
@@ -65,12 +65,12 @@ class LightGlueMatching:
         for start in range(0, len(filled), self.options.pairs_at_once):
             check()
             batch = filled[start : start + self.options.pairs_at_once]
-            for i, found in zip(batch, self._halving(query, [references[i].view for i in batch]), strict=True):
+            for i, found in zip(batch, self._match_or_halve(query, [references[i].view for i in batch]), strict=True):
                 matches[i] = found
         return matches
 
-    def _halving(self, query: View, references: Sequence[View]) -> list[Matches]:
-        """Matches; where the device's memory does not hold them all, half and half, once."""
+    def _match_or_halve(self, query: View, references: Sequence[View]) -> list[Matches]:
+        """Matches in one batch, or in two halves if the device runs out of memory."""
         try:
             return self._match(query, references)
         except torch.OutOfMemoryError:
@@ -99,7 +99,7 @@ class LightGlueMatching:
 
 @dataclass(frozen=True, eq=False)
 class Padded:
-    """Views side by side, as many rows each as the one with most keypoints; zeros after a view's own.
+    """A batch of views, padded with zeros to the largest number of keypoints.
 
     Attributes:
         positions: (K, M, 2) float32, see `normalized_positions`.
@@ -113,12 +113,12 @@ class Padded:
 
     @property
     def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-        """In the order that the network takes them."""
+        """In the order of the network's arguments."""
         return self.positions, self.descriptors, self.mask
 
     @classmethod
     def of(cls, views: Sequence[View], max_keypoints: int) -> Padded:
-        """Of views with the same kind of descriptor, the first `max_keypoints` keypoints each."""
+        """Pads views with the same kind of descriptor, the first `max_keypoints` keypoints of each."""
         counts = [min(len(v.features), max_keypoints) for v in views]
         shape = (len(views), max(counts))
         positions = np.zeros((*shape, 2), np.float32)
@@ -130,6 +130,6 @@ class Padded:
 
 
 def normalized_positions(features: Features, camera: Camera) -> NDArray[np.float32]:
-    """(N, 2): from the middle of the image, in halves of its longer side, as the authors do."""
+    """(N, 2): relative to the image centre, in halves of its longer side, as the authors do."""
     size = np.array([camera.width_px, camera.height_px], np.float32)
     return np.asarray((features.keypoints - size / 2) / (size.max() / 2), np.float32)

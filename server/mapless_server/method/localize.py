@@ -86,7 +86,7 @@ def refine(coarse: Coarse) -> Answer:
     """
     answer = _strict_then_wide(coarse, counts_agreement=False)
     is_gated = isinstance(answer.outcome, Rejection) and answer.outcome.reason is RejectionReason.GATE
-    if is_gated and coarse.prepared.priors.tells_directions:
+    if is_gated and coarse.prepared.priors.has_directions:
         return _strict_then_wide(coarse, counts_agreement=True)
     return answer
 
@@ -145,6 +145,6 @@ def _structure_and_matches(coarse: Coarse, scale: MetricScale) -> tuple[Structur
         structure = build_structure(reconstruction, scale, references, correspondences, prepared.structure_options)
     with prepared.context.stage("match"):
         initial, options = scale.world_from_query, prepared.match_options
-        foreseen = prepared.priors.pose.world_from_camera if prepared.priors.pose else None
-        matches = match_points(prepared.query, references, structure, correspondences, initial, options, foreseen)
+        prior_pose = prepared.priors.pose.world_from_camera if prepared.priors.pose else None
+        matches = match_points(prepared.query, references, structure, correspondences, initial, options, prior_pose)
     return structure, matches

@@ -1,8 +1,8 @@
-"""Matching: which keypoints of the query show which points of the structure.
+"""Matching: 2D-3D matches of the query's keypoints with the points of the structure.
 
 The paper projects every point with the query's initial pose, u_k = pi(P_q^init, X_k), and takes the nearest descriptor
-within a radius. Ours first takes what the query's matches with each reference say through the tracks, and lets the
-guided search only add to it.
+within a radius. Our form first carries the query's matches with each reference to points through the tracks; the guided
+search only adds to them.
 """
 
 from __future__ import annotations
@@ -28,10 +28,9 @@ class MatchOptions:
 
     Attributes:
         through_tracks: begin with the matches between the query and the references, carried to points by their tracks.
-        radius_px: how far from its projection a point's keypoint is searched; the paper's 20. Ours searches only for
-            points that have no match yet, and near, because the initial pose is good.
-        min_similarity: smallest cosine of descriptors found by the guided search; -1 takes the nearest however far, as
-            the paper does.
+        radius_px: search radius around a point's projection; 20 in the paper. Ours searches only for points without a
+            match, and nearby, because the initial pose is good.
+        min_similarity: smallest cosine of descriptors found by the guided search; -1 accepts any, as the paper does.
     """
 
     through_tracks: bool = True
@@ -44,7 +43,7 @@ class MatchOptions:
 
 
 PAPER_MATCH = MatchOptions(through_tracks=False, radius_px=20.0, min_similarity=-1.0)
-"""What the paper does."""
+"""The paper's form."""
 
 
 def match_points(
@@ -54,9 +53,9 @@ def match_points(
     correspondences: Correspondences,
     world_from_query: RigidTransform,
     options: MatchOptions,
-    foreseen: RigidTransform | None = None,
+    prior_pose: RigidTransform | None = None,
 ) -> PointMatches:
-    """Matches of the query with the points of a structure.
+    """Matches the query with the points of a structure.
 
     Args:
         query: the query.
@@ -65,17 +64,17 @@ def match_points(
         correspondences: matches between query and references.
         world_from_query: the query's initial pose.
         options: `PAPER_MATCH` for the paper's form.
-        foreseen: its pose as it was known before; the search begins there if that explains more of the matches that
-            were found without either.
+        prior_pose: world_from_query of a pose prior; the search starts from it if more of the matches through tracks
+            are inliers of it than of the initial pose.
     """
     nothing = np.empty(0, np.intp)
     known = PointMatches(nothing, nothing, np.empty(0, bool), options.radius_px)
     if options.through_tracks:
         known = vote(structure, [len(r.view.features) for r in references], correspondences)
-    if foreseen is not None and _explained(query, structure, known, foreseen, options) > _explained(
+    if prior_pose is not None and _inlier_count(query, structure, known, prior_pose, options) > _inlier_count(
         query, structure, known, world_from_query, options
     ):
-        world_from_query = foreseen
+        world_from_query = prior_pose
     found = search(query, references, structure, world_from_query, known, options)
     return PointMatches(
         np.concatenate([known.point, found.point]),
@@ -85,17 +84,17 @@ def match_points(
     )
 
 
-def _explained(
+def _inlier_count(
     query: View, structure: Structure, known: PointMatches, world_from_query: RigidTransform, options: MatchOptions
 ) -> int:
-    """How many matches a guided search from this pose would have found where they are."""
+    """How many matches lie within the radius of a guided search from this pose."""
     x_in_camera = world_from_query.inverse().apply(structure.x_in_world[known.point])
     away = query.camera.project(x_in_camera) - query.features.keypoints[known.keypoint]
     return int((np.linalg.norm(away, axis=1) < options.radius_px).sum())
 
 
 def vote(structure: Structure, keypoint_counts: Sequence[int], correspondences: Correspondences) -> PointMatches:
-    """Carries matches between query and references to points; where references disagree, most of them win."""
+    """Carries matches between query and references to points; where references disagree, the majority decides."""
     tracks = structure.tracks
     offsets = np.concatenate([[0], np.cumsum(keypoint_counts)])
     point_of = np.full(offsets[-1], -1)
@@ -117,9 +116,9 @@ def search(
     known: PointMatches,
     options: MatchOptions,
 ) -> PointMatches:
-    """The most similar free keypoint within the radius of each free point's projection.
+    """Matches each free point with the most similar free keypoint within the radius of its projection.
 
-    The similarity of a point and a keypoint is that of the best of the point's descriptors, one for each observation.
+    The similarity of a point and a keypoint is the largest over the descriptors of the point's observations.
     """
     keypoints = query.features.keypoints.astype(np.float64)
     projected = query.camera.project(world_from_query.inverse().apply(structure.x_in_world))
@@ -136,7 +135,7 @@ def search(
     offsets = np.concatenate([[0], np.cumsum([len(r.view.features) for r in references])])
     descriptors = np.concatenate([r.view.features.descriptors for r in references])
     length = np.diff(np.append(tracks.starts, len(tracks.point)))[point]
-    first = np.cumsum(length) - length  # where each pair's observations begin below
+    first = np.cumsum(length) - length  # first row below of each pair
     observation = np.arange(length.sum()) - np.repeat(first - tracks.starts[point], length)
     theirs = descriptors[offsets[tracks.view[observation]] + tracks.keypoint[observation]]
     ours = query.features.descriptors[np.repeat(keypoint, length)]
@@ -150,7 +149,7 @@ def search(
 def one_to_one(
     first: NDArray[np.intp], second: NDArray[np.intp], score: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Of scored pairs, those that are the best of their first and then of their second element."""
+    """Keeps the best pair of each first element, then of each second element."""
     for key in (0, 1):
         order = np.lexsort((-score, (first, second)[key]))
         first, second, score = first[order], second[order], score[order]

@@ -1,6 +1,6 @@
-"""Points seen by cameras whose poses are fixed: the equations of the structure.
+"""Observations of points by cameras: residuals, derivatives, triangulation and adjustment of points.
 
-Everything works on NumPy's arrays and on torch's tensors (see `arrays`).
+All but `linearize` works on NumPy arrays and on torch tensors (see `arrays`).
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from .tracks import Grouping
 ONE_PIXEL = KeypointNoise(1.0, 0.0)
 FIRST_GUESS = KeypointNoise(0.3, 0.06)
 MIN_NOISE_LEVEL_PX = 0.15
-"""No keypoint is better than this: the residuals of surveyed scenes under good light."""
+"""Least noise of a keypoint: that of the residuals in surveyed scenes under good light."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Where references see points; row o is one observation.
+    """Observations of points by references; row o is one observation.
 
     Attributes:
-        tracks: which rows belong to which of P points.
+        tracks: assigns the rows to P points.
         pixel: (O, 2) observed pixel.
         size_px: (O,) size of the keypoint.
         sigma_px: (O,) standard deviation of its coordinates.
@@ -65,11 +65,11 @@ class Observations:
         return self.tracks.point
 
     def residuals(self, x_in_world: AnyArray) -> AnyArray:
-        """(O, 2) projection minus observation of points (P, 3), in standard deviations; NaN where not in front."""
+        """(O, 2) projection minus observation of points (P, 3), in standard deviations; NaN behind the camera."""
         return self.camera_residuals(self.in_camera(x_in_world))
 
     def linearized(self, x_in_world: AnyArray) -> tuple[AnyArray, AnyArray]:
-        """The residuals (O, 2), and the derivative (O, 2, 3) of each by its own point, per metre."""
+        """The residuals (O, 2), and the derivative (O, 2, 3) of each by its point, per metre."""
         x_in_camera = self.in_camera(x_in_world)
         return self.camera_residuals(x_in_camera), multiply(self.camera_jacobians(x_in_camera), self.rotation)
 
@@ -98,19 +98,19 @@ class Observations:
         return self.tracks.max_by_point(xp.where(xp.isnan(values), np.inf, values))
 
     def in_camera(self, x_in_world: AnyArray) -> AnyArray:
-        """Each observation's point (O, 3) in the frame of its camera, of points (P, 3)."""
+        """The point (O, 3) of each observation in its camera's frame, from points (P, 3) in the world."""
         return apply(self.rotation, x_in_world[self.point]) + self.translation
 
     def moved(self, rotation: AnyArray, translation: AnyArray) -> Observations:
-        """The same from cameras at other poses (O, 3, 3), (O, 3)."""
+        """The same observations by cameras at other poses (O, 3, 3), (O, 3)."""
         return replace(self, rotation=rotation, translation=translation)
 
     def weighted(self, noise: KeypointNoise) -> Observations:
-        """The same with another noise."""
+        """The same observations with another noise."""
         return replace(self, sigma_px=noise.sigma_px(self.size_px))
 
     def prune(self, chosen: AnyArray, x_in_world: AnyArray) -> tuple[Observations, AnyArray]:
-        """Only the chosen rows (O,), and those of points (P, 3) that are left with at least two of them."""
+        """Only the chosen rows (O,), and the points (P, 3) with at least two of them."""
         tracks, rows, points = self.tracks.prune(chosen)
         columns = ("pixel", "size_px", "sigma_px", "rotation", "translation", "focal_px", "principal_px")
         return Observations(tracks, *(getattr(self, name)[rows] for name in columns)), x_in_world[points]
@@ -133,7 +133,7 @@ def triangulate(observations: Observations) -> AnyArray:
 
 
 def better_start(observations: Observations, first: AnyArray, second: AnyArray, loss_scale_sigma: float) -> AnyArray:
-    """Of two guesses (P, 3) each, point by point the one with the lower cost."""
+    """Point by point the one of two initial values (P, 3) with the lower cost."""
     xp = namespace(first)
     cost_first = _cost(observations, observations.residuals(first), loss_scale_sigma)
     cost_second = _cost(observations, observations.residuals(second), loss_scale_sigma)
@@ -153,7 +153,7 @@ def adjust_points(
         iterations: number of Levenberg-Marquardt steps.
 
     Returns:
-        (P, 3). No point has a higher cost than it began with.
+        (P, 3). No point has a higher cost than at the start.
     """
 
     def cost(points: AnyArray) -> AnyArray:
@@ -170,11 +170,11 @@ def adjust_points(
 
 
 def estimate_noise(observations: Observations, x_in_world: AnyArray, noise: KeypointNoise) -> KeypointNoise:
-    """`noise`, with which the observations were weighted, at the level that their residuals show.
+    """`noise`, with which the observations were weighted, with its level estimated from their residuals.
 
-    Looks at points with three or more observations, and says nothing new of fewer than 30 rows. The median length of a
+    Uses points with three or more observations; fewer than 30 rows leave the level as it is. The median length of a
     two-dimensional normal residual is sqrt(2 ln 2) sigma; a point takes 3 of its 2 n degrees of freedom, so residuals
-    come out too small by sqrt(1 - 1.5 / n).
+    are too small by sqrt(1 - 1.5 / n).
     """
     xp = namespace(x_in_world)
     count = observations.tracks.length
@@ -208,7 +208,7 @@ class Linearization:
 
 
 def linearize(observations: Observations, x_in_world: Array, loss_scale_sigma: float) -> Linearization:
-    """Of points (P, 3), with a Cauchy loss of this scale."""
+    """Linearizes the observations of points (P, 3), weighted by a Cauchy loss of this scale."""
     x_in_camera = observations.in_camera(x_in_world)
     residual = observations.camera_residuals(x_in_camera)
     weight = cauchy_weight((residual**2).sum(axis=1), loss_scale_sigma)

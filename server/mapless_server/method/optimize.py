@@ -1,11 +1,10 @@
 """Levenberg-Marquardt: `minimize` for one problem, `minimize_each` for many small ones side by side.
 
-A step solves the linearized problem with its diagonal enlarged by a relative damping. One that lowers the cost is taken
-and the damping falls; any other, also one that cannot be computed, is tried again with more damping. So no cost ever
-rises, and a start whose cost is NaN is returned as it is.
+A step solves the linearized problem with its diagonal enlarged by a relative damping. A step that lowers the cost is
+accepted and the damping is reduced; any other, also one that cannot be computed, is repeated with more damping. So the
+cost never rises, and a start whose cost is NaN is returned as it is.
 
-What is solved is the problem's own: six unknowns at once (`damped_step`), or a system from which points are eliminated
-(see `bundle`).
+Each problem solves its own normal equations: dense ones (`damped_step`), or with the points eliminated (see `bundle`).
 """
 
 from __future__ import annotations
@@ -26,25 +25,25 @@ X = TypeVar("X")
 E = TypeVar("E")
 
 LOWERED = 0.1
-"""The damping's factor after a step that was taken."""
+"""Factor on the damping after an accepted step."""
 
 LEAST_DIAGONAL = 1e-12
-"""Added to the diagonal before it is damped: an unknown that nothing determines stays where it is."""
+"""Added to the diagonal before it is damped: an unknown that is not determined stays where it is."""
 
 
 class Problem(Protocol[X, E]):
-    """A cost over points of any type X; E is what a step is computed from."""
+    """A cost over points of any type X; E is the type of its linearization."""
 
     def cost(self, x: X) -> float:
-        """NaN where there is none, behind a camera for example."""
+        """The cost; NaN where it is not defined, for example behind a camera."""
         ...
 
     def linearize(self, x: X) -> E:
-        """What `step` needs at a point, whatever the damping."""
+        """The linearization at a point, which does not depend on the damping."""
         ...
 
     def step(self, x: X, equations: E, damping: float) -> X | None:
-        """Where a step leads; None where it is not determined."""
+        """The point after a step; None where the step is not determined."""
         ...
 
 
@@ -55,9 +54,9 @@ class MinimizeOptions:
     Attributes:
         iterations: at most so many steps are tried.
         min_decrease: stop after a step that lowers the cost by a smaller share.
-        damping: the first. Small: from within an inlier threshold of the minimum Gauss-Newton's step is nearly right.
-        raised_by: the damping's factor after a step that was not taken.
-        max_damping: give up beyond; the steps are then too short to matter.
+        damping: initial value. Small: within an inlier threshold of the minimum the Gauss-Newton step is nearly right.
+        raised_by: factor on the damping after a rejected step.
+        max_damping: stop beyond it; the steps are then too short to matter.
     """
 
     iterations: int
@@ -73,7 +72,7 @@ class MinimizeOptions:
 
 
 def minimize(problem: Problem[X, E], start: X, options: MinimizeOptions) -> X:
-    """The minimum near a start, or where the last of the steps led."""
+    """The minimum near a start, or the point after the last step."""
     x, cost, damping = start, problem.cost(start), options.damping
     if math.isnan(cost):
         return start
@@ -104,14 +103,14 @@ def minimize_each(
 ) -> AnyArray:
     """Minima of many independent problems of three unknowns, each with its own damping.
 
-    Looks at no value, so that a device does not wait for the host: all take the same number of steps.
+    Reads no value, so that nothing synchronizes with a device: all problems take the same number of steps.
 
     Args:
         cost: of points (P, 3), the cost of each (P,).
         linearize: at points (P, 3), hessians (P, 3, 3) and gradients (P, 3) of half the cost.
         start: (P, 3).
         iterations: number of steps.
-        damping: the first.
+        damping: initial value.
     """
     xp, x, eye = namespace(start), start, identity(start)
     damped, least = xp.full_like(start[:, 0], damping), cost(start)
@@ -132,7 +131,7 @@ def damped_step(hessian: Array, gradient: Array, damping: float) -> Array | None
 
 
 def solve_step(matrix: Array, gradient: Array, *, least_norm: bool = False) -> Array | None:
-    """-matrix^-1 gradient, None where that does not exist or is not finite; or the shortest step in a singular case."""
+    """-matrix^-1 gradient; None if it does not exist or is not finite. `least_norm`: the shortest if it is singular."""
     try:
         step = -np.linalg.lstsq(matrix, gradient, rcond=None)[0] if least_norm else -np.linalg.solve(matrix, gradient)
     except np.linalg.LinAlgError:

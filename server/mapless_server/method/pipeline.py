@@ -1,7 +1,7 @@
-"""A query between the parts of the method, and the part that works on many queries at a time: coarse and scale.
+"""A query between the parts of the method, and the part that computes batches: coarse and scale.
 
-A network reconstructs several queries in one go, so what `localize` does for one query up to its metric scale is done
-here for a batch, on the device where the network's output lies on one.
+A network reconstructs several queries together, so the stages up to the metric scale are computed here for a batch, on
+the device if the network's output is on one.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class StageOptions:
-    """Options of the stages after the coarse one, the same for all queries; the defaults are the best we know.
+    """Options of the stages after the coarse one, the same for all queries; the defaults are the best measured.
 
     Attributes:
         weak_inliers: an answer of `Variant.BEST` with fewer inliers is computed again from wide correspondences (see
-            `correspond`), and replaced if that finds more. Above a hundred they do not help any more.
-        max_radius_ratio: but not if the wide answer claims a radius this many times as large. On photographs where it
-            was the better one it claimed at most 1.7 times as much; where repeated floor tiles had given it inliers,
-            and centimetres of error, 40 to 80 times.
+            `correspond`), and replaced if that gives more. Above a hundred they do not help.
+        max_radius_ratio: the wide answer is not used if its radius is more than this many times as large. Where it was
+            better, its radius was at most 1.7 times as large; where repeated floor tiles had given it inliers, and
+            centimetres of error, 40 to 80 times.
         pnp: of the pose solver.
-        gate: what is no pose at all.
+        gate: of the gate.
         adjust: of the final adjustment.
-        judge: of what is accepted.
+        judge: of the judge.
     """
 
     weak_inliers: int = 100
@@ -69,17 +69,17 @@ class StageOptions:
 
     @staticmethod
     def match(variant: Variant, guided_similarity: float) -> MatchOptions:
-        """Options of the matching stage; what similarity is enough depends on the features."""
+        """Options of the matching stage; the least similarity depends on the features."""
         return MatchOptions(min_similarity=guided_similarity) if variant is Variant.BEST else PAPER_MATCH
 
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """What the method runs on, shared by all queries.
+    """Backend, matcher and options, shared by all queries.
 
     Attributes:
         reconstructor: the coarse backend.
-        matcher: keeps matches between references.
+        matcher: matches views, and caches matches between references.
         options: of the stages.
     """
 
@@ -90,14 +90,14 @@ class Pipeline:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A query whose features are matched: all that is known of it before the coarse stage.
+    """A query whose features are matched: the input of the coarse stage.
 
     Attributes:
         query: the photograph.
         references: the most similar first, in a world whose origin is the first one's camera centre. World coordinates
-            may be millions of metres (UTM, ECEF), too long for the digits of differences of squares.
-        origin: (3,) where that is in the caller's world, metres.
-        pipeline: what to run on.
+            may be millions of metres (UTM, ECEF), too large for differences of squares in double precision.
+        origin: (3,) that origin in the caller's world, metres.
+        pipeline: backend, matcher and options.
         options: of the request.
         correspondences: between all photographs.
         bucket: prepared queries of the same bucket may be reconstructed together.
@@ -127,7 +127,7 @@ class Prepared:
         return self.pipeline.options.match(self.options.variant, similarity)
 
     def can_improve(self, answer: Answer) -> bool:
-        """Whether wide correspondences could give a better answer than this one."""
+        """Whether wide correspondences could give a better answer."""
         if self.options.variant is not Variant.BEST or len(self.references) < 2:
             return False
         if isinstance(answer.outcome, Rejection):
@@ -141,10 +141,10 @@ class Coarse:
 
     Attributes:
         prepared: the query.
-        reconstruction: up to scale, or why there is none.
-        scale: and with it the initial pose, in the world of `prepared`. Or why there is none: then wide correspondences
-            are still to be tried.
-        structure, matches: where they came with the scale, as they do from a device.
+        reconstruction: up to scale, or a rejection.
+        scale: the metric scale with the initial pose, in the world of `prepared`; or a rejection, if wide
+            correspondences are still to be tried.
+        structure, matches: if they were computed on a device together with the scale.
     """
 
     prepared: Prepared
@@ -154,7 +154,7 @@ class Coarse:
     matches: PointMatches | None = None
 
     def answer(self, outcome: Localization | Rejection, support: Support | None = None) -> Answer:
-        """The answer to the caller, of an outcome in the world of `prepared`."""
+        """The answer in the caller's world, from an outcome in the world of `prepared`."""
         prepared, scale = self.prepared, None if isinstance(self.scale, Rejection) else self.scale
         matches = tuple(len(m) for m in prepared.correspondences.query_matches)
         inliers = support.inliers_by_reference() if support else (0,) * len(prepared.references)
@@ -163,22 +163,22 @@ class Coarse:
 
 
 def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Answer | Exception]:
-    """The coarse stage of many queries in one go, then the metric scale of each.
+    """The coarse stage of a batch of queries, then the metric scale of each.
 
-    A reconstruction that stays on a device is worked on there as far as it can be, and the device has nothing more to
-    do for these queries when this returns.
+    For a reconstruction on a device, scale, structure and matches are computed there too; the device has no work left
+    for these queries when this returns.
 
     Args:
         batch: queries of one reconstructor. Those of one bucket are reconstructed together.
 
     Returns:
-        For each query, in their order, what is known of it; or its answer, if no more was asked for or nothing more
-        can be done; or the exception that is its own, unchanged: what its check raised, or what was raised while it
-        alone was computed, such as a torch.OutOfMemoryError when it was alone.
+        For each query, in order: its reconstruction and scale; or its answer, if nothing remains to be computed; or its
+        own exception, unchanged: raised by its check, or while it alone was computed, such as a torch.OutOfMemoryError
+        for a batch of one.
 
     Raises:
         ValueError: several reconstructors.
-        Exception: of the batch as a whole; its halves show which query caused it.
+        Exception: of the batch as a whole; splitting it shows which query caused it.
     """
     if len({id(prepared.pipeline.reconstructor) for prepared in batch}) > 1:
         raise ValueError("one batch has one reconstructor")
@@ -191,20 +191,20 @@ def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Answer | Exception]:
     spent_s = time.perf_counter() - start_s
     for prepared in batch:
         prepared.context.add("coarse", spent_s)
-    # All are launched before the first is waited for, so that a device does not wait for the host in between.
+    # All are launched before waiting for the first, so that the device does not wait for the host.
     launched = _each(_launch_scale, batch, outcomes)
     return _each(lambda finish: _answered_if_final(finish()), launched)
 
 
 def coarse_answer(coarse: Coarse) -> Answer | None:
-    """What can be answered when there is no time to refine: the pose of `Variant.COARSE`; None if there is none yet."""
+    """The answer if there is no time to refine: the pose of `Variant.COARSE`; None if there is none yet."""
     if isinstance(coarse.scale, Rejection):
         return None
     return coarse.answer(Localization(coarse.scale.world_from_query, None, PoseStage.COARSE, 0, 0, 0.0))
 
 
 def with_wide_correspondences(coarse: Coarse) -> Coarse:
-    """The same query with wide correspondences among the references, and a reconstruction from them if it uses any."""
+    """The query with wide correspondences among the references; reconstructed again if the backend uses them."""
     prepared, reconstruction = coarse.prepared, coarse.reconstruction
     query, references, pipeline, context = prepared.query, prepared.references, prepared.pipeline, prepared.context
     with context.stage("correspond"):
@@ -219,7 +219,7 @@ def with_wide_correspondences(coarse: Coarse) -> Coarse:
 
 
 def _each(work: Callable[..., T], *columns: Sequence[Any]) -> list[T | Exception]:
-    """The work's result in each row; an exception that stands in the row, or is raised there, is the row's alone."""
+    """The result of `work` for each row; an exception in a row, or raised by it, is the result of that row."""
     results: list[T | Exception] = []
     for row in zip(*columns, strict=True):
         failures = [value for value in row if isinstance(value, Exception)]
@@ -231,7 +231,7 @@ def _each(work: Callable[..., T], *columns: Sequence[Any]) -> list[T | Exception
 
 
 def _launch_scale(prepared: Prepared, reconstruction: Outcome) -> Callable[[], Coarse]:
-    """The metric scale, computed where the reconstruction lies; only what is returned waits for a device."""
+    """Launches the metric scale where the reconstruction is; the returned function waits for its result."""
     references, correspondences, context = prepared.references, prepared.correspondences, prepared.context
     options = ScaleOptions(prepared.options.scale_strategy)
     coarse = partial(Coarse, prepared, reconstruction)
@@ -251,14 +251,14 @@ def _launch_scale(prepared: Prepared, reconstruction: Outcome) -> Callable[[], C
 
     def wait() -> Coarse:
         found = launched()
-        context.add("refine", time.perf_counter() - start_s)  # waiting for the whole batch is each query's
+        context.add("refine", time.perf_counter() - start_s)  # each query waits for the whole batch
         return coarse(found) if isinstance(found, Rejection) else coarse(found.scale, found.structure, found.matches)
 
     return wait
 
 
 def _answered_if_final(coarse: Coarse) -> Coarse | Answer:
-    """The answer, if refining would not change it."""
+    """The answer, if nothing remains to be refined."""
     if isinstance(coarse.scale, Rejection):
         answer = coarse.answer(coarse.scale)
         return coarse if coarse.prepared.can_improve(answer) else answer

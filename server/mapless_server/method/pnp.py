@@ -1,8 +1,7 @@
 """Pose from 2D-3D matches: RANSAC and Levenberg-Marquardt.
 
-As in the paper, the refined pose replaces the initial one only if it explains at least as many matches. Whether the
-winner is believed is not decided here (see `gate` and `judge`). What is known of the pose beforehand brings more
-candidates, and terms of its own in the cost (see `informed`).
+As in the paper, the refined pose replaces the initial one only if it has at least as many inliers. Whether the pose is
+accepted is decided later (see `gate` and `judge`). Priors add candidates, and terms in the cost (see `informed`).
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ class PnpOptions:
     Attributes:
         inlier_px: largest reprojection error of an inlier.
         loss_scale_px: of the Cauchy loss in the final refinement; about the error of a good keypoint.
-        min_iterations: RANSAC's least; enough with an initial pose to start from.
-        max_iterations: RANSAC's most, reached when 5 % of the matches are right.
-        max_matches: a larger, evenly thinned number is not better, and scoring is linear in it.
-        min_matches: fewer are no ground for a pose.
-        error_inflation: factor on the standard deviations of what matches say, before it is compared or combined with
-            priors; as in the adjustment.
+        min_iterations: least number of RANSAC iterations; enough with an initial pose.
+        max_iterations: largest number of RANSAC iterations, reached with 5 % inliers.
+        max_matches: evenly thinned; more are not more accurate, and scoring is linear in it.
+        min_matches: fewer give no pose.
+        error_inflation: factor on the standard deviations of a pose from matches, before it is compared or combined
+            with priors; as in the adjustment.
     """
 
     inlier_px: float = 4.0
@@ -54,7 +53,7 @@ class PnpOptions:
 
     @property
     def informed(self) -> InformedOptions:
-        """Options of what is done with priors."""
+        """Options of pose estimation with priors."""
         refine = PoseOnlyOptions(sigma_px=self.loss_scale_px, prior_weight=self.error_inflation**2)
         return InformedOptions(self.inlier_px, refine)
 
@@ -70,9 +69,9 @@ def solve_pose(
     """The query's pose from its matches with the structure.
 
     Returns:
-        The refined or the initial pose, whichever has more inliers (the refined one on a tie); with priors, a pose that
-        they bring if that is better, refined with those that are consistent with it. Rejections: TOO_FEW_MATCHES,
-        PNP_FAILED when no pose explains any four.
+        The refined or the initial pose, whichever has more inliers (the refined one on a tie); or a better candidate
+        from priors, refined with the consistent priors. Rejections: TOO_FEW_MATCHES; PNP_FAILED if no pose has four
+        inliers.
     """
     if len(matches) < options.min_matches:
         return Rejection(RejectionReason.TOO_FEW_MATCHES, f"{len(matches)} 2D-3D matches, {options.min_matches} needed")
@@ -104,7 +103,7 @@ def solve_pose(
 def _estimate(
     camera: Camera, x_in_world: Array, pixels: Array, stage: PoseStage, pose: RigidTransform, options: PnpOptions
 ) -> PoseEstimate | Rejection:
-    """What the matches say of a pose; PNP_FAILED if it explains no four of them."""
+    """Inliers, errors and covariance of a pose; PNP_FAILED if it has fewer than four inliers."""
     errors_px = reprojection_errors_px(camera, pose, x_in_world, pixels)
     inliers = errors_px < options.inlier_px
     if inliers.sum() < 4:
@@ -121,7 +120,7 @@ def ransac(
 ) -> RigidTransform | None:
     """P3P in RANSAC with a final Cauchy refinement, by PoseLib; None without a finite pose.
 
-    The only place that knows PoseLib, which accepts misspelt options without a word.
+    PoseLib silently ignores options that it does not know.
     """
     step = -(-len(pixels) // options.max_matches)
     pose, _ = poselib.estimate_absolute_pose(

@@ -1,8 +1,8 @@
-"""Resection: where a photograph was taken, and with what focal length, from points that stay where they are.
+"""Resection: pose and focal length of a photograph from fixed points.
 
     min  sum_i rho(|u_i - c - e^s f pi(P X_i)|^2 / sigma_i^2)      (Cauchy's loss)
 
-over a left perturbation (v, w) of camera_from_world P, and s, the logarithm of the focal length over the given one.
+over a left perturbation (v, w) of camera_from_world P and s, the logarithm of focal length over given focal length.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ class Resection:
         sigma_px: (N,) standard deviation of each coordinate.
         loss_scale_sigma: of the Cauchy loss.
         unknowns: which of v, w and s are free.
-        behind_sigma: residual that a point behind the camera counts for; NaN, and no step may put one there.
-        max_log_step: of s at once.
-        shorten_all: whether a step with a larger one is shortened as a whole, which stays on course from nearby, or in
-            s alone, so that a pose that begins far off still gets nearer at once.
+        behind_sigma: residual of a point behind the camera; with NaN no step may move a point there.
+        max_log_step: largest change of s in one step.
+        shorten_all: whether a step with a larger change is shortened as a whole, which keeps its direction near the
+            minimum, or in s alone, so that a pose far from the minimum still moves by the full step.
     """
 
     camera: Camera

@@ -1,6 +1,6 @@
-"""Choosing references for a photograph: those that share the most matches with it, not all from one spot.
+"""Choosing references for a photograph: those with the most matches, from different places.
 
-The rule looks at nothing but the photographs, so it never uses what it is asked for, the query's pose.
+The choice uses the photographs and the references' poses only, never the query's pose.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ class RetrieveOptions:
     """Options of the choice.
 
     Attributes:
-        apart_m: references closer together than this see the same and triangulate nothing (the paper's baseline).
-        nearby_weight: what the match count of a reference is worth when one within `apart_m` is chosen already. 0 would
-            spread the references at any price; half of the matches is worth a baseline, a tenth is not: in a dense
-            sequence the strictly spread ones see so little of the query that they cost a third of the accuracy.
+        apart_m: references closer together than this triangulate nothing (the paper's least baseline).
+        nearby_weight: factor on the match count of a reference within `apart_m` of a chosen one. 0 would spread the
+            references at any cost: in a dense sequence such references show so little of the query that a third of
+            the accuracy is lost.
     """
 
     apart_m: float = 0.3
@@ -53,7 +53,7 @@ def choose_references(
 def spread_choice(
     match_counts: ArrayLike, centres: ArrayLike, count: int, options: RetrieveOptions | None = None
 ) -> list[int]:
-    """Takes the best score again and again, where a candidate near a chosen one scores less; ties go to the first.
+    """Greedy choice by match count, reduced for candidates near a chosen one; the first of equals.
 
     Args:
         match_counts: (N,) matches with the query.

@@ -1,12 +1,12 @@
-"""Robust losses: what a measurement adds to a cost, by its squared residual s and a scale c, in standard deviations.
+"""Robust losses rho(s) of a squared residual s, with a scale c; both in standard deviations.
 
     loss       rho(s)                           weight rho'(s)
     Cauchy     c^2 log(1 + s / c^2)             1 / (1 + s / c^2)
     soft L1    2 c^2 (sqrt(1 + s / c^2) - 1)    1 / sqrt(1 + s / c^2)
 
-Both are s where that is small. Then soft L1 grows like the residual, and Cauchy's loss forgets gross errors rather than
-merely bounding them. The weights are those of iteratively reweighted least squares: the gradient of a sum of losses is
-2 sum rho'(s) J^T r. (As `scipy.optimize.least_squares` has them, with f_scale = c.)
+Both are s for small s. For large s, soft L1 grows like the residual, and Cauchy's loss like its logarithm, so that the
+influence of outliers vanishes. The weights are those of iteratively reweighted least squares: the gradient of a sum of
+losses is 2 sum rho'(s) J^T r. (As in `scipy.optimize.least_squares`, with f_scale = c.)
 """
 
 from __future__ import annotations

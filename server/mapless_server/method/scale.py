@@ -1,11 +1,12 @@
-"""Scale: makes a reconstruction metric with the references' known poses, and so poses the query.
+"""Scale: makes a reconstruction metric with the references' known poses, which gives the query's initial pose.
 
 The paper's scale estimation and pose initialization. Stage 1 compares depths triangulated from the known poses with the
-predicted ones; if the predicted trajectory, so scaled, is as large as the known one, that is the scale. Otherwise
-stage 2 lays the predicted trajectory onto the known one, and the stage whose scale fits its size better wins.
+predicted depths; if the predicted trajectory, scaled by the result, is as large as the known one, this scale is
+adopted. Otherwise stage 2 aligns the predicted trajectory with the known one, and the stage whose scale fits the
+trajectory's size better is used.
 
-The equations are in `scale_equations`. They look at no value, so that they run on NumPy's arrays and on torch's
-tensors; `judge` looks at what came out.
+The equations are in `scale_equations`, for NumPy arrays and torch tensors, and read no value; `judge` evaluates their
+result on the host.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ def estimate_scale(
     Args:
         reconstruction: query and references up to scale, its references in the order of `references`.
         references: with known poses.
-        correspondences: matches between references; those with the query are not looked at.
+        correspondences: matches between references; those with the query are not used.
         options: defaults to the paper's.
 
     Returns:
-        The scale, everything in it finite; or a rejection: NO_USABLE_REFERENCES for fewer than two,
-        DEGENERATE_REFERENCES for references that stand too close together, SCALE_UNRELIABLE when the reconstruction is
-        not finite or the strategy finds no scale.
+        The scale, with finite values only; or a rejection: NO_USABLE_REFERENCES for fewer than two references,
+        DEGENERATE_REFERENCES for references too close to one another, SCALE_UNRELIABLE if the reconstruction is not
+        finite or the strategy finds no scale.
 
     Raises:
         ValueError: the reconstruction has another number of references.
@@ -52,13 +53,13 @@ def estimate_scale(
     if rejection is not None:
         return rejection
     known = gather(references, correspondences, options)
-    with np.errstate(divide="ignore", invalid="ignore"):  # what is not finite is for `judge`
+    with np.errstate(divide="ignore", invalid="ignore"):  # `judge` rejects what is not finite
         candidates = scale_candidates(known, predicted, options)
     return judge(candidates, len(references), options)
 
 
 def check_references(references: Sequence[PosedView], options: ScaleOptions) -> Rejection | None:
-    """References at one place have no trajectory radius, and nothing else tells how long a metre is."""
+    """Rejects references at one place: their trajectory radius is 0, so the scale is not determined."""
     count = len(references)
     if count < 2:
         message = f"the scale needs two references at different places, got {count}"
@@ -71,7 +72,7 @@ def check_references(references: Sequence[PosedView], options: ScaleOptions) -> 
 
 
 def judge(candidates: ScaleCandidates, reference_count: int, options: ScaleOptions) -> MetricScale | Rejection:
-    """The scale; or why the candidates give none."""
+    """The scale from the candidates, or a rejection."""
     broken = not_finite(candidates, reference_count)
     if broken:
         return Rejection(RejectionReason.SCALE_UNRELIABLE, broken)
@@ -102,7 +103,7 @@ def judge(candidates: ScaleCandidates, reference_count: int, options: ScaleOptio
 
 
 def not_finite(candidates: ScaleCandidates, reference_count: int) -> str | None:
-    """A network that fails numerically answers NaN; nothing of it may come near a pose. None if it did not fail."""
+    """What of a network's output is not finite, in one sentence; None if everything is finite."""
     if candidates.broken_poses:
         return f"{candidates.broken_poses:.0f} of {reference_count + 1} predicted poses are not finite"
     if not candidates.known_depths:

@@ -12,8 +12,8 @@ S_tri; S_traj          `triangulation_scale`; `trajectory_scale`
 R_align; P_q^init      `alignment_rotation`; `align`
 =====================  ======================================================
 
-What is known is gathered from the references on the host; `scale_candidates` compares it with what was predicted, on
-NumPy's arrays and on torch's tensors (see `arrays`).
+`gather` collects the known values from the references on the host; `scale_candidates` compares them with the predicted
+ones, for NumPy arrays and torch tensors (see `arrays`).
 """
 
 from __future__ import annotations
@@ -36,27 +36,28 @@ from .views import PosedView
 
 @dataclass(frozen=True)
 class ScaleOptions:
-    """Options of the scale. Numbers "of the paper" are its own; each of the others says what it adds.
+    """Options of the scale; "of the paper" marks the paper's values.
 
     Attributes:
-        strategy: two stages, as in the paper; or one of them alone, to compare.
-        min_baseline_m, max_baseline_m: pairs of references that are triangulated (of the paper). Closer ones see no
-            depth, farther ones hardly see the same things.
-        min_parallax_deg: angle at which the two rays of a triangulated match must meet. The paper bounds the baseline
-            alone, but 0.3 m tells nothing about what is 100 m away: one pixel at a focal length of 800 px is 0.07 deg,
-            so an angle of 1 deg gives a depth to 7 %, about the gate's 5 %. 0 keeps every match.
-        min_ratios: fewest depth ratios, two from a match, for their median to count. The median of 12 matches errs by
-            1.25 / sqrt(12) of their spread: 3.6 % for a spread of 10 %, inside the gate. Fewer leave it to stage 2.
-        max_matches: most matches that are triangulated, evenly chosen among more: 32 references can have 400 000, but
-            the median of 20 000 errs by less than a hundredth of their spread.
+        strategy: two stages, as in the paper; or one of them alone, for comparison.
+        min_baseline_m, max_baseline_m: baselines of pairs of references to triangulate (of the paper). Shorter ones do
+            not determine depth, longer ones share few points.
+        min_parallax_deg: least angle between the two rays of a triangulated match. The paper bounds the baseline alone,
+            but 0.3 m does not determine a depth of 100 m: one pixel at a focal length of 800 px is 0.07 deg, so an
+            angle of 1 deg gives a depth to 7 %, about the 5 % of `max_deviation`. 0 keeps every match.
+        min_ratios: fewest depth ratios, two per match, for stage 1. The median of 12 matches errs by 1.25 / sqrt(12) of
+            their spread: 3.6 % for a spread of 10 %, within `max_deviation`. With fewer, stage 2 gives the scale.
+        max_matches: most matches to triangulate, evenly thinned: 32 references can have 400 000, but the median of
+            20 000 errs by less than a hundredth of their spread.
         max_deviation: deviation below which the scale of stage 1 is adopted at once (of the paper).
-        inlier_distance_m: a camera agrees with a scale of stage 2 when its aligned centre comes this close to the known
-            one (of the paper).
-        max_pair_cameras: stage 2 tries every pair of so many cameras, evenly chosen among more. All 496 pairs of 32
-            stand for the paper's 500 random ones, so that an answer is reproducible.
-        min_radius_m: smallest trajectory radius of the references that tells a scale: poses are known to about 1 cm.
-        min_radius_per_depth: the same as a share of the scene's depth, which is how predicted poses err. At 0.002 the
-            references' images differ by the parallax of 1.6 px at a focal length of 800 px: noise of a keypoint.
+        inlier_distance_m: largest distance between the aligned and the known centre of a camera that is an inlier of a
+            scale of stage 2 (of the paper).
+        max_pair_cameras: stage 2 tries every pair of so many cameras, evenly thinned. All 496 pairs of 32 replace the
+            paper's 500 random ones, so that an answer is reproducible.
+        min_radius_m: smallest trajectory radius of the references that determines a scale: poses are accurate to about
+            1 cm.
+        min_radius_per_depth: the same for the predicted trajectory, as a share of the scene's depth. At 0.002 the
+            references' images differ by a parallax of 1.6 px at a focal length of 800 px: the noise of a keypoint.
     """
 
     strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
@@ -92,13 +93,13 @@ class ScaleOptions:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is known of K references before anything is predicted. Keypoints are counted through all references.
+    """Known values of K references. Keypoint indices are into the concatenated keypoints of all references.
 
     Attributes:
         rotation: (K, 3, 3) world_from_camera.
         centre: (K, 3) in the world, metres.
-        pairs: (P, 2) references whose distance proposes a scale.
-        matches: (M, 2) keypoints of the matches that were triangulated.
+        pairs: (P, 2) references whose distance proposes a scale in stage 2.
+        matches: (M, 2) keypoints of the triangulated matches.
         depth_m: (M, 2) their depths, above 0.
     """
 
@@ -111,7 +112,7 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """What a reconstruction predicts of the same, float64, in its frame and unit.
+    """Values that a reconstruction predicts, float64, in its frame and unit.
 
     Attributes:
         rotation: (K + 1, 3, 3) local_from_camera of the references, then of the query.
@@ -128,7 +129,7 @@ class Predicted:
 
 @dataclass(frozen=True, eq=False)
 class ScaleCandidates:
-    """What the conclusion needs to know; arrays of one number where no shape is given.
+    """Result of the two stages, from which `scale.judge` takes the scale; arrays of one number if no shape is given.
 
     Attributes:
         broken_poses: number of predicted poses that are not finite.
@@ -136,10 +137,10 @@ class ScaleCandidates:
         radius_per_depth: of the predicted trajectory, by the median depth.
         ratio_count: number of depth ratios.
         metres_per_unit: S; NaN if the strategy finds none.
-        by_triangulation: whether stage 1 gave it.
+        by_triangulation: whether it is from stage 1.
         deviation: d of this scale.
         anchor: index of the reference with the highest total confidence, the first of equals.
-        local_rotation, local_centre: (3, 3), (3,) world_from_local but for the scale.
+        local_rotation, local_centre: (3, 3), (3,) world_from_local without the scale.
         query_rotation, query_centre: (3, 3), (3,) world_from_query, P_q^init.
     """
 
@@ -158,7 +159,7 @@ class ScaleCandidates:
 
 
 def predict(reconstruction: Reconstruction, references: Sequence[PosedView]) -> Predicted:
-    """What the reconstruction says, as far as the scale is concerned."""
+    """The reconstruction's values that the scale uses."""
     poses = [view.local_from_camera for view in (*reconstruction.references, reconstruction.query)]
     return Predicted(
         np.stack([pose.rotation for pose in poses]),
@@ -169,14 +170,14 @@ def predict(reconstruction: Reconstruction, references: Sequence[PosedView]) -> 
 
 
 def gather(references: Sequence[PosedView], correspondences: Correspondences, options: ScaleOptions) -> Known:
-    """What is known of two or more references."""
+    """The known values of two or more references."""
     poses = [reference.world_from_camera for reference in references]
     if not options.by_triangulation:
         correspondences = Correspondences({}, ())
     matches = _matches_in_range(references, correspondences, options)
     centre, ray = keypoint_rays(references)
     depth_m, parallax_deg = triangulate_depths(centre[matches], ray[matches])
-    # A match behind either camera is wrong, whatever the other one says. False for NaN.
+    # A match behind either camera is wrong. False for NaN.
     usable = (depth_m > 0).all(axis=1) & (parallax_deg >= options.min_parallax_deg)
     return Known(
         np.stack([pose.rotation for pose in poses]),
@@ -208,7 +209,7 @@ def pairs_of(count: int, max_cameras: int) -> NDArray[np.intp]:
 
 
 def scale_candidates(known: Known, predicted: Predicted, options: ScaleOptions) -> ScaleCandidates:
-    """Compares what is known with what was predicted."""
+    """Both stages, from known and predicted values."""
     xp, count = namespace(predicted.depth), len(known.centre)
     finite = xp.isfinite(xp.concatenate([predicted.rotation.reshape(count + 1, 9), predicted.centre], 1)).all(1)
     has_depth = ~xp.isnan(predicted.depth)
@@ -220,7 +221,7 @@ def scale_candidates(known: Known, predicted: Predicted, options: ScaleOptions) 
     )
     rotation = alignment_rotation(world_from_anchor[0], local_from_anchor[0])
 
-    # In both images of a match, so that the order of the references does not matter.
+    # Ratios in both images of a match, so that the order of the references does not matter.
     ratios = (known.depth_m / predicted.depth[known.matches]).reshape(-1)
     usable = xp.isfinite(ratios)
     enough = (usable.sum() >= options.min_ratios) & options.by_triangulation
@@ -229,7 +230,7 @@ def scale_candidates(known: Known, predicted: Predicted, options: ScaleOptions) 
     if not options.by_trajectory:
         second = second * np.nan
     of_first, of_second = (trajectory_deviation(scale, radius, radius_m) for scale in (first, second))
-    # d_tri below the gate settles it; otherwise the smaller one, of equals the first stage's.
+    # Stage 1 if d_tri is below the bound; otherwise the stage with the smaller d, stage 1 of equals.
     by_triangulation = (of_first < options.max_deviation) | (of_first <= of_second) | xp.isnan(of_second)
 
     scale = xp.where(by_triangulation, first, second)
@@ -251,12 +252,12 @@ def scale_candidates(known: Known, predicted: Predicted, options: ScaleOptions) 
 
 
 def _pick(rows: AnyArray, index: AnyArray) -> AnyArray:
-    """One row; torch would wait for an index that is not in an array."""
+    """One row; torch synchronizes for an index that is not in a tensor."""
     return rows[index.reshape(1)][0]
 
 
 def triangulate_depths(centre: Array, ray: Array) -> tuple[Array, Array]:
-    """Depths at which the two rays of each match pass nearest to one another.
+    """Depths at which the two rays of each match are nearest to one another.
 
     They solve z_i r_i - z_j r_j = C_j - C_i in the least squares sense:
 
@@ -295,44 +296,43 @@ def alignment_rotation(world_from_anchor: AnyArray, local_from_anchor: AnyArray)
 
 
 def triangulation_scale(ratios: AnyArray, usable: AnyArray) -> AnyArray:
-    """S_tri, the median of those ratios Z^GT / Z^local (N,) that are usable (N,), in metres per unit."""
+    """S_tri, the median of the usable (N,) ratios Z^GT / Z^local (N,), in metres per unit."""
     return median(ratios, usable)
 
 
 def trajectory_scale(aligned: AnyArray, centres_world: AnyArray, pairs: AnyArray, inlier_distance_m: float) -> AnyArray:
-    """S_traj: the scale with the most inliers, among equals that with the smallest RMS distance.
+    """S_traj: the scale with the most inliers, of equals that with the smallest RMS distance.
 
-    Every pair of cameras proposes the ratio of their known to their predicted distance. The proposal scales the whole
-    trajectory, which is then moved onto the known one by the offset of their centroids; cameras that come near enough
-    to their known centre are inliers.
+    Every pair of cameras proposes the ratio of their known to their predicted distance. The predicted trajectory is
+    scaled by it and shifted so that its centroid is that of the known one; cameras near their known centre are inliers.
 
     Args:
         aligned: (K, 3) predicted centres in world axes, R_align C^local.
         centres_world: (K, 3) known centres, metres.
         pairs: (P, 2) of the cameras, at least one.
-        inlier_distance_m: how near.
+        inlier_distance_m: largest distance of an inlier.
 
     Returns:
         Metres per unit; NaN when no pair has a distance in both trajectories.
     """
     xp = namespace(aligned)
     predicted, known = (length(centres[pairs[:, 0]] - centres[pairs[:, 1]]) for centres in (aligned, centres_world))
-    # A distance of nothing but rounding proposes nothing but rounding.
+    # Distances at the level of rounding propose no scale.
     apart = (predicted > 1e-6 * trajectory_radius(aligned)) & (known > 1e-6 * trajectory_radius(centres_world))
     proposals = known / xp.where(apart, predicted, np.nan)
     moved = proposals[:, None, None] * (aligned - aligned.mean(0))  # (P, K, 3)
     squared = ((moved - (centres_world - centres_world.mean(0))) ** 2).sum(2)  # (P, K) square metres
     inliers = squared <= inlier_distance_m**2
     count = xp.where(apart, inliers.sum(1), -1)
-    judges = inliers | (count == 0)[:, None]  # where no camera agrees, all of them judge
-    mean_squared = (squared * judges).sum(1) / judges.sum(1)
+    counted = inliers | (count == 0)[:, None]  # all cameras, where none is an inlier
+    mean_squared = (squared * counted).sum(1) / counted.sum(1)
     return _pick(proposals, xp.where(count == count.max(), mean_squared, np.inf).argmin())
 
 
 def align(
     metres_per_unit: AnyArray, rotation: AnyArray, anchor_in_world: AnyArray, anchor_in_local: AnyArray
 ) -> AnyArray:
-    """Translation (3,) of ``world_from_local``, which lays the anchor's predicted centre (3,) on its known one (3,).
+    """Translation (3,) of ``world_from_local``, which maps the anchor's predicted centre (3,) to its known one (3,).
 
     x_in_world = t_anc^GT + S R_align (x_in_local - t_anc^local). Applied to P_q^local it gives the paper's P_q^init:
     R_q^init = R_align R_q^local,   t_q^init = t_anc^GT + R_align S (t_q^local - t_anc^local).

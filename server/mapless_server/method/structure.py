@@ -1,13 +1,13 @@
-"""Structure: 3D points from tracks over the references, whose poses are known and stay fixed.
+"""Structure: 3D points from tracks over the references, whose poses are known and fixed.
 
 The paper's structure-only bundle adjustment: with fixed poses every point is its own problem of three unknowns,
 
     X_k = argmin sum_i rho(|| pi(P_i, X_k) - u_ki ||^2),     rho(s) = 2 c^2 (sqrt(1 + s / c^2) - 1)   (soft L1),
 
 so all points take Levenberg-Marquardt steps at once, each with its own damping. Residuals are divided by the standard
-deviation of their keypoint; the paper's form is the one where that is a pixel for all.
+deviation of their keypoint; in the paper's form this is one pixel for all.
 
-The equations are in `observations`; they run on NumPy's arrays and on torch's tensors.
+The equations are in `observations`, for NumPy arrays and torch tensors.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ class StructureOptions:
     Attributes:
         all_references: merge tracks over all pairs of references (better poses) or, as the paper does, take the first
             reference's pairs alone.
-        optimize: move the points. Without, they stay where the reconstruction put them (the paper's ablation).
-        model_noise: weigh observations by the expected error of their keypoint; the paper gives all the same weight.
+        optimize: adjust the points; otherwise they stay as the reconstruction predicts them (the paper's ablation).
+        model_noise: weight observations by the noise of their keypoint; the paper gives all the same weight.
         iterations: Levenberg-Marquardt steps, twice; four converge from a good start.
         loss_scale_sigma: residual, in standard deviations, at which the loss turns from square to linear.
         max_residual_sigma: points with a larger residual in any view are dropped; None keeps all.
-        min_parallax_deg: points whose rays meet at less are dropped, because their depth is a guess.
+        min_parallax_deg: points with a smaller parallax are dropped, because their depth is not determined.
     """
 
     all_references: bool = True
@@ -70,7 +70,7 @@ class StructureOptions:
 
     @property
     def first_noise(self) -> KeypointNoise:
-        """Of the keypoints, before their residuals tell."""
+        """Noise of the keypoints before it is estimated from the residuals."""
         return FIRST_GUESS if self.model_noise else ONE_PIXEL
 
 
@@ -82,7 +82,7 @@ PAPER_STRUCTURE = StructureOptions(
     max_residual_sigma=None,
     min_parallax_deg=0.0,
 )
-"""What the paper does."""
+"""The paper's form."""
 
 
 def build_structure(
@@ -92,7 +92,7 @@ def build_structure(
     correspondences: Correspondences,
     options: StructureOptions,
 ) -> Structure:
-    """Metric points from the references' tracks, started at the reconstruction's depths; possibly none at all.
+    """Triangulates metric points from the references' tracks, starting at the reconstruction's depths; possibly none.
 
     Args:
         reconstruction: up to scale; its references in the order of `references`.
@@ -114,20 +114,20 @@ def build_structure(
 
 
 def tracks_of(references: Sequence[PosedView], correspondences: Correspondences, options: StructureOptions) -> Tracks:
-    """The tracks that become points."""
+    """The tracks to triangulate."""
     counts = [len(r.view.features) for r in references]
     return build_tracks(correspondences.reference_pairs, counts, None if options.all_references else 0)
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedPoints:
-    """What became of the points.
+    """Adjusted points.
 
     Attributes:
         x_in_world: (P, 3) metres.
-        observations: of these points; without those that did not fit.
+        observations: of these points, without outliers.
         trusted: (P,) which points to keep.
-        noise: of the keypoints.
+        noise: noise of the keypoints.
     """
 
     x_in_world: AnyArray
@@ -137,7 +137,7 @@ class RefinedPoints:
 
 
 def refine_points(observations: Observations, x_in_world: AnyArray, options: StructureOptions) -> RefinedPoints:
-    """The stage's work, from predicted points (P, 3) to refined ones; `observations` carry `options.first_noise`."""
+    """Adjusts predicted points (P, 3); `observations` must have the noise `options.first_noise`."""
     points, noise = x_in_world, options.first_noise
     if options.optimize:
         if options.all_references:
@@ -147,7 +147,7 @@ def refine_points(observations: Observations, x_in_world: AnyArray, options: Str
             noise = estimate_noise(observations, points, noise)
             observations = observations.weighted(noise)
         if options.max_residual_sigma is not None:
-            # A chain of matches that took a wrong turn has good links too.
+            # A track with one wrong match has right observations too.
             explained = length(observations.residuals(points)) < options.max_residual_sigma
             observations, points = observations.prune(explained, points)
         points = adjust_points(observations, points, options.loss_scale_sigma, options.iterations)
@@ -155,7 +155,7 @@ def refine_points(observations: Observations, x_in_world: AnyArray, options: Str
 
 
 def trustworthy(observations: Observations, x_in_world: AnyArray, options: StructureOptions) -> AnyArray:
-    """Which points (P,) are finite, explained by all their observations and seen under enough parallax."""
+    """Which points (P,) are finite, fit all their observations and have enough parallax."""
     xp = namespace(x_in_world)
     limit = options.max_residual_sigma
     explained = observations.max_by_point(length(observations.residuals(x_in_world))) < (limit or np.inf)
@@ -195,7 +195,7 @@ def predicted_points(
 ) -> Array:
     """Back-projects the first keypoint of each track with its predicted depth at metric scale, (P, 3) in the world.
 
-    NaN where the reconstruction knows no depth.
+    NaN where the reconstruction has no depth.
     """
     first = keypoint_offsets(references)[tracks.view[tracks.starts]] + tracks.keypoint[tracks.starts]
     centre, ray = keypoint_rays(references)

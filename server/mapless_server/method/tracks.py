@@ -1,4 +1,4 @@
-"""Merging pairwise matches into tracks: which keypoints of all references show one point."""
+"""Tracks: keypoints of several references that show one point, merged from pairwise matches."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .views import Matches, PosedView
 
 
 class Grouping(Protocol):
-    """Which rows observe the same point: `Tracks`, or what stands for them on a device.
+    """Which rows observe the same point: `Tracks`, or their counterpart on a device.
 
     Attributes:
         point: (O,) index of each row's point.
@@ -52,16 +52,16 @@ class Grouping(Protocol):
         ...
 
     def prune(self, observations: AnyArray) -> tuple[Any, Any, Any]:
-        """See Tracks; where nothing can be taken out, both selectors take everything."""
+        """See Tracks; an implementation that cannot remove rows returns selectors of everything."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Observations of points, sorted by point, then view; a point is seen at most once in a view, and in at least two.
+    """Observations of points, sorted by point, then view; one per point and view at most, two per point at least.
 
     Attributes:
-        point: (O,) index of the point, 0 to P - 1, every one occurring.
+        point: (O,) index of the point, 0 to P - 1; each occurs.
         view: (O,) index of the observing reference.
         keypoint: (O,) index of its keypoint there.
     """
@@ -88,7 +88,7 @@ class Tracks:
 
     @property
     def length(self) -> NDArray[np.intp]:
-        """(O,) how many references see each observation's point."""
+        """(O,) number of observations of each observation's point."""
         return np.bincount(self.point)[self.point]
 
     def sum_by_point(self, values: Array) -> Array:
@@ -100,10 +100,10 @@ class Tracks:
         return np.maximum.reduceat(values, self.starts) if len(self.starts) else values[:0]
 
     def prune(self, observations: NDArray[np.bool_]) -> tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_]]:
-        """The tracks with only the chosen observations (O,), without points that are left with fewer than two.
+        """The tracks with only the chosen observations (O,), without points that have fewer than two of them.
 
         Returns:
-            The tracks, and what is left of arrays by observation and by point: masks (O,) and (P,) to index them with.
+            The tracks, and masks (O,) and (P,) of the observations and points that are kept.
         """
         count = np.bincount(self.point[observations], minlength=self.point_count)
         rows, points = observations & (count[self.point] >= 2), count >= 2
@@ -119,8 +119,8 @@ def build_tracks(
     Args:
         pairs: matches of views i < j.
         keypoint_counts: number of keypoints of each view.
-        anchor: None merges over all pairs. A view merges that view's pairs alone (the paper), so that every track
-            begins at one of its keypoints.
+        anchor: None merges all pairs; the index of a view merges only the pairs of that view (the paper), so that
+            every track begins at one of its keypoints.
 
     Returns:
         The tracks. Where a chain of matches reaches two keypoints of one view, the one with more matches is kept.
@@ -141,7 +141,7 @@ def build_tracks(
     degree = np.bincount(edges.ravel(), minlength=total)
     node = np.flatnonzero(degree)
     view = np.searchsorted(offsets, node, side="right") - 1
-    # Sorted by (component, view, -degree), the first of each (component, view) is the one to keep.
+    # Sorted by (component, view, -degree), the first of each (component, view) is kept.
     order = np.lexsort((-degree[node], view, component[node]))
     node, view = node[order], view[order]
     label = component[node]

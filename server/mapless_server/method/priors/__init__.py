@@ -1,1 +1,1 @@
-"""What is known of a pose beforehand (`known`), and poses that use it: `gravity`, `informed`, `pose_only`."""
+"""Priors on a pose (`known`), and pose estimation with them: `gravity`, `informed`, `pose_only`."""

@@ -1,7 +1,7 @@
-"""Pose from two 2D-3D matches and gravity, in RANSAC: where few matches are right, two are found sooner than three.
+"""Pose from two 2D-3D matches and gravity, in RANSAC: with few inliers, samples of two need fewer draws than of three.
 
-Gravity is known to a degree or so, which is many pixels, so what two matches say is only a first guess: it is scored
-with a tolerance as wide as gravity's error looks in the image, and the best guesses are refined with gravity as one
+Gravity is known to about a degree, which is many pixels, so a pose from two matches is only a hypothesis: it is scored
+with a tolerance as large as gravity's error in the image, and the best hypotheses are refined with gravity as one
 measurement among others.
 """
 
@@ -26,11 +26,11 @@ class GravityOptions:
     """Options of the two-point RANSAC.
 
     Attributes:
-        max_matches: a larger, evenly thinned number is not better for choosing, and scoring is linear in it.
-        batch: samples that are scored in one go.
+        max_matches: evenly thinned; more do not improve the choice, and scoring is linear in it.
+        batch: samples that are scored together.
         max_samples: by then two right matches have been drawn with 99.4 % if 10 % are right.
         confidence: stop when two right matches have been drawn with this probability.
-        refined: so many of the best guesses are refined, the others forgotten.
+        refined: number of the best hypotheses to refine.
     """
 
     max_matches: int = 300
@@ -52,13 +52,13 @@ def ransac_with_gravity(
     inlier_px: float,
     options: GravityOptions | None = None,
 ) -> list[RigidTransform]:
-    """The most promising poses, refined; none where no two matches give one.
+    """The best hypotheses, refined; none if no two matches give a pose.
 
     Args:
         camera: pinhole.
         x_in_world: (N, 3) points.
         pixels: (N, 2) where they are seen.
-        priors: with gravity. All of them take part in the refinement.
+        priors: with gravity. All are used in the refinement.
         inlier_px: largest reprojection error of a right match.
         options: see there.
     """
@@ -70,7 +70,7 @@ def ransac_with_gravity(
         return []
     step = -(-len(pixels) // options.max_matches)
     x_in_world, pixels = x_in_world[::step], pixels[::step]
-    # What is off by an angle in the camera is off by so many pixels; half of it a shift of the camera makes good.
+    # An angle error in pixels; a shift of the camera compensates half of it.
     wide_px = math.hypot(inlier_px, 0.5 * camera.focal_x_px * min(gravity.sigma, 0.1))
     hypotheses = _Hypotheses(camera, x_in_world, pixels, wide_px, options.refined)
     rng = np.random.default_rng(0)
@@ -86,11 +86,10 @@ def ransac_with_gravity(
 
 
 def solve_pairs(gravity: GravityPrior, rays: Array, x_in_world: Array, pairs: NDArray[np.int64]) -> tuple[Array, Array]:
-    """The poses that see two points along two rays, down being where gravity says.
+    """The poses that see two points along two rays, with the direction of gravity given.
 
     PoseLib's solver (Kukelova et al., "Closed-form solutions to minimal absolute pose problems with known vertical
-    direction", ACCV 2010) takes both frames with their y axes along the vertical. Whether that is up or down does not
-    matter to it, but it must be the same in both.
+    direction", ACCV 2010) takes both frames with their y axes along the vertical, both up or both down.
 
     Args:
         gravity: down in both frames.
@@ -113,8 +112,8 @@ def solve_pairs(gravity: GravityPrior, rays: Array, x_in_world: Array, pairs: ND
 
 
 def _to_y(direction: Array) -> Array:
-    """A rotation (3, 3) that turns a direction of unit length onto the y axis."""
-    # Of the other two axes any will do; the cross product with the least parallel one is the most exact.
+    """A rotation (3, 3) that maps a direction of unit length to the y axis."""
+    # The other two axes are arbitrary; the cross product with the least parallel axis is the most accurate.
     other = np.eye(3)[int(np.argmin(np.abs(direction)))]
     x = np.cross(direction, other)
     x /= np.linalg.norm(x)
@@ -128,13 +127,13 @@ def _pairs(rng: np.random.Generator, count: int, size: int) -> NDArray[np.int64]
 
 
 def _samples_needed(inlier_share: float, confidence: float) -> float:
-    """Until two right matches have been drawn with this probability."""
+    """Number of samples after which two inliers have been drawn with this probability."""
     missed = 1 - inlier_share**2
     return math.log(1 - confidence) / math.log(missed) if 0 < missed < 1 else (math.inf if missed >= 1 else 1.0)
 
 
 class _Hypotheses:
-    """Poses camera_from_world with the truncated sum of their squared errors; remembers the best ones."""
+    """The best poses camera_from_world by the truncated sum of their squared errors."""
 
     def __init__(self, camera: Camera, x_in_world: Array, pixels: Array, tolerance_px: float, kept: int) -> None:
         self._focal = np.array([camera.focal_x_px, camera.focal_y_px])
@@ -152,7 +151,7 @@ class _Hypotheses:
         squared = ((x / depth - self._ideal[:, 0]) * self._focal[0]) ** 2
         squared += ((y / depth - self._ideal[:, 1]) * self._focal[1]) ** 2
         limit = self._tolerance_px**2
-        inlier = squared < limit  # NaN is none
+        inlier = squared < limit
         costs = np.where(inlier, squared, limit).sum(axis=1)
         self.inlier_share = max(self.inlier_share, float(inlier.mean(axis=1).max()))
         poses = np.concatenate([rotation, translation[:, :, None]], axis=2)
@@ -161,14 +160,14 @@ class _Hypotheses:
         self._costs, self._poses = self._costs[order], self._poses[order]
 
     def best(self) -> list[RigidTransform]:
-        """World_from_camera of the best ones, the best first."""
+        """world_from_camera of the best hypotheses, the best first."""
         return [RigidTransform(pose[:, :3], pose[:, 3]).inverse() for pose in self._poses]
 
 
 def _refined(
     camera: Camera, x_in_world: Array, pixels: Array, pose: RigidTransform, priors: Priors, wide_px: float
 ) -> RigidTransform:
-    """The guess drawn in, first from as far as gravity's error reaches, then from nearby."""
+    """Refines a hypothesis, first with a loss as wide as gravity's error, then with a narrow one."""
     options = PoseOnlyOptions()
     for loss_px in (wide_px / 2, options.loss_scale_sigma * options.sigma_px):
         with_loss = replace(options, loss_scale_sigma=max(loss_px / options.sigma_px, options.loss_scale_sigma))

@@ -1,9 +1,8 @@
-"""Poses that priors find, whether one of them is better, and the best one refined with the priors.
+"""Pose estimation with priors: candidates from priors, the best candidate, and its refinement with the priors.
 
-A pose that priors bring must explain more than the one that the photograph gave; what priors say against a pose counts
-like one match and no more. The winner is compared with each prior by the pose that the photograph alone gives in its
-place, and refined with those that are consistent with it. So a wrong prior costs nothing: it is found to be one and not
-used, and then the answer is, to the last bit, the one without it.
+A candidate from priors must explain more matches than the pose from the photograph; a prior's cost counts at most as
+much as one match. The best pose is refined without priors, compared with each prior, and refined with the consistent
+ones. So a wrong prior does no harm: it is not used, and the answer is bit-identical to the one without it.
 """
 
 from __future__ import annotations
@@ -21,22 +20,22 @@ from .gravity import ransac_with_gravity
 from .known import NO_PRIORS, PriorCheck, Priors
 from .pose_only import PoseOnlyOptions, information, refine_pose
 
-SOMEWHERE = np.diag([1e-6] * 3 + [1e-2] * 3)
-"""Information of a pose of which nothing is known: within kilometres, turned in any way."""
+WEAK_INFORMATION = np.diag([1e-6] * 3 + [1e-2] * 3)
+"""Information of an unknown pose: within kilometres, of any orientation."""
 
 
 @dataclass(frozen=True)
 class InformedOptions:
-    """Options of what is done with priors.
+    """Options of pose estimation with priors.
 
     Attributes:
         inlier_px: largest reprojection error of a right match.
-        refine: how poses are refined.
+        refine: of the refinement.
         min_inliers: fewer give no pose.
-        enough_inliers: priors are not asked for poses of their own if one has been found with so many: nothing that
-            they bring could win. Repeated structure has fooled no more than 23 matches.
-        min_kept_share: a refinement without priors that loses more of the inliers has run off: then the photograph
-            alone gives no pose here, and priors are compared with the one that they helped to find.
+        enough_inliers: with so many inliers no candidates from priors are tried, since none could be better. Repeated
+            structure has supported wrong poses with at most 23 matches.
+        min_kept_share: a refinement without priors that keeps a smaller share of the inliers has diverged; priors are
+            then compared with the pose before it.
     """
 
     inlier_px: float = 4.0
@@ -52,19 +51,19 @@ class InformedOptions:
 
     @property
     def worst_cost(self) -> float:
-        """What a match that does not agree with a pose counts against it."""
+        """Cost of a match that is an outlier."""
         return (self.inlier_px / self.refine.sigma_px) ** 2
 
 
 @dataclass(frozen=True, eq=False)
 class InformedPose:
-    """A pose with everything that is consistent with it.
+    """A pose refined with the priors that are consistent with it.
 
     Attributes:
         world_from_camera: metric.
-        without_priors: the same before priors were used.
-        checks: of each prior.
-        used: those that took part.
+        without_priors: the pose before priors were used.
+        checks: comparison with each prior.
+        used: the priors that were used.
     """
 
     world_from_camera: RigidTransform
@@ -81,22 +80,22 @@ def informed_pose(
     priors: Priors,
     options: InformedOptions,
 ) -> InformedPose | None:
-    """The best pose that the photograph and the priors find together; None if neither finds any.
+    """The best of the pose from the photograph and those from priors; None if there is none.
 
     Args:
         camera: pinhole.
         x_in_world: (N, 3) points.
         pixels: (N, 2) where they are seen.
-        found: world_from_camera that the photograph gave alone; None if it gave none.
-        priors: what is known.
+        found: world_from_camera from the photograph alone; None if there is none.
+        priors: on the pose.
         options: see there.
     """
-    support = 0 if found is None else supporting(camera, x_in_world, pixels, found, options)
+    support = 0 if found is None else inlier_count(camera, x_in_world, pixels, found, options)
     others = [] if support >= options.enough_inliers else _from_priors(camera, x_in_world, pixels, priors, options)
     best = found
     if others:
         costs = [_cost(camera, x_in_world, pixels, pose, priors, options) for pose in others]
-        # One match more, or it is the same pose found in another way.
+        # Better by one match at least; otherwise it is the same pose found in another way.
         least = math.inf if found is None else _cost(camera, x_in_world, pixels, found, priors, options)
         if min(costs) < least - options.worst_cost:
             best = others[int(np.argmin(costs))]
@@ -106,7 +105,7 @@ def informed_pose(
 def _from_priors(
     camera: Camera, x_in_world: Array, pixels: Array, priors: Priors, options: InformedOptions
 ) -> list[RigidTransform]:
-    """Gravity finds poses; a prior on the whole pose is one."""
+    """Candidates: the pose prior, and poses by RANSAC with gravity."""
     poses = []
     if priors.pose:
         poses.append(refine_pose(camera, x_in_world, pixels, priors.pose.world_from_camera, priors, options.refine))
@@ -123,10 +122,7 @@ def _cost(
     priors: Priors,
     options: InformedOptions,
 ) -> float:
-    """What matches and priors say against a pose: squared errors in units of a keypoint's, and `Priors.penalty`.
-
-    No match counts for more than an outlier does.
-    """
+    """Truncated sum of squared reprojection errors, in standard deviations of a keypoint, plus `Priors.penalty`."""
     errors_px = reprojection_errors_px(camera, world_from_camera, x_in_world, pixels)
     squared = (np.where(errors_px < options.inlier_px, errors_px, options.inlier_px) / options.refine.sigma_px) ** 2
     return float(squared.sum()) + priors.penalty(world_from_camera)
@@ -140,13 +136,13 @@ def use_priors(
     priors: Priors,
     options: InformedOptions,
 ) -> InformedPose:
-    """A pose that at least `min_inliers` matches support, with priors checked and the consistent ones used."""
+    """Checks the priors and refines a pose, of at least `min_inliers` inliers, with the consistent ones."""
     alone = refine_pose(camera, x_in_world, pixels, world_from_camera, NO_PRIORS, options.refine)
-    before, after = (supporting(camera, x_in_world, pixels, it, options) for it in (world_from_camera, alone))
+    before, after = (inlier_count(camera, x_in_world, pixels, it, options) for it in (world_from_camera, alone))
     if after < max(options.min_inliers, options.min_kept_share * before):
         alone = world_from_camera
     found = information(camera, x_in_world, pixels, alone, options.refine)
-    covariance = np.linalg.inv(found / options.refine.prior_weight + SOMEWHERE)
+    covariance = np.linalg.inv(found / options.refine.prior_weight + WEAK_INFORMATION)
     checks = priors.check(alone, np.asarray(covariance, np.float64))
     used = priors.consistent(checks)
     refined = world_from_camera
@@ -155,8 +151,8 @@ def use_priors(
     return InformedPose(refined, world_from_camera, checks, used)
 
 
-def supporting(
+def inlier_count(
     camera: Camera, x_in_world: Array, pixels: Array, world_from_camera: RigidTransform, options: InformedOptions
 ) -> int:
-    """How many matches agree with a pose."""
+    """Number of inliers of a pose."""
     return int((reprojection_errors_px(camera, world_from_camera, x_in_world, pixels) < options.inlier_px).sum())

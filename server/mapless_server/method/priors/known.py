@@ -1,15 +1,14 @@
-"""What is known of a pose before its photograph is looked at: position, gravity, heading, a previous pose.
+"""Priors on the pose of a photograph: position, gravity, heading, a previous pose.
 
-Each prior compares a pose with what was said of it: a residual r, its covariance C, and the derivative J of r by the
-pose's error, an error being a shift (x, y, z) and a turn (rx, ry, rz) about fixed world axes, as in the covariances of
-poses (ROS's order). Everything about priors is made of these three:
+Each prior gives, for a pose, a residual r, its covariance C, and the derivative J of r by the pose error: a shift
+(x, y, z) and a rotation (rx, ry, rz) about fixed world axes, as in the covariances of poses (ROS's order). From these:
 
-    distance        m^2 = r^T (C + J Sigma J^T)^-1 r,    Sigma the covariance of a pose that was found without the prior
+    distance        m^2 = r^T (C + J Sigma J^T)^-1 r,    Sigma the covariance of a pose estimated without the prior
     cost            r^T C^-1 r,                          which `adjust` and `pose_only` add to the reprojection errors
-    information     J^T C^-1 J,                          which sharpens the covariance of the answer.
+    information     J^T C^-1 J,                          which reduces the covariance of the answer.
 
-m^2 of a consistent prior follows a chi-square distribution. One further out than `CONFLICT_PROBABILITY` allows is in
-conflict with the photograph, and is not used: photographs lie less often than compasses.
+m^2 of a consistent prior follows a chi-square distribution. A prior beyond the quantile of `CONFLICT_PROBABILITY` is in
+conflict with the photograph and is not used: compasses are wrong more often than photographs.
 """
 
 from __future__ import annotations
@@ -28,18 +27,18 @@ from mapless.geometry import Array, RigidTransform, cross_matrix
 from ..perturbation import rotation_vector
 
 CONFLICT_PROBABILITY = 1e-4
-"""A prior is in conflict if so few consistent ones are as far from the photograph's pose."""
+"""Probability that a consistent prior is taken for one in conflict."""
 
-LEAST_NEWS = 0.1
-"""A prior that knows less than this share of what the photograph knows of the same is not used: it could lower no
-standard deviation by more than 5 %, and may be off by what its own does not say."""
+MIN_RELATIVE_INFORMATION = 0.1
+"""A prior with a smaller share of the photograph's information is not used: it could lower no standard deviation by
+more than 5 %, and its error may exceed its own standard deviation."""
 
 UNIT_TOLERANCE = 1e-6
-"""How far from one the length of a direction may be."""
+"""Largest deviation of the length of a direction from one."""
 
 
 class PriorKind(str, Enum):
-    """What a prior says."""
+    """Kinds of priors."""
 
     POSITION = "position"
     HEADING = "heading"
@@ -49,7 +48,7 @@ class PriorKind(str, Enum):
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A prior compared with a pose.
+    """A prior evaluated at a pose.
 
     Attributes:
         residual: r, (n,).
@@ -76,15 +75,15 @@ class Term:
         covariance = self.covariance + self.jacobian @ pose_covariance @ self.jacobian.T
         return float(self.residual @ np.linalg.solve(covariance, self.residual))
 
-    def news(self, pose_covariance: Array) -> float:
-        """How much the prior knows of what it knows best, as a multiple of what a pose of covariance (6, 6) knows."""
+    def relative_information(self, pose_covariance: Array) -> float:
+        """Largest information of the prior over that of a pose of covariance (6, 6), over all directions."""
         known = self.jacobian @ pose_covariance @ self.jacobian.T
         return float(np.abs(np.linalg.eigvals(np.linalg.solve(self.covariance, known))).max())
 
 
 @dataclass(frozen=True, eq=False)
 class PositionPrior:
-    """The camera's centre.
+    """A prior on the camera centre.
 
     Attributes:
         position: (3,) world, metres.
@@ -102,7 +101,7 @@ class PositionPrior:
         check_covariance(self.covariance, 3)
 
     def term(self, world_from_camera: RigidTransform) -> Term:
-        """The shift from the prior: r = t - position."""
+        """R = t - position."""
         return Term(world_from_camera.translation - self.position, np.eye(3, 6), self.covariance)
 
     def loosened(self, factor: float) -> PositionPrior:
@@ -116,12 +115,12 @@ class PositionPrior:
 
 @dataclass(frozen=True, eq=False)
 class DirectionPrior:
-    """A direction known both in the camera and in the world; the camera's turn about it stays unknown.
+    """A direction known both in the camera and in the world; the rotation about it is free.
 
     Attributes:
         in_camera: (3,) unit length.
         in_world: (3,) unit length.
-        sigma_deg: standard deviation about each of the two axes across it.
+        sigma_deg: standard deviation about each of the two perpendicular axes.
     """
 
     in_camera: Array
@@ -139,35 +138,35 @@ class DirectionPrior:
 
     @property
     def sigma(self) -> float:
-        """In radians."""
+        """The standard deviation in radians."""
         return math.radians(self.sigma_deg)
 
     def term(self, world_from_camera: RigidTransform) -> Term:
-        """The chord r = R in_camera - in_world: as long as the angle while that is small, and longest where opposite.
+        """The chord r = R in_camera - in_world: the angle if small, and longest for opposite directions.
 
-        It has three numbers, but none along the direction itself, so two degrees of freedom.
+        It has three components, but none along the direction itself, so two degrees of freedom.
         """
         turned = world_from_camera.rotation @ self.in_camera
         jacobian = np.concatenate([np.zeros((3, 3)), -cross_matrix(turned)], axis=1)
         return Term(turned - self.in_world, jacobian, self.sigma**2 * np.eye(3))
 
     def loosened(self, factor: float) -> DirectionPrior:
-        """With its variance multiplied by a factor; a sigma of half a turn says nothing already."""
+        """With its variance multiplied by a factor, up to a sigma of 180 degrees, which is no information."""
         return replace(self, sigma_deg=min(180.0, math.sqrt(factor) * self.sigma_deg))
 
     def shifted(self, offset: Array) -> DirectionPrior:
-        """Directions do not shift."""
+        """Unchanged: directions do not depend on the origin."""
         return self
 
 
 @dataclass(frozen=True, eq=False)
 class GravityPrior(DirectionPrior):
-    """Down, the way things fall."""
+    """The direction of gravity, down."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeadingPrior(DirectionPrior):
-    """Where the optical axis points.
+    """The direction of the optical axis.
 
     Attributes:
         in_camera: (0, 0, 1).
@@ -183,7 +182,7 @@ class HeadingPrior(DirectionPrior):
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """The whole pose: a previous answer, carried on by what the device tracked.
+    """A prior on the whole pose: a previous answer, continued by the device's tracking.
 
     Attributes:
         world_from_camera: metric.
@@ -201,7 +200,7 @@ class PosePrior:
         check_covariance(self.covariance, 6)
 
     def term(self, world_from_camera: RigidTransform) -> Term:
-        """The motion from the prior: r = (t - t_prior, Log(R R_prior^T))."""
+        """R = (t - t_prior, Log(R R_prior^T))."""
         turn = rotation_vector(world_from_camera.rotation @ self.world_from_camera.rotation.T)
         shift = world_from_camera.translation - self.world_from_camera.translation
         jacobian = np.eye(6)
@@ -222,15 +221,15 @@ Prior: TypeAlias = PositionPrior | HeadingPrior | GravityPrior | PosePrior
 
 @dataclass(frozen=True, eq=False)
 class PriorCheck:
-    """How the pose that the photograph alone gives compares with a prior.
+    """Comparison of a prior with the pose from the photograph alone.
 
     Attributes:
         kind: which prior.
         mahalanobis: m, 0 and above.
         degrees_of_freedom: of m^2.
         conflict: whether the two contradict each other.
-        used: whether the prior took part in finding the pose: those in conflict do not, nor those that could add next
-            to nothing (`LEAST_NEWS`).
+        used: whether the prior was used for the pose: not if it is in conflict, nor if it has too little information
+            (`MIN_RELATIVE_INFORMATION`).
     """
 
     kind: PriorKind
@@ -242,7 +241,7 @@ class PriorCheck:
 
 @dataclass(frozen=True, eq=False)
 class Priors:
-    """All that is known of one pose; iterates over those that are there."""
+    """The priors on one pose; iterates over those that are given."""
 
     position: PositionPrior | None = None
     heading: HeadingPrior | None = None
@@ -256,8 +255,8 @@ class Priors:
         return any(True for _ in self)
 
     @property
-    def tells_directions(self) -> bool:
-        """Whether `log10_chance` may say anything."""
+    def has_directions(self) -> bool:
+        """Whether `log10_chance` can differ from 0."""
         return self.gravity is not None or self.heading is not None
 
     def shifted(self, offset: Array) -> Priors:
@@ -265,22 +264,21 @@ class Priors:
         return Priors(**{prior.kind.value: prior.shifted(offset) for prior in self})  # type: ignore[arg-type]
 
     def check(self, world_from_camera: RigidTransform, covariance: Array) -> tuple[PriorCheck, ...]:
-        """Each prior against a pose that was found without any, and its covariance (6, 6)."""
+        """Compares each prior with a pose estimated without any, of covariance (6, 6)."""
         checks = []
         for prior in self:
             term = prior.term(world_from_camera)
             squared = term.squared_distance(covariance)
             conflict = not squared <= conflict_threshold(prior.degrees_of_freedom)
-            used = not conflict and term.news(covariance) >= LEAST_NEWS
+            used = not conflict and term.relative_information(covariance) >= MIN_RELATIVE_INFORMATION
             checks.append(PriorCheck(prior.kind, math.sqrt(squared), prior.degrees_of_freedom, conflict, used))
         return tuple(checks)
 
     def consistent(self, checks: tuple[PriorCheck, ...]) -> Priors:
-        """Those that are used, each as uncertain as its distance shows it to be.
+        """The priors that are used, with covariances enlarged by their distance.
 
-        One that is further out than the average consistent prior, m^2 > n, is believed less: its covariance is
-        multiplied by m^2 / n (Birge's ratio). That costs honest priors little, and one that is wrong by less than a
-        conflict loses most of its weight.
+        The covariance of a prior that is further off than the average consistent one, m^2 > n, is multiplied by m^2 / n
+        (Birge's ratio). Right priors lose little weight, and one that is wrong but not in conflict loses most of it.
         """
         used = {check.kind: check for check in checks if check.used}
         kept = {
@@ -291,9 +289,9 @@ class Priors:
         return Priors(**kept)  # type: ignore[arg-type]
 
     def penalty(self, world_from_camera: RigidTransform) -> float:
-        """What the priors say against a pose: their costs, none counted for more than a conflict.
+        """The sum of the costs of the priors, each truncated at the conflict threshold.
 
-        A prior may be wrong altogether, so that it weighs as much as a conflict and no more: what one good match does.
+        A prior may be wrong altogether, so it counts at most as much as one good match.
         """
         return sum(min(p.term(world_from_camera).cost, conflict_threshold(p.degrees_of_freedom)) for p in self)
 
@@ -311,11 +309,11 @@ class Priors:
         return gradient, information
 
     def log10_chance(self, world_from_camera: RigidTransform) -> float:
-        """How improbable, as a power of ten, it is that a pose found by chance agrees with gravity and heading.
+        """log10 of the probability that a pose found by chance agrees with gravity and heading; 0 if one disagrees.
 
-        That a random direction comes within an angle a of the right one has probability (1 - cos a) / 2. Both may be of
-        one source, so the one that says more counts alone. Positions and poses say nothing: wrong matches are
-        searched among the references that they chose, and near the pose that they foresee. 0 if a prior disagrees.
+        A random direction is within an angle a of the right one with probability (1 - cos a) / 2. Both priors may come
+        from one sensor, so only the more accurate one counts. Position and pose priors do not count: they select the
+        references and the search area in which wrong matches are found.
         """
         directions = [prior for prior in (self.gravity, self.heading) if prior is not None]
         threshold = conflict_threshold(DirectionPrior.degrees_of_freedom)
@@ -335,7 +333,7 @@ class Priors:
 
 
 NO_PRIORS = Priors()
-"""Nothing is known."""
+"""No prior at all."""
 
 
 def conflict_threshold(degrees_of_freedom: int) -> float:
@@ -351,7 +349,7 @@ def check_covariance(covariance: Array, size: int) -> None:
     deviations = np.sqrt(np.diag(c).clip(min=0))
     if not deviations.min() > 0:
         raise ValueError("a covariance must have positive variances")
-    # Compared as correlations: metres and radians, or a height that nobody knows, differ by orders of magnitude.
+    # Compared as correlations: metres and radians, or an unknown height, differ by orders of magnitude.
     correlation = c / np.outer(deviations, deviations)
     if np.abs(correlation - correlation.T).max() > 1e-6:
         raise ValueError("a covariance must be symmetric")

@@ -1,8 +1,8 @@
-"""Pose from 2D-3D matches whose points stay where they are, together with what is known of the pose beforehand.
+"""Refinement of a pose from 2D-3D matches with fixed points and priors.
 
     min  sum_i rho(|u_i - pi(P, X_i)|^2 / sigma^2) + w sum_k r_k^T C_k^-1 r_k,    rho(s) = c^2 log(1 + s / c^2)
 
-(Cauchy's loss) over the pose alone, six unknowns, by Levenberg-Marquardt. PoseLib's own refinement knows no priors.
+(Cauchy's loss) over the pose alone, six unknowns, by Levenberg-Marquardt. PoseLib's refinement has no priors.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class PoseOnlyOptions:
     Attributes:
         sigma_px: standard deviation of a right match.
         loss_scale_sigma: of the Cauchy loss.
-        prior_weight: w, how much less the matches know than they would if their errors were independent.
+        prior_weight: w, factor by which the matches have less information than if their errors were independent.
         iterations: at most so many steps.
         min_decrease: stop when a step lowers the cost by a smaller share.
     """
@@ -50,14 +50,14 @@ def refine_pose(
     priors: Priors,
     options: PoseOnlyOptions,
 ) -> RigidTransform:
-    """The pose nearby with the least cost.
+    """Minimizes the cost, starting from a pose.
 
     Args:
         camera: pinhole.
-        x_in_world: (N, 3) points; those behind the camera to begin with take no part.
+        x_in_world: (N, 3) points; those behind the camera at the start are not used.
         pixels: (N, 2) where they are seen.
-        world_from_camera: where to begin.
-        priors: those that take part.
+        world_from_camera: the start.
+        priors: on the pose; all are used.
         options: see there.
     """
     in_front = world_from_camera.inverse().apply(x_in_world)[:, 2] > 0
@@ -68,14 +68,14 @@ def refine_pose(
 def information(
     camera: Camera, x_in_world: Array, pixels: Array, world_from_camera: RigidTransform, options: PoseOnlyOptions
 ) -> Array:
-    """What the matches alone say of a pose, (6, 6): the inverse covariance of its error, were they independent."""
+    """Information (6, 6) of the matches alone: the inverse covariance of the pose error if they were independent."""
     in_front = world_from_camera.inverse().apply(x_in_world)[:, 2] > 0
     problem = _Problem(camera, x_in_world[in_front], pixels[in_front], NO_PRIORS, options)
     return problem.linearize(world_from_camera)[1]
 
 
 class _Problem:
-    """The cost and its derivatives by an error of the pose."""
+    """The cost and its derivatives by the pose error; see `optimize.Problem`."""
 
     def __init__(
         self, camera: Camera, x_in_world: Array, pixels: Array, priors: Priors, options: PoseOnlyOptions
@@ -85,12 +85,12 @@ class _Problem:
         self.focal = np.array([camera.focal_x_px, camera.focal_y_px])
 
     def residuals(self, pose: RigidTransform) -> tuple[Array, Array]:
-        """Points in the camera (N, 3), and reprojection errors (N, 2) in standard deviations."""
+        """Points in the camera frame (N, 3), and reprojection errors (N, 2) in standard deviations."""
         x_in_camera = (self.x_in_world - pose.translation) @ pose.rotation
         return x_in_camera, (self.camera.project(x_in_camera) - self.pixels) / self.options.sigma_px
 
     def cost(self, pose: RigidTransform) -> float:
-        """NaN for a point behind the camera, which is no decrease."""
+        """NaN for a point behind the camera, so that the step is rejected."""
         _, residual = self.residuals(pose)
         matched = cauchy_cost((residual**2).sum(axis=1), self.options.loss_scale_sigma)
         return matched + self.options.prior_weight * self.priors.cost(pose)

@@ -1,5 +1,5 @@
-"""Whether a pose is to be believed.
+"""Acceptance of a pose.
 
-`gate` rejects what chance could do; `judge` weighs the `evidence` into a trust, with `ambiguity` (a second place)
-and `focal` (a focal length that the photograph contradicts).
+`gate` rejects poses that chance could support; `judge` computes a trust from the evidence, and rejects by it, by
+`ambiguity` (a second pose explains the photograph) and by `focal` (the photograph contradicts its focal length).
 """

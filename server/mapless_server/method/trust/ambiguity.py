@@ -1,16 +1,16 @@
-"""Two places that look the same: a second pose, elsewhere, that other references support about as well.
+"""Ambiguity: a second pose, at another place, that other references support about as well.
 
-Repeated corridors and floors, the same furniture twice, references of which some are posed wrongly: then references
-vote in two clusters, and whichever pose has a few votes more wins. So the matches with which the winner disagrees are
-asked again for a pose. It is a rival if
+With repeated corridors and floors, identical furniture, or some references with wrong poses, the matches of the
+references form two clusters, and the pose with a few more inliers is found. So a second pose is searched among the
+matches that are outliers of the first. It is a rival if
 
-    its own matches are no chance (the a-contrario test of `gate`, over the matches asked),
-    it explains at least a stated share of as many keypoints as the winner does, counted alike,
-    it stands apart from the winner, further than both poses' 95 % radii, and
-    most of its matches come from references that agree with it more than with the winner.
+    its inliers are not chance (the a-contrario test of `gate`, over these matches),
+    it explains at least a given share of the number of keypoints that the first pose explains,
+    it is further from the first pose than the 95 % radii of both, and
+    most of its inliers come from references that support it more than the first pose.
 
-Keypoints are counted over the matches with each reference, before the vote in which a keypoint's point is chosen, since
-the vote is what the stronger place wins.
+Keypoints are counted over the matches with each reference, before the majority vote for a keypoint's point, which
+removes the matches of the weaker place.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ class AmbiguityOptions:
     """Options of the search for a rival.
 
     Attributes:
-        min_share: a rival explains at least this share of as many keypoints as the winner. A place that has half the
-            votes of another is distinguished from it by that alone.
-        min_keypoints: and no fewer keypoints than this.
-        max_log10_false_alarms: as of the gate, with a reserve: every answer is asked for a rival.
-        min_own_share: least share of its matches from references that agree with it more than with the winner. A few
-            references that see both places support both.
-        min_apart_m, min_apart_deg: poses nearer than this are one place, whatever their radii say.
-        agreeing_px: matches within this distance are the winner's; beyond the inliers' bound, since a point that is
-            off is no second place.
-        pnp: of the rival. The few iterations find a pose that explains a third of the matches asked.
+        min_share: least number of keypoints of a rival, as a share of those of the first pose. A place with less than
+            half the keypoints of another is distinguished from it.
+        min_keypoints: least number of keypoints of a rival.
+        max_log10_false_alarms: as of the gate, but stricter, because a rival is searched for every answer.
+        min_own_share: least share of a rival's inliers from references that support it more than the first pose. A few
+            references that show both places support both.
+        min_apart_m, min_apart_deg: poses nearer than this are one place, independent of their radii.
+        agreeing_px: matches within this distance belong to the first pose; larger than the inlier bound, since a point
+            with an error is not a second place.
+        pnp: of the rival. The few iterations find a pose with a third of the matches as inliers.
     """
 
     min_share: float = 0.5
@@ -68,10 +68,10 @@ class AmbiguityOptions:
 
 @dataclass(frozen=True, eq=False)
 class _Votes:
-    """Matches with each reference, carried to points: row v is one vote.
+    """Matches with each reference, carried to points; row v is one match.
 
     Attributes:
-        reference: (V,) which reference's match it was.
+        reference: (V,) index of the reference.
         keypoint: (V,) of the query.
         x_in_world: (V, 3) the point.
         pixels: (V, 2) the keypoint.
@@ -90,19 +90,19 @@ class _Votes:
         return reprojection_errors_px(camera, world_from_camera, self.x_in_world, self.pixels)
 
     def keypoint_count(self, rows: NDArray[np.bool_]) -> int:
-        """Different keypoints among some of the votes (V,)."""
+        """Number of different keypoints among the selected rows (V,)."""
         return len(np.unique(self.keypoint[rows]))
 
 
 def find_rival(
     support: Support, query_matches: Sequence[Matches], options: AmbiguityOptions
 ) -> tuple[Hypothesis, Hypothesis] | None:
-    """The winner and its rival, as hypotheses in the support's world; None if nothing rivals it.
+    """The first pose and its rival, as hypotheses in the support's world; None without a rival.
 
-    Costs a projection of all matches, and a search only where enough of them disagree.
+    Projects all matches, and searches only if enough of them are outliers.
 
     Args:
-        support: of the winner, with its estimate.
+        support: of the first pose, with its estimate.
         query_matches: with each reference, (query keypoint, reference keypoint).
         options: see there.
     """
@@ -113,15 +113,15 @@ def find_rival(
     errors_px = votes.errors_px(camera, estimate.world_from_camera)
     own = errors_px < options.pnp.inlier_px
     wanted = max(options.min_keypoints, int(np.ceil(options.min_share * votes.keypoint_count(own))))
-    asked = _dissenting(votes, own, ~(errors_px < options.agreeing_px), len(support.references))
-    if votes.keypoint_count(asked) < wanted:
+    candidates = _outliers(votes, own, ~(errors_px < options.agreeing_px), len(support.references))
+    if votes.keypoint_count(candidates) < wanted:
         return None
-    rival = _second_pose(camera, votes[asked], wanted, options)
+    rival = _second_pose(camera, votes[candidates], wanted, options)
     if rival is None:
         return None
     pose, radii = rival
-    claim = accuracy_from_covariance(estimate.covariance)
-    if not _stand_apart(estimate.world_from_camera, claim, pose, radii, options):
+    own_radii = accuracy_from_covariance(estimate.covariance)
+    if not _are_apart(estimate.world_from_camera, own_radii, pose, radii, options):
         return None
     theirs = votes.errors_px(camera, pose) < options.pnp.inlier_px
     counts = [np.bincount(votes.reference[rows], minlength=len(support.references)) for rows in (own, theirs)]
@@ -137,29 +137,29 @@ def find_rival(
 def _second_pose(
     camera: Camera, votes: _Votes, wanted: int, options: AmbiguityOptions
 ) -> tuple[RigidTransform, Accuracy] | None:
-    """What some votes agree on, if enough keypoints do and chance would not; with its radii."""
+    """A pose with enough inliers that are not chance, and its radii."""
     pose = ransac(camera, votes.x_in_world, votes.pixels, None, options.pnp)
     if pose is None:
         return None
     inliers = votes.errors_px(camera, pose) < options.pnp.inlier_px
-    asked, count = len(np.unique(votes.keypoint)), votes.keypoint_count(inliers)
-    # A keypoint hits by chance as often as it has votes.
+    keypoint_count, count = len(np.unique(votes.keypoint)), votes.keypoint_count(inliers)
+    # The chance of an inlier is proportional to the number of matches of a keypoint.
     disc_share = np.pi * options.pnp.inlier_px**2 / (camera.width_px * camera.height_px)
-    chance = float(disc_share * len(votes.keypoint) / asked)
-    if count < wanted or false_alarms(asked, count, chance) > options.max_log10_false_alarms:
+    chance = float(disc_share * len(votes.keypoint) / keypoint_count)
+    if count < wanted or false_alarms(keypoint_count, count, chance) > options.max_log10_false_alarms:
         return None
-    # By a keypoint noise of a pixel.
+    # With a keypoint noise of one pixel.
     covariance = world_covariance(pose_hessian(camera, pose, votes.x_in_world[inliers]), pose)
     return pose, accuracy_from_covariance(covariance)
 
 
 def _supporters(names: Sequence[str], own: NDArray[np.intp], other: NDArray[np.intp]) -> tuple[str, ...]:
-    """Names of the references with more votes for one place than for the other, the most first."""
+    """Names of the references with more inliers of one pose than of the other, the most first."""
     return tuple(names[i] for i in np.argsort(-own, kind="stable") if own[i] > other[i])
 
 
 def _votes(support: Support, query_matches: Sequence[Matches]) -> _Votes:
-    """The matches that end at a point."""
+    """The matches with keypoints of triangulated points."""
     tracks = support.structure.tracks
     offsets = np.concatenate([[0], np.cumsum([len(r.view.features) for r in support.references])])
     point_of = np.full(offsets[-1], -1)
@@ -173,19 +173,19 @@ def _votes(support: Support, query_matches: Sequence[Matches]) -> _Votes:
     return _Votes(reference[known], keypoint, support.structure.x_in_world[point[known]], pixels)
 
 
-def _dissenting(
+def _outliers(
     votes: _Votes, own: NDArray[np.bool_], apart: NDArray[np.bool_], reference_count: int
 ) -> NDArray[np.bool_]:
-    """The votes (V,) against the winner, of references that have more of these than for it."""
+    """The matches (V,) far from the first pose, of references with more such matches than inliers."""
     against, favour = (np.bincount(votes.reference[rows], minlength=reference_count) for rows in (apart, own))
     return np.asarray(apart & (against > favour)[votes.reference])
 
 
-def _stand_apart(
-    first: RigidTransform, claim: Accuracy, second: RigidTransform, other: Accuracy, options: AmbiguityOptions
+def _are_apart(
+    first: RigidTransform, radii: Accuracy, second: RigidTransform, other: Accuracy, options: AmbiguityOptions
 ) -> bool:
     apart_m = float(np.linalg.norm(second.translation - first.translation))
     apart_deg = rotation_angle_deg(first.rotation.T @ second.rotation)
-    reach_m = max(options.min_apart_m, claim.position_95_m + other.position_95_m)
-    reach_deg = max(options.min_apart_deg, claim.rotation_95_deg + other.rotation_95_deg)
+    reach_m = max(options.min_apart_m, radii.position_95_m + other.position_95_m)
+    reach_deg = max(options.min_apart_deg, radii.rotation_95_deg + other.rotation_95_deg)
     return apart_m > reach_m or apart_deg > reach_deg

@@ -1,13 +1,13 @@
-"""What focal length a photograph itself says it has, next to the one that came with it.
+"""Check of a photograph's focal length against its matches.
 
-A wrong focal length is the classic mistake of whoever crops or resizes photographs. The pose is then off towards what
-is seen, or away from it, and its own residuals tell little of that: the motion absorbs most of the error. But not all
-where points lie at several depths. So the pose is solved again with one more unknown, s = ln(f / f given), the points
-where they are (see `resection`), from the answered pose and with all its matches: a wrong focal length makes outliers
-of right ones, and the loss begins wide and narrows to find them again. How far off s may be is estimated by a sandwich,
-H^-1 (sum_g b_g b_g^T) H^-1, b_g the gradients of the matches in group g (Liang and Zeger 1986), once with references
-for groups and once with parts of the image: what neighbours share does not average out over their number. Where depth
-hardly varies, or all is far away, it is large, and nothing is said.
+Cropped or resized photographs often come with a wrong focal length. The pose is then off along the viewing direction,
+with small residuals: the motion absorbs most of the error, but not all of it if points lie at several depths. So the
+pose is estimated again with one more unknown, s = ln(f / f given), and fixed points (see `resection`), from the
+answered pose and with all its matches: a wrong focal length turns inliers into outliers, and the loss starts wide and
+narrows to recover them. The variance of s is estimated by a sandwich, H^-1 (sum_g b_g b_g^T) H^-1, b_g the gradients of
+the matches in group g (Liang and Zeger 1986), once with references as groups and once with parts of the image, because
+errors that neighbours share do not average out. If depth hardly varies, or all points are far away, it is large, and
+the focal length is not judged.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ class FocalOptions:
     """Options of the check.
 
     Attributes:
-        max_log_ratio: |ln(f / f given)| up to which a focal length is never doubted. Of 298 photographs with the true
-            one none said more than 0.02.
-        max_sigmas: a larger one is believed beyond so many standard deviations, which do not know how far the points
-            are off: those of some photographs are too small. Wrong focal lengths of 7 % to 70 % stood beyond seven.
-        first_loss_sigma: loss scale of the one step that decides whether to look closer, which most photographs end at.
-        first_share: of `max_log_ratio`, up to which that step of s decides not to: 13 of the 298 were looked at closer.
-        loss_scales_sigma: of the closer look, from wide, where right matches lie beside a wrong pose, to narrow.
+        max_log_ratio: |ln(f / f given)| up to which a focal length is accepted. Of 298 photographs with the true one
+            none had more than 0.02.
+        max_sigmas: a larger one is rejected beyond so many standard deviations, which leave out errors of the points
+            and are too small for some photographs. Wrong focal lengths of 7 % to 70 % were beyond seven.
+        first_loss_sigma: loss scale of a first step, after which most photographs are accepted.
+        first_share: of `max_log_ratio`, up to which s after that step is accepted: 13 of the 298 were above.
+        loss_scales_sigma: of the full estimation, from wide, so that matches of a wrong pose are used, to narrow.
         iterations: steps with each of them.
-        max_step: of s at once.
+        max_step: largest change of s in one step.
         min_decrease: a step that lowers the cost by a smaller share is the last with this loss.
-        max_matches: more are thinned evenly.
-        min_agreeing: fewer matches within three times the last loss scale say nothing.
+        max_matches: evenly thinned.
+        min_agreeing: fewer matches within three times the last loss scale give no result.
         grid: the image is split into so many parts along each side.
     """
 
@@ -68,14 +68,14 @@ class FocalOptions:
 
 @dataclass(frozen=True)
 class Focal:
-    """What a photograph says of its focal length.
+    """A focal length estimated from a photograph's matches.
 
     Attributes:
-        log_ratio: s, ln of what it says over what came with it.
+        log_ratio: s, ln of the estimated over the given focal length.
         sigma: standard deviation of s.
-        agreeing: matches that agree with it, of those looked at, within three times the last loss scale.
-        agreeing_before: matches that agree with the answered pose and the given focal length as well.
-        given_px: focal length that came with it, along x.
+        agreeing: matches within three times the last loss scale.
+        agreeing_before: the same for the answered pose and the given focal length.
+        given_px: given focal length along x.
     """
 
     log_ratio: float
@@ -86,17 +86,17 @@ class Focal:
 
     @property
     def estimated_px(self) -> float:
-        """Focal length along x that the photograph says."""
+        """Estimated focal length along x."""
         return self.given_px * math.exp(self.log_ratio)
 
     def is_wrong(self, options: FocalOptions) -> bool:
-        """Whether the focal length that came with the photograph is not its own."""
-        is_told = self.agreeing >= max(options.min_agreeing, self.agreeing_before)
-        return is_told and abs(self.log_ratio) > max(options.max_log_ratio, options.max_sigmas * self.sigma)
+        """Whether the given focal length is significantly wrong."""
+        is_supported = self.agreeing >= max(options.min_agreeing, self.agreeing_before)
+        return is_supported and abs(self.log_ratio) > max(options.max_log_ratio, options.max_sigmas * self.sigma)
 
 
 def wrong_focal(support: Support, options: FocalOptions) -> Focal | None:
-    """What a support's photograph says of its focal length, where that contradicts the one that came with it.
+    """The focal length estimated from a support, if it contradicts the given one; else None.
 
     Raises:
         ValueError: there is no estimate.
@@ -112,7 +112,7 @@ def wrong_focal(support: Support, options: FocalOptions) -> Focal | None:
 
 
 def focal_of(problem: Resection, start: Fit, seen_by: NDArray[np.bool_], options: FocalOptions) -> Focal | None:
-    """What a photograph says of its focal length; None where it says nothing at all (singular equations).
+    """Estimates the focal length; None if the equations are singular.
 
     Args:
         problem: of matches that are in front of the camera.
@@ -132,13 +132,13 @@ def focal_of(problem: Resection, start: Fit, seen_by: NDArray[np.bool_], options
 
 
 def problem_of(support: Support, options: FocalOptions) -> tuple[Resection, Fit, NDArray[np.bool_]]:
-    """Evenly thinned, without points behind the camera, with the first loss; the answered pose; which references see.
+    """The problem, evenly thinned, without points behind the camera; its start; which references observe each point.
 
     Raises:
         ValueError: there is no estimate.
     """
     if support.estimate is None:
-        raise ValueError("without an estimate there is nothing to begin with")
+        raise ValueError("support.estimate must not be None")
     matches, structure, features = support.matches, support.structure, support.query.features
     camera_from_world = support.estimate.world_from_camera.inverse()
     taken = np.arange(len(matches))[:: max(1, -(-len(matches) // options.max_matches))]
@@ -158,7 +158,7 @@ def problem_of(support: Support, options: FocalOptions) -> tuple[Resection, Fit,
 
 
 def _sigma(problem: Resection, fit: Fit, seen_by: NDArray[np.bool_], grid: int) -> float | None:
-    """Standard deviation of s at an optimum: of independent matches, of references and of parts of the image."""
+    """Standard deviation of s at an optimum: from independent matches, references and parts of the image."""
     hessian, gradient = problem.equations(fit)
     column = solve_step(hessian, np.eye(7)[6])
     if column is None or not column[6] < 0:
@@ -173,6 +173,6 @@ def _sigma(problem: Resection, fit: Fit, seen_by: NDArray[np.bool_], grid: int) 
 
 
 def _scatter(shifts: Array) -> float:
-    """Variance of a sum of independent shifts (G,) whose mean is zero, of which those at zero are not there."""
+    """Variance of a sum of independent shifts (G,) of mean zero; zeros are empty groups."""
     count = max(2, int((shifts != 0).sum()))
     return float((shifts**2).sum()) * count / (count - 1)

@@ -1,10 +1,10 @@
-"""Whether a pose is one at all: what wrong matches alone could support as well is not.
+"""Gate: rejects poses that chance or repeated structure could support as well.
 
-Wrong matches must not be expected to support a pose so well (a-contrario model estimation, Moisan and Stival 2004), and
-repeated texture, whose wrong matches do agree with each other, lacks two things that a true pose has: what should be
-seen is found, and not in one corner only.
+A pose must have more inliers than wrong matches can be expected to give (a-contrario model estimation, Moisan and
+Stival 2004). Wrong matches of repeated texture agree with one another, so two more conditions hold for right poses: a
+share of the points inside the image is found, and the inliers cover more than one corner.
 
-This is the coarse sieve, before anything dear is computed; how far to trust what passes it is the judge's (`judge`).
+This is a cheap first test; `judge` computes the trust of poses that pass it.
 """
 
 from __future__ import annotations
@@ -29,18 +29,17 @@ class GateOptions:
     """Options of the gate.
 
     Attributes:
-        max_log10_false_alarms: a pose is one when fewer than 10 to this power poses supported as well are expected
-            from wrong matches.
-        min_found_share: least share of the points inside the image that are inliers; a photograph with fewer features
-            than that has points can show no more of them than it has features. Of 200 photographs posed rightly,
-            hard ones among them, the worst had 0.10; of those posed wrongly by chance or repetition most had 0.01.
-        enough_inliers: so many are believed whatever else should be visible: with many references the structure reaches
-            far beyond what one photograph can show. Repetition has fooled no more than 23.
-        min_hull_share: least share of the image that the inliers' convex hull covers. On the same photographs the worst
-            right one had 0.08; a repeated floor tile that fooled 16 matches had 0.03.
-        agreeing_factor: on both shares where gravity or heading agrees with the pose. Of 120 poses found by chance none
-            agreed with gravity to a degree. Of 23 photographs with few or distant references whose pose agreed and
-            found too little, none was somewhere else: 14 were off by less than 10 cm, none by more than 30.
+        max_log10_false_alarms: largest log10 of the expected number of poses with as many inliers among wrong matches.
+        min_found_share: least share of inliers among the points inside the image, or among the photograph's features if
+            they are fewer. Of 200 photographs with right poses, hard ones among them, the lowest was 0.10; wrong poses
+            by chance or repetition mostly had 0.01.
+        enough_inliers: so many inliers are enough for any share: with many references the structure extends far beyond
+            one photograph. Repetition has supported wrong poses with at most 23.
+        min_hull_share: least share of the image covered by the convex hull of the inliers. On the same photographs the
+            lowest of right poses was 0.08; a repeated floor tile with 16 inliers had 0.03.
+        agreeing_factor: on both shares if gravity or heading agrees with the pose. Of 120 poses found by chance none
+            agreed with gravity to a degree. Of 23 photographs with few or distant references whose pose agreed but had
+            too small a share, none was at another place: 14 were off by less than 10 cm, none by more than 30.
     """
 
     max_log10_false_alarms: float = -3.0
@@ -65,17 +64,17 @@ def doubts(
     options: GateOptions,
     log10_chance: float = 0.0,
 ) -> str | None:
-    """What speaks against a pose, in one sentence; None if nothing does.
+    """Why a pose fails the gate, in one sentence; None if it passes.
 
     Args:
         query: the photograph.
         structure: metric points.
         matches: of the query with them.
         world_from_camera: the pose.
-        inliers: (M,) which of the matches agree with it; at least four.
-        inlier_px: within which they do.
+        inliers: (M,) which of the matches are inliers; at least four.
+        inlier_px: largest reprojection error of an inlier.
         options: see there.
-        log10_chance: how improbable it is that a pose found by chance agrees with what is known of it (see `priors`).
+        log10_chance: see `Priors.log10_chance`.
     """
     expected = log10_false_alarms(query.camera, matches, inliers, inlier_px) + log10_chance
     count = f"{inliers.sum()} of {len(matches)} matches agree on a pose"
@@ -92,7 +91,7 @@ def doubts(
 
 
 def findable_count(query: View, structure: Structure, world_from_camera: RigidTransform) -> int:
-    """Points of the structure that lie inside the image, hidden or not; at most as many as it has features."""
+    """Number of points that project into the image, occluded or not; at most the number of its features."""
     size = np.array([query.camera.width_px, query.camera.height_px])
     projected = query.camera.project(world_from_camera.inverse().apply(structure.x_in_world))
     inside = int(((projected >= -0.5) & (projected < size - 0.5)).all(axis=1).sum())
@@ -100,16 +99,16 @@ def findable_count(query: View, structure: Structure, world_from_camera: RigidTr
 
 
 def hull_share(query: View, matches: PointMatches, inliers: NDArray[np.bool_]) -> float:
-    """Share of the image that the convex hull of the inliers (M,), three or more, covers."""
+    """Share of the image covered by the convex hull of the inliers (M,), three or more."""
     pixels = query.features.keypoints[matches.keypoint[inliers]]
     return float(ConvexHull(pixels, qhull_options="QJ").volume) / (query.camera.width_px * query.camera.height_px)
 
 
 def log10_false_alarms(camera: Camera, matches: PointMatches, inliers: NDArray[np.bool_], inlier_px: float) -> float:
-    """Expected number, as a power of ten, of poses that random matches would support as well.
+    """log10 of the expected number of poses with as many inliers among random matches.
 
-    Matches found in the whole image hit an inlier's disc by chance with its share of the image; matches searched within
-    a radius with its share of that circle. The stronger of the two groups decides.
+    The chance of an inlier is the share of its disc in the image for matches found in the whole image, and in the
+    search circle for guided matches. The smaller of the two groups' results is returned.
     """
     disc = inlier_px**2
     area = camera.width_px * camera.height_px / np.pi
@@ -135,7 +134,7 @@ def false_alarms(match_count: int, inlier_count: int, chance: float) -> float:
 
 
 def format_false_alarms(log10_expected: float) -> str:
-    """The number for a person; three matches agree with a pose by construction, which no number tells."""
+    """The number as text; it is infinite for three matches, which agree with a pose by construction."""
     if log10_expected == np.inf:
         return "any number of such poses expected"
     return f"10^{log10_expected:.1f} such poses expected"

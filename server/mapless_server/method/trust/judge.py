@@ -1,17 +1,17 @@
-"""Accept or reject, at a stated share of right answers: never by a raw count alone.
+"""Judge: accepts or rejects a pose, at a given share of right answers to accept.
 
-What speaks for a pose (`evidence`) makes a score, s = w . ln(evidence), monotone in each piece of evidence. From it
-follows the answer's *trust*: the share of right answers to photographs with known poses (the calibration's: off by no
-more than 10 cm and 5 degrees) that score at most as high. So accepting poses whose trust is at least 1 - c accepts the
-share c of right answers, whatever the score's own unit: trust is the p-value of "this is a right answer", as in
-conformal prediction (Vovk, Gammerman and Shafer 2005). It is no probability of being right, which would depend on how
-many of a caller's photographs show the place at all.
+The evidence for a pose gives a score, s = w . ln(evidence), monotone in each component. The *trust* of an answer is the
+share of right answers to photographs with known poses (off by at most 10 cm and 5 degrees) whose score is at most as
+high. So accepting poses with a trust of at least 1 - c accepts the share c of right answers, independent of the scale
+of the score: trust is the p-value of "this is a right answer", as in conformal prediction (Vovk, Gammerman and Shafer
+2005). It is not the probability of being right, which depends on how many of a caller's photographs show the place at
+all.
 
-One mistake of the caller's is looked for by itself, because answers to it look as good as right ones and are not: a
-wrong focal length (`focal`).
+A wrong focal length is checked separately (`focal`), because the evidence of its answers is as good as that of right
+ones.
 
-Weights and quantiles come from `research.trust`, which tells wrong poses (of other places, mirrored photographs,
-references with wrong poses, hardly any overlap) from right ones by logistic regression with weights of one sign.
+Weights and quantiles come from `research.trust`, which separates wrong poses (other places, mirrored photographs,
+references with wrong poses, little overlap) from right ones by logistic regression with weights of one sign.
 """
 
 from __future__ import annotations
@@ -35,27 +35,27 @@ from .focal import Focal, FocalOptions, wrong_focal
 from .gate import findable_count, hull_share, log10_false_alarms
 
 FEATURES = ("significance", "inlier share", "found share", "hull share", "references", "fit", "precision")
-"""What `Evidence.features` holds; more is better in each."""
+"""The components of `Evidence.features`; a larger value is better in each."""
 
 LEAST_RADIUS_M, LARGEST_RADIUS_M = 0.005, 1.0
-"""Between them a smaller claimed radius is evidence: right is what is off by 10 cm at most. Beyond a metre it does not
-matter any more how much beyond, and a few millimetres more or less prove nothing."""
+"""Range in which a smaller radius is evidence: right answers are off by 10 cm at most, so radii beyond a metre do not
+differ, nor do radii of a few millimetres."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What speaks for a pose.
+    """The evidence for a pose.
 
     Attributes:
-        log10_false_alarms: expected number, as a power of ten, of poses that wrong matches would support as well.
-        inlier_count: matches that agree with it.
-        match_count: matches tried.
-        findable_count: points of the structure that it has inside the image; no more than the photograph has features.
-        hull_share: of the image that the inliers' convex hull covers.
+        log10_false_alarms: log10 of the expected number of poses with as many inliers among wrong matches.
+        inlier_count: number of inliers.
+        match_count: number of 2D-3D matches.
+        findable_count: points of the structure that project into the image; at most the number of its features.
+        hull_share: share of the image covered by the convex hull of the inliers.
         reference_count: effective number of references that support it, (sum n_i)^2 / sum n_i^2 over the inliers n_i
             on points of each: 1 if one has them all, K if all have as many.
-        error_sigma: median error of the inliers, in standard deviations of their keypoints, where it exceeds one.
-        position_95_m: radius claimed for the position.
+        error_sigma: median error of the inliers, in standard deviations of their keypoints, at least one.
+        position_95_m: radius of the position.
     """
 
     log10_false_alarms: float
@@ -69,16 +69,16 @@ class Evidence:
 
     @property
     def inlier_share(self) -> float:
-        """Of the matches, those that agree."""
+        """Share of the matches that are inliers."""
         return self.inlier_count / self.match_count
 
     @property
     def found_share(self) -> float:
-        """Inliers over what should be found."""
+        """Inliers over findable points, at most one."""
         return min(1.0, self.inlier_count / max(1, self.findable_count))
 
     def features(self) -> Array:
-        """Logarithms (7,) in the order of `FEATURES`, each the larger the better."""
+        """Logarithms (7,) in the order of `FEATURES`."""
         return np.log(
             [
                 max(1.0, -self.log10_false_alarms),
@@ -94,7 +94,7 @@ class Evidence:
 
 _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
 LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-"""Shares of the right answers, of which `JudgeOptions.scores` are the quantiles."""
+"""Shares of the right answers at which `JudgeOptions.scores` are the quantiles."""
 
 
 @dataclass(frozen=True)
@@ -103,11 +103,11 @@ class JudgeOptions:
 
     Attributes:
         weights: of each of `FEATURES`. Fitted; see the module.
-        scores: that the shares `LEVELS` of the right answers do not exceed.
-        agreement_weight: of ln(1 / chance) where gravity or heading agrees with a pose: 1 if nothing but chance made
-            poses wrong. But repeated structure and wrong references stand upright too, and an answer that is off by
-            little agrees as well as one that is not.
-        ambiguity: of the search for a second place.
+        scores: quantiles of the scores of right answers at `LEVELS`.
+        agreement_weight: of ln(1 / chance) if gravity or heading agrees with a pose. It would be 1 if poses were wrong
+            only by chance; but poses from repeated structure and wrong references agree too, and so do slightly wrong
+            ones.
+        ambiguity: of the search for a second pose.
         focal: of the check of the photograph's focal length.
     """
 
@@ -131,11 +131,11 @@ class JudgeOptions:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What the judge says of a pose.
+    """The result of the judge.
 
     Attributes:
-        trust: 0 to 1; share of right answers that look at most as good.
-        evidence: what it rests on.
+        trust: 0 to 1; share of right answers whose score is at most as high.
+        evidence: from which it is computed.
         rejection: why the pose is not accepted; None if it is.
     """
 
@@ -157,15 +157,15 @@ def judge(
     Args:
         support: with an estimate that passed the gate.
         query_matches: of the query with each reference.
-        inlier_px: within which matches agree with a pose.
+        inlier_px: largest reprojection error of an inlier.
         coverage: share of right answers to accept, above 0 and at most 1.
         options: see there.
-        log10_chance: how improbable it is that a pose found by chance agrees with what is known of it.
+        log10_chance: see `Priors.log10_chance`.
 
     Returns:
-        The judgement. Rejections, in the support's world: GATE, with a hint, where the photograph says another focal
-        length than it came with, AMBIGUOUS with both hypotheses where another place is supported about as well, GATE
-        where the trust is less than 1 - coverage.
+        The judgement. Rejections, in the support's world: GATE, with a hint, if the photograph contradicts its focal
+        length; AMBIGUOUS with both hypotheses if a second pose is supported about as well; GATE if the trust is less
+        than 1 - coverage.
     """
     evidence = evidence_of(support, inlier_px, log10_chance)
     trust = trust_of(evidence, options, log10_chance)
@@ -176,17 +176,17 @@ def judge(
     if hypotheses:
         return Judgement(trust, evidence, _ambiguous(hypotheses))
     if trust < 1 - coverage:
-        return Judgement(trust, evidence, _distrusted(evidence, trust, coverage))
+        return Judgement(trust, evidence, _low_trust(evidence, trust, coverage))
     return Judgement(trust, evidence, None)
 
 
 def evidence_of(support: Support, inlier_px: float, log10_chance: float = 0.0) -> Evidence:
-    """What speaks for the estimate of a support.
+    """The evidence for the estimate of a support.
 
     Args:
         support: with an estimate of four inliers or more.
-        inlier_px: within which matches agree.
-        log10_chance: how improbable it is that a pose found by chance agrees with what is known of it (see `priors`).
+        inlier_px: largest reprojection error of an inlier.
+        log10_chance: see `Priors.log10_chance`.
     """
     estimate, query, structure, matches = support.estimate, support.query, support.structure, support.matches
     if estimate is None or estimate.inliers.sum() < 4:
@@ -207,18 +207,18 @@ def evidence_of(support: Support, inlier_px: float, log10_chance: float = 0.0) -
 
 
 def score_of(evidence: Evidence, options: JudgeOptions) -> float:
-    """The larger, the more a pose looks like a right one."""
+    """The score of a pose; right poses have larger ones."""
     return float(evidence.features() @ np.array(options.weights))
 
 
 def trust_of(evidence: Evidence, options: JudgeOptions, log10_chance: float = 0.0) -> float:
-    """Share of right answers whose score is at most this evidence's, and what agreement with priors adds to it."""
+    """Trust: share of right answers with at most this score, to which agreement with priors is added."""
     agreement = -options.agreement_weight * math.log(10) * log10_chance
     return float(np.interp(score_of(evidence, options) + agreement, options.scores, LEVELS))
 
 
-def _distrusted(evidence: Evidence, trust: float, coverage: float) -> Rejection:
-    shown = math.floor(1000 * trust) / 1000  # never as much as what it is below
+def _low_trust(evidence: Evidence, trust: float, coverage: float) -> Rejection:
+    shown = math.floor(1000 * trust) / 1000  # rounded down, so that it never equals the bound
     message = (
         f"its trust of {shown:g} is below the {round(1 - coverage, 6):g} that a coverage of {coverage:g} asks for: "
         f"{format_evidence(evidence)}"
@@ -241,7 +241,7 @@ def _miscalibrated(support: Support, focal: Focal) -> Rejection:
 
 
 def format_evidence(evidence: Evidence) -> str:
-    """The evidence for a person."""
+    """The evidence as text."""
     return (
         f"{evidence.inlier_count} of {evidence.match_count} matches agree, {100 * evidence.found_share:.0f} % of the "
         f"points that should be found, over {100 * evidence.hull_share:.0f} % of the image, the position within "

@@ -1,1 +1,1 @@
-"""How far a pose may be off: `covariance` has the model, `dispersion` its data, `perturbation` the conventions."""
+"""The covariance of a pose: `covariance` combines its parts, `dispersion` is the jackknife over the references."""

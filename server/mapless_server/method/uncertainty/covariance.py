@@ -1,34 +1,34 @@
-"""How far a pose may be off: its covariance, from what it rests on.
+"""The covariance of a pose, and its radii.
 
 The answer's covariance is that of world_from_camera in ROS's order (see `perturbation`), and is the sum of
 
     references   the dispersion of the poses that leave out one reference each (see `dispersion`): errors of reference
-                 poses, lens models and shutters, which all points of a reference share. In it is the structure's
-                 uncertainty as well: other references see other points, and see them by other pixels.
-    photograph   what its own pixels are off, scaled by its residuals.
+                 poses, lens models and shutters, which all points of a reference share. It includes the uncertainty of
+                 the structure: other references observe other points, by other pixels.
+    photograph   the noise of the photograph's own pixels, scaled by its residuals.
     scale        s^2 d d^T, d = camera centre - centroid of the references, s the relative uncertainty of the metric
-                 scale: where the scale, and not points that the references triangulate, places the camera. That is so
-                 of initial poses and of predicted points (`no_structure`). Elsewhere the references' poses are the
-                 yardstick, and what they are off is in their dispersion.
-    offset       o o^T, o the Gauss-Newton step that would lead from the pose to its optimum: zero there, and what an
-                 initial pose that is answered as it is may be off.
-    shared       what all references and the photograph share, so that no dispersion shows it (one lens model, one
-                 survey) does not average out over matches. It moves the camera, as observed: positions are never
-                 better than `shared_matches` independent matches at the structure's noise would make them.
+                 scale, for poses that depend on the scale rather than on triangulated points: initial poses, and poses
+                 from predicted points (`no_structure`). Otherwise the references' poses determine the scale, and their
+                 errors are in the dispersion.
+    offset       o o^T, o the Gauss-Newton step from the pose to its optimum: zero at the optimum, and the error to
+                 expect of an initial pose that is answered as it is.
+    shared       errors that all references and the photograph share (one lens model, one survey), which no dispersion
+                 shows and which do not average out over matches. Observed in positions: they are never more accurate
+                 than `shared_matches` independent matches at the structure's noise would make them.
 
-With K references a covariance of six numbers from K poses is rough, so the dispersion C is drawn halfway towards a
-covariance of known shape, that of independent matches, H^-1 (points eliminated, references fixed), as large as C when
-both are seen in units of the latter (Ledoit and Wolf 2004, with another measure of size):
+With K references a covariance of six numbers from K poses is rough, so the dispersion C is shrunk halfway towards the
+covariance of independent matches, H^-1 (points eliminated, references fixed), scaled to the size of C in units of H^-1
+(Ledoit and Wolf 2004, with another measure of size):
 
     (1 - a) C + a i^2 H^-1,    i^2 = trace(H C) / 6.
 
-Against planted noise, of pixels and of reference poses, the sum of C and the photograph's part is right within a
-quarter (the tests). What is drawn towards i^2 H^-1 claims more than that where noise is as planted, and is what holds
-on photographs: their errors are larger in poorly determined directions than the references' disagreement shows.
+With simulated noise of pixels and of reference poses, the sum of C and the photograph's part is right within a quarter
+(the tests). The shrunk covariance is larger than that, and right for photographs: their errors in poorly determined
+directions are larger than the dispersion of the references.
 
-What remains are two factors on standard deviations, one for positions and one for angles, and one for the tail: errors
-have heavier ones than the normal distribution. `research.radii` measures all three on scenes with
-known poses, each tested on a scene that it was not measured on.
+Three factors remain: on the standard deviations of positions and of angles, and on the radii of 95 %, because errors
+have heavier tails than the normal distribution. `research.radii` measures them on scenes with known poses, each tested
+on a scene that it was not measured on.
 """
 
 from __future__ import annotations
@@ -56,15 +56,15 @@ class UncertaintyOptions:
     """Options of the covariance.
 
     Attributes:
-        shrinkage: a, of the dispersion towards the shape of independent matches: halfway. Between a third and two
-            thirds no difference is measurable on some hundred photographs.
-        shared_matches: so many independent matches are as good as any number. Without this bound positions of the two
-            surveyed scenes, where a thousand matches agree, are claimed twice as exact as they are.
-        position_factor, rotation_factor: on standard deviations; as `research.radii` prints them.
-        max_matches: of the photograph that are looked at, evenly thinned; twice as many take twice the time, and the
-            references' errors are in all of them.
-        loss_scale_sigma: of the Cauchy loss that weighs matches, for poses without an adjustment.
-        max_error_px: matches further from such a pose say nothing.
+        shrinkage: a, of the dispersion towards the covariance of independent matches. Between a third and two thirds no
+            difference is measurable on some hundred photographs.
+        shared_matches: number of independent matches beyond which positions do not become more accurate. Without this
+            bound standard deviations in the two surveyed scenes, with a thousand inliers, are half the errors.
+        position_factor, rotation_factor: on standard deviations, from `research.radii`.
+        max_matches: of the photograph, evenly thinned; the time is linear in it, and the references' errors are the
+            same in all of them.
+        loss_scale_sigma: of the Cauchy loss that weights matches, for poses without an adjustment.
+        max_error_px: matches with a larger error are not used, for such poses.
     """
 
     shrinkage: float = 0.5
@@ -88,18 +88,17 @@ def uncertainty_of(
     options: UncertaintyOptions,
     is_offset: bool = False,
 ) -> Uncertainty | None:
-    """The references', the offset's and the shared part of a pose's covariance, with the factors.
+    """All parts of a pose's covariance but that of the scale, with the factors.
 
     Args:
-        jackknife: the observations it rests on; its unknowns a left perturbation (v, w) of camera_from_world.
+        jackknife: its observations; the unknowns are a left perturbation (v, w) of camera_from_world.
         world_from_camera: the pose.
-        one_match: (6, 6) covariance of the pose, in the world, if it rested on one match of average place at the
-            structure's noise.
+        one_match: see `one_match_covariance`, at the structure's noise.
         options: see there.
         is_offset: whether the pose is known not to be at its optimum.
 
     Returns:
-        None where the observations determine no pose.
+        The covariance; None if the observations do not determine a pose.
     """
     dispersion = disperse(jackknife)
     if dispersion is None:
@@ -125,20 +124,20 @@ def covariance_of(dispersion: Dispersion, shrinkage: float) -> Array:
 def one_match_covariance(
     camera: Camera, world_from_camera: RigidTransform, x_in_world: Array, level_px: float
 ) -> Array:
-    """Covariance (6, 6) of a pose, in the world, that rests on one match at this noise, of average place.
+    """Covariance (6, 6), in the world, of a pose with the information of one average match.
 
     Args:
         camera: pinhole.
         world_from_camera: the pose.
         x_in_world: (N, 3) points, in front of it, over which the information is averaged.
-        level_px: standard deviation of a match, each coordinate.
+        level_px: standard deviation of each coordinate of a match.
     """
     information = pose_hessian(camera, world_from_camera, x_in_world) / max(len(x_in_world), 1)
     return world_covariance(information / level_px**2, world_from_camera)
 
 
 def scale_covariance(world_from_camera: RigidTransform, centroid: Array, relative_sigma: float) -> Array:
-    """s^2 d d^T as (6, 6): of a pose that a scale places at a distance d from the references' centroid (3,)."""
+    """s^2 d d^T as (6, 6), for a pose whose distance d from the references' centroid (3,) depends on the scale."""
     covariance = np.zeros((6, 6))
     arm = world_from_camera.translation - centroid
     covariance[:3, :3] = relative_sigma**2 * np.outer(arm, arm)
@@ -146,13 +145,12 @@ def scale_covariance(world_from_camera: RigidTransform, centroid: Array, relativ
 
 
 TAIL_95 = 1.4
-"""Errors have heavier tails than the normal distribution: by so much the radius for 95 % is larger than the
-covariance's, which is right at 68 %. Measured by `research.radii`."""
+"""Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. From `research.radii`."""
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Errors not exceeded in 68 and 95 % of cases, if the covariance is right."""
+    """Radii: errors not exceeded in 68 and 95 % of cases."""
 
     position_68_m: float
     position_95_m: float
@@ -176,15 +174,15 @@ def accuracy_from_covariance(covariance: Array) -> Accuracy:
 def error_radius(covariance: Array, probability: float) -> float:
     """Length that a zero-mean normal vector with this covariance (n, n) does not exceed with this probability.
 
-    The squared length is a sum of chi-squares weighted by the eigenvalues; it is taken as one scaled chi-square with
-    the same mean and variance (Satterthwaite). Exact where all eigenvalues are equal or all but one vanish, within 4 %
-    between.
+    The squared length is a sum of chi-squares weighted by the eigenvalues, approximated by one scaled chi-square with
+    the same mean and variance (Satterthwaite). Exact if all eigenvalues are equal or all but one vanish, else within
+    4 %.
     """
     return float(error_radii(covariance, np.array([probability]))[0])
 
 
 def error_radii(covariance: Array, probabilities: Array) -> Array:
-    """The same (P,) for each of some probabilities (P,)."""
+    """`error_radius` (P,) for several probabilities (P,)."""
     eigenvalues = np.linalg.eigvalsh(covariance).clip(min=0)
     total = float(eigenvalues.sum())
     if total <= 0:
@@ -205,18 +203,18 @@ def pose_covariance(
 
     Args:
         support: with an estimate, of any stage.
-        scale: its metric scale, whose deviation is taken for its relative standard deviation.
+        scale: its metric scale, whose deviation is used as its relative standard deviation.
         options: see there.
-        priors: what was known of the pose; those that took part sharpen the covariance.
-        points_are_predicted: whether the structure's points are where the reconstruction and the scale put them, and
-            not triangulated from the references' poses.
+        priors: on the pose; those that were used reduce the covariance.
+        points_are_predicted: whether the structure's points are predicted by the reconstruction, rather than
+            triangulated from the references' poses.
 
     Raises:
         ValueError: there is no estimate.
     """
     estimate = support.estimate
     if estimate is None:
-        raise ValueError("without an estimate there is nothing to be uncertain of")
+        raise ValueError("support.estimate must not be None")
     if estimate.uncertainty is not None:
         return estimate.covariance
     is_initial = estimate.stage is PoseStage.INITIAL

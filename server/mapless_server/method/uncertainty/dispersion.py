@@ -1,37 +1,37 @@
-"""Dispersion: how far a pose moves when one of its references is left out.
+"""Dispersion: change of a pose when one of its references is left out.
 
-The errors of a reference, of its pose, its lens model and its shutter, are shared by all points that it shows. A sum
-over residuals takes them for independent, and says that a thousand matches are as good as a thousand measurements. The
-jackknife over references (Quenouille; Efron and Tibshirani 1993, chapter 11) does not: from the poses q_(i) without
-reference i, i = 1 ... K,
+The errors of a reference, of its pose, its lens model and its shutter, are shared by all points that it observes. A sum
+over residuals treats them as independent, as if a thousand matches were a thousand measurements. The jackknife over
+references (Quenouille; Efron and Tibshirani 1993, chapter 11) does not: from the poses q_(i) without reference i,
+i = 1 ... K,
 
     C = (K - 1) / K sum_i (q_(i) - mean) (q_(i) - mean)^T
 
-is the covariance of the pose due to its references, whatever goes together within each of them. That holds if leaving
-out one of K takes away 1 / K of what is known, and here it takes away more: points come from pairs of photographs, and
-of the K (K + 1) / 2 pairs that K references and the query make K (K - 1) / 2 are left. The steps are longer than they
-should be by the ratio of the two, (K + 1) / (K - 1), and C is divided by its square.
+is the covariance of the pose due to its references, with any correlation within each of them. This holds if leaving out
+one of K removes 1 / K of the information. Here it removes more: points come from pairs of photographs, and of the
+K (K + 1) / 2 pairs of K references and the query K (K - 1) / 2 remain. The steps are too long by the ratio of the two,
+(K + 1) / (K - 1), so C is divided by its square.
 
-Solving K times would cost K times the adjustment, so each q_(i) is one Gauss-Newton step away. Let point p be seen by
-the query with weight w, derivatives A by the point and J by the pose, and residual r; and by the references with
-information C_p = sum_o w_o A_o^T A_o and gradient h_p = sum_o w_o A_o^T r_o. Eliminating the point leaves to the pose
+Solving K times would cost K times the adjustment, so each q_(i) is one Gauss-Newton step away. Let point p be observed
+by the query with weight w, derivatives A by the point and J by the pose, and residual r; and by the references with
+information C_p = sum_o w_o A_o^T A_o and gradient h_p = sum_o w_o A_o^T r_o. Eliminating the point gives, with
 
     W = w - w^2 A T^-1 A^T,    u = w (r - A T^-1 (h_p + w A^T r)),    T = C_p + w A^T A,
 
-the information J^T W J and the gradient J^T u. Leaving out reference i takes its share away from C_p and h_p, which
-changes W and u of the points that it shows and of no others; so each (point, reference) pair costs the inverse of one
-3 x 3 matrix and the K steps one product of matrices.
+the information J^T W J and the gradient J^T u of the pose. Leaving out reference i subtracts its terms from C_p and
+h_p, which changes W and u only of the points that it observes; so each (point, reference) pair costs the inverse of one
+3 x 3 matrix, and the K steps one product of matrices.
 
-The photograph's own pixels have errors of their own, which no other choice of references shows. They are independent
-from match to match, so that their part of the pose's covariance is
+The noise of the photograph's own pixels does not depend on the references. It is independent between matches, so its
+part of the pose's covariance is
 
     Q = s^2 H^-1 (sum J^T W w^-1 W J) H^-1,    H = sum J^T W J,
 
-with s the size of the residuals by the expected one: the median of |r|^2 is 2 ln 2 times the variance of a coordinate,
-and of a residual only the share W / w of the noise is left once the point has been fitted to it too.
+with s^2 the ratio of the squared residuals to the expected ones: the median of |r|^2 is 2 ln 2 times the variance of a
+coordinate, and the point's own fit leaves only the share W / w of the noise in a residual.
 
-Residuals of the references are those with their poses as given: an adjustment that moves references to where they agree
-would otherwise hide what is looked for.
+Residuals of the references are those with their poses as given: an adjustment that moves the references into agreement
+would otherwise hide their errors.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ from mapless.geometry import Array
 from ..observations import Linearization
 
 MIN_DETERMINANT = 1e-10
-"""Of a point's information, by the cube of its largest diagonal element: below, the point is unknown in some direction
-and tells nothing."""
+"""Least determinant of a point's information, over the cube of its largest diagonal element: below, the point is not
+determined and not used."""
 
 LEAST_EIGENVALUE = 1e-10
-"""Of the pose's information, in units in which its diagonal is one: below, some direction is not determined."""
+"""Least eigenvalue of the pose's information with unit diagonal: below, the pose is not determined."""
 
 LEAST_LEFT = 0.01
-"""Share of the information that is taken to be left without a reference, at least."""
+"""Least share of the information assumed to remain without a reference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class LinearizedObservations:
     """Observations of points, linearized; residuals and derivatives in standard deviations.
 
     Attributes:
-        point: (N,) which of the points; any numbers that are the same for query and references.
+        point: (N,) index of the point, common to query and references.
         by_point: (N, 2, 3) derivative of the residual by the point, per metre.
         residual: (N, 2).
         weight: (N,) of the squared residual.
@@ -75,16 +75,16 @@ class LinearizedObservations:
 
 @dataclass(frozen=True, eq=False)
 class JackknifeInput:
-    """What a pose, or poses that are solved for together, rest on.
+    """The observations of one pose, or of several estimated jointly.
 
     Attributes:
-        query: what the photograph, or photographs, to be posed see. A point seen twice counts as two points.
-        by_pose: (N, 2, U) derivative of its residuals by the U unknowns.
-        references: what the references see of the same points, with their poses as given.
-        reference: (M,) which of the references, from 0.
+        query: observations by the photographs to pose. A point observed twice counts as two points.
+        by_pose: (N, 2, U) derivative of their residuals by the U unknowns.
+        references: observations of the same points by the references, with their poses as given.
+        reference: (M,) index of the reference, from 0.
         reference_count: K.
-        thinning: of so many observations of the query one is here. The references' errors are the same in all of them;
-            the photograph's own pixels' average out.
+        thinning: the query has so many times as many observations. The references' errors are the same in all of them;
+            the noise of the photograph's own pixels averages out.
     """
 
     query: LinearizedObservations
@@ -125,7 +125,7 @@ class Dispersion:
 
 
 def disperse(jackknife: JackknifeInput) -> Dispersion | None:
-    """Leaves out one reference at a time; None where all together determine no pose."""
+    """Leaves out one reference at a time; None if all together do not determine a pose."""
     seen, query = jackknife.references, jackknife.query
     size = 1 + int(max(query.point.max(initial=0), seen.point.max(initial=0)))
     of_seen, gradients = _information(seen), _gradient(seen)
@@ -140,7 +140,7 @@ def disperse(jackknife: JackknifeInput) -> Dispersion | None:
         some, of_point[:, point] - of_seen[:, other], gradient_of_point[:, point] - gradients[:, other]
     )
     change = np.zeros((jackknife.reference_count, 5, len(query.point)))
-    # A point is seen once by a reference: no pair falls upon another.
+    # A reference observes a point once, so the pairs are distinct.
     change[jackknife.reference[other], :, row] = (without - everything[:, row]).T
     found = _steps(query, jackknife.by_pose, everything, change)
     return found and replace(found, photograph=found.photograph / jackknife.thinning)
@@ -164,7 +164,7 @@ def _steps(query: LinearizedObservations, by_pose: Array, everything: Array, cha
     informations = information + (change[:, :3].reshape(count, -1) @ squares).reshape(count, unknowns, unknowns)
     gradients = gradient + change[:, 3:].reshape(count, -1) @ slopes
     offset = -np.linalg.solve(information, gradient[0])
-    # Without its only reference a point says nothing, and what is left may determine no pose.
+    # Without its only reference a point has no information, and the rest may not determine a pose.
     without = -np.linalg.solve(informations + LEAST_LEFT * information, gradients[:, :, None])[..., 0]
     if not (np.isfinite(offset).all() and np.isfinite(without).all()):
         return None
@@ -174,7 +174,7 @@ def _steps(query: LinearizedObservations, by_pose: Array, everything: Array, cha
 
 
 def _is_definite(information: Array) -> bool:
-    """Whether a symmetric matrix has an inverse worth the name, whatever its units."""
+    """Whether a symmetric matrix is well-conditioned positive definite, independent of its units."""
     unit = np.sqrt(np.diag(information).clip(min=0))
     if not (np.isfinite(information).all() and unit.min() > 0):
         return False
@@ -191,7 +191,7 @@ def _pixel_noise(query: LinearizedObservations, marginal: Array) -> Array:
 
 
 def _pairs(query_point: NDArray[np.intp], seen_point: NDArray[np.intp], size: int) -> tuple[NDArray[np.intp], ...]:
-    """Rows of the query and rows of the references that show the same point."""
+    """Rows of the query and rows of the references with the same point."""
     order = np.argsort(seen_point, kind="stable")
     counts = np.bincount(seen_point, minlength=size)
     starts = np.cumsum(counts) - counts
@@ -262,15 +262,15 @@ def jackknife_input(
     max_matches: int,
     motions: Array | None = None,
 ) -> JackknifeInput:
-    """What the last view's pose rests on.
+    """The jackknife input for the pose of the last view.
 
     Args:
         rows: of all observations.
         point: (O,) of each.
-        view: (O,) of each; the references, in their order, and last the photograph whose pose is asked for.
-        max_matches: of its observations; more are thinned evenly.
-        motions: (V, 6) left perturbations that brought the cameras from their given poses to those that `rows` is
-            linearized at; None if they are at their given poses.
+        view: (O,) of each; the references, in order, and last the photograph to pose.
+        max_matches: of its observations, evenly thinned.
+        motions: (V, 6) left perturbations from the given poses to those at which `rows` is linearized; None if both are
+            the same.
     """
     asked = int(view.max())
     is_asked = view == asked
