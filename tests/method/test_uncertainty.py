@@ -175,7 +175,7 @@ def test_without_an_estimate_there_is_nothing_to_ask() -> None:
     scene = make_scene(random_for("nothing"), FEW)
     structure, matches = true_structure(scene)
     support = Support(scene.query, scene.references, structure, matches, None, np.zeros(3))
-    with pytest.raises(ValueError, match="without an estimate"):
+    with pytest.raises(ValueError, match="estimate must not be None"):
         pose_covariance(support, UNSCALED, PLAIN)
 
 
