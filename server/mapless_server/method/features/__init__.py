@@ -1,7 +1,7 @@
-"""Local features: a photograph becomes a view, a pinhole camera with keypoints and descriptors.
+"""Local features: extractors turn a photograph into a view, a pinhole camera with keypoints and descriptors.
 
-A seam, one file each. What an extractor finds is stored with the reference under the extractor's name, so a change of
-anything that changes the features must change the name. The learned ones import torch, and only when they are made.
+One file per extractor. Features are stored with the reference under the extractor's name, so anything that changes the
+features must change the name. The learned extractors import torch, only when they are made.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 FEATURES = ("sift", "aliked", "xfeat", "superpoint")
-"""The kinds there are; the setting may also be `auto`. All but the first need weights of the same name."""
+"""Names of the extractors; the setting may also be `auto`. All but the first need weights of the same name."""
 
 
 class FeatureExtractor(Protocol):
@@ -53,7 +53,7 @@ class FeatureExtractor(Protocol):
             camera: its camera, of the same size.
 
         Returns:
-            The view, possibly with no keypoints at all (a blank wall); that is for the caller to judge.
+            The view, possibly without keypoints (a blank wall); the caller decides what follows.
         """
         ...
 

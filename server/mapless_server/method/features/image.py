@@ -1,4 +1,4 @@
-"""What all extractors share: the image made smaller, and keypoints of it made those of an ideal pinhole camera."""
+"""Common to all extractors: reduction of the image, and undistortion of keypoints to an ideal pinhole camera."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def undistort_pixels(pixels: Array, camera: Camera) -> Array:
         ideal = cv2.fisheye.undistortPoints(
             points, k, np.array([d.k1, d.k2, d.k3, d.k4], float), P=k, criteria=criteria
         )[:, 0]
-    # The iteration may run off where the model folds over; what does not come back to where it started is no solution.
+    # The iteration may diverge where the model folds over; only pixels that project back to themselves are solutions.
     rays = camera.rays(ideal)
     returned = camera.project(rays)
     good = np.linalg.norm(returned - pixels, axis=1) < 0.05
@@ -60,7 +60,7 @@ def undistort_pixels(pixels: Array, camera: Camera) -> Array:
 
 
 def view_of(camera: Camera, pixels: Array, descriptors: NDArray[np.float32], sizes_px: NDArray[np.float32]) -> View:
-    """The view of what was found in an image: undistorted, without what has no undistorted pixel.
+    """The view of keypoints found in an image: undistorted, without those that have no undistorted pixel.
 
     Args:
         camera: of the image, with its lens distortion.

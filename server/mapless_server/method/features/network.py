@@ -1,4 +1,4 @@
-"""What the learned extractors share."""
+"""Common to the learned extractors."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class LearnedOptions:
 def image_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
     """(1, C, H, W) float32 in 0 to 1 of an image (H, W) or (H, W, 3)."""
     pixels = image[..., None] if image.ndim == 2 else image
-    # Bytes travel to the device, a quarter of the floats.
+    # Transferred as bytes, a quarter of the size of floats.
     return torch.from_numpy(np.ascontiguousarray(pixels)).to(device).permute(2, 0, 1)[None].float() / 255
 
 

@@ -1,11 +1,10 @@
-"""A device's tracking: poses in a session's frame that drift, and what they say of each other all the same.
+"""Drift of a device's tracking: relative poses of consecutive frames, with their noise.
 
-Between two frames the device says how it moved. That is wrong by so much for each metre and each degree, and by a
-little where it stood still; errors of different steps have nothing to do with each other, so that they add up to drift.
-Now and then a device loses itself and jumps, and some are worse than others: a step that turns out to be far wronger
-than it should be is forgotten little by little (Cauchy's loss), not obeyed.
+The noise of a step between two frames grows with its length and angle, and has a floor. Steps have independent errors,
+so that they add up to drift. Tracking can also jump, and some devices are worse than others: steps with errors far
+beyond their noise lose their weight (Cauchy's loss).
 
-With an unknown unit of the session (its tracking has one camera and no other sensor), all steps share one scale more.
+If the unit of the session is unknown (monocular tracking), all steps share one more unknown, the scale.
 """
 
 from __future__ import annotations
@@ -29,15 +28,15 @@ _MEDIAN_SQUARE = 5.35
 
 @dataclass(frozen=True)
 class DriftOptions:
-    """How wrong the steps of a session are: standard deviations of each axis.
+    """Noise of the steps of a session: standard deviations of each axis.
 
     Attributes:
-        share: of the distance travelled. What visual-inertial tracking of phones and headsets loses is about 1 % of it;
-            twice that costs little where it is better, and much is lost where it is worse and believed.
-        floor_m: and at least this, standing still.
+        share: of the distance travelled. Visual-inertial tracking of phones and headsets drifts by about 1 %; twice
+            that costs little if tracking is better, and protects if it is worse.
+        floor_m: added, also standing still.
         deg_per_m: of direction, for a metre travelled.
         turn_share: of direction, of the angle turned.
-        floor_deg: and at least this.
+        floor_deg: added, also standing still.
         loss_scale: of Cauchy's loss, in standard deviations of a step of six numbers.
     """
 
@@ -62,7 +61,7 @@ class DriftOptions:
 
 @dataclass(frozen=True, eq=False)
 class SequenceFreedom:
-    """Frames move freely, but their steps are held to those of the session; see `joint.Freedom`.
+    """Frames move freely, with a cost on the difference of their steps from the session's; see `problem.Freedom`.
 
     Its parameters are left perturbations (v, w) of every frame's camera_from_world, in order, and, if the unit of the
     session is unknown, the logarithm of the scale.
@@ -71,7 +70,7 @@ class SequenceFreedom:
         frames: camera_from_world of every frame, metric.
         steps: from each frame to the next as the session has them: camera i from camera i + 1, in its unit.
         scale: metres per unit of the session.
-        scale_is_free: whether it is to be found.
+        scale_is_free: whether it is estimated.
         sigma: (F - 1, 6) of the steps.
         options: see there.
     """
@@ -122,9 +121,9 @@ class SequenceFreedom:
         return replace(self, frames=frames, scale=scale)
 
     def relaxed(self) -> SequenceFreedom:
-        """With steps as uncertain as they have turned out to be, if that is more than before.
+        """With the noise of the steps enlarged to that observed.
 
-        A session is good or bad as a whole: its median step tells, which some that jump do not spoil.
+        The quality is that of the whole session, estimated by the median over the steps, which jumps do not affect.
         """
         if not self.steps:
             return self
@@ -136,11 +135,11 @@ class SequenceFreedom:
         return cauchy_cost((self.residuals() ** 2).sum(axis=1), self._loss_scale)
 
     def residuals(self) -> Array:
-        """(F - 1, 6): by how many standard deviations each step differs from the session's."""
+        """(F - 1, 6): difference of each step from the session's, in standard deviations."""
         return np.array([self._error(i) for i in range(len(self.steps))]).reshape(-1, 6) / self.sigma
 
     def weights(self) -> Array:
-        """(F - 1,) how much of each step is still believed, 0 to 1."""
+        """(F - 1,) robust weight of each step, 0 to 1."""
         return cauchy_weight((self.residuals() ** 2).sum(axis=1), self._loss_scale)
 
     def equations(self) -> tuple[Array, Array]:
@@ -159,14 +158,14 @@ class SequenceFreedom:
         return math.sqrt(6) * self.options.loss_scale
 
     def _step(self, i: int) -> RigidTransform:
-        """Camera i from camera i + 1, as the poses have it."""
+        """Camera i from camera i + 1, from the frames' poses."""
         return self.frames[i].compose(self.frames[i + 1].inverse())
 
     def _error(self, i: int) -> Array:
-        """(6,): the step's shift less the session's, and the turn between them, in the axes of camera i."""
-        step, said = self._step(i), self.steps[i]
-        shift = step.translation - self.scale * said.translation
-        return np.concatenate([shift, rotation_vector(step.rotation @ said.rotation.T)])
+        """(6,): difference of the step's shift from the session's, and rotation between them, axes of camera i."""
+        step, tracked = self._step(i), self.steps[i]
+        shift = step.translation - self.scale * tracked.translation
+        return np.concatenate([shift, rotation_vector(step.rotation @ tracked.rotation.T)])
 
     def _jacobian_of_error(self, i: int) -> Array:
         """(6, N), for a small turn between the steps."""
@@ -184,7 +183,7 @@ class SequenceFreedom:
 def world_from_session_at(
     world_from_camera: RigidTransform, session_from_camera: RigidTransform, scale: float
 ) -> Similarity:
-    """What puts a session into the world so that one of its frames is where it should be."""
+    """The similarity that maps one frame of a session to its pose in the world."""
     rotation = world_from_camera.rotation @ session_from_camera.rotation.T
     translation = world_from_camera.translation - scale * rotation @ session_from_camera.translation
     return Similarity(scale, rotation, translation)

@@ -33,12 +33,12 @@ _rand_lock = threading.Lock()
 
 @dataclass(frozen=True, eq=False)
 class CameraMatches:
-    """One camera of several, and its matches.
+    """One camera of a group, with its matches.
 
     Attributes:
         camera: pinhole.
-        rig_from_camera: where it is fixed; metres, or units of the frame that it is fixed to.
-        pixels: (M, 2) seen there.
+        rig_from_camera: its mounting; metres, or units of the rig's frame.
+        pixels: (M, 2) of the matches.
         x_in_world: (M, 3) metres.
     """
 
@@ -48,12 +48,12 @@ class CameraMatches:
     x_in_world: Array
 
     def inliers(self, world_from_rig: RigidTransform | Similarity, inlier_px: float) -> NDArray[np.bool_]:
-        """Which of the matches (M,) agree with a pose."""
+        """Which of the matches (M,) are inliers of a pose."""
         pose = camera_in_world(world_from_rig, self.rig_from_camera)
         return reprojection_errors_px(self.camera, pose, self.x_in_world, self.pixels) < inlier_px
 
     def thinned(self, step: int) -> CameraMatches:
-        """Every so manieth match."""
+        """Every `step`-th match."""
         return CameraMatches(self.camera, self.rig_from_camera, self.pixels[::step], self.x_in_world[::step])
 
 
@@ -67,7 +67,7 @@ def camera_in_world(world_from_rig: RigidTransform | Similarity, rig_from_camera
 def inlier_count(
     cameras: Sequence[CameraMatches], world_from_rig: RigidTransform | Similarity, inlier_px: float
 ) -> int:
-    """Matches of all cameras that agree with a pose."""
+    """Number of inliers of a pose, over all cameras."""
     return sum(int(camera.inliers(world_from_rig, inlier_px).sum()) for camera in cameras)
 
 
@@ -103,13 +103,13 @@ def scaled_ransac(
 
     Args:
         cameras: with `rig_from_camera` in a unit of its own.
-        options: what agrees.
-        max_iterations: samples at the most; a good pose found early ends it sooner.
-        max_matches: that poses are tried on; evenly thinned.
+        options: of the inlier bound.
+        max_iterations: largest number of samples; fewer if a pose has many inliers.
+        max_matches: on which poses are scored; evenly thinned.
 
     Returns:
-        The pose with the most inliers among those of the samples; None where there is none. A scale below or equal to
-        zero, or one that no camera's motion tells (they all stand at one place), is no pose.
+        The pose with the most inliers; None if there is none. A scale that is not above zero, or not determined because
+        all cameras are at one place, is no pose.
     """
     cameras = _bounded(cameras, max_matches)
     rays = np.concatenate([_rays(camera) for camera in cameras])
@@ -140,9 +140,9 @@ def scaled_ransac(
 
 @contextmanager
 def _repeatable() -> Iterator[None]:
-    """For PoseLib's solvers of generalized poses, which turn the problem by the C library's random numbers.
+    """Makes PoseLib's generalized solvers repeatable: they rotate the problem by the C library's random numbers.
 
-    No seed of PoseLib's reaches these: without this, the same matches give poses that differ in their last digits.
+    PoseLib's seed does not apply to these: without this, the same matches give poses that differ in their last digits.
     """
     with _rand_lock:
         _libc.srand(0)
@@ -150,7 +150,7 @@ def _repeatable() -> Iterator[None]:
 
 
 def _iterations_needed(inlier_share: float) -> int:
-    """Until four of four are inliers with a probability of 99.9 %, and half of the samples are of one camera alone."""
+    """Samples until four of four are inliers with 99.9 %, if half of the samples are of one camera alone."""
     good = inlier_share**4 / 2
     return 2 if good >= 1 else math.ceil(math.log(1e-3) / math.log1p(-good))
 

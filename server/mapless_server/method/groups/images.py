@@ -1,6 +1,6 @@
-"""Several photographs that are to be posed together: what each of them knows, in one common world.
+"""The photographs of a group with their matches, in one common world.
 
-A photograph that could not be localized by itself has matches all the same, and together they may be enough.
+A photograph that was rejected alone still has matches, and those of the group together may be enough for a pose.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from .generalized import CameraMatches
 
 @dataclass(frozen=True, eq=False)
 class GroupImage:
-    """A photograph of a group and what the method says of it alone.
+    """A photograph of a group with its own answer.
 
     Attributes:
-        answer: its own; `support` is what counts, where there is any.
-        match: how it is matched with points near where they should be.
+        answer: its own; the group uses its `support`.
+        match: options of the guided search.
     """
 
     answer: Answer
@@ -44,12 +44,12 @@ class MatchedImage:
     """A photograph with matches, in the world of its group.
 
     Attributes:
-        image: which of the group's.
+        image: its index in the group.
         query: the photograph.
         references: in the order that the structure's tracks number them.
         structure: metric points.
-        tracked: matches that do not rest on a pose of the photograph.
-        own_pose: world_from_camera that the photograph alone is answered with; None if it is rejected.
+        tracked: matches that do not depend on a pose of the photograph.
+        own_pose: world_from_camera of its own answer; None if it is rejected.
         match: see GroupImage.
     """
 
@@ -62,12 +62,12 @@ class MatchedImage:
     match: MatchOptions
 
     def camera_matches(self, rig_from_camera: RigidTransform) -> CameraMatches:
-        """The tracked matches as pixels and points, of a camera that is fixed there."""
+        """The tracked matches as pixels and points of a camera with this mounting."""
         pixels = self.query.features.keypoints[self.tracked.keypoint].astype(np.float64)
         return CameraMatches(self.query.camera, rig_from_camera, pixels, self.structure.x_in_world[self.tracked.point])
 
     def matches_at(self, world_from_camera: RigidTransform) -> PointMatches:
-        """The tracked matches, and those that are found near where a pose says."""
+        """The tracked matches, and those of a guided search from a pose."""
         found = search(self.query, self.references, self.structure, world_from_camera, self.tracked, self.match)
         return PointMatches(
             np.concatenate([self.tracked.point, found.point]),
@@ -79,13 +79,13 @@ class MatchedImage:
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """A matched image, its matches under the pose of the group, and which of them agree.
+    """A matched image posed by its group, and its inliers.
 
     Attributes:
         source: the matched image.
-        world_from_camera: where the group's pose puts it.
+        world_from_camera: its pose in the group.
         matches: of the photograph with the points.
-        inliers: (M,) which agree.
+        inliers: (M,) which of the matches are inliers.
         errors_px: (M,) reprojection errors; NaN for points behind the camera.
     """
 
@@ -122,7 +122,7 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
     outcome = image.answer.outcome
     structure = replace(support.structure, x_in_world=support.structure.x_in_world + offset)
     references = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(offset)) for r in support.references)
-    # Found near where a pose that was not believed put them, they would speak for that pose.
+    # Matches from a guided search around a rejected pose would be evidence for that pose.
     guided = support.matches.guided
     kept = np.flatnonzero(~guided) if not guided.all() or isinstance(outcome, Rejection) else np.arange(len(guided))
     tracked = PointMatches(
@@ -133,7 +133,7 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
 
 
 def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
-    """Of a group none of whose photographs has matches: that of the one that came furthest."""
+    """Rejection of a group without matches: that of the photograph that reached the latest stage."""
     order = list(RejectionReason)
     outcomes = [(i, image.answer.outcome) for i, image in enumerate(images)]
     rejected = [(order.index(outcome.reason), i, outcome) for i, outcome in outcomes if isinstance(outcome, Rejection)]
@@ -144,7 +144,7 @@ def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
 
 
 def group_doubts(matched: Sequence[PosedImage], inlier_px: float, options: GateOptions) -> str | None:
-    """What speaks against the pose of a group, in one sentence; None if nothing does. `gate.doubts` of the sums."""
+    """Why the pose of a group fails the gate; None if it passes. `gate.doubts` with sums over the photographs."""
     inlier_total = sum(int(it.inliers.sum()) for it in matched)
     count = (
         f"{inlier_total} of {sum(len(it.matches) for it in matched)} matches in {len(matched)} images agree on a pose"
@@ -163,7 +163,7 @@ def group_doubts(matched: Sequence[PosedImage], inlier_px: float, options: GateO
 
 
 def group_log10_false_alarms(matched: Sequence[PosedImage], inlier_px: float) -> float:
-    """`gate.log10_false_alarms` of all matches together, each taken to hit by chance as easily as the easiest."""
+    """`gate.log10_false_alarms` of all matches, with the largest chance of an inlier of any photograph."""
     disc = inlier_px**2
     expected = []
     for guided in (False, True):
@@ -175,7 +175,7 @@ def group_log10_false_alarms(matched: Sequence[PosedImage], inlier_px: float) ->
 
 
 def _searched_area(matched: PosedImage, guided: bool) -> float:
-    """In which a match was searched, square pixels over pi."""
+    """Area in which a match was searched, square pixels over pi."""
     if guided:
         return matched.matches.radius_px**2
     camera = matched.source.query.camera
@@ -183,7 +183,11 @@ def _searched_area(matched: PosedImage, guided: bool) -> float:
 
 
 def tracked_support(prepared: Prepared) -> Support | None:
-    """What a pose of the photograph could rest on, found more widely; None where there is nothing."""
+    """Matches of a photograph that could not be posed alone, from wide correspondences; None without any.
+
+    Without a reconstruction, the references' tracks and poses are enough to triangulate points, and the photograph's
+    matches with the references lead to them through the tracks.
+    """
     query, references, check = prepared.query, prepared.references, prepared.context.check
     if len(references) < 2:
         return None

@@ -1,11 +1,11 @@
-"""Adjustment of a group: the poses of all its photographs, their points and, a little, the references, at once.
+"""Joint adjustment of a group: the poses of its photographs, their points and the references.
 
 What `adjust` minimizes for one photograph, summed over those of a group,
 
     min  sum_f sum_obs rho(|r_o|^2 / sigma_o^2) + sum_i |xi_i|^2 / sigma_prior^2 + (what holds the frames together),
 
-where the references xi_i are common to the photographs that use them. The points are each photograph's own, and are
-eliminated photograph by photograph; what is left is a dense system of the references and of the group's freedom.
+where the references xi_i are common to the photographs that use them. Each photograph has its own points, which are
+eliminated photograph by photograph; the rest is a dense system of the references and the group's parameters.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class JointEstimate(Generic[F]):
 def adjust_in_rounds(
     matched_images: Sequence[MatchedImage], freedom: F, options: JointOptions, rounds: int
 ) -> JointEstimate[F]:
-    """Searches for matches near where the poses so far put the points, and adjusts the poses, in turns."""
+    """Alternates guided searches from the current poses with adjustments."""
     for _ in range(rounds):
         poses = [freedom.camera_from_world(it.image).inverse() for it in matched_images]
         matches = [it.matches_at(pose) for it, pose in zip(matched_images, poses, strict=True)]
@@ -66,12 +66,12 @@ def adjust_jointly(
 
     Args:
         matched_images: the photographs that have matches.
-        matches: of each with its points; those that are too far from the pose so far take no part.
-        freedom: the poses so far, and how they may move.
+        matches: of each with its points; those with too large an error at the start are not used.
+        freedom: initial poses and their parametrization.
         options: see there.
 
     Returns:
-        The refined poses; those that were given where no match takes part.
+        The refined poses; the initial ones if no match is used.
     """
     problem = GroupProblem(matched_images, matches, freedom, options)
     steps = MinimizeOptions(options.iterations, options.adjust.min_decrease)

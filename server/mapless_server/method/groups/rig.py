@@ -1,8 +1,7 @@
 """The pose of a rig: several cameras that are fixed to each other, each with a photograph of the same moment.
 
-Together they see more than each of them: a pose is found from the matches of all (generalized PnP), also where none of
-the photographs could be localized alone; then matches are searched for near where it puts them, and everything is
-adjusted at once.
+A pose is estimated from the matches of all photographs (generalized PnP), also if none of them could be localized
+alone; then matches are searched near the projected points, and everything is adjusted together.
 """
 
 from __future__ import annotations
@@ -30,9 +29,9 @@ class RigOptions:
 
     Attributes:
         pnp: of the pose solver; `min_matches` of all cameras together.
-        gate: what is no pose, by the sums over the cameras.
+        gate: of the gate, on the sums over the cameras.
         joint: of the adjustment.
-        rounds: of searching for matches and adjusting; the second begins with a better pose.
+        rounds: of searching matches and adjusting; the second starts from a better pose.
     """
 
     pnp: PnpOptions = field(default_factory=PnpOptions)
@@ -46,7 +45,7 @@ class RigOptions:
 
 @dataclass(frozen=True, eq=False)
 class RigEstimate:
-    """Where a rig is.
+    """The estimated pose of a rig.
 
     Attributes:
         world_from_rig: metric.
@@ -86,11 +85,11 @@ class RigFreedom:
         return RigFreedom(perturbed(self.rig_from_world, step), self.rig_from_camera)
 
     def relaxed(self) -> RigFreedom:
-        """It is rigid."""
+        """Unchanged: a rig is rigid."""
         return self
 
     def cost(self) -> float:
-        """Nothing is left to hold."""
+        """Zero: a rig is rigid."""
         return 0.0
 
     def equations(self) -> tuple[Array, Array]:
@@ -104,13 +103,13 @@ def solve_rig(
     """The pose of a rig.
 
     Args:
-        images: one of each camera, and what is known of it alone.
-        rig_from_camera: where each camera is fixed, metric.
+        images: one of each camera, with its own answer.
+        rig_from_camera: mounting of each camera, metric.
         options: see there.
 
     Returns:
-        The estimate. Rejections: of the image that came furthest where none has matches; TOO_FEW_MATCHES; PNP_FAILED
-        when no pose explains any four; GATE when chance could have done as well.
+        The estimate. Rejections: that of the image that reached the latest stage, if none has matches; TOO_FEW_MATCHES;
+        PNP_FAILED if no pose has four inliers; GATE.
     """
     origin, matched_images = matched_images_of(images)
     if not matched_images:
@@ -133,7 +132,7 @@ def solve_rig(
 def _start(
     matched_images: Sequence[MatchedImage], rig_from_camera: Sequence[RigidTransform], options: RigOptions
 ) -> RigidTransform | Rejection:
-    """The pose that explains most matches: of the solver, or one that an image is answered with alone."""
+    """The pose with most inliers: from generalized PnP, or from the own pose of an image."""
     cameras = [it.camera_matches(rig_from_camera[it.image]) for it in matched_images]
     total = sum(len(camera.pixels) for camera in cameras)
     if total < options.pnp.min_matches:

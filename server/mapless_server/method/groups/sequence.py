@@ -1,12 +1,10 @@
-"""The poses of a short sequence: photographs of one camera, and where the device believed it to be at each of them.
+"""The poses of a short sequence: photographs of one camera with the poses that the device tracked.
 
-Three steps: a first guess of how the session lies in the world, from the photographs that were localized alone, or
-from the matches of all (generalized PnP, the whole sequence one camera); from that a pose of every frame, begun at the
-frames that are sure and carried on by the session; and an adjustment in which frames move freely, but are held to each
-other by what the device says of its steps, as far as that can be believed (see `drift`).
+Three steps: an initial world_from_session, from the photographs localized alone or from the matches of all (generalized
+PnP, the whole sequence as one camera); from it a pose of every frame, continued by tracking from the frames with
+consistent poses of their own; and a joint adjustment with a robust cost on the tracked steps (see `drift`).
 
-So a session that drifts does not spoil what single photographs say, and one that does not makes up for those that say
-nothing.
+So drift does not affect frames with good matches, and accurate tracking poses those without.
 """
 
 from __future__ import annotations
@@ -37,19 +35,19 @@ class SequenceOptions:
 
     Attributes:
         pnp: of the pose solvers; `min_matches` of all frames together.
-        gate: what is no pose, by the sums over the frames.
+        gate: of the gate, on the sums over the frames.
         joint: of the adjustment.
         drift: of the session.
-        rounds: of searching for matches and adjusting; the second begins with better poses.
-        loose_px: error at which a match agrees with a session that drifts, when first guesses are compared.
-        enough_share: of the matches, with which a guess from single frames is not tried to be bettered.
-        same_position_m, same_rotation_deg: two frames' own poses contradict the session by more than this, beyond three
-            times what drift explains, if one of them is wrong.
-        min_motion: least extent of a session whose unit is unknown, as a share of its distance from its own origin:
-            what is less is rounding.
-        max_scale_sigma: a scale less sure than this, relative, is none.
-        scale_iterations: samples of the search for pose and scale at once.
-        scale_matches: that they are tried on.
+        rounds: of searching matches and adjusting; the second starts from better poses.
+        loose_px: inlier bound for initial guesses, which drift.
+        enough_share: share of inliers with which a guess from single frames is used without generalized PnP.
+        same_position_m, same_rotation_deg: two frames' own poses are consistent with the session within this plus three
+            standard deviations of the drift.
+        min_motion: least extent of a session of unknown unit, as a share of its distance from its own origin; less is
+            rounding.
+        max_scale_sigma: largest relative standard deviation of an accepted scale.
+        scale_iterations: samples of the RANSAC for pose and scale.
+        scale_matches: matches on which they are scored.
     """
 
     pnp: PnpOptions = field(default_factory=PnpOptions)
@@ -74,14 +72,14 @@ class SequenceOptions:
 
 @dataclass(frozen=True, eq=False)
 class SequenceEstimate:
-    """Where the frames of a sequence were taken.
+    """The estimated poses of a sequence.
 
     Attributes:
         world_from_session: as it is at the last frame, metres from the session's unit.
         scale_sigma: relative standard deviation of its scale; 0 where the session is metric.
         world_from_camera: of every frame, metric, drift taken out.
         covariances: (F, 6, 6) of the same, order x y z rx ry rz, fixed world axes, metres and radians.
-        step_weights: (F - 1,) how much of the session's step to the next frame was believed, 0 to 1.
+        step_weights: (F - 1,) robust weight of the session's step to the next frame, 0 to 1.
         matched: the frames that have matches, in order.
         origin: (3,) of the world in which these are, metres; the poses are in the caller's.
     """
@@ -104,15 +102,15 @@ def solve_sequence(
     """The poses of a sequence.
 
     Args:
-        images: the frames in the order they were taken, and what is known of each alone.
-        session_from_camera: where the device believed its camera to be at each.
+        images: the frames in the order they were taken, with their own answers.
+        session_from_camera: the tracked pose of each.
         estimate_scale: whether the unit of the session is unknown; else it is the metre.
         options: see there.
 
     Returns:
-        The estimate. Rejections: of the frame that came furthest where none has matches; TOO_FEW_MATCHES; PNP_FAILED
-        when nothing explains any four; SCALE_UNRELIABLE when the scale is to be found and the session does not move
-        enough to tell it; GATE when chance could have done as well.
+        The estimate. Rejections: that of the frame that reached the latest stage, if none has matches; TOO_FEW_MATCHES;
+        PNP_FAILED if no poses have four inliers; SCALE_UNRELIABLE if the scale is unknown and the session moves too
+        little to determine it; GATE.
     """
     origin, matched_images = matched_images_of(images)
     if not matched_images:
@@ -170,7 +168,7 @@ def _result(
 
 @dataclass(frozen=True, eq=False)
 class _Session:
-    """What the device says, and what that means for the first guess.
+    """The tracked session, and initial poses from it.
 
     Attributes:
         frames: session_from_camera.
@@ -184,13 +182,13 @@ class _Session:
 
     @property
     def moves(self) -> bool:
-        """Whether there is any motion that could tell the unit."""
+        """Whether there is enough motion to determine the unit."""
         centres = np.array([frame.translation for frame in self.frames])
         extent = float(np.ptp(centres, axis=0).max())
         return extent > self.options.min_motion * float(np.abs(centres).max())
 
     def first_guess(self, matched_images: Sequence[MatchedImage]) -> Similarity | None:
-        """How the session lies in the world, the guess that explains most matches; None if none explains four."""
+        """The initial world_from_session with most inliers; None if none has four."""
         cameras = [it.camera_matches(self.frames[it.image]) for it in matched_images]
         total = sum(len(camera.pixels) for camera in cameras)
         candidates = self._of_single_frames(matched_images)
@@ -221,43 +219,43 @@ class _Session:
         return [] if rigid is None else [Similarity(1.0, rigid.rotation, rigid.translation)]
 
     def poses(self, matched_images: Sequence[MatchedImage], guess: Similarity) -> list[RigidTransform]:
-        """world_from_camera of every frame: its own if it can be believed, else carried on from the nearest such."""
+        """world_from_camera of every frame: its own if consistent, else tracked from the nearest consistent one."""
         own = {it.image: it.own_pose for it in matched_images if it.own_pose is not None}
-        believed = self._believed(own, guess)
+        consistent = self._consistent_frames(own, guess)
         poses = []
         for i, frame in enumerate(self.frames):
-            if not believed:
+            if not consistent:
                 poses.append(guess.transform_pose(frame))
                 continue
-            nearest = min(believed, key=lambda j: abs(i - j))
+            nearest = min(consistent, key=lambda j: abs(i - j))
             there = world_from_session_at(own[nearest], self.frames[nearest], guess.scale)
             poses.append(there.transform_pose(frame))
         return poses
 
-    def _believed(self, own: dict[int, RigidTransform], guess: Similarity) -> list[int]:
-        """Frames whose own poses agree with another's, as the session says; or, if none do, with the guess."""
+    def _consistent_frames(self, own: dict[int, RigidTransform], guess: Similarity) -> list[int]:
+        """Frames whose own poses agree with another's by the tracking; or, if none do, with the guess."""
         freedom = SequenceFreedom.of((), self.frames, guess.scale, False, self.options.drift)
-        drift = np.concatenate([np.zeros((1, 6)), np.cumsum(freedom.sigma, axis=0)])  # to each frame at the most
+        drift = np.concatenate([np.zeros((1, 6)), np.cumsum(freedom.sigma, axis=0)])  # largest drift to each frame
 
         def agree(i: int, j: int) -> bool:
-            said = world_from_session_at(own[i], self.frames[i], guess.scale).transform_pose(self.frames[j])
-            return self._is_near(own[j], said, np.abs(drift[j] - drift[i]))
+            tracked = world_from_session_at(own[i], self.frames[i], guess.scale).transform_pose(self.frames[j])
+            return self._is_near(own[j], tracked, np.abs(drift[j] - drift[i]))
 
         indices = sorted(own)
         links = np.array([[agree(i, j) for j in indices] for i in indices], bool).reshape(len(own), len(own))
         _, group = connected_components(links, directed=False)
-        # After a jump of the device there are two such groups, and both are right.
-        in_company = [indices[k] for k in range(len(indices)) if (group == group[k]).sum() > 1]
-        if in_company:
-            return in_company
+        # After a jump of the tracking there are two such groups, and both are right.
+        agreeing = [indices[k] for k in range(len(indices)) if (group == group[k]).sum() > 1]
+        if agreeing:
+            return agreeing
         as_guessed = [i for i in indices if self._is_near(own[i], guess.transform_pose(self.frames[i]), drift[-1])]
-        # Photographs that were believed alone, all of which contradict the session: it is the session that is wrong.
+        # If most of the accepted own poses contradict the session, the session is wrong.
         return as_guessed if 2 * len(as_guessed) >= len(indices) else indices
 
-    def _is_near(self, pose: RigidTransform, said: RigidTransform, drift: Array) -> bool:
-        """Whether a pose may be what is said of it after so much drift (6,)."""
-        apart_m = float(np.linalg.norm(pose.translation - said.translation))
-        apart_deg = rotation_angle_deg(pose.rotation.T @ said.rotation)
+    def _is_near(self, pose: RigidTransform, tracked: RigidTransform, drift: Array) -> bool:
+        """Whether a pose is within the drift (6,) of a tracked one."""
+        apart_m = float(np.linalg.norm(pose.translation - tracked.translation))
+        apart_deg = rotation_angle_deg(pose.rotation.T @ tracked.rotation)
         return apart_m <= self.options.same_position_m + 3 * drift[
             0
         ] and apart_deg <= self.options.same_rotation_deg + 3 * math.degrees(drift[3])
