@@ -1,7 +1,7 @@
 """The coarse stage: query and references reconstructed together, up to one common scale.
 
-A seam. The paper calls a feed-forward network here (its equation for Phi); whatever else gives local points,
-confidences and poses in one local frame will do. A backend is one file in this package with a `Reconstructor`.
+The paper uses a feed-forward network here (its equation for Phi); any method that gives local points, confidences and
+poses in one local frame can replace it. A backend is one file in this package with a `Reconstructor`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # it needs torch
 
 
 Outcome: TypeAlias = "Reconstruction | DeviceReconstruction | Rejection"
-"""What a backend says of one query: its reconstruction, or why there is none."""
+"""The result of a backend for one query: its reconstruction, or a rejection."""
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,13 @@ class Bucket:
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """What is to be reconstructed together.
+    """A query and its references, to be reconstructed together.
 
     Attributes:
         query: the photograph to localize.
         references: with known poses.
-        correspondences: between them all; a network looks at the images alone and needs none.
-        priors: what is known of the query's pose, in the world of the references; a network does not listen.
+        correspondences: between all views; networks use the images alone and need none.
+        priors: on the query's pose, in the world of the references; networks ignore them.
     """
 
     query: View
@@ -66,8 +66,8 @@ class Reconstructor(Protocol):
     Attributes:
         name: "geometric", "pi3", ...
         weights_sha256: of the network's weights; empty without any.
-        uses_correspondences: whether the answer depends on them. A network's does not, so it is asked once for a query,
-            whatever else is tried with it.
+        uses_correspondences: whether the result depends on them. A network's does not, so it runs once for a query,
+            also if other correspondences are tried.
     """
 
     @property
@@ -86,14 +86,14 @@ class Reconstructor(Protocol):
         ...
 
     def close(self) -> None:
-        """Gives back threads and devices; nothing follows."""
+        """Releases threads and devices; the backend cannot be used afterwards."""
         ...
 
     def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
         """With which other queries this one, of one reference at least, may be reconstructed in one go.
 
         Raises:
-            ValueError: a view lacks what the backend looks at.
+            ValueError: a view lacks input of the backend.
         """
         ...
 
@@ -101,12 +101,11 @@ class Reconstructor(Protocol):
         """Reconstructs each query and its references, as far as it can in one go.
 
         Returns:
-            For each request, in their order, the reconstruction, why there is none, or the exception that is its own,
-            among them one of too little memory for it alone. What company a request has changes its outcome by no
-            more than rounding.
+            For each request, in order: the reconstruction, a rejection, or its own exception, such as too little memory
+            for it alone. The other requests of a batch change an outcome by no more than rounding.
 
         Raises:
-            Exception: of the batch as a whole. Halves of it tell whose fault it was.
+            Exception: of the batch as a whole; splitting it shows which request caused it.
         """
         ...
 

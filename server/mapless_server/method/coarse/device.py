@@ -1,4 +1,4 @@
-"""What a network's coarse stage hands on when its output shall stay on the device."""
+"""The reconstruction of a network whose output stays on the device."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class DeviceReconstruction:
             values.reshape(part.shape)
             for values, part in zip(np.split(flat, np.cumsum([p.numel() for p in parts])[:-1]), parts, strict=True)
         )
-        # As they are, NaN included: to judge them is the scale's business.
+        # As they are, NaN included: the scale stage rejects these.
         local_from_camera = [RigidTransform(pose[:3, :3], pose[:3, 3]) for pose in poses.astype(np.float64)]
         query = ReconstructedView(
             self.query_camera,

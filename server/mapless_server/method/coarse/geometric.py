@@ -79,7 +79,7 @@ class GeometricReconstructor:
     def _attempt(self, request: Request) -> Outcome | Exception:
         try:
             return self._reconstruct(request)
-        except Exception as error:  # one request's fault is not the others'
+        except Exception as error:  # an error of one request does not fail the others
             return error
 
     def _reconstruct(self, request: Request) -> Reconstruction | Rejection:
@@ -115,7 +115,7 @@ class GeometricReconstructor:
             known = priors.pose
             if known is None:
                 return rejection
-            # Where the photograph tells too little at first sight, what was known of its pose says where to look.
+            # With too few matches here, the pose prior is the initial pose from which more are searched.
             pose, inliers = known.world_from_camera, np.zeros(len(matches), bool)
         assert pose is not None
         return self._scatter(query, references, structure, pose, x_in_world[inliers], pixels[inliers])
@@ -123,7 +123,7 @@ class GeometricReconstructor:
     def _judge(
         self, query: View, structure: Structure, matches: PointMatches, pose: RigidTransform | None, priors: Priors
     ) -> tuple[Rejection | None, NDArray[np.bool_]]:
-        """Why a pose is none, and which of the matches (M,) agree with it."""
+        """A rejection of the pose, if any, and which of the matches (M,) are its inliers."""
         inlier_px = self.options.pnp.inlier_px
         if pose is None:
             message = f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references"

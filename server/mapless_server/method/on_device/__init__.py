@@ -1,7 +1,7 @@
-"""Scale, structure and matching where a network left its output: one upload, one download, no waiting in between.
+"""Scale, structure and matching on the device of a network's output: one upload, one download, no synchronization.
 
-What does not depend on the network is prepared on the host, while the network runs, and queues up behind it. `compute`
-then only launches work: nothing in it looks at a value, so that rejections are numbers too until they are fetched. The
+What does not depend on the network is prepared on the host while the network runs. `compute` then only launches work:
+it reads no value, so that rejections are numbers too until they are fetched. The
 equations are those of the host (see `arrays`), in float64; the results are what the host's stages give.
 """
 
@@ -125,7 +125,7 @@ def _judged(
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What the host knows before the network has answered.
+    """What the host prepares before the network has finished.
 
     Attributes:
         inputs: to upload.
@@ -145,7 +145,7 @@ def prepare(
     correspondences: Correspondences,
     options: Options,
 ) -> Job:
-    """Everything that does not depend on the network; `map_cameras` are those of the references' maps."""
+    """All inputs that do not depend on the network; `map_cameras` are those of the references' maps."""
     known, cell = gather(references, correspondences, options.scale), _cells(map_cameras, references)
     nothing = np.empty(0, np.intp)
     if options.structure is None or options.match is None:
@@ -173,7 +173,7 @@ def _not_finite(outputs: Outputs, reference_count: int) -> str | None:
 
 
 def _structure(points: Points, job: Job, options: StructureOptions) -> Structure:
-    """What of the points and tracks is left."""
+    """The points and tracks that are kept."""
     seen = points.seen.astype(bool)
     keep, rows = seen.any(axis=1), seen.reshape(-1)[job.row]
     renumbered = np.cumsum(keep) - 1
