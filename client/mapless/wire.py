@@ -98,6 +98,8 @@ def camera_to_message(camera: Camera) -> pb.CameraIntrinsics:
         message.radial_tangential.CopyFrom(pb.RadialTangentialDistortion(**vars(lens)))
     elif isinstance(lens, Fisheye):
         message.fisheye.CopyFrom(pb.FisheyeDistortion(**vars(lens)))
+    elif lens is not None:
+        raise TypeError(f"camera.distortion must be a RadialTangential or a Fisheye, is a {type(lens).__name__}")
     return message
 
 

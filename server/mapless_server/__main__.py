@@ -1,4 +1,4 @@
-"""`python -m mapless_server [flags]` serves, as `mapless-server serve` does; it needs nothing of `mapless_tools`."""
+"""`python -m mapless_server serve` is `mapless-server serve`; it needs nothing of `mapless_tools`."""
 
 import sys
 
@@ -13,8 +13,9 @@ def main() -> None:
         from mapless_server.serve.command import serve_command
 
         # A traceback with local variables would print image bytes and secrets.
-        app = typer.Typer(add_completion=False, pretty_exceptions_show_locals=False)
-        app.command()(serve_command)
+        app = typer.Typer(add_completion=False, pretty_exceptions_show_locals=False, no_args_is_help=True)
+        app.callback()(lambda: None)  # makes it a group, so that `serve` is named
+        app.command("serve")(serve_command)
         app(prog_name="python -m mapless_server")
     except ModuleNotFoundError as error:
         sys.exit(f"mapless-server: {install_hint(error)}")

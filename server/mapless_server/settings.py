@@ -248,11 +248,14 @@ def _read_file(path: Path) -> dict[str, Any]:
 
 def _read_environment() -> dict[str, str]:
     variables = {f"{PREFIX}{name.upper()}": name for name in Settings.model_fields}
-    ours = {name for name in os.environ if name.startswith(PREFIX) and not _SERVICE_LINKS.fullmatch(name)}
-    unknown = ours - {*variables, CONFIG_VARIABLE, CLIENT_TOKEN_VARIABLE, CLIENT_ADDRESS_VARIABLE}
+    known = {*variables, CONFIG_VARIABLE, CLIENT_TOKEN_VARIABLE, CLIENT_ADDRESS_VARIABLE}
+    ours = {name for name in os.environ if name.upper().startswith(PREFIX) and not _SERVICE_LINKS.fullmatch(name)}
+    unknown = {name for name in ours if name.upper() not in known}
     if unknown:
         raise ConfigError("\n".join(f"environment: {ascii(name)[1:-1]} is not a setting" for name in sorted(unknown)))
-    values = {name: os.environ[variable] for variable, name in variables.items() if variable in os.environ}
+    # In any case; of two spellings the one in capitals, which sort first, counts.
+    given = {variable: os.environ[variable] for variable in sorted(ours, reverse=True)}
+    values = {variables[name.upper()]: value for name, value in given.items() if name.upper() in variables}
     if values.get("port", "").startswith(_SERVICE_LINK_VALUE):
         del values["port"]
     return values
@@ -260,4 +263,10 @@ def _read_environment() -> dict[str, str]:
 
 def _describe(fault: Mapping[str, Any], origins: Mapping[str, str]) -> str:
     name = ascii(".".join(map(str, fault["loc"])))[1:-1]  # a key of a file may be any text
-    return f"{name} ({origins.get(name, 'default')}): {fault['msg']}" if name else str(fault["msg"])
+    message = str(fault["msg"]).removeprefix("Value error, ").replace("Input should be", "must be")
+    if not name:
+        return message
+    field = Settings.model_fields.get(name)
+    is_secret = field is None or field.annotation is None or "Secret" in str(field.annotation)
+    value = "" if is_secret or fault["type"] == "missing" else f", is {fault['input']!a}"
+    return f"{name} ({origins.get(name, 'default')}): {message}{value}"

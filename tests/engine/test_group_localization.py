@@ -6,8 +6,9 @@ import asyncio
 import itertools
 import threading
 import time
+import weakref
 from collections import Counter
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -15,7 +16,7 @@ from typing import Any, cast
 import pytest
 from support.servers import CAMERA
 
-from mapless_server.engine.groups import localize_each
+from mapless_server.engine.groups import PhotoGroup
 from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Caller, Photo, Query, Result
 from mapless_server.engine.queue_engine import JOIN, QueueEngine
@@ -51,6 +52,8 @@ class Toy(QueueEngine):
     def __init__(self, seconds: float = 0.002, max_queued_s: float = 2.0) -> None:
         self.options = EngineOptions(workers=2, max_batch=1)
         self.seconds, self.fails_at, self._numbers = seconds, -1, itertools.count(1)
+        self.failure: Exception = RuntimeError("planted")
+        self.jobs: weakref.WeakSet[Job] = weakref.WeakSet()
         options = WorkQueueOptions(max_queued_s=max_queued_s, max_bytes=MAX_BYTES)
         stages = {Stage(PREPARE, "host"): compute_items, Stage(JOIN, "host"): compute_items}
         self.queue = WorkQueue(stages, {"host": 2}, options, Observer())
@@ -60,10 +63,12 @@ class Toy(QueueEngine):
             number = next(self._numbers)
             time.sleep(self.seconds)
             if number == self.fails_at:
-                raise RuntimeError("planted")
+                raise self.failure
 
         step = Step(PREPARE, "p", "p", ItemList([None], compute))
-        return Job(caller.flow, step, caller.deadline_s, 0 if query.is_part else len(query.photo.image))
+        job = Job(caller.flow, step, caller.deadline_s, 0 if query.is_part else len(query.photo.image))
+        self.jobs.add(job)
+        return job
 
     async def run(self, job: Job) -> Result:
         try:
@@ -78,10 +83,6 @@ class Toy(QueueEngine):
 
 def caller(name: str, lasts_s: float = LIMIT_S) -> Caller:
     return Caller(Flow("tenant", name), time.monotonic() + lasts_s)
-
-
-def jobs_of(engine: Toy, queries: Sequence[Query], caller: Caller) -> list[Job]:
-    return [engine.query_job(query, caller) for query in queries]
 
 
 def run(engine: Toy, work: Coroutine[Any, Any, None]) -> None:
@@ -106,7 +107,7 @@ def test_groups_in_progress_are_bounded_and_others_refused() -> None:
                 held += 300
                 most = max(most, held)
                 try:
-                    await localize_each(engine, jobs_of(engine, queries, who), who, "images")
+                    await PhotoGroup(engine, queries, who, "images").localize()
                     await engine.join(lambda: None, who)
                 finally:
                     held -= 300
@@ -180,7 +181,7 @@ def test_computed_photos_are_posed_together_in_a_full_queue() -> None:
         rig = caller("rig")
         for _ in range(3):  # the queue learns what a joint pose costs: two of them fill it
             await engine.join(lambda: time.sleep(0.25), rig)
-        await localize_each(engine, jobs_of(engine, [PART] * 4, rig), rig, "images")
+        await PhotoGroup(engine, [PART] * 4, rig, "images").localize()
         others = [asyncio.ensure_future(engine._each(JOIN, [None], held, caller(name), 0)) for name in "abcd"]
         try:
             await asyncio.sleep(0.05)
@@ -201,7 +202,7 @@ def test_and_while_the_server_drains_but_not_after_its_end() -> None:
     engine, rig = Toy(), caller("rig")
 
     async def work() -> None:
-        await localize_each(engine, jobs_of(engine, [PART] * 2, rig), rig, "images")
+        await PhotoGroup(engine, [PART] * 2, rig, "images").localize()
         engine.queue.drain()
         assert await engine.join(lambda: "pose", caller("rig")) == "pose"
         with pytest.raises(DeadlineExceeded):
@@ -220,12 +221,12 @@ def test_the_stages_of_a_group_that_fails_are_told_too() -> None:
 
     async def work() -> None:
         rig = caller("rig")
-        jobs = jobs_of(engine, [PART] * 4, rig)
+        group = PhotoGroup(engine, [PART] * 4, rig, "images")
         with pytest.raises(RuntimeError, match="planted"):
-            await localize_each(engine, jobs, rig, "images")
-        seen = [len(job.records) for job in jobs]
+            await group.localize()
+        seen = [len(records) for records in group.records]
         assert sum(seen) >= 2  # the one that failed, and the one that had to be through before it began
-        assert all(it.stage == PREPARE for job in jobs for it in job.records)
+        assert all(it.stage == PREPARE for records in group.records for it in records)
         engine.fails_at = next(engine._numbers) + 3
         call = Call("id", time.monotonic(), time.monotonic() + LIMIT_S)
         with pytest.raises(RuntimeError, match="planted"):
@@ -234,3 +235,36 @@ def test_the_stages_of_a_group_that_fails_are_told_too() -> None:
         assert call.history.stage_seconds[PREPARE] >= engine.seconds
 
     run(engine, work())
+
+
+def test_a_photo_that_a_full_store_failed_is_tried_again() -> None:
+    engine = Toy(seconds=0.05)
+    engine.fails_at, engine.failure = 1, Overloaded("the store is full", reason="STORE_FULL", retry_after_s=0.01)
+
+    async def work() -> None:
+        result = await PhotoGroup(engine, [PART] * 3, caller("rig"), "images").localize()
+        assert len(result.results) == 3
+        assert engine.queue.job_count == 0
+        assert engine.queue.backlog_s == 0
+
+    run(engine, work())
+
+
+def test_what_has_been_localized_holds_no_photograph() -> None:
+    engine = Toy()
+    alive: list[int] = []
+
+    async def work() -> None:
+        group = PhotoGroup(engine, [PART] * 12, caller("rig"), "images")
+        query_job = engine.query_job
+
+        def watched(*arguments: Any) -> Job:
+            alive.append(len(engine.jobs))
+            return query_job(*arguments)
+
+        engine.query_job = watched  # type: ignore[method-assign, assignment]
+        await group.localize()
+
+    run(engine, work())
+    assert len(alive) == 12
+    assert max(alive) <= 4, "two are computed at a time, and threads let go of theirs a moment later"

@@ -188,6 +188,15 @@ def in_loop(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
 
 class TestResults:
     @in_loop
+    async def test_a_job_that_has_ended_is_not_run_again(self) -> None:
+        async with Toy(lambda jobs: [Done(job.step.payload) for job in jobs]) as toy:
+            job = Job(Flow("t", "c"), Step("then", "toy", "b", "z"), time.monotonic() + FAR_S, 1)
+            toy.gate.set()
+            assert await toy.queue.run(job) == "z"
+            with pytest.raises(ValueError, match="has ended"):
+                await toy.queue.run(job)
+
+    @in_loop
     async def test_a_job_goes_through_its_stages_and_its_records_say_when(self) -> None:
         marks: dict[str, tuple[float, float]] = {}
 

@@ -120,7 +120,7 @@ def real(folder: Path, **settings: Any) -> Iterator[Program]:
     """`python -m mapless_server`, at once."""
     given = {"port": 0, "metrics_port": 0, "data_dir": folder / "data", "workers": 2} | settings
     flags = [part for name, value in given.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-    with program(folder, ["-m", "mapless_server", *flags], MAPLESS_WARM_UP="false") as running:
+    with program(folder, ["-m", "mapless_server", "serve", *flags], MAPLESS_WARM_UP="false") as running:
         yield running
 
 

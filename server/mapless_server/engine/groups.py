@@ -6,13 +6,13 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from mapless_server.errors import Overloaded, RequestError
-from mapless_server.scheduling import Job
+from mapless_server.scheduling import StageRecord
 
 from .interface import Engine
-from .query import Caller, Result
+from .query import Caller, Query, Result
 
 MAX_RIG_IMAGES = 8
 MIN_FRAMES, MAX_FRAMES = 2, 16
@@ -34,47 +34,54 @@ class GroupResult:
     seconds: tuple[float, ...]
 
 
-async def localize_each(engine: Engine, jobs: Sequence[Job], caller: Caller, list_name: str) -> GroupResult:
-    """Localizes photographs, as many at a time as the engine computes.
+class PhotoGroup:
+    """The photographs of a call that are localized each by itself.
 
-    All of them at once would be more than a caller may have waiting. A photograph that there is no room for waits until
-    another one of the same call is done; only the first one is refused.
-
-    Args:
-        engine: which computes.
-        jobs: the photographs', of `Engine.query_job`.
-        caller: of them all.
-        list_name: the field of the request that holds them, for messages about one of them.
-
-    Raises:
-        RequestError: as of `Engine.run`, its field within the list.
+    Attributes:
+        records: of each photograph, the stages that it has been through; also where one fails.
     """
-    group = _Group(engine, jobs, caller, list_name)
-    workers = [asyncio.ensure_future(group.work()) for _ in range(min(len(jobs), engine.parallel_queries))]
-    try:
-        await asyncio.gather(*workers)
-    finally:
-        for worker in workers:
-            worker.cancel()
-        await asyncio.gather(*workers, return_exceptions=True)
-    return group.result()
 
+    def __init__(self, engine: Engine, queries: Sequence[Query], caller: Caller, list_name: str) -> None:
+        """A group that has not begun.
 
-@dataclass(eq=False)
-class _Group:
-    """Photographs that are being localized; several workers take one after the other."""
-
-    engine: Engine
-    jobs: Sequence[Job]
-    caller: Caller
-    list_name: str
-    done: dict[int, tuple[Result, float]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self._waiting = deque(range(len(self.jobs)))
+        Args:
+            engine: which computes.
+            queries: the photographs.
+            caller: of them all.
+            list_name: the field of the request that holds them, for messages about one of them.
+        """
+        self.records: tuple[list[StageRecord], ...] = tuple([] for _ in queries)
+        self._engine = engine
+        self._queries = queries
+        self._caller = caller
+        self._list_name = list_name
+        self._waiting = deque(range(len(queries)))
         self._running = 0
+        self._done: dict[int, tuple[Result, float]] = {}
 
-    async def work(self) -> None:
+    async def localize(self) -> GroupResult:
+        """Localizes the photographs, as many at a time as the engine computes.
+
+        All of them at once would be more than a caller may have waiting. A photograph that there is no room for waits
+        until another one of the group is done; only the first one is refused.
+
+        Raises:
+            RequestError: as of `Engine.run`, its field within the list.
+        """
+        count = min(len(self._queries), self._engine.parallel_queries)
+        workers = [asyncio.ensure_future(self._work()) for _ in range(count)]
+        try:
+            await asyncio.gather(*workers)
+        finally:
+            for worker in workers:
+                worker.cancel()
+            await asyncio.gather(*workers, return_exceptions=True)
+        results, seconds = zip(*(self._done[i] for i in range(len(self._queries))), strict=True)
+        first = (next(iter(records), None) for records in self.records)
+        queued_s = tuple(0.0 if it is None else it.start_s - it.queued_s for it in first)
+        return GroupResult(results, queued_s, seconds)
+
+    async def _work(self) -> None:
         """Localizes what waits, until nothing does or there is no room for as many at a time."""
         while self._waiting:
             index = self._waiting.popleft()
@@ -91,24 +98,21 @@ class _Group:
 
     async def _localize(self, index: int) -> None:
         start_s = time.monotonic()
+        # Made for each attempt, and not kept: it holds the decoded photograph.
+        job = self._engine.query_job(self._queries[index], self._caller)
         try:
-            result = await self.engine.run(self.jobs[index])
+            result = await self._engine.run(job)
         except RequestError as error:
             if error.field is not None and error.field.startswith("references"):
-                error.field = f"{self.list_name}[{index}].{error.field}"
+                error.field = f"{self._list_name}[{index}].{error.field}"
             raise
-        self.done[index] = result, time.monotonic() - start_s
+        finally:
+            self.records[index].extend(job.records)
+        self._done[index] = result, time.monotonic() - start_s
 
     async def _wait(self, refused: Overloaded) -> None:
         """Until there may be room; raises the refusal if nothing was computed or there is no time."""
         pause_s = refused.retry_after_s
-        if not self.done or pause_s is None or time.monotonic() + pause_s > self.caller.deadline_s:
+        if not self._done or pause_s is None or time.monotonic() + pause_s > self._caller.deadline_s:
             raise refused
         await asyncio.sleep(pause_s)
-
-    def result(self) -> GroupResult:
-        """Of all."""
-        results, seconds = zip(*(self.done[i] for i in range(len(self.jobs))), strict=True)
-        first = (next(iter(job.records), None) for job in self.jobs)
-        queued_s = tuple(0.0 if it is None else it.start_s - it.queued_s for it in first)
-        return GroupResult(results, queued_s, seconds)

@@ -80,7 +80,7 @@ class Engine(Protocol):
         ...
 
     async def run(self, job: Job) -> Result:
-        """The result of a query's job; a job that was refused may be run again."""
+        """The result of a query's job."""
         ...
 
     async def pose_rig(

@@ -135,7 +135,7 @@ class QueueEngine:
         return Job(caller.flow, run.first_step, caller.deadline_s, size_bytes)
 
     async def run(self, job: Job) -> Result:
-        """The result of a query's job; a job that was refused may be run again.
+        """The result of a query's job.
 
         Raises:
             RequestError: a bad image, unknown scene or reference, a full queue, a passed deadline.

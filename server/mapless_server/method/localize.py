@@ -1,4 +1,4 @@
-"""The method, on one screen: correspond > coarse > scale > structure > match > pnp (the paper), then adjust (ours).
+"""The method on one screen: correspond > coarse > scale > structure > match > pnp > gate > adjust > covariance > judge.
 
 `localize` calls the three parts in order for one query. The queue calls each part separately: `prepare` (correspond),
 `reconstruct` (coarse and scale of a batch of queries; in `pipeline`), `refine` (the rest).
@@ -75,8 +75,7 @@ def prepare(
     bucket = pipeline.reconstructor.bucket(query, nearby)
     with context.stage("correspond"):
         correspondences = pipeline.matcher.correspond(query, nearby, False, context.check, query_matches)
-    known = priors.shifted(-origin)
-    return Prepared(query, nearby, origin, pipeline, options, correspondences, bucket, context, known)
+    return Prepared(query, nearby, origin, pipeline, options, correspondences, bucket, context, priors.shifted(-origin))
 
 
 def refine(coarse: Coarse) -> Answer:

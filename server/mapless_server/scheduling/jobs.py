@@ -150,6 +150,11 @@ class StageRecord:
     batch: int
     jobs: int
 
+    @property
+    def waited_s(self) -> float:
+        """How long the job waited before it was computed or stopped waiting."""
+        return self.start_s - self.queued_s
+
 
 @dataclass(eq=False)
 class Job:
@@ -192,11 +197,6 @@ class Job:
     checked_s: float = -math.inf
     timer_s: float = -math.inf
     _over: threading.Event = field(default_factory=threading.Event)
-
-    @property
-    def waited_s(self) -> float:
-        """How long it waited for the stages that it has been through."""
-        return sum(record.start_s - record.queued_s for record in self.records)
 
     @property
     def is_over(self) -> bool:

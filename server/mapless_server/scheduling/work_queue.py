@@ -140,11 +140,14 @@ class WorkQueue:
         """Submits a job and waits for its result; cancelling the wait cancels the job.
 
         Raises:
-            Refused: there is no room for it; the same job may be run again.
+            ValueError: it has been run and has ended.
+            Refused: there is no room for it.
             Expired: its deadline passed.
             Fatal: the queue has ended.
             Exception: its stage failed with it.
         """
+        if job.is_over:
+            raise ValueError("a job that has ended cannot be run again")
         loop = asyncio.get_running_loop()
         future: asyncio.Future[Any] = loop.create_future()
 

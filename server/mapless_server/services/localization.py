@@ -11,7 +11,7 @@ from typing import Any
 
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
-from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES, GroupResult, localize_each
+from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES, GroupResult, PhotoGroup
 from mapless_server.engine.interface import Engine
 from mapless_server.engine.query import Query, Result
 from mapless_server.method.answer import Localization
@@ -106,7 +106,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
                     getattr(response, echoed).CopyFrom(getattr(request, echoed))
             response.diagnostics.CopyFrom(diagnostics_to_message(result, query.options))
             response.diagnostics.request_id = call.request_id
-            response.diagnostics.queue_duration.FromNanoseconds(round(1e9 * job.waited_s))
+            response.diagnostics.queue_duration.FromNanoseconds(round(1e9 * sum(it.waited_s for it in records)))
             response.diagnostics.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))
             return response
 
@@ -118,10 +118,11 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
                 coarse.set_result(to_message(result))
 
         job = engine.query_job(query, call.caller, on_coarse=None if coarse is None else give_coarse)
+        records = job.records  # what the functions above use, not the job: it holds the photograph, and them
         try:
             result = await engine.run(job)
         finally:
-            call.record(job.records)
+            call.record(records)
         response, answer = to_message(result), result.answer
         parts_ms = {stage: round(1000 * seconds, 1) for stage, seconds in result.stage_seconds.items()}
         call.note(parts_ms=parts_ms, used_references=len(result.references))
@@ -228,12 +229,12 @@ async def localize_photographs(engine: Engine, queries: Sequence[Query], call: C
         list_name: the field of the request that holds them.
 
     Raises:
-        RequestError: as of `localize_each`.
+        RequestError: as of `PhotoGroup.localize`.
     """
     call.note(scene=queries[0].scene_key, images=len(queries))
-    jobs = [engine.query_job(query, call.caller) for query in queries]
+    group = PhotoGroup(engine, queries, call.caller, list_name)
     try:
-        return await localize_each(engine, jobs, call.caller, list_name)
+        return await group.localize()
     finally:
-        for job in jobs:
-            call.record(job.records)
+        for records in group.records:
+            call.record(records)
