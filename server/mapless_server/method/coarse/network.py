@@ -55,7 +55,7 @@ class NetworkReconstructor:
     """A `Reconstructor`; safe to use from several threads.
 
     Attributes:
-        cache: tokens of references; its counters are for whoever watches.
+        cache: tokens of references; its counters are read by the metrics.
     """
 
     def __init__(self, runner: NetworkRunner, options: NetworkOptions | None = None) -> None:

@@ -1,7 +1,8 @@
-"""Whether what photographs say alone fits what they were said to be to one another: mounts and units that are wrong.
+"""Checks of a group: mountings and units that single photographs contradict, and what helps after a rejection.
 
-A rig has one pose whatever its mounts are, and a walk bends to any unit of length; both are answered with small radii,
-because the photographs that fit agree well. What tells is the photographs that fit no more, and the length of the way.
+A rig has one pose whatever its mounting, and a sequence bends to any unit of length; both are answered with small
+radii, because the photographs that fit agree well. The evidence against them is the photographs that do not fit any
+more, and the length of the way.
 """
 
 from __future__ import annotations

@@ -260,7 +260,7 @@ class GroupProblem(Generic[F]):
         for (its_matrix, its_gradient, _), its_columns in zip(reduced, columns, strict=True):
             matrix += its_columns.T @ its_matrix @ its_columns
             gradient += its_columns.T @ its_gradient
-        # A parameter that nothing tells (a photograph without matches, before anything holds it) stays.
+        # An unobserved parameter (a photograph without matches, before anything holds it) stays.
         step = solve_step(matrix, gradient, least_norm=True)
         if step is None:
             return None
@@ -282,7 +282,7 @@ class GroupProblem(Generic[F]):
         return matrix, gradient
 
     def covariance(self, point: Point[F]) -> Array:
-        """(N, N) of the freedom's parameters; infinite on the diagonal where nothing tells them.
+        """(N, N) of the freedom's parameters; infinite on the diagonal of unobserved ones.
 
         What holds the photographs together is believed as it is said, the observations less than they say (see
         AdjustOptions.error_inflation).

@@ -102,7 +102,7 @@ class CapturedCall:
         method: "Localize", "LocalizeRig" or "LocalizeSequence".
         tenant: whose call.
         scene_id: of the scene, as its tenant knows it.
-        scene_created_us: when the scene was created, Unix microseconds; tells scenes of one name apart.
+        scene_created_us: when the scene was created, Unix microseconds; distinguishes scenes of one name.
         circumstances: what else decides an answer, by name: versions, settings, weights.
         attributes: of the scene.
         parts: one for each photograph.

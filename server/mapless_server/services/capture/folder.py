@@ -68,7 +68,7 @@ class CapturedEntry:
     Attributes:
         path: its file.
         scene_key: its scene.
-        scene_created_us: when the scene was created, Unix microseconds; tells scenes of one name apart.
+        scene_created_us: when the scene was created, Unix microseconds; distinguishes scenes of one name.
         references: id and key of each.
         blobs: files that it needs.
         disk_bytes: of its own file.
