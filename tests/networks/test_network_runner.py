@@ -15,7 +15,7 @@ from mapless_server.networks.blocks import Attention, flash_attention
 from mapless_server.networks.network import Network, NetworkOutput, Sizes
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.pi3x import Pi3X
-from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions, UnsuitableDevice
+from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions, UnsuitableDevice
 
 GRID = (2, 3)
 
@@ -79,7 +79,7 @@ def test_compiled_it_answers_the_same_without_compiling_again(name: str) -> None
     """That it compiles as a whole also shows that nothing in it waits for the device: that would break the graph."""
     plain = NetworkRunner(shallow_network(name), name, "sha")
     compiled = NetworkRunner(shallow_network(name), name, "sha", options=RunnerOptions(compile_backend="eager"))
-    compiled.warm_up([Bucket(GRID, 3), Bucket((3, 2), 3)])
+    compiled.warm_up([CompiledShape(GRID, 3), CompiledShape((3, 2), 3)])
     counters.clear()
     # The last one was not warmed up, and is run as it is.
     for views, grid in ((3, GRID), (3, (3, 2)), (3, GRID), (4, (3, 3))):

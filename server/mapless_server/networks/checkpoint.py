@@ -1,4 +1,4 @@
-"""A network's weights from a safetensors file: every tensor, every shape, nothing else; never a pickle."""
+"""Loads a network's weights from a safetensors file, whose tensors must be exactly the network's."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ UNUSED = (
     *("omega", "flow_decoder.", "flow_head.", "global_points_decoder.", "global_point_head."),
     *("depth_encoder.", "depth_emb"),
 )
-"""Beginnings of names in checkpoints of Pi3 and Pi3X that only their training uses, and that are for given depths."""
+"""Prefixes of names in checkpoints of Pi3 and Pi3X that are not used here: for training, and for given depths."""
 
 _DTYPES = {
     "F64": torch.float64,
@@ -47,31 +47,31 @@ def load_strictly(
     ignored_prefixes: tuple[str, ...] = (),
     device: torch.device | str = "cpu",
 ) -> str:
-    """Replaces all parameters and persistent buffers of a module by those of a file; other buffers stay as they are.
+    """Replaces all parameters and persistent buffers of a module by those of a file; other buffers are not changed.
 
-    The file is read once: what is hashed is what is loaded, so the identity cannot be that of another file, which a
-    digest kept beside the file could (copying tools keep sizes and times). Tensors are read one at a time, so a module
-    built on the meta device (`with torch.device("meta")`) costs its own size and one tensor more. Numbers are converted
-    to the dtype that the module has for them.
+    The file is read once, and the bytes that are hashed are those that are loaded; a digest recorded beside the file
+    could belong to another file (copying tools preserve sizes and times). Tensors are read one at a time, so a module
+    on the meta device (`with torch.device("meta")`) needs memory for itself and one tensor. Numbers are converted to
+    the dtype of the module's tensor.
 
     Args:
-        module: on any device; on the meta device best.
+        module: on any device; the meta device saves memory.
         file: safetensors, of any floating-point type.
-        optional: names that the file may lack, with the values they then get; None leaves the module's own.
-        ignored_prefixes: names that begin so may be surplus, and are read (to be hashed) but not kept.
-        device: where the tensors go.
+        optional: names that the file may lack, with their default values; None leaves the module's own.
+        ignored_prefixes: further names with these prefixes are allowed; their tensors are hashed and dropped.
+        device: of the loaded tensors.
 
     Returns:
         The weights' identity: SHA-256 of the file, 64 hexadecimal digits.
 
     Raises:
-        CheckpointError: the file cannot be read, is no safetensors file or a damaged one, holds other tensors than the
-            module, or numbers that are not finite. The module is then as it was.
+        CheckpointError: the file cannot be read, is not a safetensors file or a damaged one, holds other tensors than
+            the module, or numbers that are not finite. The module is then unchanged.
     """
     state = module.state_dict()
     header = read_header(file)
-    who = f"{file} does not fit {type(module).__name__}"
-    check_fit(header, expected_tensors(module), optional.keys(), ignored_prefixes, who)
+    message = f"{file} does not fit {type(module).__name__}"
+    check_fit(header, expected_tensors(module), optional.keys(), ignored_prefixes, message)
     with opened(file) as stream:
         digest = hashlib.sha256(stream.read(header.size_bytes))
         loaded = {name: tensor.to(device) for name, tensor in _defaults(state, header.entries, optional).items()}
@@ -98,7 +98,7 @@ def expected_tensors(module: torch.nn.Module) -> dict[str, tuple[tuple[int, ...]
 def _defaults(
     state: Mapping[str, torch.Tensor], entries: Mapping[str, Entry], optional: Mapping[str, Sequence[float] | None]
 ) -> dict[str, torch.Tensor]:
-    """Values for what the file lacks."""
+    """Values of the optional tensors that the file lacks."""
     values: dict[str, torch.Tensor] = {}
     for name, given in optional.items():
         if name not in state or name in entries:
@@ -119,7 +119,7 @@ def _read(stream: BufferedReader, entry: Entry, file: Path) -> torch.Tensor:
 
 
 def _is_finite(tensor: torch.Tensor) -> bool:
-    """Whether all numbers are; by their extremes, which costs a thirtieth of torch.isfinite."""
+    """Whether all numbers are finite; by their extremes, in a thirtieth of the time of torch.isfinite."""
     return not tensor.is_floating_point() or tensor.numel() == 0 or all(map(math.isfinite, tensor.aminmax()))
 
 

@@ -1,7 +1,7 @@
-"""What Pi3X takes beside the images: rays of all views, and poses of some.
+"""The conditions of Pi3X, its input beside the images: rays of all views, poses of some.
 
-Poses enter through attention whose queries, keys and values are moved by the cameras (PRoPE, Li et al. 2025), among the
-views that have one; rays are added to the patch tokens.
+Poses enter through attention among the posed views, whose queries, keys and values are transformed by the cameras
+(PRoPE, Li et al. 2025); rays are added to the patch tokens.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def rays_from_intrinsics(intrinsics: Tensor, height_px: int, width_px: int) -> T
     pixels = torch.stack(
         [*torch.meshgrid(columns, rows, indexing="xy"), torch.ones_like(rows)[:, None].expand(-1, width_px)]
     )
-    # 3x3 inverses by cofactors: a library's inverse makes the host wait.
+    # 3x3 inverses by cofactors: torch.linalg.inv makes the host wait for the device.
     rays = torch.einsum("vij,jhw->vihw", invert_small(intrinsics), pixels)
     return rays[:, :2] / rays[:, 2:]
 
@@ -51,8 +51,8 @@ def invert_poses(poses: Tensor) -> Tensor:
 def normalize_poses(poses: Tensor) -> Tensor:
     """Poses of each scene's views relative to its first, at the scale of the network's training.
 
-    The mean distance of the other views from the first is 1: of all of them, also of those whose pose is then not used
-    (so what stands in for an unknown pose matters).
+    The mean distance of the other views from the first is 1, of all of them, also those whose pose is not used. So the
+    value given for an unknown pose matters.
 
     Args:
         poses: (B, N, 4, 4) world_from_camera.
@@ -76,8 +76,9 @@ def normalize_poses(poses: Tensor) -> Tensor:
 class Prope:
     """Camera-relative positions of M posed views with P patches each.
 
-    A head's first d/2 channels, four by four, are moved between cameras; the next d/4 turn with the patch's column and
-    the last d/4 with its row. Queries meet keys and values in the world of the first view; outputs return from it.
+    A head's first d/2 channels, four by four, are transformed between cameras; the next d/4 are rotated by the patch's
+    column and the last d/4 by its row. Queries, keys and values are compared in the frame of the first view; outputs
+    are transformed back.
 
     Attributes:
         camera_from_world, world_from_camera: (B, M, 4, 4) of the views.
@@ -122,10 +123,7 @@ def prope(poses: Tensor, grid: tuple[int, int], head_width: int) -> Prope:
 
 
 class PoseInjection(nn.Module):
-    """What the posed views' patches learn from one another's cameras, to be added to them.
-
-    Attention and MLP read the same input, side by side.
-    """
+    """The update of the posed views' patches by one another's cameras. Attention and MLP are parallel branches."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()

@@ -1,6 +1,6 @@
 """The main decoder: blocks that attend within each view and over all views in turn (Wang et al. 2025, pi^3).
 
-No view is special: the network is equivariant to their order.
+The network is equivariant to the order of views.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ SPECIALS = 5
 """Learned tokens in front of each view's patches."""
 
 Injection = Callable[[int, Tensor], Tensor]
-"""Takes the index of a block and its output (B, N, T, C), and gives what the next one gets."""
+"""From the index of a block and its output (B, N, T, C) to the input of the next block."""
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """How the T = 5 + P tokens of one view lie; the same for all views of a scene. Made once for each size of images.
+    """The arrangement of the T = 5 + P tokens of one view, the same for all views of a scene.
 
     Attributes:
         grid: rows and columns of patches.
-        rope: special tokens stand at (0, 0), patches at (row + 1, column + 1).
+        rope: special tokens have position (0, 0), patches (row + 1, column + 1).
     """
 
     grid: tuple[int, int]
@@ -42,13 +42,13 @@ def make_layout(grid: tuple[int, int], head_width: int, device: torch.device) ->
 
 
 class AlternatingDecoder(nn.ModuleList):
-    """An even number of blocks; those with an even index see one view, those with an odd one the whole scene."""
+    """An even number of blocks; those with an even index attend within a view, the others over the whole scene."""
 
     def __init__(self, width: int, heads: int, depth: int) -> None:
         super().__init__(Block(width, heads, normalize_qk=True) for _ in range(depth))
 
     def begin(self, tokens: Tensor, rope: Rope) -> Tensor:
-        """Block 0: tokens (V, T, C) to (V, T, C). It depends on each view alone, so its result can be kept."""
+        """Block 0: tokens (V, T, C) to (V, T, C). It depends on each view alone, so its result can be cached."""
         return self[0](tokens, rope)
 
     def forward(self, tokens: Tensor, rope: Rope, inject: Injection | None = None) -> Tensor:
@@ -57,7 +57,7 @@ class AlternatingDecoder(nn.ModuleList):
         Args:
             tokens: (B, N, T, C) of B scenes with N views, after `begin`.
             rope: of one view.
-            inject: changes what a block over the whole scene gives; None changes nothing.
+            inject: changes the output of a block over the whole scene; None changes nothing.
 
         Returns:
             (B, N, T, 2 C): the last block within views, then the last one over the scene.

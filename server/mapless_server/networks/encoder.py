@@ -1,4 +1,4 @@
-"""The image encoder: DINOv2 ViT-L/14 with registers (Oquab, Darcet et al. 2023). It sees one view at a time."""
+"""The image encoder: DINOv2 ViT-L/14 with registers (Oquab, Darcet et al. 2023). It encodes each view alone."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The heads, which read values off the decoded tokens of a view. Their decoders see one view at a time.
+"""The heads, which compute values from the decoded tokens of a view. Their decoders take one view at a time.
 
-`HeadDecoder` prepares tokens for a head; `CameraHead` gives a pose; `LinearHead` (Pi3) and `ConvHead` (Pi3X, as in
-MoGe, Wang et al. 2024) give a value for each pixel; `MetricDecoder` (Pi3X) gives one for the scene. Heads compute in
-float32, and their decoders, which have no LayerScale, carry their residual stream in the type of their weights.
+`HeadDecoder` prepares tokens for a head; `CameraHead` computes a pose; `LinearHead` (Pi3) and `ConvHead` (Pi3X, as in
+MoGe, Wang et al. 2024) values for each pixel; `MetricDecoder` (Pi3X) a vector for the scene. Heads compute in float32,
+and their decoders, which have no LayerScale, carry their residual stream in the type of their weights.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ class CrossAttention(nn.Module):
         self.proj = Linear(width, width)
 
     def forward(self, queries: Tensor, context: Tensor, context_rope: Rope) -> Tensor:
-        """(B, Q, C) and (B, M, C) to (B, Q, C). Queries stand at position (0, 0), which turns nothing."""
+        """(B, Q, C) and (B, M, C) to (B, Q, C). Queries have position (0, 0), whose rotation is the identity."""
         q, k, v = (
             projection(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for projection, x in ((self.q_proj, queries), (self.k_proj, context), (self.v_proj, context))
@@ -185,7 +185,7 @@ class CrossAttention(nn.Module):
 
 
 class MetricBlock(nn.Module):
-    """Cross-attention and MLP on the query; the context stays what it is."""
+    """Cross-attention and MLP on the query; the context is not changed."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -202,7 +202,7 @@ class MetricBlock(nn.Module):
 
 
 class MetricDecoder(nn.Module):
-    """One learned query looks at all tokens of the scene."""
+    """One learned query attends to all tokens of the scene."""
 
     def __init__(self, width_in: int, width: int, heads: int, depth: int) -> None:
         super().__init__()

@@ -1,8 +1,8 @@
 """LightGlue (Lindenberger et al. 2023), the network: kornia's layers, the authors' checkpoint.
 
-All layers run, nothing stops early and no keypoint is pruned on the way, so that several pairs of photographs can go
-through together: those with fewer keypoints are padded, and masks keep the padding out of every sum. A pair's matches
-then do not depend on the others', and the host waits for the device once.
+All layers run, without early stopping and without pruning of keypoints, so that several pairs of photographs can be
+matched in one batch: those with fewer keypoints are padded, and masks keep the padding out of every sum. A pair's
+matches do not depend on the other pairs, and the host waits for the device once.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from torch.nn.functional import log_softmax, logsigmoid, scaled_dot_product_atte
 
 from .checkpoint import load_strictly
 
-if TYPE_CHECKING:  # only SuperPoint's needs it
+if TYPE_CHECKING:  # needed for SuperPoint's only
     from transformers import LightGlueConfig
 
 
 class LightGlue(nn.Module):
-    """The network, its parameters under the names of the authors' checkpoint; `token_confidence` only for its sake.
+    """The network, its parameters under the names of the authors' checkpoint. `token_confidence` is loaded, not used.
 
     Args:
         input_dim: of descriptors: 128 for ALIKED, 256 for SuperPoint.
@@ -152,7 +152,7 @@ def load_lightglue(features: str, weights: Path) -> LightGlue:
 
 
 def load_superpoint_lightglue(weights: Path, config: LightGlueConfig | None = None) -> LightGlue:
-    """The network with the weights of the file that transformers reads: the same tensors, cut otherwise.
+    """The network with the weights of the file that transformers reads: the same tensors, split differently.
 
     Args:
         weights: safetensors file with transformers' names. What it holds of SuperPoint itself is not used.
@@ -172,17 +172,17 @@ def load_superpoint_lightglue(weights: Path, config: LightGlueConfig | None = No
 
 
 def _translated(theirs: Mapping[str, Tensor], layers: int) -> dict[str, Tensor]:
-    """Their tensors under our names."""
+    """The tensors of transformers' network under the names of this one."""
     ours = {"posenc.Wr.weight": theirs["positional_encoder.projector.weight"]}
     for i in range(layers):
         layer, to = f"transformer_layers.{i}", f"transformers.{i}"
         for kind in ("weight", "bias"):
             q, k, v = (theirs[f"{layer}.self_attention.{part}_proj.{kind}"] for part in "qkv")
-            # Ours has query, key and value of each channel of each head side by side.
+            # kornia's layer interleaves query, key and value of each channel of each head.
             ours[f"{to}.self_attn.Wqkv.{kind}"] = torch.stack([q, k, v], dim=1).flatten(end_dim=1)
             for our_name, their_name in (
                 ("self_attn.out_proj", "self_attention.o_proj"),
-                # Across photographs queries and keys are made alike, and theirs are the same tensor twice.
+                # Across photographs queries and keys have one projection, which transformers stores twice.
                 ("cross_attn.to_qk", "cross_attention.q_proj"),
                 ("cross_attn.to_v", "cross_attention.v_proj"),
                 ("cross_attn.to_out", "cross_attention.o_proj"),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from .checkpoint import load_strictly
 
-if TYPE_CHECKING:  # none of the packages is needed for the networks of another
+if TYPE_CHECKING:  # each package is needed for its own networks only
     from kornia.feature import ALIKED
     from kornia.feature.xfeat import XFeatModel
     from torch import nn

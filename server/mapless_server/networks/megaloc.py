@@ -1,4 +1,4 @@
-"""MegaLoc (Berton and Masone 2025): one vector for a whole image, the nearer the likelier the same place.
+"""MegaLoc (Berton and Masone 2025): one vector for a whole image; images of one place have similar vectors.
 
 A DINOv2 ViT-B/14 without registers (Oquab et al. 2023), SALAD on top, and a linear layer that mixes the parts. Written
 from the papers and a description of the published model; modules are named as the entries of its checkpoint.
@@ -19,8 +19,8 @@ from .network import IMAGE_MEAN, IMAGE_STD, patch_grid
 from .salad import Salad
 
 POSITION_OFFSET = 0.1
-"""DINOv2 resizes its learned positions by the factor (cells + 0.1) / 37, once a guard against rounding. Weights were
-trained so: on 23 x 23 patches the last samples lie a sixth of a cell elsewhere than without."""
+"""DINOv2 resizes its learned positions by the factor (cells + 0.1) / 37, once a guard against rounding. The weights
+were trained with it: on 23 x 23 patches it moves the last samples by a sixth of a cell."""
 
 REDUCTION_SEED = 2025
 """Of the signed sums; another one makes descriptors that cannot be compared."""
@@ -83,7 +83,7 @@ class Backbone(nn.Module):
 
 
 class Mixing(nn.Module):
-    """SALAD and the linear layer behind it."""
+    """SALAD, then a linear layer."""
 
     def __init__(self, sizes: MegaLocSizes) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ class MegaLoc(nn.Module):
     def __init__(self, sizes: MegaLocSizes | None = None) -> None:
         sizes = sizes or MegaLocSizes()
         super().__init__()
-        # No checkpoint holds the two constants, so they are there even in a network that is made without memory.
+        # No checkpoint holds the two constants, so they have values even in a network on the meta device.
         for name, values in (("image_mean", IMAGE_MEAN), ("image_std", IMAGE_STD)):
             self.register_buffer(name, torch.tensor(values, device="cpu").view(1, 3, 1, 1), persistent=False)
         self.backbone = Backbone(sizes.width, sizes.heads, sizes.depth)
@@ -127,10 +127,10 @@ class MegaLoc(nn.Module):
         return descriptors
 
     def set_compute_type(self, dtype: torch.dtype) -> None:
-        """Casts what computes in low precision: the transformer's linear layers and the patch embedding.
+        """Casts the parts that compute in low precision: the transformer's linear layers and the patch embedding.
 
-        The rest, what adds up residuals and all of SALAD, stays float32: it costs a hundredth, and its logarithms and
-        sums over patches are where rounding would show.
+        The residual stream and all of SALAD stay float32: SALAD is a hundredth of the time, and its logarithms and sums
+        over patches are sensitive to rounding.
         """
         for module in self.backbone.modules():
             if isinstance(module, (Linear, PatchEmbedding)):
@@ -138,13 +138,13 @@ class MegaLoc(nn.Module):
 
     @torch.no_grad()
     def reduce(self, length: int) -> None:
-        """Shortens all descriptors to come; the similarity of two stays the same but for an error around zero.
+        """Shortens all later descriptors; the similarity of two keeps its expected value.
 
         Each new number is a sum of `signed_groups` of old ones, divided by the root of their count: a random projection
         with orthonormal rows. It is built into the linear layer, which shrinks as the descriptors do.
 
         Raises:
-            ValueError: the length is no divisor of the present one.
+            ValueError: the length is not a divisor of the present one.
         """
         if length == self.length:
             return
@@ -162,8 +162,7 @@ class MegaLoc(nn.Module):
 def signed_groups(count: int) -> tuple[Tensor, Tensor]:
     """A random order (count,) int64 of numbers, consecutive ones of which make a group, and a sign (count,) for each.
 
-    From the raw stream of a generator, which NumPy promises to keep as it is; it does not promise that of its
-    distributions.
+    From the raw stream of a generator, which NumPy keeps stable across versions; its distributions are not.
     """
     raw = np.random.PCG64(REDUCTION_SEED).random_raw(2 * count)
     order = np.argsort(raw[:count], kind="stable")
@@ -174,7 +173,7 @@ def signed_groups(count: int) -> tuple[Tensor, Tensor]:
 def _signed_sums(rows: Tensor, order: Tensor, signs: Tensor) -> Tensor:
     """Sums (D, ...) of G each of ``rows`` (D * G, ...), in the order and with the signs (D, G), over the root of G.
 
-    One summand at a time, in memory that is there: all of them together are as large as the rest of the network.
+    One summand at a time, in preallocated memory: all of them together are as large as the rest of the network.
     """
     shape = (-1, *[1] * (rows.dim() - 1))
     total = rows.new_zeros(len(order), *rows.shape[1:])

@@ -1,4 +1,4 @@
-"""What Pi3 and Pi3X have in common: the way from images to decoded tokens, poses and maps."""
+"""The common part of Pi3 and Pi3X: from images to decoded tokens, poses and maps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .heads import CameraHead, HeadDecoder
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
-"""Of ImageNet's pixels, red, green, blue; what the encoder was trained with."""
+"""Of ImageNet's pixels, red, green, blue; the encoder was trained with them."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ class NetworkOutput:
 
 
 class Network(nn.Module, ABC):
-    """A network in two steps, so that the first one's result can be kept for each view.
+    """A network in two steps, so that the result of the first can be cached for each view.
 
-    `encode` sees one view alone; `reconstruct` all views of a scene.
+    `encode` depends on one view alone, `reconstruct` on all views of a scene.
     """
 
     image_mean: Tensor
@@ -75,7 +75,7 @@ class Network(nn.Module, ABC):
         super().__init__()
         self.sizes = sizes
         self.register_token = nn.Parameter(torch.empty(1, 1, SPECIALS, sizes.width))
-        # Checkpoints may lack the two constants, so they are there even in a network that is made without memory.
+        # Checkpoints may lack the two constants, so they have values even in a network on the meta device.
         self.register_buffer("image_mean", torch.tensor(IMAGE_MEAN, device="cpu").view(1, 3, 1, 1))
         self.register_buffer("image_std", torch.tensor(IMAGE_STD, device="cpu").view(1, 3, 1, 1))
         self.encoder = Encoder(sizes.width, sizes.heads, sizes.encoder_depth)
@@ -90,20 +90,20 @@ class Network(nn.Module, ABC):
         return HeadDecoder(2 * sizes.width, sizes.width, width_out, sizes.heads, sizes.head_depth)
 
     def set_compute_type(self, dtype: torch.dtype) -> None:
-        """Casts what computes in low precision: the linear layers of all transformer blocks, and the patch embeddings.
+        """Casts the parts that compute in low precision: linear layers of all transformer blocks, patch embeddings.
 
-        The rest, normalizations, LayerScale, learned tokens and the heads proper, stays float32.
+        The rest, normalizations, LayerScale, learned tokens and the heads themselves, stays float32.
         """
         for module in self.modules():
             if isinstance(module, (Linear, PatchEmbedding)):
                 module.to(dtype)
 
     def layout(self, grid: tuple[int, int]) -> Layout:
-        """The layout of tokens that the methods below ask for, of a grid (rows, columns) of patches."""
+        """The layout of tokens that the methods below take, of a grid (rows, columns) of patches."""
         return make_layout(grid, self.sizes.width // self.sizes.heads, self.register_token.device)
 
     def encode(self, images: Tensor, layout: Layout, intrinsics: Tensor | None = None) -> Tensor:
-        """Tokens (V, T, C) of each view by itself, after block 0 of the decoder; T = 5 + H/14 * W/14.
+        """Tokens (V, T, C) of each view alone, after block 0 of the decoder; T = 5 + H/14 * W/14.
 
         Args:
             images: (V, 3, H, W) in [0, 1], sides multiples of 14.
@@ -126,7 +126,7 @@ class Network(nn.Module, ABC):
         Args:
             tokens: (B, N, T, C) from `encode`.
             layout: of one view.
-            mapped: M; points and confidence cost a tenth of everything, so only what is used is computed.
+            mapped: M; points and confidence of all views would be a tenth of the work, so only those used are computed.
             poses: (B, N, 4, 4) from `conditions.normalize_poses`; None if nothing is known, or
                 the network is not conditioned.
             posed: (B, M') int64, the indices of the views of each scene whose pose is known, two at least.
@@ -158,7 +158,7 @@ class Network(nn.Module, ABC):
     def maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
         """Local points (B, M, H, W, 3), confidence logits (B, M, H, W) of decoded tokens (B, M, T, 2 C); M may be 0."""
         shape = decoded.shape[:2]
-        if not shape.numel():  # which not every kernel takes
+        if not shape.numel():  # not every kernel accepts an empty tensor
             empty = decoded.new_empty(*shape, *(side * PATCH_PX for side in layout.grid), 3)
             return empty, empty[..., 0]
         points, logits = self.read_maps(decoded.flatten(0, 1), layout)
@@ -170,7 +170,7 @@ class Network(nn.Module, ABC):
 
 
 def patch_grid(images: Tensor) -> tuple[int, int]:
-    """Rows and columns of patches of images (..., H, W); ValueError if a side is no multiple of 14."""
+    """Rows and columns of patches of images (..., H, W); ValueError if a side is not a multiple of 14."""
     height, width = images.shape[-2:]
     if height % PATCH_PX or width % PATCH_PX or not height * width:
         raise ValueError(f"images must have sides that are multiples of {PATCH_PX}, not {width}x{height}")

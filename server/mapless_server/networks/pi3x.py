@@ -1,7 +1,7 @@
 """Pi3X, the successor of pi^3: takes intrinsics and poses as conditions, and its output is roughly metric.
 
-Given poses fix neither the frame nor the scale of what it answers: align it with them afterwards, as with Pi3. What the
-official network has for given depths, a fifth of its weights, is not here: no query comes with depths.
+Given poses fix neither the frame nor the scale of the output: align it with them afterwards, as with Pi3. The official
+network's part for given depths, a fifth of its weights, is left out: no query comes with depths.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MAX_LOG_DEPTH = 15.0
 
 
 class Pi3X(Network):
-    """See the module."""
+    """The network of Pi3X, without its part for depths."""
 
     conditioned = True
 
@@ -52,7 +52,7 @@ class Pi3X(Network):
         poses: Tensor | None = None,
         posed: Tensor | None = None,
     ) -> NetworkOutput:
-        """See Network.reconstruct; what it gives is roughly metric."""
+        """See Network.reconstruct; the output is roughly metric."""
         inject = None if poses is None or posed is None else self._injection(poses, posed, layout.grid)
         decoded = self.decode(tokens, layout, inject)
         points, logits = self.maps(decoded[:, :mapped], layout)
@@ -62,7 +62,7 @@ class Pi3X(Network):
         return NetworkOutput(points * metric[:, None, None, None, None], logits, cameras)
 
     def _injection(self, poses: Tensor, posed: Tensor, grid: tuple[int, int]) -> Injection:
-        """Adds to the posed views' patches what they learn from one another's cameras."""
+        """Adds the update by the posed views' cameras to these views' patches."""
         known = torch.take_along_dim(poses, posed[:, :, None, None], dim=1)
         positions = prope(known, grid, self.sizes.width // self.sizes.heads)
 
@@ -72,8 +72,8 @@ class Pi3X(Network):
             specials, patches = x.split([SPECIALS, x.shape[2] - SPECIALS], dim=2)
             chosen = posed[:, :, None, None].expand(-1, -1, *patches.shape[2:])
             block = self.pose_inject_blk[index // INJECTION_PERIOD]
-            learned = block(patches.gather(1, chosen).flatten(1, 2), positions).unflatten(1, (posed.shape[1], -1))
-            patches = patches.scatter_add(1, chosen, learned.to(patches.dtype))
+            update = block(patches.gather(1, chosen).flatten(1, 2), positions).unflatten(1, (posed.shape[1], -1))
+            patches = patches.scatter_add(1, chosen, update.to(patches.dtype))
             return torch.cat([specials, patches], dim=2)
 
         return inject
@@ -92,7 +92,7 @@ class Pi3X(Network):
 
 
 def _scaling_column(scale: Tensor) -> Tensor:
-    """(B, 1, 4, 1): what the last column of a pose is multiplied by to scale its translation by (B,)."""
+    """Factors (B, 1, 4, 1) of the last column of a pose that scale its translation by (B,)."""
     column = scale[:, None].repeat(1, 4)
     column[:, 3] = 1
     return column[:, None, :, None]

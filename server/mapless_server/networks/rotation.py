@@ -1,4 +1,4 @@
-"""The rotation nearest to a matrix, without a decomposition that the host would have to wait for."""
+"""The rotation nearest to a matrix, without a decomposition, for which the host would wait for the device."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 NEWTON_STEPS = 32
-"""From above, Newton's method comes at least a quarter nearer to the largest root of a quartic with each step, and is
-quadratic at the end; where that root is double it halves the distance."""
+"""From above, each step of Newton's method reduces the distance to the largest root of a quartic by at least a quarter,
+and convergence is quadratic at the end; if the root is double, a step halves the distance."""
 
 
 def nearest_rotation(matrices: Tensor) -> Tensor:
@@ -22,8 +22,8 @@ def nearest_rotation(matrices: Tensor) -> Tensor:
     A fixed number of elementwise steps in float64. NaN in gives NaN out, where a library's SVD raises.
 
     Args:
-        matrices: (..., 3, 3), any; near those that have no single nearest rotation the result is not accurate, and on
-            them (the denominator is 0) it is not finite.
+        matrices: (..., 3, 3). Where the nearest rotation is not unique, the denominator is 0 and the result not finite;
+            close to there the result is not accurate.
     """
     m = matrices.double()
     first, second, third = m.unbind(-2)

@@ -1,4 +1,4 @@
-"""A loaded network on a device, run by one thread, in the precision and with the kernels that the device is best at."""
+"""A loaded network on a device, run by one thread, in the precision and with the kernels that suit the device."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ class UnsuitableDevice(ValueError):
 
 
 MAX_COMPILED_SHAPES = 64
-"""Torch gives up compiling after eight shapes; grids and numbers of views make more."""
+"""torch's default, after which it stops compiling, is eight; grids and numbers of views make more."""
 
 
 @dataclass(frozen=True)
-class Bucket:
-    """Shapes that are compiled before the first query.
+class CompiledShape:
+    """The shape of a batch for which a network is compiled before the first query.
 
     Attributes:
         grid: rows and columns of patches.
-        views: of a scene, the query among them; all but it are mapped.
-        scenes: reconstructed at a time.
+        views: of a scene, the query included; all others are mapped.
+        scenes: reconstructed together.
     """
 
     grid: tuple[int, int]
@@ -51,9 +51,9 @@ class RunnerOptions:
     """Options of a runner.
 
     Attributes:
-        dtype: what transformer blocks compute in; None is bfloat16 on CUDA, like the official code, else float32.
-        compile_backend: of torch.compile, for the shapes that `warm_up` is given; None compiles nothing. "inductor"
-            fuses what lies between the matrix products, about a third of the time on a large GPU.
+        dtype: of the computation in transformer blocks; None is bfloat16 on CUDA, like the official code, else float32.
+        compile_backend: of torch.compile, for the shapes passed to `warm_up`; None compiles nothing. "inductor" fuses
+            the operations between matrix products, about a third of the time on a large GPU.
     """
 
     dtype: torch.dtype | None = None
@@ -61,13 +61,13 @@ class RunnerOptions:
 
 
 class NetworkRunner:
-    """Runs a network. Safe to call from several threads; one thread of its own does the work, in order of arrival.
+    """Runs a network. Safe to call from several threads; one thread of its own computes, in order of arrival.
 
     Attributes:
         name: "pi3" or "pi3x".
         weights_sha256: of the checkpoint.
-        device: where.
-        dtype: what transformer blocks compute in, and the type of tokens.
+        device: on which it computes.
+        dtype: of the computation in transformer blocks, and of tokens.
         conditioned: whether the network takes intrinsics and poses.
     """
 
@@ -100,7 +100,7 @@ class NetworkRunner:
     def _compiled(self, backend: str | None) -> tuple[Callable[..., Tensor], Callable[..., NetworkOutput]]:
         if backend is None:
             return self.network.encode, self.network.reconstruct
-        # Graphs of kernels take the launches off the host; other backends and devices know no such mode.
+        # CUDA graphs spare the host the launches of kernels; other backends and devices have no such mode.
         graphs = backend == "inductor" and self.device.type == "cuda"
         compiled = partial(
             torch.compile,
@@ -123,13 +123,13 @@ class NetworkRunner:
         """Ends the thread."""
         self._thread.shutdown()
 
-    def warm_up(self, buckets: Sequence[Bucket]) -> None:
-        """Runs, and compiles, the shapes of these buckets; others are run as they are, never compiled later."""
-        for bucket in buckets:
-            self._thread.submit(self._warm_up, bucket).result()
+    def warm_up(self, shapes: Sequence[CompiledShape]) -> None:
+        """Compiles and runs these shapes; all others are run uncompiled."""
+        for shape in shapes:
+            self._thread.submit(self._warm_up, shape).result()
 
     def encode(self, images: Tensor, intrinsics: Tensor | None = None) -> Tensor:
-        """Tokens of views, each by itself, so that they can be kept.
+        """Tokens of views, each computed alone, so that they can be cached.
 
         Args:
             images: (V, 3, H, W) float32 in [0, 1].
@@ -137,9 +137,9 @@ class NetworkRunner:
                 that is not conditioned.
 
         Returns:
-            (V, T, C) on the device, in the compute type. Rounding here, and not only where tokens are kept, makes no
-            difference between those that were and those that were not. Nor do the other views: they are encoded one by
-            one, because kernels round differently for batches of another size, and a thousand tokens fill a device.
+            (V, T, C) on the device, in the compute type. Tokens are rounded here and not only in a cache, so cached and
+            new tokens are equal. Views are encoded one at a time: kernels round differently for batches of another
+            size, and a thousand tokens fill a device.
         """
         return self._run(self._encode_views, images, intrinsics)
 
@@ -157,9 +157,9 @@ class NetworkRunner:
             tokens: (B, N, T, C) from `encode`.
             grid: rows and columns of patches.
             mapped: M; see Network.reconstruct.
-            poses: (B, N, 4, 4) world_from_camera in any unit and frame, for a conditioned network; plausible ones for
-                views without a pose, which count for the scale.
-            posed: (B, N) bool on the CPU, which views have one; as many in each scene. A single one counts as none.
+            poses: (B, N, 4, 4) world_from_camera in any unit and frame, for a conditioned network. Views without a pose
+                need plausible values, for these enter the scale.
+            posed: (B, N) bool on the CPU, whether a view has a pose; as many in each scene. A single pose is ignored.
 
         Raises:
             ValueError: scenes with different numbers of posed views.
@@ -167,10 +167,10 @@ class NetworkRunner:
         return self._run(self._reconstruct_scenes, tokens, grid, mapped, poses, posed)
 
     def _run(self, work: Callable[..., T], *arguments: Any) -> T:
-        return self._thread.submit(self._prepared, work, *arguments).result()
+        return self._thread.submit(self._without_gradients, work, *arguments).result()
 
-    def _prepared(self, work: Callable[..., T], *arguments: Any) -> T:
-        # Not inference_mode: its tensors are of another kind, for which everything would be compiled a second time.
+    def _without_gradients(self, work: Callable[..., T], *arguments: Any) -> T:
+        # Not inference_mode: for its tensors torch.compile would compile everything a second time.
         with torch.no_grad():
             return work(*arguments)
 
@@ -189,7 +189,7 @@ class NetworkRunner:
         for view in range(len(images)):
             of_view = None if intrinsics is None else intrinsics[view : view + 1]
             tokens = encode(images[view : view + 1], self._layout(grid), of_view)
-            # Recorded graphs write into the same memory again and again; `to` alone copies only if the type changes.
+            # A recorded graph reuses its output's memory, and `to` alone copies only if the type changes.
             parts.append(tokens.to(self.dtype, copy=True))
         return torch.cat(parts)
 
@@ -217,25 +217,25 @@ class NetworkRunner:
         poses = poses.to(self.device, torch.float32, non_blocking=True)
         return normalize_poses(poses), indices.to(self.device, non_blocking=True)
 
-    def _warm_up(self, bucket: Bucket) -> None:
-        height, width = (side * PATCH_PX for side in bucket.grid)
-        self._warm.add(("encode", bucket.grid))
-        references = bucket.views - 1
-        posed = torch.arange(bucket.views).expand(bucket.scenes, -1) < references if self.conditioned else None
+    def _warm_up(self, shape: CompiledShape) -> None:
+        height, width = (side * PATCH_PX for side in shape.grid)
+        self._warm.add(("encode", shape.grid))
+        references = shape.views - 1
+        posed = torch.arange(shape.views).expand(shape.scenes, -1) < references if self.conditioned else None
         count = references if self.conditioned and references > 1 else 0
-        self._warm.add(("reconstruct", bucket.grid, bucket.scenes, bucket.views, references, count))
-        poses = torch.eye(4).repeat(bucket.scenes, bucket.views, 1, 1)
-        poses[..., 0, 3] = torch.arange(bucket.views)
+        self._warm.add(("reconstruct", shape.grid, shape.scenes, shape.views, references, count))
+        poses = torch.eye(4).repeat(shape.scenes, shape.views, 1, 1)
+        poses[..., 0, 3] = torch.arange(shape.views)
         with torch._dynamo.config.patch(recompile_limit=MAX_COMPILED_SHAPES):
             for _ in range(3):  # compiles, records, replays
                 intrinsics = torch.eye(3)[None] if self.conditioned else None
-                tokens = self._prepared(self._encode_views, torch.rand(1, 3, height, width), intrinsics)
-                tokens = tokens.expand(bucket.scenes, bucket.views, -1, -1).contiguous()
-                self._prepared(self._reconstruct_scenes, tokens, bucket.grid, references, poses, posed)
+                tokens = self._without_gradients(self._encode_views, torch.rand(1, 3, height, width), intrinsics)
+                tokens = tokens.expand(shape.scenes, shape.views, -1, -1).contiguous()
+                self._without_gradients(self._reconstruct_scenes, tokens, shape.grid, references, poses, posed)
 
 
 def _keep_graphs_in_this_thread() -> None:
-    """Before torch 2.13 only the thread that happens to import torch's CUDA graphs first can use them."""
+    """Before torch 2.13 only the thread that imports torch's CUDA graphs first can use them."""
     if TorchVersion(torch.__version__) < "2.13" and torch.cuda.is_available():
         from torch._inductor.cudagraph_trees import local
 

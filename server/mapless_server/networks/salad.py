@@ -1,8 +1,8 @@
 """SALAD (Izquierdo and Civera 2024): one vector from an image's tokens, by optimal transport to learned clusters.
 
-Every patch has mass one to give: to clusters, or to a dustbin for what does not identify a place (sky, people).
-Every cluster takes mass one, the dustbin the rest. What a cluster is given, features weighted by mass, is one part of
-the descriptor; the class token's features are another.
+The mass of every patch is one; it goes to clusters, or to a dustbin for what does not identify a place (sky, people).
+Every cluster receives mass one, the dustbin the rest. The sum of features in a cluster, weighted by mass, is one part
+of the descriptor; the class token's features are another.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import torch.nn.functional as F  # noqa: N812  its usual name
 from torch import Tensor, nn
 
 ROUNDS = 3
-"""Of the Sinkhorn iteration; what the published weights were trained with, so not to be tuned."""
-_SAME = nn.Identity
-"""Where training drops features: the published entries' numbers count it."""
+"""Of the Sinkhorn iteration; the published weights were trained with them, so not to be tuned."""
+_DROPOUT = nn.Identity
+"""In the place of the dropout of training, which is counted in the names of the published entries."""
 
 
 class PointLinear(nn.Conv2d):
@@ -37,7 +37,7 @@ class Salad(nn.Module):
         width: channels of a token.
         hidden: between the two layers of each of the three perceptrons.
         clusters: how many.
-        cluster_width: channels of what a cluster is given.
+        cluster_width: channels of a cluster's part.
         token_width: channels of the class token's part.
     """
 
@@ -52,19 +52,19 @@ class Salad(nn.Module):
     def forward(self, patches: Tensor, of_class: Tensor) -> Tensor:
         """Patch tokens (B, P, C) and class tokens (B, C) to (B, length); more patches than clusters."""
         masses = transport(self.score(patches).transpose(1, 2), self.dust_bin)
-        given = self.cluster_features(patches).transpose(1, 2) @ masses.transpose(1, 2)  # (B, cluster_width, clusters)
-        parts = F.normalize(self.token_features(of_class), dim=1), F.normalize(given, dim=1).flatten(1)
+        sums = self.cluster_features(patches).transpose(1, 2) @ masses.transpose(1, 2)  # (B, cluster_width, clusters)
+        parts = F.normalize(self.token_features(of_class), dim=1), F.normalize(sums, dim=1).flatten(1)
         return F.normalize(torch.cat(parts, dim=1), dim=1)
 
 
 def transport(scores: Tensor, dustbin_score: Tensor) -> Tensor:
-    """Masses (B, M, N) that each of N patches gives to each of M clusters; what it gives to the dustbin is left out.
+    """Masses (B, M, N) from each of N patches to each of M clusters, without those to the dustbin.
 
-    Sinkhorn's iteration in logarithms: clusters and dustbin scale to what they may take, then patches to what they
-    have. Patches come last, so each has given exactly one in all; the clusters' sums are one only in the limit.
+    Sinkhorn's iteration in logarithms: clusters and dustbin are scaled to their masses, then patches to theirs. Patches
+    come last, so the mass of each is exactly one; the masses of clusters are one only in the limit.
 
     Args:
-        scores: (B, M, N), the higher the better they go together.
+        scores: (B, M, N) of cluster and patch, higher for a better fit.
         dustbin_score: (), of the dustbin with any patch.
 
     Raises:
@@ -74,14 +74,14 @@ def transport(scores: Tensor, dustbin_score: Tensor) -> Tensor:
     if patches <= clusters:
         raise ValueError(f"{patches} patches are too few for {clusters} clusters: show a larger image")
     scores = torch.cat([scores, dustbin_score.expand(batch, 1, patches)], dim=1)
-    log_taken = scores.new_zeros(clusters + 1)
-    log_taken[-1] = math.log(patches - clusters)
+    log_masses = scores.new_zeros(clusters + 1)
+    log_masses[-1] = math.log(patches - clusters)
     of_patches = scores.new_zeros(batch, 1, patches)
     for _ in range(ROUNDS):
-        of_clusters = log_taken[:, None] - torch.logsumexp(scores + of_patches, dim=2, keepdim=True)
+        of_clusters = log_masses[:, None] - torch.logsumexp(scores + of_patches, dim=2, keepdim=True)
         of_patches = -torch.logsumexp(scores + of_clusters, dim=1, keepdim=True)
     return torch.exp(scores + of_clusters + of_patches)[:, :-1]
 
 
 def _of_patches(width: int, hidden: int, width_out: int) -> nn.Sequential:
-    return nn.Sequential(PointLinear(width, hidden), _SAME(), nn.ReLU(), PointLinear(hidden, width_out))
+    return nn.Sequential(PointLinear(width, hidden), _DROPOUT(), nn.ReLU(), PointLinear(hidden, width_out))

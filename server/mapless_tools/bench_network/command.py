@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions
+from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions
 from mapless_server.observability.provenance import cpu_model
 
 from . import host
@@ -123,7 +123,7 @@ class _Bench:
         """The network as the server runs it, with the shapes of a query of ten references compiled."""
         options = RunnerOptions(compile_backend=self._backend)
         runner = NetworkRunner(make_network(name, device=weights_on), name, "random weights", self.device, options)
-        runner.warm_up([Bucket(GRID, REFERENCES + 1)])
+        runner.warm_up([CompiledShape(GRID, REFERENCES + 1)])
         return runner
 
     def _query(self, name: str) -> Iterator[Figure]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mapless_server.networks.decoder import SPECIALS
 from mapless_server.networks.network import Network, NetworkOutput, Sizes
-from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions
+from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions
 
 from .device import CACHED, median_s
 from .forward import max_difference
@@ -164,7 +164,7 @@ def count_compilations() -> Iterator[Figure]:
     """Graphs that are compiled after the warm-up, by shapes that are warm and one that is not."""
     for name in ("pi3", "pi3x"):
         runner = NetworkRunner(make_network(name, SMALL), name, "random", "cpu", RunnerOptions(compile_backend="eager"))
-        runner.warm_up([Bucket((3, 4), 3), Bucket((4, 3), 4)])
+        runner.warm_up([CompiledShape((3, 4), 3), CompiledShape((4, 3), 4)])
         before = compiled_graphs()
         for grid, views in (((3, 4), 3), ((4, 3), 4), ((3, 4), 3), ((2, 2), 3)):
             _run(runner, grid, views)

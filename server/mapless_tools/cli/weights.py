@@ -15,7 +15,7 @@ from rich.table import Table
 
 from mapless_server.networks.weights.catalogue import CATALOGUE, Weights, WheelMember, named
 from mapless_server.networks.weights.errors import FetchError, LicenceNotAccepted, UnknownWeights, WeightsError
-from mapless_server.networks.weights.folder import Status, look_up, place_of, workplace
+from mapless_server.networks.weights.folder import Status, look_up, path_of, temporary_folder
 from mapless_server.networks.weights.install import Installed, Progress, add, check, fetch
 from mapless_server.networks.weights.sources import require_converter
 from mapless_server.serve.command import fail
@@ -69,7 +69,7 @@ def fetch_command(
         _show_downloads(wanted)
         if not accept_licence and any(weights.licence.restriction for weights in wanted):
             _ask()
-        with terminable(), workplace(folder) as workspace:
+        with terminable(), temporary_folder(folder) as workspace:
             for weights in wanted:
                 _report(weights, fetch(weights, folder, workspace))
 
@@ -118,7 +118,7 @@ def _absent(names: list[str], folder: Path) -> list[Weights]:
     """Those of the named weights that are to be fetched; FetchError if another file is in the place of one."""
     wanted = []
     for weights in dict.fromkeys(map(named, names)):
-        place_of(weights, folder)
+        path_of(weights, folder)
         stored = look_up(weights, folder)
         if stored.status in (Status.OFFICIAL, Status.RECORDED):
             print(f"{weights.name}: already in {stored.path}")

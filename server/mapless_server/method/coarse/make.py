@@ -96,7 +96,7 @@ def _load(
     from mapless_server.networks.checkpoint import UNUSED, load_strictly
     from mapless_server.networks.pi3 import Pi3
     from mapless_server.networks.pi3x import Pi3X
-    from mapless_server.networks.runner import Bucket, NetworkRunner, RunnerOptions
+    from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions
 
     from .grids import GridOptions, fitted_grid
     from .network import NetworkReconstructor
@@ -113,5 +113,5 @@ def _load(
         log.info("backend %s: compiling for %d views", backend, compiled_views)
         limit = (options.grids if options else GridOptions()).pixel_limit
         grids = (fitted_grid(width, height, limit) for width, height in COMPILED_ASPECTS)
-        runner.warm_up([Bucket((grid.rows, grid.columns), compiled_views) for grid in grids])
+        runner.warm_up([CompiledShape((grid.rows, grid.columns), compiled_views) for grid in grids])
     return NetworkReconstructor(runner, options)

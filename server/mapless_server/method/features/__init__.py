@@ -53,7 +53,7 @@ class FeatureExtractor(Protocol):
             camera: its camera, of the same size.
 
         Returns:
-            The view, possibly without keypoints (a blank wall); the caller decides what follows.
+            The view, possibly without keypoints (a blank wall).
         """
         ...
 

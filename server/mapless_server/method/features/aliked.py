@@ -17,15 +17,15 @@ from .network import LearnedOptions, array_of, image_tensor
 
 
 class AlikedExtractor:
-    """ALIKED. Scores are in 0 to 1; blank images have maxima of up to 0.006, weakly textured rooms are full of 0.02.
+    """ALIKED. Scores are in 0 to 1: maxima of up to 0.006 in blank images, of about 0.02 in weakly textured rooms.
 
-    kornia's pixels are ours: (0, 0) is the centre of the top-left one. Photographs reduced to half and three quarters
-    of their size have the same keypoints to 0.1 px, so the weights have learned no shift worth a correction.
+    kornia's pixel coordinates are those used here: (0, 0) is the centre of the top-left pixel. Photographs reduced to
+    half and three quarters of their size have the same keypoints to 0.1 px, so there is no shift to correct.
 
     Args:
         weights: safetensors file, the names of the authors' checkpoint.
         device: "cpu" or a CUDA device.
-        options: see there.
+        options: the defaults if None.
 
     Raises:
         CheckpointError: the weights do not fit.
@@ -59,8 +59,8 @@ class AlikedExtractor:
     def _peak_sizes_px(self, dispersities: torch.Tensor) -> NDArray[np.float32]:
         """Diameter of the score map's peak: four times the root mean square distance of the score from its centre.
 
-        A wide peak says less about where it is: on surveyed photographs the matches of the widest sixth lie 1.6 times
-        as far from their epipolar lines as those of the narrowest, as sizes times `structure.FIRST_GUESS.slope` say.
-        A dispersity is that mean square, in squared radii of the window that kornia looks for the peak in.
+        The position of a wide peak is less certain: on surveyed photographs the matches of the widest sixth lie 1.6
+        times as far from their epipolar lines as those of the narrowest, as sizes times `structure.FIRST_GUESS.slope`
+        predict. A dispersity is that mean square, in squared radii of the window in which kornia searches the peak.
         """
         return 4 * self._network.nms_radius * np.sqrt(array_of(dispersities))

@@ -17,8 +17,8 @@ class LearnedOptions:
 
     Attributes:
         max_keypoints: the strongest are kept; matching is quadratic in it.
-        max_side_px: longer images are reduced to it; what the networks were trained and published with.
-        min_score: weaker keypoints are dropped; each extractor says what its scores are.
+        max_side_px: longer images are reduced to it; the size of the networks' training and publication.
+        min_score: weaker keypoints are dropped; the extractor's docstring gives the range of its scores.
     """
 
     max_keypoints: int = 2048

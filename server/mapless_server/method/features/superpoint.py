@@ -22,13 +22,13 @@ WINDOW_PX = 9
 
 
 class SuperPointExtractor:
-    """SuperPoint. Scores are probabilities of a pixel among its cell's 64, and those of the authors begin at 0.005.
+    """SuperPoint. A score is the probability of a pixel among its cell's 64; the authors' threshold is 0.005.
 
     Args:
         weights: safetensors file, transformers' names.
         device: "cpu" or a CUDA device.
-        options: see there.
-        config: of the network; None is that of the authors' weights.
+        options: the defaults, with the authors' threshold, if None.
+        config: of the network; that of the authors' weights if None.
 
     Raises:
         CheckpointError: the weights do not fit.

