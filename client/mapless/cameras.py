@@ -11,7 +11,7 @@ from google.protobuf import json_format
 from google.protobuf.message import Message
 
 from . import wire
-from .geometry import Camera, RadialTangential, RigidTransform
+from .geometry import DEFAULT_LENS_MODEL, Camera, RigidTransform, lens_from_coefficients
 from .pixels import size_of_image
 from .v1 import geometry_pb2
 
@@ -65,7 +65,7 @@ def read_cameras(file: str | Path) -> dict[Path, Camera]:
     """The photographs of a cameras.json with their cameras, in the file's order.
 
     The file has `frames`, each with `image` (path beside the file), `width`, `height`, `K` (3x3, pixels) and perhaps
-    `dist` (OpenCV's k1 k2 p1 p2 k3); poses are ignored.
+    `dist` (OpenCV's k1 k2 p1 p2 k3) and `lens` ("fisheye": `dist` is then k1 k2 k3 k4); poses are ignored.
 
     Raises:
         OSError: the file cannot be read.
@@ -81,7 +81,7 @@ def read_cameras(file: str | Path) -> dict[Path, Camera]:
 
 def _photograph(path: Path, index: int, frame: Any) -> tuple[Path, Camera]:
     try:
-        k = frame["K"]
+        k, dist = frame["K"], frame.get("dist") or None
         camera = Camera(
             frame["width"],
             frame["height"],
@@ -89,7 +89,7 @@ def _photograph(path: Path, index: int, frame: Any) -> tuple[Path, Camera]:
             float(k[1][1]),
             float(k[0][2]),
             float(k[1][2]),
-            RadialTangential(*map(float, frame["dist"])) if frame.get("dist") else None,
+            lens_from_coefficients(frame.get("lens", DEFAULT_LENS_MODEL), dist and [*map(float, dist)]),
         )
         checked = wire.camera_from_message(wire.camera_to_message(camera), "camera")
         return path.parent / frame["image"], checked

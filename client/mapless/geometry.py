@@ -13,7 +13,8 @@ Everything is float64 NumPy. Points are rows: ``(..., 3)``; pixels are ``(..., 2
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -262,6 +263,48 @@ class Fisheye:
 
 
 Distortion = RadialTangential | Fisheye
+
+LENS_MODELS: Mapping[str, type[Distortion]] = {"radial_tangential": RadialTangential, "fisheye": Fisheye}
+"""Lens models by name. The interface (the oneof `distortion` of CameraIntrinsics), the store and cameras.json use these
+names, and the names of the coefficients; another model begins here."""
+
+DEFAULT_LENS_MODEL = "radial_tangential"
+"""Of a cameras.json that names none; the last coefficient, k3, may be left out there, as in OpenCV."""
+
+
+def lens_model_of(lens: object, field: str = "camera.distortion") -> str:
+    """The name of a lens's model; TypeError, naming the field, if it has none."""
+    for name, kind in LENS_MODELS.items():
+        if isinstance(lens, kind):
+            return name
+    raise unknown_lens(lens, field)
+
+
+def unknown_lens(lens: object, field: str = "camera.distortion") -> TypeError:
+    """The error of a lens whose model has no counterpart where it is needed."""
+    known = ", ".join(kind.__name__ for kind in LENS_MODELS.values())
+    return TypeError(f"{field} is a {type(lens).__name__}, which has no counterpart here; lens models: {known}")
+
+
+def lens_from_coefficients(model: object, coefficients: Sequence[float] | None) -> Distortion | None:
+    """The lens of a model's name and its coefficients in their order, as a cameras.json has both.
+
+    None for the coefficients stands for zeros, of which the default model is a pinhole: no lens.
+
+    Raises:
+        ValueError: no such model, or not as many coefficients as it has.
+    """
+    if not isinstance(model, str) or model not in LENS_MODELS:
+        raise ValueError(f"lens must be one of {', '.join(LENS_MODELS)}, is {model!r}")
+    is_default = model == DEFAULT_LENS_MODEL
+    names = [it.name for it in fields(LENS_MODELS[model])]
+    if coefficients is None:
+        coefficients = [0.0] * len(names)
+    if not len(names) - is_default <= len(coefficients) <= len(names):
+        count = f"{len(names) - 1} or {len(names)}" if is_default else f"{len(names)}"
+        expected = f"null or {count} coefficients ({' '.join(names)})"
+        raise ValueError(f"dist of a {model} lens must be {expected}, has {len(coefficients)}")
+    return LENS_MODELS[model](*coefficients) if any(coefficients) or not is_default else None
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import names
-from .geometry import Array, Camera, Distortion, Fisheye, Quaternion, RadialTangential, RigidTransform
+from .geometry import LENS_MODELS, Array, Camera, Distortion, Quaternion, RigidTransform, lens_model_of, unknown_lens
 from .v1 import geometry_pb2 as pb
 
 T = TypeVar("T")
@@ -93,13 +93,14 @@ def camera_to_message(camera: Camera) -> pb.CameraIntrinsics:
     """Message of a camera."""
     intrinsics = {name: value for name, value in vars(camera).items() if name != "distortion"}
     message = pb.CameraIntrinsics(**intrinsics)
-    lens = camera.distortion
-    if isinstance(lens, RadialTangential):
-        message.radial_tangential.CopyFrom(pb.RadialTangentialDistortion(**vars(lens)))
-    elif isinstance(lens, Fisheye):
-        message.fisheye.CopyFrom(pb.FisheyeDistortion(**vars(lens)))
-    elif lens is not None:
-        raise TypeError(f"camera.distortion must be a RadialTangential or a Fisheye, is a {type(lens).__name__}")
+    if camera.distortion is not None:
+        model = lens_model_of(camera.distortion)
+        if not hasattr(message, model):
+            raise unknown_lens(camera.distortion)
+        of_model = getattr(message, model)
+        of_model.SetInParent()  # also where all coefficients are zero
+        for name, value in vars(camera.distortion).items():
+            setattr(of_model, name, value)
     return message
 
 
@@ -136,7 +137,7 @@ def _distortion_from_message(message: pb.CameraIntrinsics, field: str) -> Distor
             raise FieldError(
                 joined(field, f"{kind}.{name}"), f"must be at most {MAX_DISTORTION:g} in magnitude, is {value:g}"
             )
-    return RadialTangential(**coefficients) if kind == "radial_tangential" else Fisheye(**coefficients)
+    return LENS_MODELS[kind](**coefficients)
 
 
 def transform_to_message(target_from_source: RigidTransform) -> pb.RigidTransform:

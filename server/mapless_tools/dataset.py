@@ -20,7 +20,15 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mapless.geodesy import Datum
-from mapless.geometry import MAX_COORDINATE_M, Array, Camera, Distortion, Fisheye, RadialTangential, RigidTransform
+from mapless.geometry import (
+    DEFAULT_LENS_MODEL,
+    MAX_COORDINATE_M,
+    Array,
+    Camera,
+    Distortion,
+    RigidTransform,
+    lens_from_coefficients,
+)
 from mapless.scenes import Vector, unit_vector
 
 FILE_NAME = "cameras.json"
@@ -253,19 +261,12 @@ def _camera(entry: Mapping[str, Any]) -> Camera:
 
 
 def _distortion(entry: Mapping[str, Any]) -> Distortion | None:
-    lens = entry.get("lens", "radial_tangential")
-    if lens not in ("radial_tangential", "fisheye"):
-        raise ValueError(f"lens must be radial_tangential or fisheye, is {lens!r}")
-    if entry.get("dist") is None:
-        return Fisheye() if lens == "fisheye" else None
-    coefficients = _numbers(entry, "dist", None)
-    if lens == "fisheye":
-        if coefficients.shape != (4,):
-            raise ValueError("dist of a fisheye lens must be null or have 4 coefficients (k1 k2 k3 k4)")
-        return Fisheye(*coefficients.tolist())
-    if coefficients.shape not in ((4,), (5,)):
-        raise ValueError("dist must be null or have 4 or 5 coefficients (k1 k2 p1 p2 [k3])")
-    return RadialTangential(*coefficients.tolist()) if coefficients.any() else None
+    coefficients = None if entry.get("dist") is None else _numbers(entry, "dist", None)
+    if coefficients is not None and coefficients.ndim != 1:
+        raise ValueError("dist must be null or a list of coefficients")
+    return lens_from_coefficients(
+        entry.get("lens", DEFAULT_LENS_MODEL), None if coefficients is None else coefficients.tolist()
+    )
 
 
 def _numbers(entry: Mapping[str, Any], field: str, shape: tuple[int, ...] | None) -> Array:

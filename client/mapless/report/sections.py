@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..answers import Diagnostics, LocalizationResult, PriorCheck, Rejected
-from ..geometry import Array, Camera, Fisheye, RigidTransform
+from ..geometry import Array, Camera, RigidTransform, lens_model_of
 from .markup import UNKNOWN, angle, duration, length, reference_id, section, table, text
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -164,9 +164,8 @@ def provenance_section(diagnostics: Diagnostics, camera: Camera) -> str:
     d = diagnostics
     lens = "none"
     if camera.distortion is not None:
-        kind = "fisheye" if isinstance(camera.distortion, Fisheye) else "radial and tangential"
         values = ", ".join(f"{name} {value:g}" for name, value in vars(camera.distortion).items() if value)
-        lens = f"{kind}: {values or 'all zero'}"
+        lens = f"{lens_model_of(camera.distortion)}: {values or 'all zero'}"
     rows = [
         ["features", d.features],
         ["backend", d.backend + (f", weights {d.weights_sha256[:12]}…" if d.weights_sha256 else "")],

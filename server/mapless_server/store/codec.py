@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geodesy import Datum
-from mapless.geometry import Camera, Distortion, Fisheye, Quaternion, RadialTangential, RigidTransform
+from mapless.geometry import LENS_MODELS, Camera, Distortion, Quaternion, RigidTransform, lens_model_of
 from mapless.scenes import Calibration
 from mapless_server.method.views import Features, View
 
@@ -39,11 +39,6 @@ _PREFIX = struct.Struct("<B3xI")
 _ALIGNMENT_BYTES = 16
 _FLOAT32 = np.dtype("<f4")
 _FLOAT16 = np.dtype("<f2")
-
-_DISTORTION_TYPES: dict[str, type[RadialTangential] | type[Fisheye]] = {
-    "radial_tangential": RadialTangential,
-    "fisheye": Fisheye,
-}
 
 
 class Damaged(Exception):
@@ -212,8 +207,7 @@ def _to_json(content: dict[str, Any]) -> bytes:
 def _camera_to_dict(camera: Camera) -> dict[str, Any]:
     content = asdict(camera)
     if camera.distortion is not None:
-        model = next(name for name, kind in _DISTORTION_TYPES.items() if isinstance(camera.distortion, kind))
-        content["distortion"] = {"model": model, **asdict(camera.distortion)}
+        content["distortion"] = {"model": lens_model_of(camera.distortion), **asdict(camera.distortion)}
     return content
 
 
@@ -221,5 +215,5 @@ def _camera_from_dict(content: dict[str, Any]) -> Camera:
     distortion: Distortion | None = None
     if content["distortion"] is not None:
         parameters = dict(content["distortion"])
-        distortion = _DISTORTION_TYPES[parameters.pop("model")](**parameters)
+        distortion = LENS_MODELS[parameters.pop("model")](**parameters)
     return Camera(**{**content, "distortion": distortion})

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, Fisheye, RadialTangential
+from mapless.geometry import Array, Camera, Fisheye, RadialTangential, unknown_lens
 
 from ..views import Features, View
 
@@ -46,11 +46,12 @@ def undistort_pixels(pixels: Array, camera: Camera) -> Array:
     if isinstance(d, RadialTangential):
         coefficients = np.array([d.k1, d.k2, d.p1, d.p2, d.k3], float)
         ideal = cv2.undistortPoints(points, k, coefficients, R=None, P=k, criteria=criteria).reshape(-1, 2)
-    else:
-        assert isinstance(d, Fisheye)
+    elif isinstance(d, Fisheye):
         ideal = cv2.fisheye.undistortPoints(
             points, k, np.array([d.k1, d.k2, d.k3, d.k4], float), P=k, criteria=criteria
         )[:, 0]
+    else:
+        raise unknown_lens(d)
     # The iteration may diverge where the model folds over; only pixels that project back to themselves are solutions.
     rays = camera.rays(ideal)
     returned = camera.project(rays)

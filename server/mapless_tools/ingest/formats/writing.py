@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mapless import Scene
-from mapless.geometry import Camera, Fisheye, RigidTransform
+from mapless.geometry import DEFAULT_LENS_MODEL, Camera, RigidTransform, lens_model_of
 from mapless_tools.dataset import FILE_NAME
 
 from .colmap.cameras import from_camera
@@ -105,7 +105,8 @@ def _entry(image: PosedImage) -> dict[str, Any]:
         "dist": None if lens is None else list(vars(lens).values()),
         "world_from_camera": image.world_from_camera.matrix().tolist(),
     }
-    return entry | {"lens": "fisheye"} if isinstance(lens, Fisheye) else entry
+    model = DEFAULT_LENS_MODEL if lens is None else lens_model_of(lens)
+    return entry if model == DEFAULT_LENS_MODEL else entry | {"lens": model}
 
 
 def _words(numbers: Sequence[float]) -> str:

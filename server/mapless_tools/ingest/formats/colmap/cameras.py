@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
-from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential
+from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, unknown_lens
 
 from ..collecting import from_corner
 
@@ -88,10 +88,12 @@ def from_camera(camera_id: int, camera: Camera) -> ColmapCamera:
     coefficients: tuple[float, ...] = ()
     if isinstance(lens, Fisheye):
         model, coefficients = "OPENCV_FISHEYE", astuple(lens)
-    elif lens is not None and lens.k3 == 0:
+    elif isinstance(lens, RadialTangential) and lens.k3 == 0:
         model, coefficients = "OPENCV", (lens.k1, lens.k2, lens.p1, lens.p2)
-    elif lens is not None:
+    elif isinstance(lens, RadialTangential):
         model, coefficients = "FULL_OPENCV", (*astuple(lens), 0.0, 0.0, 0.0)
+    elif lens is not None:
+        raise unknown_lens(lens)
     centre = (camera.principal_x_px + 0.5, camera.principal_y_px + 0.5)
     parameters = (camera.focal_x_px, camera.focal_y_px, *centre, *coefficients)
     return ColmapCamera(camera_id, model, camera.width_px, camera.height_px, parameters)
