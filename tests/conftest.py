@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zlib
 
 import pytest
@@ -10,6 +11,8 @@ from hypothesis import settings
 # Machines are shared: how long an example takes says nothing of the code.
 settings.register_profile("shared", deadline=None)
 settings.load_profile("shared")
+# Servers that tests start as processes begin without the seconds of computing that make first answers fast.
+os.environ.setdefault("MAPLESS_WARM_UP", "false")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -94,10 +94,9 @@ def chess(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _same_code_and_no_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who edits the code while its tests run measures anew; the first call's time is nobody's matter here."""
+def _same_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Code that is edited while its tests run would be measured anew."""
     monkeypatch.setattr("mapless_tools.evaluate.provenance.commit_of", lambda _: "abc1234")
-    monkeypatch.setenv("MAPLESS_WARM_UP", "false")
 
 
 def test_a_failed_scene_stops_no_other_and_is_measured_later(chess: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from support.layouts import write_cameras
 from support.wall import wall
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from mapless.geometry import Camera
 from mapless_tools.cli.app import app
@@ -32,13 +32,13 @@ def command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "mapless_tools", *map(str, arguments)]
 
 
-def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=120)
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [*map(str, arguments)])
 
 
 def refusal(*arguments: object) -> str:
     """What is said of arguments that are wrong: one line, and exit code 2."""
-    done = CliRunner().invoke(app, [*map(str, arguments)])
+    done = run(*arguments)
     assert done.exit_code == 2
     assert done.stdout == ""
     assert len(done.stderr.strip().splitlines()) == 1
@@ -47,7 +47,7 @@ def refusal(*arguments: object) -> str:
 
 def test_leaves_one_out(folder: Path, tmp_path: Path) -> None:
     done = run("evaluate", folder, "--queries", 3, "--json", tmp_path / "figures.json")
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.output
     assert "3 of 3" in done.stdout
     assert "localizing: 3" in done.stderr
     figures: dict[str, Any] = json.loads((tmp_path / "figures.json").read_text())
@@ -61,7 +61,7 @@ def test_leaves_one_out(folder: Path, tmp_path: Path) -> None:
 
 def test_chosen_references(folder: Path, tmp_path: Path) -> None:
     done = run("evaluate", folder, "--references", 4, "--queries", 3, "--k", 3, "--json", tmp_path / "figures.json")
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.output
     figures = json.loads((tmp_path / "figures.json").read_text())
     references = {"0", "3", "5", "8"}
     assert figures["references"] == 4

@@ -214,7 +214,7 @@ def test_terminated_in_the_middle_the_next_run_goes_on(tmp_path: Path) -> None:
         write_image(folder / "images" / f"p{i:03d}.png", i, 160, 120)
         images.append(PosedImage(f"p{i:03d}.png", Camera(160, 120, 150.0, 150.0, 79.5, 59.5), pose))
     (folder / "cameras.json").write_text(LAYOUTS["cameras"](images, "a test")["cameras.json"])
-    environment = os.environ | {"MAPLESS_DATA_DIR": str(tmp_path / "store"), "MAPLESS_WARM_UP": "false"}
+    environment = os.environ | {"MAPLESS_DATA_DIR": str(tmp_path / "store")}
     report = tmp_path / "report.json"
     arguments = [sys.executable, "-c", PROGRAM, "import", str(folder), "place", "--skip-check", "--report", str(report)]
     process = subprocess.Popen(arguments, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)

@@ -99,7 +99,7 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a call of each kind, by itself, and some of them once more, side by side."""
     folder = tmp_path_factory.mktemp("captured")
     flags = {"--capture-dir": str(folder / "calls"), "--workers": "2"}
-    environment = {"MAPLESS_WARM_UP": "false", "MAPLESS_CAPTURE_HOURS": "1"}
+    environment = {"MAPLESS_CAPTURE_HOURS": "1"}
     with (
         child_server(folder / "data", flags, environment) as server,
         Client(server.address) as client,

@@ -17,7 +17,6 @@ from support.stores import (
     EXTRACTOR,
     Folder,
     Place,
-    Shared,
     assert_same_view,
     faults_of,
     make_reference,
@@ -30,8 +29,7 @@ from mapless.geodesy import Datum
 from mapless_server.security import DEFAULT_TENANT, SceneKey, key_of
 from mapless_server.store import SceneAttributes, Store, StoreError, codec, tables
 from mapless_server.store.backup import GENERATIONS_SKIPPED, back_up, restore
-from mapless_server.store.postgresql import PostgresqlDatabase
-from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase, choose_library
+from mapless_server.store.sqlite import SqliteDatabase, choose_library
 from mapless_server.store.verification import verify
 from mapless_tools.cli.store import store_app
 
@@ -139,11 +137,8 @@ def test_a_backup_beside_writers_shows_one_moment(place: Place, tmp_path: Path) 
         try:
             for number in range(2):
                 path = tmp_path / f"{number}.sqlite3"
-                source = place.url if isinstance(place, Shared) else str(tmp_path / "data" / DATABASE_FILE)
-                paths = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
-                environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-                command = [sys.executable, __file__, source, str(path)]
-                subprocess.run(command, check=True, timeout=60, env=environment)
+                with closing(place.open_as_is()) as source:
+                    back_up(source, path)
                 with closing(SqliteDatabase.open_as_is(path)) as database, database.read() as connection:
                     found = verify(connection)
                 assert found.faults == ()
@@ -273,12 +268,3 @@ def test_commands_do_it_beside_a_server(tmp_path: Path, backup: Path, monkeypatc
     assert "reference 'r0': image" in said
     shutil.rmtree(other)
     assert f"schema version {tables.SCHEMA_VERSION}" in run("migrate", "--data-dir", str(other))
-
-
-if __name__ == "__main__":
-    source, destination = sys.argv[1:]
-    is_url = source.startswith("postgresql:")
-    with closing(
-        PostgresqlDatabase.open_as_is(source) if is_url else SqliteDatabase.open_as_is(Path(source))
-    ) as opened:
-        back_up(opened, Path(destination))
