@@ -58,34 +58,12 @@ def settings_table() -> str:
             [
                 f"`{name}`",
                 f"{flag}<br>`{settings.PREFIX}{name.upper()}`",
-                _default(name, field),
-                ", ".join(_bounds(field)),
+                f"`{default}`" if (default := settings.default_text(name)) else "",
+                settings.bounds_text(name),
                 str(field.description),
             ]
         )
     return table(["setting", "flag, variable", "default", "bounds", "meaning"], rows)
-
-
-def _default(name: str, field: Any) -> str:
-    computed = {"workers": "all cores", "weights_dir": "`~/.cache/mapless/weights`"}
-    if name in computed:
-        return computed[name]
-    if field.default is None or field.default == "":
-        return ""
-    value = str(field.default).lower() if isinstance(field.default, bool) else f"{field.default}"
-    return f"`{value.removesuffix('.0')}`"
-
-
-def _bounds(field: Any) -> Iterator[str]:
-    signs = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
-    for bound in field.metadata:
-        for name, words in signs.items():
-            value = getattr(bound, name, None)
-            if value is not None:
-                yield f"{words} {value:g}"
-    allowed = getattr(field.annotation, "__args__", ())
-    if allowed and all(isinstance(value, str) for value in allowed):
-        yield " ".join(f"`{value}`" for value in allowed)
 
 
 # Errors

@@ -8,9 +8,20 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SecretStr,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from mapless_server.method.choices import AUTO, BACKENDS, FEATURES
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -60,18 +71,18 @@ class Settings(BaseModel):
     """Folder of the store, on a local disk; as a flag, it replaces database_url."""
     database_url: SecretStr | None = None
     """URL of a PostgreSQL that several servers share, postgresql://user:password@host/name; else data_dir."""
-    backend: str = "geometric"
-    """Backend of the coarse stage: geometric, pi3, pi3x (both non-commercial), or auto."""
-    features: str = "sift"
-    """Local features: sift, aliked, xfeat, superpoint (research only), or auto."""
+    backend: str = Field(default="geometric", json_schema_extra={"enum": [AUTO, *BACKENDS]})
+    """Backend of the coarse stage; the weights of pi3 and pi3x are for non-commercial use."""
+    features: str = Field(default="sift", json_schema_extra={"enum": [AUTO, *FEATURES]})
+    """Local features; superpoint is for research only."""
     device: str = "auto"
     """Device of networks: auto, cpu, cuda or cuda:N."""
     weights_dir: Path = Field(default_factory=default_weights_dir)
     """Folder of the networks' weights."""
     compiled_views: int = Field(default=0, ge=0, le=65)
-    """Photographs of a query, itself included, that a network is compiled for at the start; 0: none."""
+    """Photographs of a query, itself included, that a network is compiled for at the start, at least 3; 0: none."""
     workers: int = Field(default_factory=available_cores, ge=1)
-    """Threads that compute; default: all cores."""
+    """Threads that compute."""
     max_batch: int = Field(default=4, ge=1, le=64)
     """Queries that a network reconstructs at a time."""
     max_queued_s: float = Field(default=2.0, gt=0)
@@ -94,8 +105,8 @@ class Settings(BaseModel):
     """Largest image file, MiB."""
     max_image_megapixels: float = Field(default=50.0, gt=0, le=268)
     """Largest image, width times height."""
-    retrieval: str = "auto"
-    """Descriptors by which references are chosen: vlad (of the local features), megaloc, or auto."""
+    retrieval: str = Field(default=AUTO, json_schema_extra={"enum": [AUTO, "vlad", "megaloc"]})
+    """Descriptors by which references are chosen; vlad is made of the local features."""
     retrieval_cache_mib: int = Field(default=1024, ge=1)
     """Memory for the scenes whose references are chosen, MiB."""
     reference_cache_mib: int = Field(default=512, ge=0)
@@ -143,6 +154,14 @@ class Settings(BaseModel):
     log_format: Literal["json", "text"] = "json"
     """One JSON object a line, or plain text."""
 
+    @field_validator("backend", "features", "retrieval")
+    @classmethod
+    def _check_choice(cls, value: str, info: ValidationInfo) -> str:
+        allowed = allowed_words(str(info.field_name))
+        if value not in allowed:
+            raise ValueError(f"must be one of {', '.join(allowed)}")
+        return value
+
     @field_validator("compiled_views")
     @classmethod
     def _check_compiled_views(cls, count: int) -> int:
@@ -174,7 +193,9 @@ class Settings(BaseModel):
     @model_validator(mode="after")
     def _check_together(self) -> Settings:
         if self.max_image_mib > self.max_message_mib:
-            raise ValueError("max_image_mib must not exceed max_message_mib")
+            raise ValueError(_exceeds(self, "max_image_mib", "max_message_mib"))
+        if self.default_deadline_s > self.max_deadline_s:
+            raise ValueError(_exceeds(self, "default_deadline_s", "max_deadline_s"))
         if (self.tls_certificate is None) != (self.tls_key is None):
             raise ValueError("tls_certificate and tls_key go together")
         if self.tls_client_ca is not None and self.tls_certificate is None:
@@ -182,6 +203,47 @@ class Settings(BaseModel):
         if self.capture_dir is not None and _overlap(self.capture_dir, self.data_dir):
             raise ValueError("capture_dir and data_dir must be folders apart: captured calls are deleted automatically")
         return self
+
+
+def allowed_words(name: str) -> list[str]:
+    """The words that a setting is one of; empty for other settings."""
+    field = Settings.model_fields[name]
+    if isinstance(field.json_schema_extra, dict):
+        return [*map(str, cast(list[object], field.json_schema_extra.get("enum", [])))]
+    return [it for it in get_args(field.annotation) if isinstance(it, str)]
+
+
+def bounds_text(name: str) -> str:
+    """The values that a setting can have, for people: "above 0, at most 268"; empty without bounds."""
+    if words := allowed_words(name):
+        return f"{', '.join(words[:-1])} or {words[-1]}"
+    bounds = {
+        relation: getattr(it, relation)
+        for it in Settings.model_fields[name].metadata
+        for relation in _BOUNDS
+        if getattr(it, relation, None) is not None
+    }
+    if {*bounds} == {"ge", "le"}:
+        return f"{bounds['ge']:g} to {bounds['le']:g}"
+    return ", ".join(f"{_BOUNDS[relation]} {bound:g}" for relation, bound in bounds.items())
+
+
+def default_text(name: str) -> str:
+    """The default of a setting, for people; empty if it has no value."""
+    default = Settings.model_fields[name].default
+    if name in _COMPUTED_DEFAULTS:
+        return _COMPUTED_DEFAULTS[name]
+    if default is None or default == "":
+        return ""
+    return f"{default}".lower() if isinstance(default, bool) else f"{default}".removesuffix(".0")
+
+
+_BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
+_COMPUTED_DEFAULTS = {"workers": "all cores", "weights_dir": "~/.cache/mapless/weights"}
+
+
+def _exceeds(settings: Settings, less: str, more: str) -> str:
+    return f"{less} must not exceed {more} ({getattr(settings, more):g}), is {getattr(settings, less):g}"
 
 
 @dataclass(frozen=True)

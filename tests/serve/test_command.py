@@ -9,7 +9,7 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from mapless_server.settings import Settings
+from mapless_server.settings import Settings, bounds_text, default_text
 from mapless_tools.cli import app as commands
 
 TOOLS = {
@@ -35,11 +35,20 @@ def test_serve_has_a_flag_for_each_setting_but_secrets() -> None:
     assert {flag for it in serve.params for flag in it.secondary_opts} >= {"--no-metrics", "--no-warm-up"}
 
 
+def test_help_shows_bound_and_default_of_each_setting() -> None:
+    shown = {it.name: str(it.help) for it in vars(typer.main.get_command(commands.app))["commands"]["serve"].params}
+    assert shown["max_batch"].endswith("(1 to 64; default: 4)")
+    for name in set(shown) - {"config"}:
+        assert bounds_text(name) in shown[name]
+        assert not default_text(name) or f"default: {default_text(name)})" in shown[name]
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
         (["--port", "65536"], "mapless-server: port (flag): "),
         (["--coverage", "1"], "mapless-server: coverage (flag): "),
+        (["--features", "surf"], "mapless-server: features (flag): must be one of auto, sift, "),
         (["--log-level", "loud"], "mapless-server: log_level (flag): "),
         (["--config", "absent.toml"], "mapless-server: absent.toml: no such file"),
     ],

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from pathlib import Path
 
 import pytest
 from pydantic import SecretStr, ValidationError
 
-from mapless_server.settings import ConfigError, LoadedSettings, Settings, load_settings
+from mapless_server.method.choices import BACKENDS
+from mapless_server.method.features import FEATURES, make_extractor
+from mapless_server.networks.weights import CheckpointError
+from mapless_server.settings import (
+    ConfigError,
+    LoadedSettings,
+    Settings,
+    allowed_words,
+    bounds_text,
+    default_text,
+    load_settings,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -63,7 +75,11 @@ def test_the_file_may_be_named_by_the_environment(config: Path, monkeypatch: pyt
         ("port = 65536", "port (file)"),
         ("port = [", "mapless.toml"),
         ('workers = "many"', "workers (file)"),
-        ("max_image_mib = 33", "max_image_mib must not exceed"),
+        ("max_image_mib = 33", "max_image_mib must not exceed max_message_mib (32), is 33"),
+        ("max_deadline_s = 20", "default_deadline_s must not exceed max_deadline_s (20), is 30"),
+        ('backend = "pi4"', "backend (file): must be one of auto, geometric, pi3, pi3x, is 'pi4'"),
+        ('features = "surf"', "features (file): must be one of auto, sift, "),
+        ('retrieval = "bow"', "retrieval (file): must be one of auto, vlad, megaloc, is 'bow'"),
         ('log_level = "loud"', "log_level (file)"),
     ],
 )
@@ -73,6 +89,32 @@ def test_an_error_in_the_file_names_setting_and_origin(tmp_path: Path, text: str
     with pytest.raises(ConfigError) as caught:
         load_settings({}, path)
     assert told in str(caught.value)
+
+
+def test_features_that_can_be_made_are_those_of_the_setting(tmp_path: Path) -> None:
+    assert allowed_words("features") == ["auto", *FEATURES]
+    assert allowed_words("backend") == ["auto", *BACKENDS]
+    for name in FEATURES:
+        assert Settings(features=name).features == name
+        with contextlib.suppress(CheckpointError, ImportError, OSError):  # unknown names are a ValueError
+            make_extractor(name, tmp_path / "absent.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("name", "bounds", "default"),
+    [
+        ("port", "0 to 65535", "50051"),
+        ("coverage", "above 0, below 1", "0.99"),
+        ("max_queued_s", "above 0", "2"),
+        ("workers", "at least 1", "all cores"),
+        ("warm_up", "", "true"),
+        ("retrieval", "auto, vlad or megaloc", "auto"),
+        ("log_format", "json or text", "json"),
+        ("tls_key", "", ""),
+    ],
+)
+def test_bounds_and_defaults_in_words(name: str, bounds: str, default: str) -> None:
+    assert (bounds_text(name), default_text(name)) == (bounds, default)
 
 
 def test_a_missing_settings_file_is_an_error(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 Begin with `localize`, the stages in order. A module imports only modules above it in this list, which has no circle:
 
+choices                      names of backends and features, for settings
 options, context             how options check themselves; cancelling and timing of a computation
 arrays, perturbation         NumPy or torch; small motions of poses, coordinates of their errors
 robust, optimize             robust losses; Levenberg-Marquardt, the only one

@@ -18,7 +18,7 @@ from mapless_server.extras import install_hint
 from mapless_server.images import ImageLimits
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import Matcher, make_matcher
-from mapless_server.method.features import FEATURES, FeatureExtractor, make_extractor
+from mapless_server.method.features import FeatureExtractor, make_extractor
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.networks.weights import CATALOGUE, WeightsError, WeightsMissing, find_weights
 from mapless_server.observability.metrics import Metrics
@@ -45,8 +45,6 @@ only 53 need it. On a GPU the second is as fast as the first, and is used alone.
 
 CACHED_AUDIT_PAIRS = 2000
 """Pairs of references whose matches audits keep in memory, about 10 KB a pair."""
-
-RETRIEVAL = ("auto", "vlad", "megaloc")
 
 WITH_WEIGHTS = frozenset(entry.name for entry in CATALOGUE)
 
@@ -93,7 +91,7 @@ MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], QueueEng
 
 
 def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
-    """The engine of the settings; StartupError if they name something unknown or missing."""
+    """The engine of the settings; StartupError if they name a device or weights that are missing."""
     try:
         tiers = make_tiers(settings)
         descriptor = make_descriptor(settings, tiers[0].extractor)
@@ -140,13 +138,7 @@ def engine_over(
 
 
 def feature_names(features: str, device: str) -> tuple[str, ...]:
-    """The features of the setting on "cpu" or "cuda...", the cheapest first.
-
-    Raises:
-        ValueError: unknown features.
-    """
-    if features not in ("auto", *FEATURES):
-        raise ValueError(f"unknown features {features!r}; known: auto, {', '.join(FEATURES)}")
+    """The features of the setting on "cpu" or "cuda...", the cheapest first."""
     if features != "auto":
         return (features,)
     return (CHEAP_FEATURES, STRONG_FEATURES) if device == "cpu" else (STRONG_FEATURES,)
@@ -158,7 +150,7 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
     `auto` leaves out features without weights or packages, and logs it; at the worst the cheap ones are used alone.
 
     Raises:
-        ValueError: unknown features or backend, or there is no such device.
+        ValueError: there is no such device.
         WeightsError: weights are missing, or do not fit.
         ImportError: a package that a network needs is not installed.
     """
@@ -178,8 +170,6 @@ def make_descriptor(settings: Settings, extractor: FeatureExtractor) -> GlobalDe
 
     `auto` is MegaLoc if networks run on a CUDA device and its weights are present: on a CPU it takes seconds.
     """
-    if settings.retrieval not in RETRIEVAL:
-        raise ValueError(f"unknown retrieval {settings.retrieval!r}; known: {', '.join(RETRIEVAL)}")
     if settings.retrieval == "vlad" or (settings.retrieval == "auto" and device_for(settings) == "cpu"):
         return VladDescriptor.of(extractor)
     try:

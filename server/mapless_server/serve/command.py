@@ -17,7 +17,7 @@ import typer
 from pydantic import SecretStr
 
 from mapless_server import __version__
-from mapless_server.settings import ConfigError, Settings, load_settings
+from mapless_server.settings import ConfigError, Settings, bounds_text, default_text, load_settings
 
 from .libraries import configure_libraries
 
@@ -36,7 +36,9 @@ def _with_setting_flags(command: Callable[..., None]) -> Callable[..., None]:
         if SecretStr not in kinds:
             # A word from a closed list is plain text here: `Settings` checks it, wherever it comes from.
             kind: Any = kinds[0] if kinds else str
-            option = typer.Option(help=field.description)
+            default = default_text(name)
+            values = "; ".join(filter(None, (bounds_text(name), default and f"default: {default}")))
+            option = typer.Option(help=f"{field.description} ({values})" if values else field.description)
             flags.append(_keyword(name, Annotated[kind | None, option]))
     vars(command)["__signature__"] = inspect.Signature([*own, *flags])
     return command

@@ -95,8 +95,8 @@ async def running_server(
         listen: makes the listener.
 
     Raises:
-        StartupError: unknown backend or features, the data folder or a file cannot be used, a port is taken, or the
-            first localization fails.
+        StartupError: weights or a device are missing, the data folder or a file cannot be used, a port is taken, or
+            the first localization fails.
     """
     async with AsyncExitStack() as stack:
         try:

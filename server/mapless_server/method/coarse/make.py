@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from mapless_server.networks.weights import WeightsMissing, find_weights
 
+from ..choices import AUTO, BACKENDS, NETWORKS
 from . import Reconstructor
 from .geometric import GeometricReconstructor
 
@@ -16,14 +17,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-NETWORKS = ("pi3", "pi3x")
-"""Those that `auto` looks for, in this order: the paper's method and figures are pi^3's, and it is the smaller one."""
-
 COMPILED_ASPECTS = ((4, 3), (3, 4))
 """Of most cameras, lying and standing."""
-
-BACKENDS = ("auto", "geometric", *NETWORKS)
-"""What a setting can name. Networks need weights of the same name, which are licensed for non-commercial use."""
 
 
 def make_reconstructor(
@@ -39,7 +34,7 @@ def make_reconstructor(
     where a CPU takes minutes; otherwise it is `geometric`, and the log says why.
 
     Args:
-        backend: one of `BACKENDS`.
+        backend: one of `BACKENDS`, or `auto`.
         weights_dir: where weights lie.
         device: "cpu" or a CUDA device.
         options: of a network's backend.
@@ -52,9 +47,9 @@ def make_reconstructor(
         CheckpointError: they do not fit.
         ImportError: a package that networks need is not installed.
     """
-    if backend not in BACKENDS:
-        raise ValueError(f"unknown backend {backend!r}; known: {', '.join(BACKENDS)}")
-    if backend == "auto":
+    if backend not in (AUTO, *BACKENDS):
+        raise ValueError(f"unknown backend {backend!r}; known: {', '.join((AUTO, *BACKENDS))}")
+    if backend == AUTO:
         backend = _choose(weights_dir, device)
     if backend == "geometric":
         return GeometricReconstructor()

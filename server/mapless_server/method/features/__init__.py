@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera
 
+from ..choices import FEATURES
 from ..views import View
 from .image import MAX_INCIDENCE_DEG, reduce_image, undistort_pixels
 from .sift import SiftExtractor, SiftOptions
@@ -28,9 +29,6 @@ __all__ = [
     "reduce_image",
     "undistort_pixels",
 ]
-
-FEATURES = ("sift", "aliked", "xfeat", "superpoint")
-"""Names of the extractors; the setting may also be `auto`. All but the first need weights of the same name."""
 
 
 class FeatureExtractor(Protocol):

@@ -1,0 +1,16 @@
+"""Names of backends and of local features, as a setting gives them.
+
+Imports nothing, so that settings are checked, and shown by --help, before anything that computes is loaded.
+"""
+
+FEATURES = ("sift", "aliked", "xfeat", "superpoint")
+"""Kinds of local features; all but the first need weights of the same name. `features.make_extractor` makes them."""
+
+NETWORKS = ("pi3", "pi3x")
+"""Backends with a network, whose weights, of the same name, are licensed for non-commercial use. `auto` looks for them
+in this order: the paper's method and figures are pi^3's, and it is the smaller one. `coarse.make` makes them."""
+
+BACKENDS = ("geometric", *NETWORKS)
+
+AUTO = "auto"
+"""The setting that chooses by device and weights."""
