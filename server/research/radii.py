@@ -26,7 +26,7 @@ from mapless_server.method.adjust import AdjustOptions
 from mapless_server.method.answer import Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import StageOptions
-from mapless_server.method.uncertainty.covariance import UncertaintyOptions, error_radius
+from mapless_server.method.uncertainty.covariance import UncertaintyOptions, error_radii
 
 from .places import METRIC, answered, read_places, right_pairs, weights_alike
 
@@ -85,9 +85,9 @@ def collect(data: Path) -> Iterator[Answered]:
             if isinstance(outcome, Localization) and outcome.covariance is not None and it.off is not None:
                 position, rotation = outcome.covariance[:3, :3], np.degrees(np.degrees(outcome.covariance[3:, 3:]))
                 ratios = (
-                    error / error_radius(covariance, p)
+                    error / radius
                     for error, covariance in zip(it.off, (position, rotation), strict=True)
-                    for p in (0.68, 0.95)
+                    for radius in error_radii(covariance, [0.68, 0.95]).tolist()
                 )
                 yield Answered(name, min(k for k in KS if k >= it.pair.k), *ratios)
 

@@ -16,7 +16,7 @@ from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseStage
-from mapless_server.method.uncertainty.covariance import accuracy_from_covariance, error_radius
+from mapless_server.method.uncertainty.covariance import accuracy_from_covariance, error_radii
 
 OPTIONS = EscalationOptions()
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
@@ -60,7 +60,7 @@ class TestDoubt:
 
     @given(trust=st.floats(0, 1), sigma_m=st.floats(1e-4, 1.0))
     def test_doubt_is_little_trust_or_a_large_radius(self, trust: float, sigma_m: float) -> None:
-        radius_m = error_radius(np.eye(3) * sigma_m**2, 0.68)
+        radius_m = float(error_radii(np.eye(3) * sigma_m**2, [0.68])[0])
         expected = trust < OPTIONS.doubtful_trust or radius_m > OPTIONS.doubtful_radius_m
         assert is_doubtful(localized(sigma_m=sigma_m, trust=trust), OPTIONS) is expected
 

@@ -17,7 +17,6 @@ from support.images import textured
 
 from mapless.geometry import Array, Camera, Fisheye, RadialTangential
 from mapless_server.method.coarse.grids import (
-    OFFICIAL_PIXEL_LIMIT,
     Grid,
     GridOptions,
     Layout,
@@ -29,6 +28,8 @@ from mapless_server.method.coarse.grids import (
 from mapless_server.method.features import undistort_pixels
 
 OPTIONS = GridOptions()
+OFFICIAL_PIXEL_LIMIT = 255_000
+"""Of the official loader; 574x434 for 4:3."""
 BARREL = RadialTangential(-0.25, 0.07, 0.001, -0.0015, -0.005)
 CAMERAS = {
     "pinhole": Camera(960, 720, 816.0, 820.0, 470.5, 365.5),

@@ -31,7 +31,7 @@ def rig(*kept: int) -> RigEstimate:
 def walk(step_m: float, sigma_m: float = 0.01) -> SequenceEstimate:
     poses = tuple(RigidTransform(np.eye(3), np.array([i * step_m, 0, 0])) for i in range(5))
     covariances = np.tile(sigma_m**2 * np.eye(6), (5, 1, 1))
-    return SequenceEstimate(cast(Any, None), 0.0, poses, covariances, np.ones(4), (), np.zeros(3))
+    return SequenceEstimate(cast(Any, None), 0.0, poses, covariances, (), np.zeros(3))
 
 
 def test_photographs_that_lose_their_inliers_contradict_the_rig() -> None:

@@ -46,6 +46,7 @@ class ChangedNetwork:
     name: str = "changed"
     weights_sha256: str = ""
     uses_correspondences: bool = False
+    is_batched: bool = True
 
     def close(self) -> None:
         self.network.close()
@@ -459,6 +460,7 @@ def test_a_network_is_asked_once_for_a_query(backend: str, times: int) -> None:
     class Counting:
         name, weights_sha256 = "counting", ""
         uses_correspondences = pipeline.reconstructor.uses_correspondences
+        is_batched = pipeline.reconstructor.is_batched
         bucket = pipeline.reconstructor.bucket
 
         def close(self) -> None:

@@ -37,6 +37,7 @@ from support.small_networks import (
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.engine.failures import failure_of
+from mapless_server.method.choices import NETWORKS
 from mapless_server.method.coarse import Bucket, Outcome, Request, reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.geometric import GeometricReconstructor
@@ -52,12 +53,11 @@ from mapless_server.networks.conditions import normalize_poses
 from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.runner import NetworkRunner
-from mapless_server.networks.weights import CheckpointError, WeightsMissing
+from mapless_server.networks.weights import CATALOGUE, CheckpointError, WeightsMissing
 from mapless_server.scheduling import Done, Flow, Job, Observer, Stage, StageResult, Step, WorkQueue, WorkQueueOptions
 
 OPTIONS = NetworkOptions(grids=GRIDS)
 UNCACHED = NetworkOptions(grids=GRIDS, cache=TokenCacheOptions(0, 0))
-NETWORKS = ("pi3", "pi3x")
 
 
 @pytest.fixture(autouse=True)
@@ -140,6 +140,10 @@ def assert_same_bits(actual: Outcome | Exception, expected: Outcome | Exception)
 
 
 # What is asked of the network
+
+
+def test_the_catalogue_has_the_weights_of_every_backend() -> None:
+    assert {it.name for it in CATALOGUE if it.purpose == "backend"} == set(NETWORKS)
 
 
 def test_every_view_has_its_own_place_in_the_answer() -> None:

@@ -28,7 +28,7 @@ from support.device import CASES, VARIANTS, Case, Watch, assert_same, case_of, o
 from torch import Tensor
 
 from mapless_server.method.coarse.device import DeviceReconstruction
-from mapless_server.method.on_device import Refined, prepare, refine_on_device
+from mapless_server.method.on_device import Refined, launch_on_device, prepare
 from mapless_server.method.on_device import match as device_match
 from mapless_server.method.on_device.compute import Inputs, Options, compute
 from mapless_server.method.on_device.transfer import fetch, upload
@@ -352,6 +352,6 @@ def test_misuse_is_refused() -> None:
             replace(good, **changes)
     scene, correspondences = case.scene, case.correspondences
     with pytest.raises(ValueError, match="4 reconstructed references of 3"):
-        refine_on_device(good, scene.query, scene.references[:3], correspondences)
-    with pytest.raises(ValueError, match="together"):
-        refine_on_device(good, scene.query, scene.references, correspondences, None, StructureOptions())
+        launch_on_device(good, scene.query, scene.references[:3], correspondences, Options())
+    with pytest.raises(ValueError, match=r"Options\.structure and Options\.match must both be given"):
+        Options(structure=StructureOptions())

@@ -19,7 +19,7 @@ from mapless_server.method.perturbation import (
     world_covariance,
     world_jacobian,
 )
-from mapless_server.method.uncertainty.covariance import TAIL_95, accuracy_from_covariance, error_radius
+from mapless_server.method.uncertainty.covariance import TAIL_95, accuracy_from_covariance, error_radii
 
 POSE = RigidTransform(rotation_from_vector([0.7, -1.1, 0.4]), np.array([3.0, -2.0, 1.5]))
 
@@ -84,7 +84,8 @@ def test_radius_against_sampling(eigenvalues: tuple[float, ...], probability: fl
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     errors = np.sqrt((rng.normal(size=(200_000, 3)) ** 2 * eigenvalues).sum(axis=1))
     covariance = axes @ np.diag(eigenvalues) @ axes.T
-    assert error_radius(covariance, probability) == pytest.approx(np.quantile(errors, probability), rel=0.04)
+    (radius,) = error_radii(covariance, [probability])
+    assert radius == pytest.approx(np.quantile(errors, probability), rel=0.04)
 
 
 def test_position_and_rotation_radii_are_separate() -> None:
@@ -96,4 +97,4 @@ def test_position_and_rotation_radii_are_separate() -> None:
 
 
 def test_no_uncertainty_is_no_radius() -> None:
-    assert error_radius(np.zeros((3, 3)), 0.95) == 0.0
+    assert error_radii(np.zeros((3, 3)), [0.95]) == 0.0

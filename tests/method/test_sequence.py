@@ -92,8 +92,9 @@ def test_a_jump_of_the_device_is_not_believed() -> None:
     images = images_of(random, truth, alone=True, own_noise_m=0.005)
     found = estimate(solve_sequence(images, session, False, OPTIONS))
     assert max(error_m(*it) for it in zip(found.world_from_camera, truth, strict=True)) < 0.008
-    assert found.step_weights.argmin() == 2
-    assert found.step_weights[2] < 0.1 < np.delete(found.step_weights, 2).min()
+    weights = SequenceFreedom.of(found.world_from_camera, session, 1.0, False, OPTIONS.drift).weights()
+    assert weights.argmin() == 2
+    assert weights[2] < 0.1 < np.delete(weights, 2).min()
 
 
 def test_a_frame_that_was_posed_wrongly_alone_is_outvoted() -> None:

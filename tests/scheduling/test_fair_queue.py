@@ -100,7 +100,7 @@ def test_callers_who_come_once_leave_nothing_behind() -> None:
     for job in range(12, 2000):
         queue.pop()
         queue.push(job, Flow("t", str(job)), 3.0)
-        assert queue.callers == len(queue) == 12
+        assert len(queue._accounts) == len(queue) == 12
 
 
 def test_who_was_taken_along_pays_it_back() -> None:

@@ -99,14 +99,14 @@ def test_no_rate_is_no_limit() -> None:
     limiter = RateLimiter(0.0, 1.0)
     assert all(limiter.charge("t", 1e6, 0.0) == 0 for _ in range(10))
     limiter.settle("t", 1.0, 2.0, 0.0)
-    assert limiter.bucket_count == 0
+    assert len(limiter._buckets) == 0
 
 
 def test_full_buckets_are_removed() -> None:
     limiter = RateLimiter(1.0, 1.0)
     for i in range(100_000):
         assert limiter.charge(f"t{i}", 0.5, 0.1 * i) == 0
-        assert limiter.bucket_count <= 64
+        assert len(limiter._buckets) <= 64
 
 
 def test_a_clock_that_goes_back_changes_no_level() -> None:

@@ -17,7 +17,8 @@ from mapless.geometry import Array
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.correspond import Correspondences
 from mapless_server.method.match import PAPER_MATCH, MatchOptions, match_points
-from mapless_server.method.on_device import Refined, refine_on_device
+from mapless_server.method.on_device import Refined, launch_on_device
+from mapless_server.method.on_device.compute import Options
 from mapless_server.method.reconstruction import Reconstruction
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.results import MetricScale, PointMatches, Structure
@@ -62,10 +63,8 @@ class Case:
     def on_device(
         self, scale: ScaleOptions, structure: StructureOptions | None = None, match: MatchOptions | None = None
     ) -> Refined | Rejection:
-        scene = self.scene
-        return refine_on_device(
-            self.reconstruction, scene.query, scene.references, self.correspondences, scale, structure, match
-        )
+        scene, options = self.scene, Options(scale, structure, match)
+        return launch_on_device(self.reconstruction, scene.query, scene.references, self.correspondences, options)()
 
     def on_host(
         self, scale_options: ScaleOptions, structure: StructureOptions | None = None, match: MatchOptions | None = None

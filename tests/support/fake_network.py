@@ -56,6 +56,7 @@ class FakeNetwork:
     name = "fake"
     weights_sha256 = ""
     uses_correspondences = False
+    is_batched = True
 
     def __init__(self, scene: SyntheticScene, seed: int = 0, options: FakeNetworkOptions | None = None) -> None:
         self.world_from_local = random_similarity(random_for("fake network", seed))

@@ -85,6 +85,7 @@ class StandInReconstructor:
     name: str = "geometric"
     weights_sha256: str = ""
     uses_correspondences: bool = True
+    is_batched: bool = False
 
     def close(self) -> None:
         pass

@@ -91,9 +91,8 @@ class QueueEngine:
         self.options = options
         self.references = references
         stages = QueryStages(self.tiers, options.escalation, method)
-        # A backend that needs correspondences computes on the CPU, one query at a time.
-        on_cpu = all(tier.pipeline.reconstructor.uses_correspondences for tier in tiers)
-        coarse = Stage(COARSE, HOST, REFINE) if on_cpu else Stage(COARSE, DEVICE, REFINE, options.max_batch)
+        is_batched = any(tier.pipeline.reconstructor.is_batched for tier in tiers)
+        coarse = Stage(COARSE, DEVICE, REFINE, options.max_batch) if is_batched else Stage(COARSE, HOST, REFINE)
         self.queue = WorkQueue(
             {
                 **{Stage(name, HOST): compute_items for name in (DESCRIBE, RETRIEVE, AUDIT, COVERAGE, JOIN)},
@@ -101,7 +100,7 @@ class QueueEngine:
                 coarse: stages.coarse,
                 Stage(REFINE, HOST): stages.refine,
             },
-            {HOST: options.workers} if on_cpu else {HOST: options.workers, DEVICE: 1},
+            {HOST: options.workers, DEVICE: 1} if is_batched else {HOST: options.workers},
             options.queue,
             observer or Observer(),
             failure_of,

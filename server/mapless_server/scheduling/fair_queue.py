@@ -49,11 +49,6 @@ class FairQueue(Generic[J]):
         return iter(self._flow_of)
 
     @property
-    def callers(self) -> int:
-        """Number of callers with waiting jobs."""
-        return len(self._accounts)
-
-    @property
     def cost_s(self) -> float:
         """Sum over all waiting jobs."""
         return self._cost_s if self._flow_of else 0.0  # without rounding errors

@@ -76,11 +76,6 @@ class RateLimiter:
         if rate > 0:
             self._keep(tenant, self._level_s(tenant, rate, now_s) + predicted_s - actual_s, now_s)
 
-    @property
-    def bucket_count(self) -> int:
-        """Number of tenants in memory."""
-        return len(self._buckets)
-
     def _rate_for(self, tenant: str) -> float:
         own = self._rate_of(tenant)
         return self._rate if own is None else own

@@ -43,6 +43,7 @@ class PlantedReconstructor:
     """
 
     uses_correspondences = False
+    is_batched = True
 
     def __init__(self, network: NetworkReconstructor, truths: Mapping[str, Truth], device: torch.device) -> None:
         """`truths` are the views' by the SHA-256 of their images; they lie on the device beforehand."""

@@ -1,7 +1,7 @@
 """The coarse stage: query and references reconstructed together, up to one common scale.
 
-The paper uses a feed-forward network here (its equation for Phi); any method that gives local points, confidences and
-poses in one local frame can replace it. A backend is one file in this package with a `Reconstructor`.
+The paper uses a feed-forward network here (its equation for Phi); any method that computes local points, confidences
+and poses in one local frame can replace it. A backend is one file in this package with a `Reconstructor`; see `make`.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ Outcome: TypeAlias = "Reconstruction | DeviceReconstruction | Rejection"
 
 @dataclass(frozen=True)
 class Bucket:
-    """Queries of one bucket may be reconstructed together; as text, a short name of it.
+    """The shape of a query's input: queries of one bucket may be reconstructed together. As text, a short name of it.
 
     Attributes:
         backend: its name.
         reference_count: of each query.
-        grid: rows and columns of the pictures' patches; None for a backend that has none.
+        grid: rows and columns of the pictures' patches; None for a backend without pictures.
     """
 
     backend: str
@@ -68,6 +68,8 @@ class Reconstructor(Protocol):
         weights_sha256: of the network's weights; empty without any.
         uses_correspondences: whether the result depends on them. A network's does not, so it runs once for a query,
             also if other correspondences are tried.
+        is_batched: whether queries are reconstructed together, by the one thread that owns the device; else each query
+            is reconstructed alone, on any thread of the CPU.
     """
 
     @property
@@ -85,12 +87,17 @@ class Reconstructor(Protocol):
         """See the class."""
         ...
 
+    @property
+    def is_batched(self) -> bool:
+        """See the class."""
+        ...
+
     def close(self) -> None:
         """Releases threads and devices; the backend cannot be used afterwards."""
         ...
 
     def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
-        """With which other queries this one, of one reference at least, may be reconstructed in one go.
+        """The bucket of a query, which has one reference at least.
 
         Raises:
             ValueError: a view lacks input of the backend.
@@ -98,14 +105,14 @@ class Reconstructor(Protocol):
         ...
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
-        """Reconstructs each query and its references, as far as it can in one go.
+        """Reconstructs each query and its references; those of one bucket together, if the backend is batched.
 
         Returns:
             For each request, in order: the reconstruction, a rejection, or its own exception, such as too little memory
-            for it alone. The other requests of a batch change an outcome by no more than rounding.
+            for this request alone. The other requests of a batch change an outcome by no more than rounding.
 
         Raises:
-            Exception: of the batch as a whole; splitting it shows which request caused it.
+            Exception: of the batch as a whole; splitting the batch shows which request caused it.
         """
         ...
 

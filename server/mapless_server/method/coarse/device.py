@@ -15,14 +15,14 @@ from ..reconstruction import ReconstructedView, Reconstruction
 
 @dataclass(frozen=True, eq=False)
 class DeviceReconstruction:
-    """Query and references in one local frame of unknown scale, its arrays where the network left them.
+    """Query and references in one local frame of unknown scale, its arrays on the network's device.
 
-    Nothing here waits for the device but `fetch`.
+    Only `fetch` waits for the device.
 
     Attributes:
         reference_cameras: K pinholes, in pixels of the maps; see ReconstructedView.camera.
         query_camera: the same of the query.
-        point_maps: (K, H, W, 3) float32, of the references alone: what each pixel sees, in that camera's frame.
+        point_maps: (K, H, W, 3) float32, of the references alone: the point at each pixel, in that camera's frame.
         confidence: (K, H, W) float32, 0 to 1; 0 where the point is unknown.
         local_from_camera: (K + 1, 4, 4) float32, of the references in order, then of the query.
         backend: its name, for messages.
@@ -46,19 +46,19 @@ class DeviceReconstruction:
             raise ValueError(f"cameras are not of the maps' size {tuple(size)}")
 
     def broken_pixels(self) -> Tensor:
-        """How many pixels the network failed at, (): no finite confidence, or one above 0 and no finite point."""
+        """Number (): pixels without a finite confidence, or with one above 0 and without a finite point."""
         point_is_finite = self.point_maps.isfinite().all(-1)
         return (~self.confidence.isfinite() | ((self.confidence > 0) & ~point_is_finite)).sum()
 
     def fetch(self) -> Reconstruction:
-        """The same on the host, in one transfer; of the query's own map nothing is known."""
+        """The same on the host, in one transfer; the query's own map is NaN."""
         parts = (self.point_maps, self.confidence, self.local_from_camera)
         flat = torch.cat([part.float().reshape(-1) for part in parts]).cpu().numpy()
         point_maps, confidence, poses = (
             values.reshape(part.shape)
             for values, part in zip(np.split(flat, np.cumsum([p.numel() for p in parts])[:-1]), parts, strict=True)
         )
-        # As they are, NaN included: the scale stage rejects these.
+        # Unchecked: the scale stage rejects poses that are not finite.
         local_from_camera = [RigidTransform(pose[:3, :3], pose[:3, 3]) for pose in poses.astype(np.float64)]
         query = ReconstructedView(
             self.query_camera,

@@ -1,8 +1,8 @@
-"""The coarse stage without a network: the embedded default on a machine without a GPU or weights.
+"""The coarse stage without a network: the default on a machine without a GPU or weights.
 
 Features matched among the references are triangulated from the references' known poses, and the query is posed by PnP
-on what it matches of them. The sparse points are scattered into the point maps, in a frame of its own with a scale of
-its own, as a network would give them: the stages behind the seam see no difference.
+on its matches with these points. The sparse points are scattered into point maps, in a local frame with a scale of its
+own, like a network's: the following stages do not depend on the backend.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class GeometricOptions:
     """Options of the geometric backend.
 
     Attributes:
-        structure: a few steps only, since the structure stage follows.
+        structure: few iterations, since the structure stage follows.
         pnp: of the query's pose.
-        gate: what chance could do as well is no pose.
-        min_baseline_m: references that all stand closer together than this triangulate nothing.
+        gate: a pose is rejected if chance could have produced its inliers.
+        min_baseline_m: least distance of the farthest reference from the mean of all; below, nothing is triangulated.
         cell_px: side of a cell of the point maps, pixels of the view. Small enough that two keypoints seldom share one.
     """
 
@@ -58,22 +58,23 @@ class GeometricOptions:
 
 @dataclass(frozen=True)
 class GeometricReconstructor:
-    """See the module."""
+    """A `Reconstructor` by triangulation and PnP; see the module."""
 
     options: GeometricOptions = field(default_factory=GeometricOptions)
     name: str = "geometric"
     weights_sha256: str = ""
     uses_correspondences: bool = True
+    is_batched: bool = False
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Nothing to release."""
 
     def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
         """See Reconstructor.bucket."""
         return Bucket(self.name, len(references))
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
-        """See Reconstructor.reconstruct_many; one after the other, since they have nothing in common."""
+        """See Reconstructor.reconstruct_many; one after the other."""
         return [self._attempt(request) for request in requests]
 
     def _attempt(self, request: Request) -> Outcome | Exception:
@@ -171,14 +172,14 @@ class GeometricReconstructor:
         query_points: Array,
         query_pixels: Array,
     ) -> Reconstruction:
-        """Point maps in a local frame: that of the first reference, where the median point is one unit away."""
+        """Point maps in a local frame: that of the first reference, in which the median point is one unit away."""
         local_from_world = _unit_frame(references[0].world_from_camera, structure.x_in_world)
         tracks = structure.tracks
         views = []
         for index, reference in enumerate(references):
-            mine = tracks.view == index
-            points = structure.x_in_world[tracks.point[mine]]
-            pixels = reference.view.features.keypoints[tracks.keypoint[mine]].astype(np.float64)
+            seen = tracks.view == index
+            points = structure.x_in_world[tracks.point[seen]]
+            pixels = reference.view.features.keypoints[tracks.keypoint[seen]].astype(np.float64)
             views.append(self._view(reference.view, reference.world_from_camera, local_from_world, points, pixels))
         queried = self._view(query, world_from_query, local_from_world, query_points, query_pixels)
         return Reconstruction(queried, tuple(views))

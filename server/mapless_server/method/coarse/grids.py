@@ -1,7 +1,7 @@
-"""What a network sees of a photograph: a picture of one of few sizes, without lens distortion, and its pinhole camera.
+"""The input of a network: a picture of one of few sizes, without lens distortion, and its pinhole camera.
 
 The official loader fits one size to the first photograph of a set. Here the sizes are fixed, one for each usual aspect
-ratio, so that a reference nearly always has the same one, and what was computed from it can be kept.
+ratio, so that a reference nearly always has the same one, and its tokens can be cached.
 """
 
 from __future__ import annotations
@@ -25,8 +25,6 @@ from ..options import check_bounds
 
 PIXEL_LIMIT = 37 * 28 * PATCH_PX**2
 """Of 518x392."""
-OFFICIAL_PIXEL_LIMIT = 255_000
-"""Of the official loader; 574x434 for 4:3."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +58,15 @@ class GridOptions:
         pixel_limit: of a picture. 518x392 for 4:3 has a fifth fewer patches than the official loader's 574x434, and
             attention over all views is quadratic in them; both lie in the range that the networks were trained on,
             100 000 to 255 000 pixels.
-        aspects: width to height, from one end of the range that the networks were trained on to the other. A
-            photograph is then at most 15 % from its nearest grid, unless it lies beyond the ends.
-        max_stretch: a photograph whose aspect is the grid's within this factor is resized along each axis on its own,
-            as the official loader does; another one is fitted inside, its aspect kept, and the rest is filled.
-        max_distortion_px: a lens that moves nothing in the picture by more than this is treated as a pinhole: depth is
-            read to the nearest pixel, and each resampling costs sharpness.
-        max_half_field_deg: how far to either side of the optical axis an undistorted picture reaches. Beyond it lies
-            what the networks have hardly seen, and a pinhole spends its pixels there: at 50 deg each covers 0.4 of the
-            angle that one on the axis does.
+        aspects: width to height, over the range that the networks were trained on. The aspect of a photograph within
+            that range differs from its nearest grid's by at most 15 %.
+        max_stretch: a photograph whose aspect is the grid's within this factor is resized along each axis separately,
+            as by the official loader; another one is fitted inside, its aspect kept, and the rest is filled.
+        max_distortion_px: a lens that moves no pixel of the picture by more than this is treated as a pinhole: depth is
+            read at the nearest pixel, and each resampling costs sharpness.
+        max_half_field_deg: largest angle between the optical axis and a side of an undistorted picture. The networks
+            were hardly trained beyond it, and a pinhole wastes pixels there: at 50 deg one covers 0.4 of the angle of
+            one on the axis.
     """
 
     pixel_limit: int = PIXEL_LIMIT
@@ -119,8 +117,8 @@ def common_grid(cameras: Sequence[Camera], options: GridOptions) -> Grid:
 def ideal_camera(camera: Camera, options: GridOptions) -> Camera:
     """The pinhole that a photograph is undistorted to: the same focal lengths, and the largest field without a gap.
 
-    It is the camera itself, as a pinhole, where distortion does not matter. A lens that shows nothing within
-    `max_half_field_deg` gets a field of that size all the same, in which then nothing is seen.
+    Where distortion does not matter, it is the camera itself as a pinhole. A lens that shows nothing within
+    `max_half_field_deg` gets an empty field of that size.
     """
     if not _distortion_matters(camera, options):
         return camera.pinhole()
@@ -154,10 +152,10 @@ def _field(camera: Camera, options: GridOptions) -> tuple[float, float, float, f
         for end in (0.0, 1.0):
             edge = np.empty((len(along), 2))
             edge[:, axis], edge[:, 1 - axis] = end, along
-            # Where the lens model has no inverse, the lens sees further than any pinhole.
+            # Where the lens model has no inverse, the lens has a wider field than any pinhole.
             ideal = camera.rays(undistort_pixels(edge * size - 0.5, camera))[:, axis]
-            known = ideal[np.isfinite(ideal)]
-            innermost = (known.max() if end == 0 else known.min()) if len(known) else (-limit if end == 0 else limit)
+            finite = ideal[np.isfinite(ideal)]
+            innermost = (finite.max() if end == 0 else finite.min()) if len(finite) else (-limit if end == 0 else limit)
             ends.append(float(np.clip(innermost, -limit, limit)))
         sides.append(ends if ends[0] < ends[1] else [-limit, limit])
     (left, right), (top, bottom) = sides
@@ -172,14 +170,14 @@ def _lattice(width_px: int, height_px: int, count: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """How a photograph is laid on a grid.
+    """The place of a photograph in a picture of a grid's size.
 
     Attributes:
         grid: the picture's size.
         source: the photograph's camera.
         ideal: the pinhole that the photograph is undistorted to.
-        box: left, top, width and height in pixels of the picture's part that is not filling.
-        options: see there.
+        box: left, top, width and height, pixels, of the picture's part that is not filling.
+        options: of the pictures.
     """
 
     grid: Grid
@@ -208,7 +206,7 @@ class Layout:
 
     @cached_property
     def intrinsics(self) -> Array:
-        """K (3, 3) of the picture as networks want it: (0.5, 0.5) is the centre of the top-left pixel."""
+        """K (3, 3) of the picture in the networks' convention: (0.5, 0.5) is the centre of the top-left pixel."""
         k = self.camera.matrix()
         k[:2, 2] += 0.5
         return k
@@ -223,7 +221,7 @@ class Layout:
         return None if shown.all() else shown
 
     def picture(self, photograph: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The picture (3, H, W) in 0 to 1 of a photograph (H, W, 3) RGB; filled with the mean of what it shows.
+        """The picture (3, H, W) in 0 to 1 of a photograph (H, W, 3) RGB, filled with the mean of the shown pixels.
 
         Raises:
             ValueError: the photograph is not of its camera's size.
@@ -245,15 +243,15 @@ class Layout:
         return np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32) / np.float32(255)
 
     def _undistorted(self, photograph: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The photograph through the ideal camera, at twice the picture's size: each resampling then costs little."""
+        """The photograph in the ideal camera, at twice the picture's size, where resampling costs little sharpness."""
         source, ideal = self._at_twice_the_size()
         reduced = _resized(photograph, source.width_px, source.height_px)
-        # What lies outside of the photograph repeats its edge, so that nothing foreign bleeds into the inside.
+        # Outside the photograph its edge is repeated, so that no other colour bleeds into the inside.
         columns, rows = _lens_map(source, ideal)
         return np.asarray(cv2.remap(reduced, columns, rows, cv2.INTER_CUBIC, None, cv2.BORDER_REPLICATE), np.uint8)
 
     def _at_twice_the_size(self) -> tuple[Camera, Camera]:
-        """Source and ideal camera, reduced alike; as they are if that is no reduction."""
+        """Source and ideal camera, reduced by the same factor; unchanged if the picture is not smaller."""
         _, _, width, height = self.box
         scale = min(1.0, max(2 * width / self.ideal.width_px, 2 * height / self.ideal.height_px))
         source, ideal = (
@@ -265,7 +263,7 @@ class Layout:
 
 @lru_cache(maxsize=256)  # with the mask of what is shown, 200 kB each
 def lay_out(camera: Camera, grid: Grid, options: GridOptions) -> Layout:
-    """How a photograph of a camera is laid on a grid."""
+    """The layout of a camera's photographs on a grid."""
     ideal = ideal_camera(camera, options)
     stretch = math.log(ideal.width_px / ideal.height_px / grid.aspect)
     width, height = grid.width_px, grid.height_px
@@ -277,25 +275,25 @@ def lay_out(camera: Camera, grid: Grid, options: GridOptions) -> Layout:
 
 
 def _resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """An image (H, W, 3) in another size, by the very filter of the official loader: OpenCV's does not antialias.
+    """An image (H, W, 3) in another size, by the filter of the official loader; OpenCV's does not antialias.
 
-    Images of more than four times the size are first averaged down to at least twice: of 12 megapixels in a third of
-    the time, at a difference of half a grey level (RMS) on photographs.
+    Images of more than four times the size are first reduced by averaging to at least twice the size: a third of the
+    time for 12 megapixels, and half a grey level of difference (RMS) on photographs.
     """
     resized = Image.fromarray(image).resize((width_px, height_px), Image.Resampling.LANCZOS, reducing_gap=2.0)
     return np.asarray(resized, np.uint8)
 
 
-@lru_cache(maxsize=8)  # 7 MB each; cameras of robots stay the same, references are prepared once
+@lru_cache(maxsize=8)  # 7 MB each; a robot's camera seldom changes, references are prepared once
 def _lens_map(source: Camera, ideal: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """For each pixel of the ideal image its column and row in the distorted one, at most a little outside of it."""
+    """For each pixel of the ideal image its column and row in the distorted one, at most two pixels outside."""
     pixels, _ = _covered(source, ideal)
     pixels = np.clip(pixels, -2, (source.width_px + 1, source.height_px + 1)).astype(np.float32)
     return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
 
 
 def _covered(source: Camera, ideal: Camera) -> tuple[Array, NDArray[np.bool_]]:
-    """Pixels (H, W, 2) of the distorted image that an ideal one's show, and which (H, W) of them exist."""
+    """For each pixel of the ideal image its pixel (H, W, 2) in the distorted one, and whether (H, W) it is inside."""
     rows, columns = np.indices((ideal.height_px, ideal.width_px))
     pixels = source.project(ideal.rays(np.stack([columns, rows], axis=-1)))
     inside = ((pixels >= -0.5) & (pixels <= (source.width_px - 0.5, source.height_px - 0.5))).all(axis=-1)
@@ -303,7 +301,7 @@ def _covered(source: Camera, ideal: Camera) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _unfolded(pixels: Array) -> NDArray[np.bool_]:
-    """Where a lens map (H, W, 2) turns nothing over; beyond that a polynomial shows the image again, mirrored."""
+    """Where a lens map (H, W, 2) keeps orientation; beyond, a polynomial repeats the image, mirrored."""
     if min(pixels.shape[:2]) < 2:
         return np.ones(pixels.shape[:2], bool)
     (x_down, x_right), (y_down, y_right) = (np.gradient(pixels[..., i]) for i in (0, 1))

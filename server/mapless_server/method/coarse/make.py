@@ -1,4 +1,7 @@
-"""From the name of a backend to the backend. Imports torch only for a network."""
+"""Makes the backend that a setting names. Imports torch only for a network.
+
+A further network needs its name in `choices.NETWORKS` and an entry, with its class, in the weights' catalogue.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mapless_server.networks.weights import WeightsMissing, find_weights
+from mapless_server.networks.weights import WeightsMissing, find_weights, named
 
 from ..choices import AUTO, BACKENDS, NETWORKS
 from . import Reconstructor
@@ -18,7 +21,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 COMPILED_ASPECTS = ((4, 3), (3, 4))
-"""Of most cameras, lying and standing."""
+"""Of most cameras, landscape and portrait."""
 
 
 def make_reconstructor(
@@ -30,20 +33,20 @@ def make_reconstructor(
 ) -> Reconstructor:
     """The backend that a setting names.
 
-    `auto` is a network if its weights are there and a CUDA device to run it, on which it takes a fraction of a second
-    where a CPU takes minutes; otherwise it is `geometric`, and the log says why.
+    `auto` is a network if its weights are in the folder and there is a CUDA device, on which a query takes a fraction
+    of a second and not minutes as on a CPU; otherwise it is `geometric`, and the reason is logged.
 
     Args:
         backend: one of `BACKENDS`, or `auto`.
-        weights_dir: where weights lie.
+        weights_dir: the weights folder.
         device: "cpu" or a CUDA device.
         options: of a network's backend.
-        compiled_views: how many views, the query among them, a network is compiled for, which takes minutes; of
-            photographs of 4:3, lying or standing. 0 compiles nothing. Other queries are computed as well, only slower.
+        compiled_views: number of views, the query included, for which a network is compiled, which takes minutes; for
+            photographs of 4:3, landscape or portrait. 0 compiles nothing. Other queries are computed uncompiled.
 
     Raises:
         ValueError: unknown name.
-        WeightsMissing: the network's weights are not there; the message names the command that brings them.
+        WeightsMissing: the network's weights are not in the folder; the message names the command that fetches them.
         CheckpointError: they do not fit.
         ImportError: a package that networks need is not installed.
     """
@@ -57,7 +60,7 @@ def make_reconstructor(
 
 
 def _choose(weights_dir: Path, device: str) -> str:
-    """What `auto` means here; the log says why."""
+    """The backend that `auto` means on this machine; logs the reason."""
     problem: str | None = "there is no CUDA device, and on a CPU a network takes minutes for a query"
     if device != "cpu":
         missing = {name: _missing(name, weights_dir) for name in NETWORKS}
@@ -71,7 +74,7 @@ def _choose(weights_dir: Path, device: str) -> str:
 
 
 def _missing(name: str, weights_dir: Path) -> str | None:
-    """What to do about weights that are not there; None if they are."""
+    """The message about missing weights; None if they are in the folder."""
     try:
         find_weights(name, weights_dir)
     except WeightsMissing as error:
@@ -89,8 +92,6 @@ def _load(
     import torch
 
     from mapless_server.networks.checkpoint import UNUSED, load_strictly
-    from mapless_server.networks.pi3 import Pi3
-    from mapless_server.networks.pi3x import Pi3X
     from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions
 
     from .grids import GridOptions, fitted_grid
@@ -99,8 +100,8 @@ def _load(
     if device == "cpu":
         log.warning("backend %s on the CPU: minutes for a query, so calls need longer deadlines", backend)
     with torch.device("meta"):
-        network = Pi3() if backend == "pi3" else Pi3X()
-    # On the host, where the runner reduces the precision before anything goes to the device.
+        network = named(backend).network_class()()
+    # On the host, where the runner reduces the precision before the weights are copied to the device.
     weights_sha256 = load_strictly(network, weights, ignored_prefixes=UNUSED)
     runner_options = RunnerOptions(compile_backend="inductor" if compiled_views else None)
     runner = NetworkRunner(network, backend, weights_sha256, device, runner_options)

@@ -1,10 +1,10 @@
 """The coarse stage by a network: pi^3, the paper's, or Pi3X, which also takes intrinsics and the references' poses.
 
     photographs > pictures > tokens > network > DeviceReconstruction
-      (views)    (grids)  (kept for             (scale and the rest,
-                           references)           on either side)
+      (views)    (grids)  (cached for           (on the device,
+                           references)           or fetched)
 
-What a network says holds up to a similarity, also when it was given poses: the scale stage aligns it in any case.
+The output of a network is known up to a similarity, also if it was given poses: the scale stage aligns it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class NetworkOptions:
     Attributes:
         grids: of the pictures.
         cache: of references' tokens.
-        keep_on_device: whether a reconstruction stays where the network left it; None keeps it on CUDA.
+        keep_on_device: whether a reconstruction stays on the network's device; None keeps it on CUDA.
     """
 
     grids: GridOptions = field(default_factory=GridOptions)
@@ -58,6 +58,9 @@ class NetworkReconstructor:
         cache: tokens of references; its counters are read by the metrics.
     """
 
+    uses_correspondences = False
+    is_batched = True
+
     def __init__(self, runner: NetworkRunner, options: NetworkOptions | None = None) -> None:
         self._runner = runner
         self._options = options or NetworkOptions()
@@ -66,8 +69,6 @@ class NetworkReconstructor:
         on_host = runner.device.type == "cpu"
         cache = self._options.cache
         self.cache = TokenCache(runner.device, replace(cache, host_bytes=0) if on_host else cache)
-
-    uses_correspondences = False
 
     @property
     def name(self) -> str:
@@ -89,19 +90,19 @@ class NetworkReconstructor:
         return Bucket(self.name, len(references), (grid.rows, grid.columns))
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
-        """See Reconstructor.reconstruct_many: in one go those that have the same grid and number of references.
+        """See Reconstructor.reconstruct_many: together those that have the same grid and number of references.
 
-        Each view is encoded once, however many requests show it. When the device's memory does not suffice, tokens
-        that are kept there leave it, and what failed is tried once more.
+        Each view is encoded once, also if several requests use it. If the device's memory does not suffice, cached
+        tokens are moved from the device, and the failed computation is tried once more.
 
         Returns:
             The outcomes, among them the exceptions:
             ValueError: a view has no photograph.
-            torch.OutOfMemoryError: there is not even room for this query alone.
+            torch.OutOfMemoryError: the memory does not suffice for this query alone.
             RequestError: a reference's photograph cannot be read any more.
 
         Raises:
-            torch.OutOfMemoryError: there is no room for so many queries; for fewer there may be.
+            torch.OutOfMemoryError: the memory does not suffice for so many queries.
         """
         try:
             return self._reconstruct_many(requests)
@@ -123,7 +124,7 @@ class NetworkReconstructor:
                 tokens = self._with_room(partial(self._encode, scene, encoded))
             except torch.OutOfMemoryError:
                 raise
-            except Exception as error:  # one request's fault is not the others'
+            except Exception as error:  # an error of one request does not fail the others
                 outcomes[i] = error
             else:
                 batches[scene.grid, len(request.references)].append((i, _EncodedScene(scene, tokens)))
@@ -134,12 +135,12 @@ class NetworkReconstructor:
         return [outcome for outcome in outcomes if outcome is not None]
 
     def _with_room(self, work: Callable[[], T]) -> T:
-        """Does the work, a second time with more room if there was too little."""
+        """Calls `work`, a second time with the cache's device memory released if the memory did not suffice."""
         try:
             return work()
         except torch.OutOfMemoryError as error:
             log.warning("%s: tokens make room: %s", self.name, str(error))
-        # Out here nothing of the failed attempt is left.
+        # Outside the handler nothing refers to the tensors of the failed attempt.
         self.cache.release_device()
         if self._runner.device.type == "cuda":
             torch.cuda.empty_cache()
@@ -160,8 +161,8 @@ class NetworkReconstructor:
     def _encode(self, scene: _Scene, encoded: dict[TokenKey, Tensor]) -> tuple[Tensor, ...]:
         """Tokens (T, C) of each of a scene's views.
 
-        Views that are not in `encoded` join it; of references the cache is asked first, so that photographs are read
-        only of the rest.
+        Views that are not in `encoded` are added to it. Tokens of references are looked up in the cache first;
+        photographs are read only if they are not there.
         """
         keys = [self._key(view) for view in scene.views]
         for key, view in zip(keys[:-1], scene.views, strict=False):
@@ -172,7 +173,7 @@ class NetworkReconstructor:
         return tuple(encoded[key] for key in keys)
 
     def _encode_reference(self, key: TokenKey, view: _LaidOut) -> Tensor:
-        """Tokens (T, C), kept for later queries."""
+        """Tokens (T, C), cached for later queries."""
         tokens = self.cache.get(key)
         if tokens is None:
             tokens = self._encode_view(view)
@@ -185,7 +186,7 @@ class NetworkReconstructor:
         intrinsics = None
         if self._runner.conditioned:
             intrinsics = torch.from_numpy(view.layout.intrinsics.astype(np.float32))[None]
-        return self._runner.encode(_sent(picture[None], self._runner.device), intrinsics)[0]
+        return self._runner.encode(_on_device(picture[None], self._runner.device), intrinsics)[0]
 
     def _key(self, view: _LaidOut) -> TokenKey:
         runner, layout, photograph = self._runner, view.layout, view.photograph
@@ -209,7 +210,7 @@ class NetworkReconstructor:
             tuple(layout.camera for layout in layouts),
             of_query.camera,
             points,
-            _blanked(logits.sigmoid(), layouts),
+            _without_filling(logits.sigmoid(), layouts),
             poses,
             self.name,
         )
@@ -218,7 +219,7 @@ class NetworkReconstructor:
 
 @dataclass(frozen=True, eq=False)
 class _LaidOut:
-    """A view's photograph, and how it is laid on the scene's grid."""
+    """A view's photograph, and its layout on the scene's grid."""
 
     photograph: Photograph
     layout: Layout
@@ -254,31 +255,30 @@ class _EncodedScene:
 
 def _photograph(view: View, name: str) -> Photograph:
     if view.photograph is None:
-        raise ValueError(f"{name} has no photograph, which a network looks at")
+        raise ValueError(f"{name} has no photograph, which a network needs")
     return view.photograph
 
 
-def _blanked(confidence: Tensor, layouts: Sequence[Layout]) -> Tensor:
-    """Confidence (K, H, W) that is 0 where pictures are filled: there is nothing to be confident of."""
+def _without_filling(confidence: Tensor, layouts: Sequence[Layout]) -> Tensor:
+    """Confidence (K, H, W), set to 0 at pixels that do not show the photograph."""
     if all(layout.shown is None for layout in layouts):
         return confidence
     everywhere = np.ones(confidence.shape[1:], bool)
     shown = np.stack([everywhere if layout.shown is None else layout.shown for layout in layouts])
-    return torch.where(_sent(torch.from_numpy(shown), confidence.device), confidence, 0.0)
+    return torch.where(_on_device(torch.from_numpy(shown), confidence.device), confidence, 0.0)
 
 
-def _sent(tensor: Tensor, device: torch.device) -> Tensor:
-    """On the device; from pinned memory, so that nobody waits for what the device still has to do."""
+def _on_device(tensor: Tensor, device: torch.device) -> Tensor:
+    """The tensor on the device; copied from pinned memory, so that the host does not wait."""
     return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
 
 
 def condition_poses(world_from_references: Sequence[RigidTransform]) -> Array:
-    """Poses of the references and, last, what stands in for the query's, relative to the first reference.
+    """Poses of the references and, last, a placeholder for the query's, relative to the first reference.
 
     Networks normalize by the mean distance of all views from the first, whether their poses are used or not. The
-    stand-in lies at the mean distance of the other references, where it leaves that mean as it is; at which side is
-    all the same, since nothing else is computed from it. A single reference, which conditions nothing, gets it at its
-    own place.
+    placeholder is at the mean distance of the other references, so that it does not change that mean; its direction is
+    arbitrary, since nothing else is computed from it. With a single reference, whose pose is not used, it is there.
 
     Args:
         world_from_references: (K,), one at least.
@@ -291,5 +291,5 @@ def condition_poses(world_from_references: Sequence[RigidTransform]) -> Array:
     relative = [first_from_world.compose(pose) for pose in world_from_references]
     distances_m = [float(np.linalg.norm(pose.translation)) for pose in relative[1:]]
     neutral_m = float(np.mean(distances_m)) if distances_m else 0.0
-    stand_in = RigidTransform(np.eye(3), np.array([neutral_m, 0.0, 0.0]))
-    return np.stack([pose.matrix() for pose in (*relative, stand_in)])
+    placeholder = RigidTransform(np.eye(3), np.array([neutral_m, 0.0, 0.0]))
+    return np.stack([pose.matrix() for pose in (*relative, placeholder)])

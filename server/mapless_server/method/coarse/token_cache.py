@@ -1,7 +1,7 @@
-"""Tokens of references, kept: what a network computes of one view alone is the same in every call.
+"""Cache of references' tokens, which a network computes from one view alone, so that they are the same in every call.
 
-They lie on the device as long as there is room, and then in the host's memory. The key says everything that they depend
-on, so an entry is never wrong, only forgotten.
+Tokens are kept on the device, and in the host's memory if the device has no room. The key holds everything that they
+depend on, so an entry is never stale.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from .grids import Grid
 
 @dataclass(frozen=True)
 class TokenKey:
-    """What the tokens of a view depend on.
+    """Everything that the tokens of a view depend on.
 
     Attributes:
-        network, weights_sha256, dtype: what computed them.
+        network, weights_sha256, dtype: of the computation.
         image_sha256: of the encoded photograph.
-        source: the photograph's camera; how it is undistorted follows from it.
+        source: the photograph's camera, from which its undistortion follows.
         grid: size of the picture.
         camera: of the picture; a conditioned network takes it.
     """
@@ -46,9 +46,9 @@ class TokenCacheOptions:
 
     Attributes:
         device_bytes: on the device; 1 GiB are 500 views in bfloat16, enough for a scene and little beside the weights.
-        host_bytes: in the host's memory, for what has no room on the device: another 1000 views. Copying one to the
-            device moves 2.1 MB; computing it takes 0.8 TFLOP. For CUDA it is pinned, which comes in powers of two: at
-            518x392 nearly twice as much is taken.
+        host_bytes: in the host's memory, for tokens that have no room on the device: another 1000 views. Copying those
+            of a view to the device moves 2.1 MB; computing them takes 0.8 TFLOP. For CUDA the memory is pinned, whose
+            blocks have sizes of powers of two: at 518x392 nearly twice as much is taken.
     """
 
     device_bytes: int = 2**30
@@ -60,7 +60,7 @@ class TokenCacheOptions:
 
 @dataclass(frozen=True)
 class TokenCacheCounters:
-    """What the cache did since it was made, and what it holds."""
+    """Events since the cache was created, and its present size."""
 
     device_hits: int = 0
     host_hits: int = 0
@@ -71,7 +71,7 @@ class TokenCacheCounters:
 
 
 class TokenCache:
-    """Least recently used tokens go from the device to the host, and from there away. Safe to use from threads."""
+    """Least recently used tokens are moved from the device to the host, and then dropped. Safe to use from threads."""
 
     def __init__(self, device: torch.device, options: TokenCacheOptions | None = None) -> None:
         options = options or TokenCacheOptions()
@@ -84,12 +84,12 @@ class TokenCache:
 
     @property
     def counters(self) -> TokenCacheCounters:
-        """A moment's."""
+        """A snapshot."""
         with self._lock:
             return replace(self._counters, device_bytes=self._on_device.used_bytes, host_bytes=self._on_host.used_bytes)
 
     def get(self, key: TokenKey) -> Tensor | None:
-        """The tokens (T, C) on the device, or None; not to be written to."""
+        """The tokens (T, C) on the device, or None; they must not be modified."""
         with self._lock:
             tokens = self._on_device.get(key)
             if tokens is not None:
@@ -105,12 +105,12 @@ class TokenCache:
             return tokens
 
     def put(self, key: TokenKey, tokens: Tensor) -> None:
-        """Holds a copy of tokens (T, C) on the device: a part of a batch would keep the whole of it."""
+        """Stores a copy of tokens (T, C) on the device: a part of a batch would keep the whole batch in memory."""
         with self._lock:
             self._hold(key, tokens.clone())
 
     def release_device(self) -> None:
-        """Leaves the device's memory to others; what has room in the host's stays at hand."""
+        """Releases the device's memory; tokens are moved to the host as far as there is room."""
         with self._lock:
             for key, tokens in self._on_device.clear():
                 self._spill(key, tokens)
@@ -120,18 +120,18 @@ class TokenCache:
             self._spill(old_key, old_tokens)
 
     def _spill(self, key: TokenKey, tokens: Tensor) -> None:
-        forgotten = 1
+        dropped = 1
         if self._on_host.get(key) is not None:
-            forgotten = 0  # what came from the host has stayed there
+            dropped = 0  # tokens that came from the host are still there
         elif self._on_host.takes(tokens):
             spilled = torch.empty(tokens.shape, dtype=tokens.dtype, pin_memory=self._pins)
-            # It is only ever read by a copy to the device, which queues up behind this one.
-            forgotten = len(self._on_host.put(key, spilled.copy_(tokens, non_blocking=self._pins)))
-        self._counters = replace(self._counters, evictions=self._counters.evictions + forgotten)
+            # Not waited for: it is only read by a copy to the device, which the device does after this one.
+            dropped = len(self._on_host.put(key, spilled.copy_(tokens, non_blocking=self._pins)))
+        self._counters = replace(self._counters, evictions=self._counters.evictions + dropped)
 
 
 class _Level:
-    """Tensors of at most `capacity_bytes` together, the least recently used ones pushed out."""
+    """Tensors of at most `capacity_bytes` together; the least recently used ones are evicted."""
 
     def __init__(self, capacity_bytes: int) -> None:
         self.used_bytes = 0
@@ -139,7 +139,7 @@ class _Level:
         self._entries: OrderedDict[TokenKey, Tensor] = OrderedDict()
 
     def takes(self, tokens: Tensor) -> bool:
-        """Whether there is room when all else is pushed out."""
+        """Whether the tokens fit if everything else is evicted."""
         return tokens.nbytes <= self._capacity_bytes
 
     def get(self, key: TokenKey) -> Tensor | None:
@@ -149,21 +149,21 @@ class _Level:
         return self._entries[key]
 
     def put(self, key: TokenKey, tokens: Tensor) -> list[tuple[TokenKey, Tensor]]:
-        """Holds tokens; returns what had to go for them, be it they themselves."""
+        """Stores tokens; returns the evicted entries, or the new one if it does not fit."""
         if not self.takes(tokens):
             return [(key, tokens)]
         replaced = self._entries.pop(key, None)
         self.used_bytes += tokens.nbytes - (replaced.nbytes if replaced is not None else 0)
         self._entries[key] = tokens
-        gone = []
+        evicted = []
         while self.used_bytes > self._capacity_bytes:
-            gone.append(self._entries.popitem(last=False))
-            self.used_bytes -= gone[-1][1].nbytes
-        return gone
+            evicted.append(self._entries.popitem(last=False))
+            self.used_bytes -= evicted[-1][1].nbytes
+        return evicted
 
     def clear(self) -> list[tuple[TokenKey, Tensor]]:
-        """Everything, the least recently used first."""
-        gone = list(self._entries.items())
+        """Evicts all entries and returns them, the least recently used first."""
+        evicted = list(self._entries.items())
         self._entries.clear()
         self.used_bytes = 0
-        return gone
+        return evicted

@@ -79,7 +79,6 @@ class SequenceEstimate:
         scale_sigma: relative standard deviation of its scale; 0 where the session is metric.
         world_from_camera: of every frame, metric, drift taken out.
         covariances: (F, 6, 6) of the same, order x y z rx ry rz, fixed world axes, metres and radians.
-        step_weights: (F - 1,) robust weight of the session's step to the next frame, 0 to 1.
         matched: the frames that have matches, in order.
         origin: (3,) of the world in which these are, metres; the poses are in the caller's.
     """
@@ -88,7 +87,6 @@ class SequenceEstimate:
     scale_sigma: float
     world_from_camera: tuple[RigidTransform, ...]
     covariances: Array
-    step_weights: Array
     matched: tuple[PosedImage, ...]
     origin: Array
 
@@ -160,7 +158,6 @@ def _result(
         _scale_sigma(estimate),
         tuple(pose.shifted(origin) for pose in poses),
         np.array([covariance_in_world(block, pose) for block, pose in zip(blocks, poses, strict=True)]),
-        freedom.weights(),
         estimate.matched,
         origin,
     )

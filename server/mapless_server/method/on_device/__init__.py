@@ -1,8 +1,8 @@
 """Scale, structure and matching on the device of a network's output: one upload, one download, no synchronization.
 
-What does not depend on the network is prepared on the host while the network runs. `compute` then only launches work:
-it reads no value, so that rejections are numbers too until they are fetched. The
-equations are those of the host (see `arrays`), in float64; the results are what the host's stages give.
+Input that does not depend on the network is prepared on the host while the network runs. `compute` then only launches
+work: it reads no value, so that rejections too are numbers until they are fetched. The equations are those of the host
+(see `arrays`), in float64; the results are those of the host's stages.
 """
 
 from __future__ import annotations
@@ -18,12 +18,11 @@ from mapless.geometry import Camera
 
 from ..coarse.device import DeviceReconstruction
 from ..correspond import Correspondences
-from ..match import MatchOptions
 from ..reconstruction import map_cells
 from ..rejection import Rejection, RejectionReason
 from ..results import KeypointNoise, MetricScale, PointMatches, Structure
 from ..scale import check_references, judge, not_finite
-from ..scale_equations import ScaleOptions, gather
+from ..scale_equations import gather
 from ..structure import StructureOptions, tracks_of
 from ..tracks import Tracks
 from ..views import PosedView, View
@@ -37,50 +36,17 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """What the three stages found.
+    """The results of the three stages.
 
     Attributes:
-        scale: and with it the initial pose.
-        structure: None if it was not asked for.
-        matches: of the query with it; None as well.
+        scale: with the initial pose.
+        structure: None without options of structure.
+        matches: of the query with the structure; None without options of matches.
     """
 
     scale: MetricScale
     structure: Structure | None
     matches: PointMatches | None
-
-
-def refine_on_device(
-    reconstruction: DeviceReconstruction,
-    query: View,
-    references: Sequence[PosedView],
-    correspondences: Correspondences,
-    scale_options: ScaleOptions | None = None,
-    structure_options: StructureOptions | None = None,
-    match_options: MatchOptions | None = None,
-) -> Refined | Rejection:
-    """The stages scale, structure and match, on the device of the reconstruction.
-
-    Args:
-        reconstruction: query and references up to scale, its references in the order of `references`.
-        query: the query.
-        references: with known poses.
-        correspondences: matches between the references, and of the query with them.
-        scale_options: defaults to the paper's.
-        structure_options: None asks for the scale alone.
-        match_options: None as well.
-
-    Returns:
-        What estimate_scale, build_structure and match_points give. A network output that is not finite, wherever, is
-        rejected with SCALE_UNRELIABLE and a warning in the log, both naming the backend.
-
-    Raises:
-        ValueError: the reconstruction has another number of references, or only one of the last two options is given.
-    """
-    if (structure_options is None) != (match_options is None):
-        raise ValueError("structure and matches go together")
-    options = Options(scale_options or ScaleOptions(), structure_options, match_options)
-    return launch_on_device(reconstruction, query, references, correspondences, options)()
 
 
 def launch_on_device(
@@ -90,23 +56,38 @@ def launch_on_device(
     correspondences: Correspondences,
     options: Options,
 ) -> Callable[[], Refined | Rejection]:
-    """As refine_on_device, but waits for nothing: what it returns waits, and then gives the result.
+    """Launches the stages scale, structure and match on the device of the reconstruction, without waiting.
 
-    So every query of a batch is prepared, and its work queued up, while the network still computes.
+    So every query of a batch is prepared, and its work launched, while the network still computes.
+
+    Args:
+        reconstruction: query and references up to scale, its references in the order of `references`.
+        query: the query.
+        references: with known poses.
+        correspondences: matches between the references, and of the query with them.
+        options: of the stages; without options of structure and matches, the scale alone.
+
+    Returns:
+        A function that waits for the results, which are those of estimate_scale, build_structure and match_points. A
+        network output that is not finite is rejected with SCALE_UNRELIABLE and a warning in the log, both naming the
+        backend.
+
+    Raises:
+        ValueError: the reconstruction has another number of references.
     """
     if len(reconstruction.reference_cameras) != len(references):
         raise ValueError(f"{len(reconstruction.reference_cameras)} reconstructed references of {len(references)}")
     rejection = check_references(references, options.scale)
     if rejection is not None:
         return lambda: rejection
-    job = prepare(reconstruction.reference_cameras, query, references, correspondences, options)
-    uploaded = upload(job.inputs, reconstruction.point_maps.device)
+    prepared = prepare(reconstruction.reference_cameras, query, references, correspondences, options)
+    uploaded = upload(prepared.inputs, reconstruction.point_maps.device)
     launched = compute(reconstruction, uploaded, query.camera, options)
-    return lambda: _judged(fetch(launched), job, reconstruction, query, options)
+    return lambda: _judged(fetch(launched), prepared, reconstruction, query, options)
 
 
 def _judged(
-    outputs: Outputs, job: Job, reconstruction: DeviceReconstruction, query: View, options: Options
+    outputs: Outputs, prepared: HostInputs, reconstruction: DeviceReconstruction, query: View, options: Options
 ) -> Refined | Rejection:
     reference_count = len(reconstruction.reference_cameras)
     broken = _not_finite(outputs, reference_count)
@@ -119,18 +100,18 @@ def _judged(
         return scale
     if outputs.points is None or options.structure is None or options.match is None:
         return Refined(scale, None, None)
-    structure = _structure(outputs.points, job, options.structure)
+    structure = _structure(outputs.points, prepared, options.structure)
     return Refined(scale, structure, _matches(outputs.points, len(query.features), options.match.radius_px))
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
-    """What the host prepares before the network has finished.
+class HostInputs:
+    """Input prepared on the host while the network runs.
 
     Attributes:
         inputs: to upload.
-        tracks: that become points.
-        row: (O,) where their observations are among the rows (P, L) on the device.
+        tracks: of the points.
+        row: (O,) index of each of their observations among the rows (P, L) on the device.
     """
 
     inputs: Inputs
@@ -144,16 +125,16 @@ def prepare(
     references: Sequence[PosedView],
     correspondences: Correspondences,
     options: Options,
-) -> Job:
+) -> HostInputs:
     """All inputs that do not depend on the network; `map_cameras` are those of the references' maps."""
     known, cell = gather(references, correspondences, options.scale), _cells(map_cameras, references)
     nothing = np.empty(0, np.intp)
     if options.structure is None or options.match is None:
-        return Job(Inputs(known, cell, None, None), Tracks(nothing, nothing, nothing), nothing)
+        return HostInputs(Inputs(known, cell, None, None), Tracks(nothing, nothing, nothing), nothing)
     tracks = tracks_of(references, correspondences, options.structure)
     structure, row = prepare_structure(tracks, references)
     match = prepare_match(query, references, correspondences, structure.keypoint, options.match)
-    return Job(Inputs(known, cell, structure, match), tracks, row)
+    return HostInputs(Inputs(known, cell, structure, match), tracks, row)
 
 
 def _cells(map_cameras: Sequence[Camera], references: Sequence[PosedView]) -> NDArray[np.intp]:
@@ -165,25 +146,25 @@ def _cells(map_cameras: Sequence[Camera], references: Sequence[PosedView]) -> ND
 
 
 def _not_finite(outputs: Outputs, reference_count: int) -> str | None:
-    """What of the network's output is broken, in one sentence; None if nothing is."""
+    """The part of the network's output that is not finite, in one sentence; None if all is finite."""
     of_poses = not_finite(outputs.candidates, reference_count)
     if of_poses is None and outputs.broken_pixels:
         return f"{outputs.broken_pixels:.0f} predicted pixels are not finite"
     return of_poses
 
 
-def _structure(points: Points, job: Job, options: StructureOptions) -> Structure:
+def _structure(points: Points, prepared: HostInputs, options: StructureOptions) -> Structure:
     """The points and tracks that are kept."""
     seen = points.seen.astype(bool)
-    keep, rows = seen.any(axis=1), seen.reshape(-1)[job.row]
-    renumbered = np.cumsum(keep) - 1
-    tracks = Tracks(renumbered[job.tracks.point[rows]], job.tracks.view[rows], job.tracks.keypoint[rows])
+    keep, rows = seen.any(axis=1), seen.reshape(-1)[prepared.row]
+    renumbered, tracks = np.cumsum(keep) - 1, prepared.tracks
+    tracks = Tracks(renumbered[tracks.point[rows]], tracks.view[rows], tracks.keypoint[rows])
     noise = KeypointNoise(float(points.noise_level_px), options.first_noise.slope)
     return Structure(points.x_in_world[keep], tracks, noise)
 
 
 def _matches(points: Points, keypoint_count: int, radius_px: float) -> PointMatches:
-    """The matches in the order of match_points: those of votes, then those searched for, each by point."""
+    """The matches in the order of match_points: by votes, then by the guided search, each in the order of points."""
     keep = points.seen.any(axis=1)
     keypoint, guided = points.keypoint[keep].astype(np.intp), points.guided[keep].astype(bool)
     order = np.argsort(guided, kind="stable")

@@ -1,8 +1,8 @@
-"""What is computed on the device, from the network's output to all that the host needs, without looking at a value."""
+"""The computation on the device, from the network's output to the results for the host, without reading a value."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -22,21 +22,25 @@ from .structure import DeviceTracks, StructureInputs, observe_on_device
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """Options of the three stages; without structure there are no matches either."""
+    """Options of the three stages. Structure and matches are both computed, or neither."""
 
-    scale: ScaleOptions
-    structure: StructureOptions | None
-    match: MatchOptions | None
+    scale: ScaleOptions = field(default_factory=ScaleOptions)
+    structure: StructureOptions | None = None
+    match: MatchOptions | None = None
+
+    def __post_init__(self) -> None:
+        if (self.structure is None) != (self.match is None):
+            raise ValueError("Options.structure and Options.match must both be given, or neither")
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What is computed with beside the reconstruction.
+    """The input beside the reconstruction.
 
     Attributes:
         known: of the references.
-        cell: (N,) where their keypoints lie in the maps, counted through all maps; -1 outside.
-        structure, match: None if they are not asked for.
+        cell: (N,) index of each of their keypoints in the pixels of all maps; -1 outside.
+        structure, match: None without options of these stages.
     """
 
     known: Known
@@ -47,13 +51,13 @@ class Inputs:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Structure and matches, before anything is taken out.
+    """Structure and matches, before points are removed.
 
     Attributes:
         x_in_world: (P, 3) metres.
         noise_level_px: of the keypoints.
-        seen: (P, L) observations that are left, of points to keep.
-        keypoint: (P,) of the query; Q for a point without.
+        seen: (P, L) which rows are observations of a point that is kept.
+        keypoint: (P,) of the query; Q for a point without a match.
         guided: (P,) see PointMatches.
     """
 
@@ -66,12 +70,12 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class Outputs:
-    """What the host needs.
+    """The results for the host.
 
     Attributes:
         broken_pixels: see DeviceReconstruction.
         candidates: of the scale.
-        points: None if they were not asked for.
+        points: None without options of structure and matches.
     """
 
     broken_pixels: AnyArray

@@ -1,6 +1,6 @@
-"""The matching stage on a device: the same votes and the same search as in `match`, without lists that grow.
+"""The matching stage on a device: the same votes and the same search as in `match`, in arrays of fixed size.
 
-A match is a number at its point: the keypoint, or their count where there is none.
+The match of a point is stored at the point: the index of the keypoint, or the number of keypoints for none.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from ..tracks import keypoint_offsets
 from ..views import PosedView, View
 
 CHUNK_ELEMENTS = 2**25
-"""Similarities that are computed at a time, of an observation and a keypoint each: 128 MiB."""
+"""Number of similarities (of an observation and a keypoint) computed together: 128 MiB."""
 
 
 @dataclass(frozen=True, eq=False)
 class MatchInputs:
-    """What matching needs beside the structure, of N keypoints of the references and Q of the query.
+    """The input of matching beside the structure, of N keypoints of the references and Q of the query.
 
     Attributes:
         descriptors: (N, D) float32.
         query_descriptors: (Q, D) float32.
         query_pixels: (Q, 2).
-        vote_row: (V,) row of (P, L) observations that a match of the query with a reference names.
-        vote_keypoint: (V,) keypoint of the query that it gives it.
+        vote_row: (V,) for each match of the query with a reference, the row among the (P, L) observations.
+        vote_keypoint: (V,) for the same match, the keypoint of the query.
     """
 
     descriptors: AnyArray
@@ -69,12 +69,12 @@ def prepare_match(
 
 @dataclass(frozen=True, eq=False)
 class DevicePoints:
-    """Structure as matching sees it on the device.
+    """The structure on the device, as input of matching.
 
     Attributes:
         x_in_world: (P, 3) metres.
-        keypoint: (P, L) observations, as keypoints counted through all references; anything where blank.
-        seen: (P, L) which are observations of points that exist.
+        keypoint: (P, L) observations, as keypoints counted through all references; arbitrary where blank.
+        seen: (P, L) which rows are observations of points that exist.
     """
 
     x_in_world: Tensor
@@ -88,8 +88,8 @@ def match_on_device(
     """Matches of the query, whose initial world_from_camera is `rotation` (3, 3), `centre` (3,), with the points.
 
     Returns:
-        keypoint: (P,) of the query; Q for a point without.
-        guided: (P,) whether it was searched for near its projection.
+        keypoint: (P,) of the query; Q for a point without a match.
+        guided: (P,) whether the match was found near the point's projection.
     """
     none = len(inputs.query_pixels)
     known = torch.full_like(points.keypoint[:, 0], none)
@@ -122,7 +122,7 @@ def _search(
     inside = (x > -radius) & (x < camera.width_px + radius) & (y > -radius) & (y < camera.height_px + radius)
     free_points = inside & points.seen.any(1) & (known == keypoints)
     taken = free_points.new_zeros(keypoints + 1).index_fill(0, known, True)[:keypoints]
-    theirs_x, theirs_y = inputs.query_pixels.unbind(1)
+    keypoint_x, keypoint_y = inputs.query_pixels.unbind(1)
 
     best = torch.full_like(inputs.query_descriptors[:, 0], -torch.inf)
     point = torch.full_like(best, count, dtype=torch.int64)
@@ -133,7 +133,7 @@ def _search(
         descriptors = inputs.descriptors[points.keypoint[chunk].clip(0).reshape(-1)]
         similarity = (descriptors @ inputs.query_descriptors.T).reshape(*seen.shape, keypoints)
         similarity = similarity.masked_fill_(~seen[:, :, None], -torch.inf).amax(1)  # (p, Q)
-        near = (x[chunk, None] - theirs_x) ** 2 + (y[chunk, None] - theirs_y) ** 2 <= radius**2
+        near = (x[chunk, None] - keypoint_x) ** 2 + (y[chunk, None] - keypoint_y) ** 2 <= radius**2
         good = near & free_points[chunk, None] & ~taken & (similarity > options.min_similarity)
         nearest = similarity.masked_fill_(~good, -torch.inf).max(0)
         better = nearest.values > best
@@ -143,7 +143,7 @@ def _search(
 
 
 def one_to_one(point: Tensor, score: Tensor, point_count: int) -> Tensor:
-    """Of each keypoint's best point (Q,), with its score (Q,), the keypoint (P,) that is the best of its point."""
+    """From each keypoint's best point (Q,) and its score (Q,), the best keypoint (P,) of each point."""
     keypoint = torch.arange(len(point), device=point.device)
     return best_by_group(point, keypoint, score, point_count, len(point))[0]
 
@@ -151,19 +151,19 @@ def one_to_one(point: Tensor, score: Tensor, point_count: int) -> Tensor:
 def best_by_group(
     group: Tensor, candidate: Tensor, score: Tensor, group_count: int, candidate_count: int
 ) -> tuple[Tensor, Tensor]:
-    """The candidate with the highest score in each group, of equals that with the smallest number.
+    """The candidate with the highest score in each group; of equal ones that with the smallest index.
 
     Args:
-        group: (M,) the group that each belongs to; `group_count` for none.
-        candidate: (M,) its number.
+        group: (M,) the candidate's group; `group_count` for none.
+        candidate: (M,) index of the candidate.
         score: (M,).
         group_count: G.
-        candidate_count: the number of nobody.
+        candidate_count: the index that stands for no candidate.
 
     Returns:
         The candidate (G,), and its score (G,).
     """
     best = score.new_full((group_count + 1,), -torch.inf).scatter_reduce(0, group, score, "amax")
     chosen = torch.where(score == best[group], candidate, candidate_count)
-    nobody = candidate.new_full((group_count + 1,), candidate_count)
-    return nobody.scatter_reduce(0, group, chosen, "amin")[:-1], best[:-1]
+    none = candidate.new_full((group_count + 1,), candidate_count)
+    return none.scatter_reduce(0, group, chosen, "amin")[:-1], best[:-1]

@@ -1,7 +1,7 @@
 """The structure stage's tracks and observations on a device; its equations are those of `observations`.
 
-Nothing can be taken out of a tensor without waiting for the number of what remains. So every point has the same number
-of rows, and those that observe nothing, or no longer, are blank.
+Removing rows of a tensor would make the host wait for the number of remaining ones. So every point has the same number
+of rows; those without an observation, or whose observation is dropped, are blank.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from ..views import PosedView
 
 @dataclass(frozen=True, eq=False)
 class StructureInputs:
-    """What the structure needs beside the reconstruction, of P points in at most L of K references.
+    """The input of the structure beside the reconstruction, of P points in at most L of K references.
 
     Attributes:
-        keypoint: (P, L) observations, as keypoints counted through all references, from the left; -1 where blank.
+        keypoint: (P, L) observations, as keypoints counted through all references; then -1 for blank rows.
         view: (P, L) their reference; 0 where blank.
         pixel: (N, 2) float32, of the keypoints.
         size_px: (N,) float32, of the keypoints.
@@ -50,12 +50,12 @@ class StructureInputs:
 
 
 def prepare_structure(tracks: Tracks, references: Sequence[PosedView]) -> tuple[StructureInputs, NDArray[np.intp]]:
-    """The inputs, and the row (O,) of each observation of the tracks when the (P, L) are counted through."""
-    place = np.arange(len(tracks.point)) - tracks.starts[tracks.point]
-    shape = (tracks.point_count, int(place.max(initial=0)) + 1)
+    """The inputs, and the index (O,) of each observation of the tracks among the flattened (P, L)."""
+    column = np.arange(len(tracks.point)) - tracks.starts[tracks.point]
+    shape = (tracks.point_count, int(column.max(initial=0)) + 1)
     keypoint, view = np.full(shape, -1), np.zeros(shape, np.int64)
-    keypoint[tracks.point, place] = keypoint_offsets(references)[tracks.view] + tracks.keypoint
-    view[tracks.point, place] = tracks.view
+    keypoint[tracks.point, column] = keypoint_offsets(references)[tracks.view] + tracks.keypoint
+    view[tracks.point, column] = tracks.view
 
     camera_from_world = [r.world_from_camera.inverse() for r in references]
     cameras = [r.view.camera for r in references]
@@ -72,17 +72,17 @@ def prepare_structure(tracks: Tracks, references: Sequence[PosedView]) -> tuple[
         centre[keypoint[:, 0]],
         ray[keypoint[:, 0]],
     )
-    return inputs, tracks.point * shape[1] + place
+    return inputs, tracks.point * shape[1] + column
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceTracks:
-    """What stands for `Tracks` (see tracks.Grouping): L rows for each of P points.
+    """`Tracks` on a device (see tracks.Grouping): L rows for each of P points.
 
     Sums run over a point's rows in their order, so that an answer is reproducible; atomic additions are not.
 
     Attributes:
-        seen: (P, L) which rows observe something.
+        seen: (P, L) which rows have an observation.
     """
 
     seen: Tensor
@@ -112,7 +112,7 @@ class DeviceTracks:
         return self._by_point(values, -torch.inf).amax(1)
 
     def prune(self, observations: Tensor) -> tuple[DeviceTracks, slice, slice]:
-        """See Tracks; everything stays where it is."""
+        """See Tracks; the rows are not moved."""
         seen = self.seen & observations.reshape(self.seen.shape)
         often = seen.sum(1, keepdim=True) >= 2
         return DeviceTracks(seen & often), slice(None), slice(None)

@@ -1,4 +1,4 @@
-"""Between host and device: arrays up without waiting, results down in one piece."""
+"""Transfer between host and device: arrays up without waiting, results down in one piece."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Record = TypeVar("Record")
 def upload(record: Record, device: torch.device) -> Record:
     """The dataclass with every NumPy array in it on the device.
 
-    Returns at once: on CUDA the arrays go through pinned memory, so that the copies queue up behind the network's
-    kernels instead of waiting for them.
+    Returns at once: on CUDA the arrays are copied from pinned memory, after the network's kernels, and the host does
+    not wait for these.
     """
 
     def up(array: Any) -> Tensor:
-        tensor = torch.from_numpy(np.require(array, requirements=("C", "W")))  # torch warns of what it may not write
+        tensor = torch.from_numpy(np.require(array, requirements=("C", "W")))  # torch warns of read-only arrays
         return (tensor.pin_memory() if device.type == "cuda" else tensor).to(device, non_blocking=True)
 
     return _changed(record, np.ndarray, up)
@@ -40,7 +40,7 @@ def fetch(record: Record) -> Record:
 
 
 def _changed(record: Record, kind: type, change: Callable[[Any], object]) -> Record:
-    """A dataclass with another value for every one of this kind in it, at any depth; the rest as it is."""
+    """A dataclass with every value of this kind in it changed, at any depth; the rest as it is."""
     values: dict[str, Any] = {field.name: getattr(record, field.name) for field in fields(record)}  # type: ignore[arg-type]
     changes = {name: change(value) for name, value in values.items() if isinstance(value, kind)}
     changes |= {name: _changed(value, kind, change) for name, value in values.items() if is_dataclass(value)}

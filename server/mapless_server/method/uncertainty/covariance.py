@@ -37,6 +37,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import gammaincinv
 
 from mapless.geometry import Array, Camera, RigidTransform
@@ -171,18 +172,14 @@ def accuracy_from_covariance(covariance: Array) -> Accuracy:
     )
 
 
-def error_radius(covariance: Array, probability: float) -> float:
-    """Length that a zero-mean normal vector with this covariance (n, n) does not exceed with this probability.
+def error_radii(covariance: Array, probabilities: ArrayLike) -> Array:
+    """Lengths (P,) that a zero-mean normal vector with this covariance (n, n) does not exceed with probabilities (P,).
 
     The squared length is a sum of chi-squares weighted by the eigenvalues, approximated by one scaled chi-square with
     the same mean and variance (Satterthwaite). Exact if all eigenvalues are equal or all but one vanish, else within
     4 %.
     """
-    return float(error_radii(covariance, np.array([probability]))[0])
-
-
-def error_radii(covariance: Array, probabilities: Array) -> Array:
-    """`error_radius` (P,) for several probabilities (P,)."""
+    probabilities = np.asarray(probabilities, float)
     eigenvalues = np.linalg.eigvalsh(covariance).clip(min=0)
     total = float(eigenvalues.sum())
     if total <= 0:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass
+from typing import Any
 
 from .errors import UnknownWeights
 
@@ -90,6 +92,15 @@ class Weights:
     size_bytes: int | None = None
     sha256: str | None = None
     network: str = ""
+
+    def network_class(self) -> Any:
+        """The class that `network` names, which must not be empty; imports torch.
+
+        Raises:
+            ImportError: a package of the network is not installed.
+        """
+        module_name, class_name = self.network.split(":")
+        return getattr(importlib.import_module(module_name), class_name)
 
 
 _CC_BY_NC = Licence("CC BY-NC 4.0", "https://creativecommons.org/licenses/by-nc/4.0/", "non-commercial")

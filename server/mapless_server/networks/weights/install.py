@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -196,18 +195,17 @@ def _compare_names(header: Header, weights: Weights, description: str) -> str | 
     Raises:
         CheckpointError: they differ.
     """
-    module_name, class_name = weights.network.split(":")
     try:
         import torch
 
         from ..checkpoint import IMAGE_NORMALIZATION, UNUSED, expected_tensors
 
-        network = getattr(importlib.import_module(module_name), class_name)
+        network = weights.network_class()
     except ImportError as error:
         return install_hint(error)
     with torch.device("meta"):
         expected = expected_tensors(network())
-    check_fit(header, expected, IMAGE_NORMALIZATION.keys(), UNUSED, f"{description} does not fit {class_name}")
+    check_fit(header, expected, IMAGE_NORMALIZATION.keys(), UNUSED, f"{description} does not fit {network.__name__}")
     return None
 
 
