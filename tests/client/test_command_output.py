@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ from mapless.answers import PriorCheck
 from mapless.axes import Axes
 from mapless.cameras import read_camera
 from mapless.cli.folder import Tally
-from mapless.cli.output import lines
+from mapless.cli.output import lines, plain
 from mapless.errors import Internal
+from mapless.geometry import Camera, Fisheye, RigidTransform
 from mapless.requests import read_image
 from mapless.v1 import localization_service_pb2 as pb
 
@@ -67,6 +69,16 @@ def test_what_the_server_is_to_keep_is_said_and_of_nothing_else() -> None:
     )
     assert lines(rejected(diagnostics=captured))[-1] == "  captured by the server"
     assert "captured" not in "\n".join([*lines(localized()), *lines(rejected())])
+
+
+def test_zeros_are_printed_and_what_is_absent_is_not() -> None:
+    answer = localized(world_from_camera=RigidTransform.identity())
+    pose = plain(answer)["world_from_camera"]
+    assert pose == {"rotation": {"x": 0, "y": 0, "z": 0, "w": 1}, "translation_m": {"x": 0, "y": 0, "z": 0}}
+    pinhole = Camera(640, 480, 500.0, 500.0, 0.0, 0.0)
+    assert {*plain(pinhole)} == {it.name for it in fields(Camera)} - {"distortion"}
+    assert plain(replace(pinhole, distortion=Fisheye(k2=0.1)))["fisheye"] == {"k1": 0, "k2": 0.1, "k3": 0, "k4": 0}
+    assert read_camera(json.dumps(plain(pinhole))) == pinhole
 
 
 def test_progress_counts_each_kind_by_its_name() -> None:

@@ -26,7 +26,7 @@ from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.method.results import PoseStage
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.scenes import Narrowing, Sphere
@@ -134,6 +134,16 @@ def is_outcome(result: Result, planted: Answer) -> bool:
     return given is planted.outcome
 
 
+NEAR_ORIGIN = Narrowing(Sphere(pose(0.0).translation, 0.5))
+
+
+def hint_of(result: Result) -> Hint:
+    """The hint of a rejection."""
+    assert isinstance(result.answer.outcome, Rejection)
+    assert result.answer.outcome.hint is not None
+    return result.answer.outcome.hint
+
+
 class TestTiers:
     @pytest.mark.parametrize(
         "sure", [localized(SURE_INLIERS), rejected(RejectionReason.DEGENERATE_REFERENCES)], ids=["pose", "rejection"]
@@ -182,10 +192,27 @@ class TestTiers:
         assert outcome.reason is RejectionReason.GATE
         assert outcome.message.startswith("the features disagree: the pose of cheap (5 inliers) and that of strong (5)")
 
+    @pytest.mark.parametrize("reason", RejectionReason)
+    def test_a_rejection_has_a_hint_whatever_its_reason(self, setting: Setting, reason: RejectionReason) -> None:
+        setting.replies = dict.fromkeys(("cheap", "strong"), rejected(reason))
+        assert hint_of(setting.localize()).message
+
+    def test_a_rejection_of_the_engine_has_a_hint(self, setting: Setting) -> None:
+        """Where tiers disagree, a pose contradicts the prior, a tier fails, or there are no references."""
+        near, far = localized(DOUBTFUL_INLIERS), localized(DOUBTFUL_INLIERS, at=pose(3.0))
+        setting.replies = {"cheap": near, "strong": far}
+        hint = hint_of(setting.localize())
+        assert (hint.advice, hint.best_reference) == (Advice.TELL_PLACES_APART, "scenes/s/references/r1")
+        setting.replies = {"cheap": far, "strong": far}
+        assert hint_of(setting.localize(narrowing=NEAR_ORIGIN)).advice is Advice.CHECK_PRIOR
+        setting.replies = {"cheap": rejected(), "strong": lambda *_: 1 / 0}  # type: ignore[dict-item, return-value]
+        assert hint_of(setting.localize()).message
+        elsewhere = Narrowing(Sphere(pose(900.0).translation, 0.5))
+        assert hint_of(setting.localize(reference_ids=(), narrowing=elsewhere)).advice is Advice.CHECK_PRIOR
+
     def test_a_pose_outside_the_prior_is_doubtful_too(self, setting: Setting) -> None:
         setting.replies = {"cheap": localized(SURE_INLIERS, at=pose(3.0)), "strong": localized(SURE_INLIERS)}
-        near = Narrowing(Sphere(pose(0.0).translation, 0.5))
-        result = setting.localize(narrowing=near)
+        result = setting.localize(narrowing=NEAR_ORIGIN)
         assert isinstance(result.answer.outcome, Localization)
         assert setting.asked == ["cheap", "strong"]
 

@@ -36,7 +36,11 @@ def plain(value: Any) -> Any:
     if isinstance(value, RigidTransform):
         return plain(wire.transform_to_message(value))
     if isinstance(value, Message):
-        return json_format.MessageToDict(value, preserving_proto_field_name=True)
+        # Zeros too, which protobuf's JSON leaves out: a program that reads translation_m.x finds it wherever the
+        # camera is. What can be absent, such as a lens, stays absent.
+        return json_format.MessageToDict(
+            value, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
+        )
     if dataclasses.is_dataclass(value):
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, dict):

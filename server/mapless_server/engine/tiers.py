@@ -14,7 +14,7 @@ import numpy as np
 
 from mapless.geometry import rotation_angle_deg
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.method.uncertainty.covariance import Accuracy, accuracy_from_covariance
 
 from .query import Result
@@ -97,7 +97,19 @@ def better_of(cheaper: Result, stronger: Result, options: EscalationOptions) -> 
         f"the features disagree: the pose of {cheaper.tier.features} ({first.inlier_count} inliers) and that of "
         f"{stronger.tier.features} ({second.inlier_count}) are {apart_m:.2f} m and {apart_deg:.1f} degrees apart"
     )
-    return replace(stronger, answer=replace(stronger.answer, outcome=Rejection(RejectionReason.GATE, message)))
+    rejection = Rejection(RejectionReason.GATE, message, _places_apart(stronger))
+    return replace(stronger, answer=replace(stronger.answer, outcome=rejection))
+
+
+def _places_apart(result: Result) -> Hint:
+    """What helps where two kinds of features find two places."""
+    matches = result.answer.reference_match_counts
+    best = result.references[int(np.argmax(matches))].name if result.references and any(matches) else None
+    message = (
+        "Say where the camera is, or take a photograph that shows more of what the references show: two kinds of "
+        "features find two places."
+    )
+    return Hint("judge", Advice.TELL_PLACES_APART, message, best)
 
 
 def _claim(localization: Localization) -> Accuracy:
