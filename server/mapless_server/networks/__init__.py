@@ -22,7 +22,8 @@ A network for retrieval, which computes one vector for a whole image:
 
 Networks of local features and of their matching:
 
-    local_features.py   ALIKED, XFeat, SuperPoint: networks of other packages, weights loaded here
+    edgepoint2.py       EdgePoint2 (Yao et al. 2025), keypoints and descriptors for small devices
+    local_features.py   it, and ALIKED, XFeat, SuperPoint, networks of other packages; weights loaded here
     lightglue.py        LightGlue (Lindenberger et al. 2023), of kornia's layers
 
     weights/       the catalogue of weights, their folder, fetching and checking; without torch

@@ -1,11 +1,13 @@
-"""The networks of local features, each with the weights of a file: kornia's ALIKED and XFeat, transformers' SuperPoint.
+"""The networks of local features, each with the weights of a file.
 
-All raise CheckpointError where the weights do not fit, and ImportError where the network's package is not installed.
+EdgePoint2 is our own; ALIKED and XFeat are kornia's, SuperPoint is that of transformers. All raise CheckpointError
+where the weights do not fit, and ImportError where the network's package is not installed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +18,8 @@ if TYPE_CHECKING:  # each package is needed for its own networks only
     from kornia.feature.xfeat import XFeatModel
     from torch import nn
     from transformers import SuperPointConfig, SuperPointForKeypointDetection
+
+    from .edgepoint2 import EdgePoint2
 
 DERIVED = {"dkd.hw_grid": None}
 """Computed by kornia, so not in the file of ALIKED's authors."""
@@ -38,6 +42,14 @@ def load_xfeat(weights: Path) -> tuple[XFeatModel, str]:
     return network, load_strictly(network, weights, optional={})
 
 
+def load_edgepoint2(variant: str, weights: Path) -> tuple[EdgePoint2, str]:
+    """EdgePoint2 of a variant ("s64", "m64", "l64", "e64") and its weights' identity."""
+    from .edgepoint2 import VARIANTS, EdgePoint2
+
+    network = EdgePoint2(VARIANTS[variant])
+    return network, load_strictly(network, weights, optional={})
+
+
 def load_superpoint(
     weights: Path, config: SuperPointConfig | None = None
 ) -> tuple[SuperPointForKeypointDetection, str]:
@@ -51,6 +63,7 @@ def load_superpoint(
 LOADERS: Mapping[str, Callable[[Path], tuple[nn.Module, str]]] = {
     "aliked": load_aliked,
     "xfeat": load_xfeat,
+    **{f"edgepoint2-{variant}": partial(load_edgepoint2, variant) for variant in ("s64", "m64", "l64", "e64")},
     "superpoint": load_superpoint,
 }
 """By the features' names."""

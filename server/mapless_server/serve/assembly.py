@@ -16,6 +16,7 @@ from mapless_server.engine.references import References
 from mapless_server.engine.stages import Method
 from mapless_server.extras import install_hint
 from mapless_server.images import ImageLimits
+from mapless_server.method.choices import BEST_VARIANTS
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import Matcher, make_matcher
 from mapless_server.method.features import FeatureExtractor, make_extractor
@@ -140,7 +141,7 @@ def engine_over(
 def feature_names(features: str, device: str) -> tuple[str, ...]:
     """The features of the setting on "cpu" or "cuda...", the cheapest first."""
     if features != "auto":
-        return (features,)
+        return (BEST_VARIANTS.get(features, features),)
     return (CHEAP_FEATURES, STRONG_FEATURES) if device == "cpu" else (STRONG_FEATURES,)
 
 

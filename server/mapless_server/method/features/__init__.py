@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera
 
-from ..choices import FEATURES
+from ..choices import EDGEPOINT2, FEATURES
 from ..views import View
 from .image import MAX_INCIDENCE_DEG, reduce_image, undistort_pixels
 from .sift import SiftExtractor, SiftOptions
@@ -75,6 +75,10 @@ def make_extractor(name: str, weights: Path | None = None, device: str = "cpu") 
         raise ValueError(f"unknown features {name!r}; known: {', '.join(FEATURES)}")
     if weights is None:
         raise ValueError(f"features {name!r} need their network's weights")
+    if name in EDGEPOINT2:
+        from .edgepoint2 import EdgePoint2Extractor
+
+        return EdgePoint2Extractor(name.removeprefix("edgepoint2-"), weights, device)
     if name == "aliked":
         from .aliked import AlikedExtractor
 

@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from kornia.feature.xfeat import InterpolateSparse2d
 from numpy.typing import NDArray
-from torch.nn.functional import log_softmax, max_pool2d, normalize, pixel_shuffle
+from torch.nn.functional import log_softmax, normalize, pixel_shuffle
 
 from mapless.geometry import Camera
 from mapless_server.networks.local_features import load_xfeat
 
 from ..views import View
 from .image import reduce_image, view_of
-from .network import LearnedOptions, array_of, image_tensor
+from .network import LearnedOptions, array_of, image_tensor, peak_offsets, strict_maxima
 
 MULTIPLE_PX = 32
 """Sides of the images that the network takes."""
@@ -70,38 +70,3 @@ class XfeatExtractor:
             array_of(normalize(descriptors, dim=1)),
             np.full(len(pixels), WINDOW_PX, np.float32),
         )
-
-
-def strict_maxima(scores: torch.Tensor, window_px: int, threshold: float) -> torch.Tensor:
-    """Pixels (N, 2), x and y, above the threshold and above all others of their window, which lies in the image.
-
-    Args:
-        scores: (H, W).
-        window_px: odd.
-        threshold: see above.
-    """
-    margin = window_px // 2
-    inner = scores[margin:-margin, margin:-margin]
-    height, width = inner.shape
-    largest_other = torch.full_like(inner, -torch.inf)
-    rows = max_pool2d(scores[None], (1, window_px), stride=1)[0]
-    for step in range(window_px):
-        if step != margin:
-            largest_other = torch.maximum(largest_other, rows[step : step + height])
-            largest_other = torch.maximum(largest_other, scores[margin : margin + height, step : step + width])
-    return (((inner > largest_other) & (inner > threshold)).nonzero() + margin).flip(1)
-
-
-def peak_offsets(heights: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
-    """From strict maxima (N, 2) to the peak of the parabolas through their neighbours, (N, 2), at most half a pixel.
-
-    Args:
-        heights: (H, W).
-        pixels: x and y, not at the border.
-    """
-    x, y = pixels.unbind(1)
-    here = heights[y, x]
-    left, right, above, below = heights[y, x - 1], heights[y, x + 1], heights[y - 1, x], heights[y + 1, x]
-    return torch.stack(
-        [(left - right) / (2 * (left + right - 2 * here)), (above - below) / (2 * (above + below - 2 * here))], dim=1
-    )

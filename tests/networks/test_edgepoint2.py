@@ -1,0 +1,73 @@
+"""EdgePoint2: the official network's own outputs; fused it computes the same; contrast and padding change nothing."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.scenes import random_for
+
+torch = pytest.importorskip("torch", reason="the networks extra is not installed")
+
+from torch import Tensor  # noqa: E402
+
+from mapless_server.networks.edgepoint2 import VARIANTS, EdgePoint2, fuse  # noqa: E402
+from mapless_server.networks.local_features import load_edgepoint2  # noqa: E402
+
+FOLDER = Path(os.environ.get("TEST_EDGEPOINT2") or Path(__file__).parents[3] / "shared" / "weights" / "edgepoint2")
+"""Where `fixture.npz` and the weights S64.safetensors and so on are: they are not part of the project."""
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_outputs_are_those_of_the_official_network(variant: str) -> None:
+    name = variant.upper()
+    if not (FOLDER / "fixture.npz").is_file():
+        pytest.skip(f"needs {FOLDER}/fixture.npz (TEST_EDGEPOINT2 names another folder)")
+    network, _ = load_edgepoint2(variant, FOLDER / f"{name}.safetensors")
+    with np.load(FOLDER / "fixture.npz") as arrays, torch.inference_mode():
+        logits, descriptors = network.eval()(torch.from_numpy(arrays["image"])[None, None])
+        np.testing.assert_allclose(logits[0, 0], arrays[f"{name}_score"], atol=1e-4, rtol=0)
+        np.testing.assert_allclose(descriptors[0], arrays[f"{name}_desc"], atol=1e-4, rtol=0)
+
+
+def random_network(variant: str) -> EdgePoint2:
+    """Of random weights, and of statistics that batch normalization could have learned."""
+    torch.manual_seed(0)
+    network = EdgePoint2(VARIANTS[variant]).eval()
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            for values, low, high in (
+                *((module.weight.data, 0.5, 2), (module.bias.data, -1, 1)),
+                *((module.running_mean, -1, 1), (module.running_var, 0.5, 2)),
+            ):
+                values.uniform_(low, high)
+    return network
+
+
+def random_image(*shape: int) -> Tensor:
+    image: Tensor = torch.from_numpy(random_for("image", shape).random((1, 1, *shape), np.float32))
+    return image
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_fused_it_computes_the_same(variant: str) -> None:
+    network, image = random_network(variant), random_image(96, 130)
+    with torch.inference_mode():
+        expected = network(image)
+        found = fuse(network)(image)
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in network.modules())
+    for ours, theirs in zip(found, expected, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
+
+
+def test_contrast_and_brightness_change_nothing_in_a_padded_image() -> None:
+    """So what is padded takes no part in the normalization."""
+    network, image = random_network("s64"), random_image(70, 100)
+    with torch.inference_mode():
+        logits, descriptors = network(image)
+        others = network(0.3 * image + 0.5)
+    assert (logits.shape, descriptors.shape) == ((1, 1, 70, 100), (1, 64, 24, 32))
+    for ours, theirs in zip(others, (logits, descriptors), strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-2, rtol=1e-2)
