@@ -206,37 +206,6 @@ def test_every_rpc_has_a_request_here() -> None:
     assert {method.name for method in service.methods} == {"CreateScene", "ListScenes", *requests_for("s", "r")}
 
 
-@pytest.mark.parametrize("stranger", [tenant for tenant in TENANTS if tenant != "acme"])
-@pytest.mark.parametrize("method", list(requests_for("s", "r")))
-def test_a_scene_of_another_tenant_looks_absent(server: Server, method: str, stranger: str) -> None:
-    assert server.call("acme", "CreateScene", pb.CreateSceneRequest(scene_id="s")).scene.name == "scenes/s"
-    assert server.call("acme", "CreateReference", create_request("s", "r")).reference.name == "scenes/s/references/r"
-    before = seen(server, "acme")
-    answer = server.call(stranger, method, requests_for("s", "r")[method])
-    absent = server.call("nobody", method, requests_for("s", "r")[method])
-    assert answer == absent
-    assert answer[0] == "NOT_FOUND"
-    assert "acme" not in str(answer)
-    assert server.call(stranger, "ListScenes", pb.ListScenesRequest()) == pb.ListScenesResponse()
-    assert seen(server, "acme") == before
-
-
-@pytest.mark.parametrize("stranger", [tenant for tenant in TENANTS if tenant != "acme"])
-def test_the_same_ids_of_two_tenants_are_two_things(server: Server, stranger: str) -> None:
-    photos = {"acme": PHOTO, stranger: OTHER_PHOTO}
-    for tenant, photo in photos.items():
-        assert server.call(tenant, "CreateScene", pb.CreateSceneRequest(scene_id="s")).scene.name == "scenes/s"
-        server.call(tenant, "CreateReference", create_request("s", "r", photo))
-    get = requests_for("s", "r")["GetReference"]
-    for tenant, photo in photos.items():
-        assert server.call(tenant, "GetReference", get).reference.image == photo
-    theirs = seen(server, "acme")
-    server.call(stranger, "DeleteScene", pb.DeleteSceneRequest(name="scenes/s"))
-    assert server.call(stranger, "GetReference", get)[0] == "NOT_FOUND"
-    assert seen(server, "acme") == theirs
-    assert server.call("acme", "GetReference", get).reference.image == PHOTO
-
-
 @pytest.mark.parametrize("method", ["ListScenes", "ListReferences"])
 def test_a_page_token_of_another_tenant_is_rejected(server: Server, method: str) -> None:
     for tenant in TENANTS:
