@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -13,11 +12,10 @@ import grpc
 import pytest
 from support.servers import CAMERA, PHOTO, RunningServer, localize_request, pose, serving
 
-from mapless import Client, ConnectOptions, LocalizationResult, NewReference
+from mapless import Client, LocalizationResult, NewReference
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.security import create_token, revoke_token
 from mapless_server.services.watching import MAX_WATCHERS_OF_TENANT
 
 LIMIT_S = 30.0
@@ -156,35 +154,3 @@ def test_a_watcher_that_reads_nothing_delays_no_stop(tmp_path: Path) -> None:
         assert seen.is_active()  # for all it knows: it has not read what came before the end
         client.close()
         channel.close()
-
-
-def test_a_token_that_is_revoked_shows_nothing_more(tmp_path: Path) -> None:
-    tokens = tmp_path / "tokens.json"
-    token = create_token(tokens, "guard", "acme", "write", None)
-    metadata = (("authorization", f"Bearer {token}"),)
-    other = create_token(tokens, "robot", "acme", "write", None)
-    with (
-        serving(tmp_path / "data", allow_watching=True, tokens_file=tokens) as guarded,
-        grpc.insecure_channel(guarded.address) as channel,
-    ):
-        stub = LocalizationServiceStub(channel)
-        robot = (("authorization", f"Bearer {other}"),)
-        with Client(guarded.address, ConnectOptions(token=other)) as client:
-            fill(client, "hall")
-        seen = watching(stub, metadata=metadata)
-        stub.Localize(localize_request("hall"), timeout=LIMIT_S, metadata=robot)
-        assert next(seen).image == PHOTO
-        revoke_token(tokens, "guard")
-        reader = threading.Thread(target=read_to_the_end, args=(seen,))
-        reader.start()
-        end_s = time.monotonic() + LIMIT_S
-        while reader.is_alive():
-            reader.join(0.2)
-            stub.Localize(localize_request("hall"), timeout=LIMIT_S, metadata=robot)
-            assert time.monotonic() < end_s
-        assert seen.code() is grpc.StatusCode.UNAUTHENTICATED
-
-
-def read_to_the_end(call: Any) -> None:
-    with pytest.raises(grpc.RpcError):
-        list(call)

@@ -9,7 +9,7 @@ import weakref
 import pytest
 
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.errors import FailedPrecondition, Overloaded, Unavailable
+from mapless_server.errors import Overloaded
 from mapless_server.security import key_of
 from mapless_server.services.watching import MAX_WATCHERS, MAX_WATCHERS_OF_TENANT, QUEUE_LENGTH, Watcher, Watchers
 
@@ -127,34 +127,6 @@ def test_nothing_is_kept_without_watchers() -> None:
         assert kept() is None
 
     asyncio.run(run())
-
-
-def test_watching_ends_when_the_server_stops() -> None:
-    async def run() -> None:
-        watchers = Watchers(True)
-        idle, late = watchers.watch(HALL), watchers.watch(HALL)
-        waits = asyncio.ensure_future(idle.__anext__())
-        await asyncio.sleep(0)
-        publish(watchers, 1)
-        assert inliers_of(await waits) == 1
-        waits = asyncio.ensure_future(idle.__anext__())
-        await asyncio.sleep(0)
-        watchers.close()
-        with pytest.raises(Unavailable) as ended:
-            await asyncio.wait_for(waits, LIMIT_S)
-        assert ended.value.reason == "DRAINING"
-        with pytest.raises(Unavailable):
-            await next_of(late)
-
-    asyncio.run(run())
-
-
-def test_watching_has_to_be_allowed() -> None:
-    watchers = Watchers(False)
-    with pytest.raises(FailedPrecondition, match="allow_watching") as refused:
-        watchers.watch(HALL)
-    assert refused.value.reason == "WATCHING_NOT_ALLOWED"
-    assert not watchers.is_watched(HALL)
 
 
 def test_one_tenant_cannot_keep_the_others_from_watching() -> None:
