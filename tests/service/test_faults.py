@@ -360,8 +360,8 @@ class TestProcess:
                     stored = {it.reference_id for it in client.list_references("s")}
         assert {name for names in acknowledged for name in names} <= stored
 
-    @pytest.mark.parametrize("signals", [1, 2])
-    def test_sigterm_drains_in_order(self, tmp_path: Path, signals: int) -> None:
+    @pytest.mark.parametrize("signals", [[signal.SIGTERM], [signal.SIGINT, signal.SIGTERM]])
+    def test_a_signal_drains_in_order(self, tmp_path: Path, signals: list[signal.Signals]) -> None:
         """Health first, while calls are still taken; then none; what runs and what waits is answered; exit code 0."""
         settings: dict[str, Any] = {
             "workers": 1,
@@ -381,8 +381,8 @@ class TestProcess:
             assert next(watch).status == SERVING
             calls = [pool.submit(client.localize, PHOTO, CAMERA, "s") for _ in range(2)]
             wait_until(lambda: server.began == 1 and scraped(server.metrics_address).started == 2)
-            for _ in range(signals):
-                server.process.send_signal(signal.SIGTERM)
+            for sent in signals:
+                server.process.send_signal(sent)
             assert next(watch).status == NOT_SERVING
             watch.cancel()
             assert client.get_scene("s").reference_count == 1

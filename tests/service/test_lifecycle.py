@@ -4,25 +4,18 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import cv2
 import grpc
-import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from support.images import encode
 from support.programs import real
 from support.servers import CAMERA, PHOTO, RunningServer, pose, serving
-from support.waiting import wait_until
 
-from mapless import Client, ConnectOptions, LocalizationResult, NewReference, Unavailable
-from mapless.geometry import Camera
+from mapless import Client, ConnectOptions, NewReference
 
 SERVICES = ["", "mapless.v1.LocalizationService", "mapless.v1.ReferenceService"]
 SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
@@ -35,38 +28,6 @@ def test_health_of_every_service(server: RunningServer) -> None:
             assert stub.Check(health_pb2.HealthCheckRequest(service=service), timeout=10).status == SERVING
         with pytest.raises(grpc.RpcError, match="NOT_FOUND"):
             stub.Check(health_pb2.HealthCheckRequest(service="mapless.v1.Absent"), timeout=10)
-
-
-def refused_soon(client: Client) -> bool:
-    """Whether calls come to be answered UNAVAILABLE."""
-    for _ in range(500):
-        try:
-            client.get_scene("s")
-        except Unavailable:
-            return True
-        time.sleep(0.01)
-    return False
-
-
-def test_draining_finishes_what_runs_and_takes_nothing_new(tmp_path: Path) -> None:
-    with (
-        serving(tmp_path) as server,
-        Client(server.address, ConnectOptions(max_attempts=1)) as client,
-        grpc.insecure_channel(server.address) as channel,
-        ThreadPoolExecutor(1) as thread,
-    ):
-        client.create_scene("s")
-        client.add_reference("s", NewReference("r", PHOTO, CAMERA, pose(0)))
-        watch = health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest(), timeout=30)
-        assert next(watch).status == SERVING
-        with server.method.held():
-            running = thread.submit(client.localize, PHOTO, CAMERA, "s")
-            assert server.method.started.acquire(timeout=20)
-            server.stop()
-            assert next(watch).status == NOT_SERVING
-            watch.cancel()
-            assert refused_soon(client)
-        assert isinstance(running.result(30), LocalizationResult)
 
 
 def test_calls_that_outlast_the_grace_are_cut_off(tmp_path: Path) -> None:
@@ -84,33 +45,6 @@ def test_calls_that_outlast_the_grace_are_cut_off(tmp_path: Path) -> None:
             with pytest.raises(Exception, match=r".") as caught:
                 running.result(20)
         assert getattr(caught.value, "code", None) in {"UNAVAILABLE", "CANCELLED"}
-
-
-def noise_photo(seed: int) -> bytes:
-    """A photograph that keeps a feature extractor busy."""
-    noise = np.random.default_rng(seed).integers(0, 256, (768, 1024, 3)).astype(np.uint8)
-    return encode(".jpg", np.asarray(cv2.GaussianBlur(noise, (0, 0), 1.5), np.uint8))
-
-
-def test_sigterm_finishes_a_running_call_and_exits_with_0(tmp_path: Path) -> None:
-    camera = Camera(1024, 768, 900.0, 900.0, 511.5, 383.5)
-    references = [NewReference(f"r{i}", noise_photo(i), camera, pose(i)) for i in range(6)]
-    with (
-        real(tmp_path / "server", workers=1, drain_grace_s=60, log_level="debug") as server,
-        Client(server.address) as client,
-        ThreadPoolExecutor(1) as thread,
-    ):
-        client.create_scene("s")
-        upload = thread.submit(client.add_references, "s", references)
-        wait_until(lambda: "BatchCreateReferences begins" in server.log)
-        server.process.send_signal(signal.SIGTERM)
-        assert not upload.done()
-        assert len(upload.result(60)) == 6
-        assert server.wait() == 0
-    with real(tmp_path / "server") as server, Client(server.address) as client:
-        assert client.get_scene("s").reference_count == 6
-        server.process.send_signal(signal.SIGINT)
-        assert server.wait() == 0
 
 
 def test_settings_are_shown_at_the_start(tmp_path: Path) -> None:
@@ -141,10 +75,6 @@ def refusal(tmp_path: Path, **settings: object) -> str:
 )
 def test_a_server_that_cannot_start_says_why_in_one_line(tmp_path: Path, setting: str, value: str) -> None:
     assert value in refusal(tmp_path, **{setting: value})
-
-
-def test_a_setting_out_of_bounds_is_named(tmp_path: Path) -> None:
-    assert "workers" in refusal(tmp_path, workers=0)
 
 
 def test_a_taken_port_is_not_shared(server: RunningServer, tmp_path: Path) -> None:
