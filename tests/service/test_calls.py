@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import logging
-import threading
 import time
 from collections.abc import Iterator
 from concurrent import futures
 from pathlib import Path
-from typing import Any
 
 import grpc
 import pytest
-from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, localize_request, make_scene, pose, serving
+from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose, serving
 from support.waiting import wait_until
 
 from mapless import (
@@ -24,7 +22,6 @@ from mapless import (
     LocalizationResult,
     NewReference,
     ResourceExhausted,
-    Unavailable,
 )
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
@@ -93,16 +90,6 @@ def test_what_nobody_waits_for_is_not_computed(
         future.result(30)
     client.localize(PHOTO, CAMERA, scene)
     assert server.method.call_count == before + 3
-
-
-def test_a_call_without_deadline_gets_the_default(tmp_path: Path) -> None:
-    with serving(tmp_path, default_deadline_s=0.3) as server, Client(server.address) as client:
-        make_scene(client)
-        with grpc.insecure_channel(server.address) as channel, server.method.held():
-            method = channel.unary_unary("/mapless.v1.LocalizationService/Localize")
-            with pytest.raises(grpc.RpcError) as caught:
-                method(localize_request("s").SerializeToString())
-        assert from_rpc_error(caught.value).code == "DEADLINE_EXCEEDED"
 
 
 def test_faults_of_ours_are_internal_without_detail(
@@ -187,62 +174,3 @@ def test_a_compressed_message_over_the_limit(server: RunningServer, client: Clie
         channel.unary_unary("/mapless.v1.LocalizationService/Localize")(bytes(64 * 2**20), timeout=30)
     assert from_rpc_error(caught.value).code == "RESOURCE_EXHAUSTED"
     client.localize(PHOTO, CAMERA, scene)
-
-
-@pytest.mark.parametrize("data", [b"\xff" * 40, b"\x0a\x05abc", b"\x0a\x02\xff\xfe"])
-def test_bytes_that_are_no_request(server: RunningServer, data: bytes) -> None:
-    with grpc.insecure_channel(server.address) as channel, pytest.raises(grpc.RpcError) as caught:
-        channel.unary_unary("/mapless.v1.LocalizationService/Localize")(data, timeout=30)
-    error = from_rpc_error(caught.value)
-    assert (error.code, error.reason) == ("INVALID_ARGUMENT", "MALFORMED_MESSAGE")
-
-
-class Unready(grpc.GenericRpcHandler):
-    """A server that says UNAVAILABLE some times before it answers."""
-
-    def __init__(self, failures: int) -> None:
-        self.failures = failures
-        self.tries = 0
-        self._lock = threading.Lock()
-
-    def service(self, handler_call_details: Any) -> Any:
-        newer: Any = pb.LocalizeResponse()
-        newer.rejection.reason = 99
-
-        def answer(data: bytes, context: Any) -> Any:
-            with self._lock:
-                self.tries += 1
-                if self.tries <= self.failures:
-                    context.abort(grpc.StatusCode.UNAVAILABLE, "starting")
-            return newer.SerializeToString()
-
-        return grpc.unary_unary_rpc_method_handler(answer)
-
-
-@pytest.mark.parametrize(("failures", "tries"), [(2, 3), (9, 4)])
-def test_the_client_resends_photographs_while_a_server_starts(
-    pool: futures.ThreadPoolExecutor, failures: int, tries: int
-) -> None:
-    unready = Unready(failures)
-    server = grpc.server(pool, [unready], options=[("grpc.max_receive_message_length", -1)])
-    port = server.add_insecure_port("127.0.0.1:0")
-    server.start()
-    options = ConnectOptions(initial_backoff_s=0.01, max_backoff_s=0.02)
-    photo = bytes(3 * 2**20)
-    with Client(f"127.0.0.1:{port}", options) as client:
-        if failures < tries:
-            answer = client.localize(photo, CAMERA, "s")
-            assert getattr(answer, "reason", None) == "99"  # a reason newer than this client
-        else:
-            with pytest.raises(Unavailable):
-                client.localize(photo, CAMERA, "s")
-    assert unready.tries == tries
-    server.stop(None).wait()
-
-
-def test_a_server_that_is_not_there_is_unavailable() -> None:
-    with (
-        Client("127.0.0.1:9", ConnectOptions(initial_backoff_s=0.01, max_backoff_s=0.02)) as client,
-        pytest.raises(Unavailable),
-    ):
-        client.get_scene("s", timeout_s=10)

@@ -109,8 +109,8 @@ def test_the_life_of_a_scene(server: RunningServer, connect: Connect, tmp_path: 
 @both
 @pytest.mark.parametrize("code", ["RESOURCE_EXHAUSTED", "UNAVAILABLE"])
 def test_a_server_that_is_busy_twice_answers_the_third_time(connect: Connect, code: str) -> None:
-    rejected = localization_pb.LocalizeResponse()
-    rejected.rejection.reason = localization_pb.RejectionReason.REJECTION_REASON_LOW_TEXTURE
+    rejected: Any = localization_pb.LocalizeResponse()
+    rejected.rejection.reason = 99
     photo = bytes(3 * 2**20)  # larger than gRPC would repeat unasked
     with (
         failing([status(code, 0.15)] * 2, lambda method, data: rejected.SerializeToString()) as (address, server),
@@ -119,7 +119,7 @@ def test_a_server_that_is_busy_twice_answers_the_third_time(connect: Connect, co
         start_s = time.monotonic()
         answer = client.localize(photo, CAMERA, "s", timeout_s=20.0)
         took_s = time.monotonic() - start_s
-    assert getattr(answer, "reason", None) == "LOW_TEXTURE"
+    assert getattr(answer, "reason", None) == "99"  # newer than this client
     assert took_s >= (0.3 if code == "RESOURCE_EXHAUSTED" else 0.15)
     assert len(server.tries) == 3
     assert all(10 < left_s <= 20 for _, left_s in server.tries)
@@ -180,16 +180,6 @@ def test_what_somebody_else_created_is_not_taken_for_ours(server: RunningServer,
         pytest.raises(AlreadyExists),
     ):
         client.create_scene(here, datum=DATUM)
-
-
-@both
-def test_no_time_is_refused(server: RunningServer, connect: Connect) -> None:
-    with connect(server.address) as client:
-        for timeout_s in (0, -1.0):
-            with pytest.raises(ValueError, match="timeout_s must be above 0"):
-                client.get_scene("s", timeout_s=timeout_s)
-            with pytest.raises(ValueError, match="timeout_s must be above 0"):
-                list(client.list_scenes(timeout_s=timeout_s))
 
 
 @both
