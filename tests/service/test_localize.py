@@ -18,7 +18,6 @@ from mapless import (
     ConnectOptions,
     InvalidArgument,
     LocalizationResult,
-    NewReference,
     NotFound,
     PositionPrior,
     Priors,
@@ -128,17 +127,6 @@ def test_a_pose_outside_the_prior_is_rejected(client: Client, scene: str) -> Non
     answer = rejected(client.localize(PHOTO, CAMERA, scene, ["r1"], priors=Priors(far)))
     assert answer.reason == "PRIOR_CONFLICT"
     assert "0.10 m outside" in answer.message
-
-
-def test_a_prior_narrows_the_choice_to_radius_and_ten_metres(client: Client) -> None:
-    client.create_scene("street")
-    client.add_references("street", [NewReference(f"x{x}", PHOTO, CAMERA, pose(float(x))) for x in (0, 8, 16, 40)])
-    prior = PositionPrior(pose(4.0).translation, 3.0)
-    answer = client.localize(PHOTO, CAMERA, "street", priors=Priors(prior))
-    assert {use.name.rpartition("/")[2] for use in answer.diagnostics.references} == {"x0", "x8", "x16"}
-    nowhere = PositionPrior(np.array([1e6, 0, 0]), 3.0)
-    assert rejected(client.localize(PHOTO, CAMERA, "street", priors=Priors(nowhere))).reason == "NO_USABLE_REFERENCES"
-    client.delete_scene("street")
 
 
 @pytest.mark.parametrize(

@@ -38,4 +38,6 @@ def test_satellites_and_a_covariance_narrow_the_choice_alike(client: Client) -> 
     for priors in (Priors(geo_position=satellites), Priors(likely)):
         answer = client.localize(PHOTO, CAMERA, "square", priors=priors)
         assert {use.name.rpartition("/")[2] for use in answer.diagnostics.references} == {"x0", "x8", "x15"}
+    nowhere = client.localize(PHOTO, CAMERA, "square", priors=Priors(PositionPrior(np.array([1e6, 0, 0]), 3.0)))
+    assert getattr(nowhere, "reason", None) == "NO_USABLE_REFERENCES"
     client.delete_scene("square")

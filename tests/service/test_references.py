@@ -217,15 +217,6 @@ def test_names_are_checked_everywhere(client: Client, stubs: Stubs) -> None:
         client.get_scene("a b")
 
 
-def test_references_of_an_unknown_scene(client: Client) -> None:
-    with pytest.raises(NotFound):
-        client.add_reference("nowhere", NewReference("r", PHOTO, CAMERA, pose(0)))
-    with pytest.raises(NotFound):
-        list(client.list_references("nowhere"))
-    with pytest.raises(NotFound):
-        client.get_reference("nowhere", "r")
-
-
 def test_a_page_is_made_off_the_event_loop(client: Client, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand messages take tens of milliseconds, in which nobody else would be answered."""
     to_message, threads = references.reference_to_message, set[str]()

@@ -337,15 +337,3 @@ class TestEncryption:
             wait_until(sees_the_new_one)
             with pytest.raises(Unavailable):
                 attempt(self.options(root, robot, token))
-
-    def test_without_tokens_certificates_name_the_caller(
-        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        root = authority()
-        paths: dict[str, Any] = {name: tmp_path / name for name in ("tls_certificate", "tls_key", "tls_client_ca")}
-        signed(root, "server").write(paths["tls_certificate"], paths["tls_key"])
-        paths["tls_client_ca"].write_bytes(root.certificate_pem)
-        with serving(tmp_path / "data", **paths) as server, caplog.at_level(logging.INFO):
-            with Client(server.address, self.options(root, signed(root, "robot-7"))) as client:
-                assert client.create_scene("s").scene_id == "s"
-            assert any("robot-7" in str(record.__dict__) for record in caplog.records)

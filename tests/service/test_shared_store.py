@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from support.images import encode, textured
-from support.postgres import Cluster, require, shared_cluster
+from support.postgres import shared_cluster
 from support.servers import CAMERA, PHOTO, pose, serving
 
-from mapless import Client, ConnectOptions, LocalizationResult, NewReference, NotFound, Unavailable
-from mapless_server.store import Store, StoreError
+from mapless import Client, LocalizationResult, NewReference, NotFound
+from mapless_server.store import Store
 
 PHOTOS = [encode(".png", textured(seed=i)) for i in range(3)]
 
@@ -69,42 +68,3 @@ def test_what_is_deleted_through_one_is_gone_for_the_other(two: tuple[Client, Cl
         used(other)
     other.create_scene("s")
     assert one.get_scene("s").reference_count == 0
-
-
-@pytest.mark.timeout(120)
-def test_a_database_that_goes_and_returns_needs_no_restart(tmp_path: Path) -> None:
-    require()
-    database = Cluster(survives_power_failure=True)
-    try:
-        url = database.fresh_url()
-        with (
-            serving(tmp_path, store=Store.connect(url)) as server,
-            Client(server.address, ConnectOptions(max_attempts=1, timeout_s=20)) as client,
-        ):
-            client.create_scene("s")
-            client.add_references(
-                "s", [NewReference(f"r{i}", photo, CAMERA, pose(i)) for i, photo in enumerate(PHOTOS)]
-            )
-            before = client.get_scene("s")
-            for how in (signal.SIGQUIT, signal.SIGINT):
-                database.stop(how)
-                for call in (lambda: client.get_scene("s"), lambda: used(client), lambda: used(client, ("r0",))):
-                    with pytest.raises(Unavailable) as caught:
-                        call()
-                    assert caught.value.retry_after_s is not None
-                database.start()
-                assert client.get_scene("s") == before
-                assert set(used(client)) == {"r0", "r1", "r2"}
-            client.add_reference("s", NewReference("late", PHOTO, CAMERA, pose(9.0)))
-            assert used(client, ("late",)) == ["late"]
-    finally:
-        database.remove()
-
-
-def test_a_server_without_its_database_does_not_start() -> None:
-    require()
-    database = Cluster()
-    url = database.fresh_url()
-    database.remove()
-    with pytest.raises(StoreError, match=r"database 127\.0\.0\.1:\d+/postgres cannot be used: .*refused"):
-        Store.connect(url)

@@ -166,15 +166,6 @@ class TestOpening:
             store.add_references(OFFICE, [make_reference("a")])
             assert store.load_references(OFFICE, None, EXTRACTOR).generation == 2
 
-    def test_second_server_is_refused_until_the_first_has_gone(self, data_dir: Path) -> None:
-        with Store.open(data_dir) as store:
-            store.create_scene(OFFICE)
-            with pytest.raises(StoreError, match=f"in use by another server .process {os.getpid()}."):
-                Store.open(data_dir)
-            assert store.get_scene(OFFICE).generation == 1
-        with Store.open(data_dir) as store:
-            assert store.get_scene(OFFICE).generation == 1
-
     def test_refused_opening_leaves_no_lock(self, data_dir: Path) -> None:
         data_dir.mkdir()
         database = data_dir / sqlite.DATABASE_FILE
