@@ -16,10 +16,10 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PointMatches, PoseEstimate
 from mapless_server.method.trust.gate import (
     GateOptions,
-    doubts,
     false_alarms,
     findable_count,
     format_false_alarms,
+    gate_failure,
     hull_share,
     log10_false_alarms,
 )
@@ -27,7 +27,7 @@ from mapless_server.method.trust.gate import (
 INLIER_PX = PnpOptions().inlier_px
 
 
-def doubt_of(problem: Problem, initial: RigidTransform = POSE, options: GateOptions | None = None) -> str:
+def failure_of(problem: Problem, initial: RigidTransform = POSE, options: GateOptions | None = None) -> str:
     """What is said against the pose that the solver finds; empty if nothing, its own words if it finds none."""
     estimate = solve_pose(*problem, initial, PnpOptions())
     if isinstance(estimate, Rejection):
@@ -37,29 +37,29 @@ def doubt_of(problem: Problem, initial: RigidTransform = POSE, options: GateOpti
 
 
 def said(problem: Problem, estimate: PoseEstimate, options: GateOptions) -> str:
-    return doubts(*problem, estimate.world_from_camera, estimate.inliers, INLIER_PX, options) or ""
+    return gate_failure(*problem, estimate.world_from_camera, estimate.inliers, INLIER_PX, options) or ""
 
 
 @pytest.mark.parametrize("outlier_share", [0.0, 0.5])
-def test_a_planted_pose_is_not_doubted(outlier_share: float) -> None:
+def test_a_planted_pose_passes(outlier_share: float) -> None:
     for seed in range(5):
-        assert not doubt_of(planted(random_for("good", outlier_share, seed), 100, 0.5, outlier_share))
+        assert not failure_of(planted(random_for("good", outlier_share, seed), 100, 0.5, outlier_share))
 
 
 @pytest.mark.parametrize("count", [6, 40, 400])
-def test_degenerate_points_are_doubted(count: int) -> None:
+def test_degenerate_points_fail(count: int) -> None:
     on_a_line = np.linspace(-1, 1, count)[:, None] * np.array([1.0, 0.3, 0.2])
     for x_in_world in (on_a_line, np.zeros((count, 3))):
         problem = problem_of(x_in_world, CAMERA.project(POSE.inverse().apply(x_in_world)))
         for initial in (POSE, POSE.shifted(np.array([3.0, 1.0, 0.0]))):
-            assert doubt_of(problem, initial)
+            assert failure_of(problem, initial)
 
 
 def test_points_with_no_pose_at_all_are_gated() -> None:
     """Random matches: no pose is true, and none may be believed."""
     for seed in range(50):
         random = random_for("no pose", seed)
-        assert doubt_of(planted(random, int(random.integers(6, 120)), outlier_share=1.0)), seed
+        assert failure_of(planted(random, int(random.integers(6, 120)), outlier_share=1.0)), seed
 
 
 def test_guided_matches_around_a_wrong_pose_are_gated() -> None:
@@ -71,38 +71,38 @@ def test_guided_matches_around_a_wrong_pose_are_gated() -> None:
         keypoints = view.features.keypoints + np.stack([within.real, within.imag], axis=1).astype(np.float32)
         searched = PointMatches(matches.point, matches.keypoint, np.ones(80, bool), radius_px=20.0)
         query = replace(view, features=replace(view.features, keypoints=keypoints))
-        assert doubt_of((query, structure, searched)), seed
+        assert failure_of((query, structure, searched)), seed
 
 
-def test_agreement_in_one_corner_is_doubted() -> None:
+def test_agreement_in_one_corner_fails() -> None:
     random = random_for("corner")
     pixels = random.uniform([100, 100], [180, 160], (60, 2))
     x_in_world = POSE.apply(CAMERA.rays(pixels) * random.uniform(3, 6, (60, 1)))
     problem = problem_of(x_in_world, pixels)
-    assert "cover only" in doubt_of(problem)
-    assert not doubt_of(problem, options=GateOptions(min_hull_share=0.0))
+    assert "cover only" in failure_of(problem)
+    assert not failure_of(problem, options=GateOptions(min_hull_share=0.0))
 
 
-def test_agreement_of_few_of_many_visible_points_is_doubted() -> None:
+def test_agreement_of_few_of_many_visible_points_fails() -> None:
     random = random_for("share")
     view, structure, matches = planted(random, 1000)
     few = PointMatches(matches.point[:30], matches.keypoint[:30], matches.guided[:30], 0.0)
-    assert "1000 points should be found" in doubt_of((view, structure, few))
+    assert "1000 points should be found" in failure_of((view, structure, few))
     behind = replace(structure, x_in_world=structure.x_in_world.copy())
     behind.x_in_world[30:] = POSE.apply([0.0, 0.0, -5.0])  # what is not in front need not be found
-    assert not doubt_of((view, behind, few))
+    assert not failure_of((view, behind, few))
 
 
 def test_agreeing_gravity_lowers_the_support_but_not_to_zero() -> None:
     view, structure, matches = planted(random_for("share"), 1000)
 
-    def doubt(count: int, log10_chance: float) -> str | None:
+    def failure(count: int, log10_chance: float) -> str | None:
         few = PointMatches(matches.point[:count], matches.keypoint[:count], matches.guided[:count], 0.0)
-        return doubts(view, structure, few, POSE, np.ones(count, bool), 4.0, GateOptions(), log10_chance)
+        return gate_failure(view, structure, few, POSE, np.ones(count, bool), 4.0, GateOptions(), log10_chance)
 
-    assert "should be found" in (doubt(30, 0.0) or "")
-    assert doubt(30, -2.8) is None
-    assert "should be found" in (doubt(15, -2.8) or "")
+    assert "should be found" in (failure(30, 0.0) or "")
+    assert failure(30, -2.8) is None
+    assert "should be found" in (failure(15, -2.8) or "")
 
 
 def test_the_hull_is_that_of_a_known_rectangle() -> None:

@@ -21,7 +21,7 @@ from .reconstruction import Reconstruction
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, Structure, Support
 from .structure import build_structure
-from .trust.gate import doubts
+from .trust.gate import gate_failure
 from .trust.judge import judge
 from .uncertainty.covariance import pose_covariance
 from .views import Matches, PosedView, View
@@ -113,9 +113,9 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
         return coarse.answer(estimate, support)
     pose, inliers = estimate.world_from_camera, estimate.inliers
     chance = priors.log10_chance(pose) if counts_agreement else 0.0
-    doubt = doubts(query, structure, matches, pose, inliers, options.pnp.inlier_px, options.gate, chance)
-    if doubt:
-        return coarse.answer(Rejection(RejectionReason.GATE, doubt), replace(support, estimate=estimate))
+    failure = gate_failure(query, structure, matches, pose, inliers, options.pnp.inlier_px, options.gate, chance)
+    if failure:
+        return coarse.answer(Rejection(RejectionReason.GATE, failure), replace(support, estimate=estimate))
     if prepared.options.variant is Variant.BEST:
         with stage("adjust"):
             estimate = adjust_pose(query, references, structure, matches, estimate, options.adjust, priors)

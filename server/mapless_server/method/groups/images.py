@@ -143,8 +143,8 @@ def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
     return Rejection(furthest.reason, f"no image has 2D-3D matches; image {i}: {furthest.message}", furthest.hint)
 
 
-def group_doubts(matched: Sequence[PosedImage], inlier_px: float, options: GateOptions) -> str | None:
-    """Why the pose of a group fails the gate; None if it passes. `gate.doubts` with sums over the photographs."""
+def group_gate_failure(matched: Sequence[PosedImage], inlier_px: float, options: GateOptions) -> str | None:
+    """Why the pose of a group fails the gate; None if it passes. `gate.gate_failure` with sums over the photographs."""
     inlier_total = sum(int(it.inliers.sum()) for it in matched)
     count = (
         f"{inlier_total} of {sum(len(it.matches) for it in matched)} matches in {len(matched)} images agree on a pose"

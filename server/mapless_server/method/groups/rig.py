@@ -19,7 +19,14 @@ from ..pnp import PnpOptions
 from ..rejection import Rejection, RejectionReason
 from ..trust.gate import GateOptions
 from .generalized import inlier_count, rig_ransac
-from .images import GroupImage, MatchedImage, PosedImage, group_doubts, matched_images_of, rejection_without_matches
+from .images import (
+    GroupImage,
+    MatchedImage,
+    PosedImage,
+    group_gate_failure,
+    matched_images_of,
+    rejection_without_matches,
+)
 from .joint import JointOptions, adjust_in_rounds, covariance_in_world
 
 
@@ -121,9 +128,9 @@ def solve_rig(
     estimate = adjust_in_rounds(matched_images, freedom, options.joint, options.rounds)
     if estimate.inlier_count < 4:
         return Rejection(RejectionReason.PNP_FAILED, "no pose of the rig explains four matches")
-    doubt = group_doubts(estimate.matched, options.pnp.inlier_px, options.gate)
-    if doubt:
-        return Rejection(RejectionReason.GATE, doubt)
+    failure = group_gate_failure(estimate.matched, options.pnp.inlier_px, options.gate)
+    if failure:
+        return Rejection(RejectionReason.GATE, failure)
     world_from_rig = estimate.freedom.rig_from_world.inverse()
     covariance = covariance_in_world(estimate.covariance, world_from_rig)
     return RigEstimate(world_from_rig.shifted(origin), covariance, estimate.matched, origin)

@@ -25,7 +25,14 @@ from ..rejection import Rejection, RejectionReason
 from ..trust.gate import GateOptions
 from .drift import DriftOptions, SequenceFreedom, world_from_session_at
 from .generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
-from .images import GroupImage, MatchedImage, PosedImage, group_doubts, matched_images_of, rejection_without_matches
+from .images import (
+    GroupImage,
+    MatchedImage,
+    PosedImage,
+    group_gate_failure,
+    matched_images_of,
+    rejection_without_matches,
+)
 from .joint import JointEstimate, JointOptions, adjust_in_rounds, covariance_in_world
 
 
@@ -132,9 +139,9 @@ def solve_sequence(
 def _rejection(estimate: JointEstimate[SequenceFreedom], options: SequenceOptions) -> Rejection | None:
     if estimate.inlier_count < 4:
         return Rejection(RejectionReason.PNP_FAILED, "no poses of the sequence explain four matches")
-    doubt = group_doubts(estimate.matched, options.pnp.inlier_px, options.gate)
-    if doubt:
-        return Rejection(RejectionReason.GATE, doubt)
+    failure = group_gate_failure(estimate.matched, options.pnp.inlier_px, options.gate)
+    if failure:
+        return Rejection(RejectionReason.GATE, failure)
     sigma = _scale_sigma(estimate)
     if not sigma <= options.max_scale_sigma:
         message = f"the session moves too little for its unit: the scale is known to {100 * sigma:.0f} % only"

@@ -54,7 +54,7 @@ class GateOptions:
         check_bounds(self, "max_log10_false_alarms", at_least=-math.inf)
 
 
-def doubts(
+def gate_failure(
     query: View,
     structure: Structure,
     matches: PointMatches,
