@@ -33,7 +33,7 @@ _REASONS = {
     "SCALE_UNRELIABLE": "the metric scale could not be established",
     "TOO_FEW_MATCHES": "too few matches",
     "PNP_FAILED": "no pose explains the matches",
-    "GATE": "chance alone could have produced the pose's support",
+    "GATE": "the evidence for the pose does not suffice",
     "AMBIGUOUS": "several places fit the photograph",
     "PRIOR_CONFLICT": "the pose contradicts a prior",
 }

@@ -19,7 +19,7 @@ class RejectionReason(str, Enum):
     TOO_FEW_MATCHES = "too_few_matches"
     PNP_FAILED = "pnp_failed"
     GATE = "gate"
-    """A pose without enough evidence: chance, or repeated structure, could support it as well."""
+    """The evidence for a pose does not suffice; the message says which test failed, the gate or one of the judge."""
     AMBIGUOUS = "ambiguous"
     """Two places explain the photograph about as well."""
     PRIOR_CONFLICT = "prior_conflict"
