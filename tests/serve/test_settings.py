@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from pydantic import SecretStr, ValidationError
 
-from mapless_server.method.choices import BACKENDS
+from mapless_server.method.choices import BACKENDS, BEST_VARIANTS
 from mapless_server.method.features import FEATURES, make_extractor
 from mapless_server.networks.weights import CheckpointError
 from mapless_server.settings import (
@@ -92,7 +92,8 @@ def test_an_error_in_the_file_names_setting_and_origin(tmp_path: Path, text: str
 
 
 def test_features_that_can_be_made_are_those_of_the_setting(tmp_path: Path) -> None:
-    assert allowed_words("features") == ["auto", *FEATURES]
+    assert allowed_words("features") == ["auto", *FEATURES, *BEST_VARIANTS]
+    assert set(BEST_VARIANTS.values()) <= set(FEATURES)
     assert allowed_words("backend") == ["auto", *BACKENDS]
     for name in FEATURES:
         assert Settings(features=name).features == name
