@@ -1,4 +1,4 @@
-"""Cameras, poses, features and scene attributes as bytes: exact to the bit, and checked when they are read.
+"""Cameras, poses, features, matches and scene attributes as bytes: exact to the bit, and checked when they are read.
 
 Geometry and scene attributes are JSON text: Python writes the shortest decimal that reads back as the same float64. A
 view is one blob:
@@ -8,7 +8,8 @@ view is one blob:
     header       JSON (camera, count, dimension), padded with spaces so that the arrays are aligned
     arrays       keypoints (N, 2), sizes (N,), descriptors (N, D), float32
 
-A global descriptor is its numbers as float16: similarities of unit vectors change by less than 0.001.
+A global descriptor is its numbers as float16: similarities of unit vectors change by less than 0.001. Matches are the
+numbers of their keypoints, int32.
 
 Everything is little-endian.
 """
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 from mapless.geodesy import Datum
 from mapless.geometry import LENS_MODELS, Camera, Distortion, Quaternion, RigidTransform, lens_model_of
 from mapless.scenes import Calibration
-from mapless_server.method.views import Features, View
+from mapless_server.method.views import Features, Matches, View
 
 from .records import SceneAttributes
 
@@ -39,6 +40,7 @@ _PREFIX = struct.Struct("<B3xI")
 _ALIGNMENT_BYTES = 16
 _FLOAT32 = np.dtype("<f4")
 _FLOAT16 = np.dtype("<f2")
+_INT32 = np.dtype("<i4")
 
 
 class Damaged(Exception):
@@ -182,6 +184,22 @@ def decode_descriptors(blobs: Sequence[bytes]) -> list[NDArray[np.float32]]:
     vectors = np.frombuffer(b"".join(blobs), _FLOAT16).reshape(len(blobs), -1).astype(np.float32)
     vectors.setflags(write=False)
     return [*vectors]
+
+
+def encode_matches(matches: Matches) -> bytes:
+    """Matches (M, 2) of the keypoints of two views."""
+    return matches.astype(_INT32).tobytes()
+
+
+def decode_matches(owner: str, data: bytes, sha256: str) -> Matches:
+    """The matches that `encode_matches` was given; read-only.
+
+    Raises:
+        Damaged: the checksum or the form of the data is wrong.
+    """
+    check(owner, data, sha256, "matches")
+    with _checked_form("matches"):
+        return np.frombuffer(data, _INT32).reshape(-1, 2)
 
 
 def check(owner: str, data: object, sha256: str, what: str) -> None:

@@ -13,19 +13,19 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import accumulate
 
-from sqlalchemy import ColumnElement, Connection, ScalarSelect, Table, delete, func, insert, select, update
+from sqlalchemy import Column, ColumnElement, Connection, ScalarSelect, delete, func, insert, literal, select, update
 
 from mapless_server.errors import Overloaded
 from mapless_server.security import SceneKey
 
 from .database import Database
 from .faults import DamagedPages
-from .tables import features, global_descriptor, image, reference, scene
+from .tables import features, global_descriptor, image, reference, reference_pair, scene
 
 logger = logging.getLogger(__name__)
 
 PORTION_BYTES = 4 * 2**20
-"""Photographs, features and descriptors that are deleted in one transaction, unless a single reference has more.
+"""Photographs, features, descriptors and matches deleted in one transaction, unless a single reference has more.
 
 SQLite overwrites what it deletes, so it writes as much to its journal, which needs the space until the transaction is
 over. This is as much as it collects there anyway: the journal stays small, and others wait for a fraction of a second.
@@ -165,15 +165,16 @@ def next_portion(connection: Connection, at_most: int) -> Sequence[str]:
     keys = connection.scalars(pending.limit(at_most).with_for_update(skip_locked=True)).all()
     if len(keys) <= 1:  # where pages are damaged even the size may not be readable
         return keys
-    size_bytes = _size_bytes(image) + _size_bytes(features) + _size_bytes(global_descriptor)
+    owners = [it.c.reference_key for it in (image, features, global_descriptor)]
+    size_bytes = sum(map(_size_bytes, [*owners, reference_pair.c.first_key]), literal(0))
     sizes = connection.scalars(select(size_bytes).where(column.key.in_(keys)).order_by(column.key))
     return keys[: max(1, bisect_right(list(accumulate(sizes)), PORTION_BYTES))]
 
 
-def _size_bytes(table: Table) -> ScalarSelect[int]:
-    """Size of a reference's rows in a table; the bytes themselves are not read for it."""
-    total = select(func.coalesce(func.sum(func.length(table.c.data)), 0))
-    return total.where(table.c.reference_key == reference.c.key).scalar_subquery()
+def _size_bytes(owner: Column[str]) -> ScalarSelect[int]:
+    """Size of a reference's rows in the table with this column of keys; the bytes themselves are not read for it."""
+    total = select(func.coalesce(func.sum(func.length(owner.table.c.data)), 0))
+    return total.where(owner == reference.c.key).scalar_subquery()
 
 
 def delete_references(connection: Connection, *keys: str) -> None:

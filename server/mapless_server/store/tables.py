@@ -17,7 +17,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 
 metadata = MetaData()
 
@@ -27,6 +27,7 @@ _Id = String(128).with_variant(String(128, collation="C"), "postgresql")
 _SceneKey = String(257).with_variant(String(257, collation="C"), "postgresql")
 _Key = String(32)
 _Sha256 = String(64)
+_Matching = String(255)
 _NONE_YET = text("0")
 
 store_version = Table(
@@ -115,4 +116,28 @@ global_descriptor = Table(
     Column("name", String(128), primary_key=True),
     Column("data", LargeBinary, nullable=False),  # see codec.py
     Column("sha256", _Sha256, nullable=False),
+)
+
+# Matches of two references, see pairs.py; of the same features and options for each name in `matching`.
+reference_pair = Table(
+    "reference_pair",
+    metadata,
+    Column("first_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
+    Column("second_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
+    Column("matching", _Matching, primary_key=True),
+    Column("data", LargeBinary, nullable=False),  # see codec.py
+    Column("sha256", _Sha256, nullable=False),
+    Index("reference_pair_by_second", "second_key"),
+)
+
+# Progress: a reference without a row has not been begun.
+reference_matching = Table(
+    "reference_matching",
+    metadata,
+    Column("reference_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
+    Column("matching", _Matching, primary_key=True),
+    # When a server may claim it: the end of a claim, or of the wait after a failure; null when its pairs are stored.
+    Column("due_time_us", BigInteger),
+    Column("failure_count", Integer, nullable=False, server_default=_NONE_YET),
+    Index("reference_matching_by_due_time", "matching", "due_time_us"),
 )

@@ -60,7 +60,8 @@ def ignore_progress(what: str, done: int, total: int) -> None:
 def verify(connection: Connection, on_progress: Progress = ignore_progress) -> Verification:
     """Checks the whole store, in the caller's transaction, which must see one moment.
 
-    The rows that are left of a deleted scene are counted, but not checked.
+    The rows that are left of a deleted scene are counted, but not checked. Matches of references are not checked: they
+    are when they are used, and damaged ones are made again.
 
     Raises:
         ValueError: it is no store, or one of a newer program.

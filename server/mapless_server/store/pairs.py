@@ -1,0 +1,252 @@
+"""Stored matches of pairs of references, and which references are matched already, by any of the servers.
+
+A *matching* names everything that determines the matches beside the two references: features, rule, options. A pair is
+stored once, under the reference whose keypoints come first in it.
+
+The pairs of a reference are those with references that precede it in its scene: every pair belongs to one reference,
+also if others are added later. A server claims a reference, matches its pairs and stores them; a claim ends by itself
+after `CLAIM_S`, so what a server leaves when it is killed is done by another one, or by the next.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, Row, Select, delete, func, literal, or_, select, update
+
+from mapless_server.errors import NotFound
+from mapless_server.method.views import Matches
+from mapless_server.security import SceneKey
+
+from . import codec, queries
+from .database import Database
+from .deletion import is_detached
+from .faults import unless_damaged
+from .tables import reference, reference_matching, reference_pair, scene, scene_generation
+
+CLAIM_S = 60.0
+"""Far longer than the pairs of one reference take on an idle server; see `scenes.background` for a busy one."""
+
+FIRST_RETRY_S, LONGEST_RETRY_S = 30.0, 3600.0
+"""After the first failure with a reference, twice as long after each further one."""
+
+_CANDIDATES = 16
+"""Servers that claim at the same time choose among so many, so that they seldom choose the same."""
+
+_MICROSECONDS = 1_000_000
+
+Pair = tuple[str, str]
+"""The keys of two references, in the order of the matches' columns."""
+
+Progress = dict[SceneKey, int]
+"""Generations until which every reference of a scene has been claimed, as far as a server knows."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A reference whose pairs one server matches.
+
+    Attributes:
+        scene_key: of its scene.
+        reference_id: unique within the scene.
+        key: of the reference.
+    """
+
+    scene_key: SceneKey
+    reference_id: str
+    key: str
+
+
+class PairStore:
+    """Matches of pairs in a store's database; thread-safe. Errors are those of `Store`."""
+
+    def __init__(self, database: Database) -> None:
+        """`database` is that of the references."""
+        self._database = database
+
+    def load(self, matching: str, pairs: Collection[Pair]) -> dict[Pair, Matches | None]:
+        """The matches of those of these pairs that are stored; None for damaged ones."""
+        column = reference_pair.c
+        first, second = ({pair[side] for pair in pairs} for side in (0, 1))
+        stored: Select[Any] = select(column.first_key, column.second_key, column.data, column.sha256)
+        stored = stored.where(column.matching == matching, column.first_key.in_(first), column.second_key.in_(second))
+        with self._database.read() as connection:
+            found = unless_damaged(connection, lambda: connection.execute(stored).all(), list)
+        wanted = set(pairs)
+        return {_pair(row): _decoded(matching, row) for row in found if _pair(row) in wanted}
+
+    def claim(self, matching: str, progress: Progress) -> Claim | None:
+        """Claims a reference whose pairs are not matched; None if there is none that may be claimed now.
+
+        Args:
+            matching: its name.
+            progress: of this server with this matching, empty at first; updated.
+        """
+        while True:
+            with self._database.read() as connection:
+                candidates = _due(connection, matching) or _new(connection, matching, progress)
+            if not candidates:
+                return None
+            for row in random.sample(candidates, len(candidates)):
+                if self._claim(matching, row.key):
+                    return Claim(SceneKey(row.scene_id), row.reference_id, row.key)
+
+    def _claim(self, matching: str, key: str) -> bool:
+        column, now_us = reference_matching.c, _now_us()
+        row = {"reference_key": key, "matching": matching, "due_time_us": now_us + round(CLAIM_S * _MICROSECONDS)}
+        with self._database.write() as connection:
+            try:
+                queries.lock_reference(connection, key)
+            except NotFound:
+                return False
+            is_free = (
+                update(reference_matching)
+                .where(column.reference_key == key, column.matching == matching, column.due_time_us <= now_us)
+                .values(due_time_us=row["due_time_us"])
+            )
+            return connection.execute(is_free).rowcount == 1 or queries.insert_new(connection, reference_matching, row)
+
+    def list_missing(self, matching: str, claim: Claim, others: Sequence[str]) -> list[str]:
+        """Those of these keys that precede the claimed reference in its scene and whose pairs are not stored."""
+        column, pair = reference.c, reference_pair.c
+        generation = select(column.generation).where(column.key == claim.key).scalar_subquery()
+        precedes = or_(column.generation < generation, (column.generation == generation) & (column.key < claim.key))
+        earlier = select(column.key).where(column.key.in_(others), column.scene_id == claim.scene_key, precedes)
+        stored = select(pair.first_key, pair.second_key).where(
+            pair.matching == matching,
+            or_(
+                (pair.first_key == claim.key) & pair.second_key.in_(others),
+                (pair.second_key == claim.key) & pair.first_key.in_(others),
+            ),
+        )
+        with self._database.read() as connection:
+            missing = set(connection.scalars(earlier))
+            missing -= {key for pair in connection.execute(stored) for key in pair}
+        return [key for key in others if key in missing]
+
+    def add(self, matching: str, claim: Claim, matches: Mapping[Pair, Matches], is_complete: bool) -> None:
+        """Stores pairs of a claimed reference, and ends the claim: it is complete, or others may claim it at once.
+
+        Pairs of references that were deleted meanwhile, and pairs that are stored already, are ignored.
+        """
+        data = {pair: codec.encode_matches(it) for pair, it in matches.items()}
+        with self._database.write() as connection:
+            present = _locked(connection, {claim.key, *(key for pair in matches for key in pair)})
+            for pair in sorted(pair for pair in data if present.issuperset(pair)):
+                row = {"first_key": pair[0], "second_key": pair[1], "matching": matching, "data": data[pair]}
+                row["sha256"] = codec.sha256_for(_owner(matching, pair), data[pair])
+                queries.insert_new(connection, reference_pair, row)
+            due_us = None if is_complete else _now_us()
+            connection.execute(_of_claim(matching, claim).values(due_time_us=due_us, failure_count=0))
+
+    def postpone(self, matching: str, claim: Claim) -> float:
+        """Ends the claim of a reference that failed; returns after how long it may be claimed again, seconds."""
+        column = reference_matching.c
+        count = select(column.failure_count).where(column.reference_key == claim.key, column.matching == matching)
+        with self._database.write() as connection:
+            failure_count = connection.scalar(count) or 0
+            wait_s = min(LONGEST_RETRY_S, FIRST_RETRY_S * 2.0 ** min(failure_count, 20))
+            due_us = _now_us() + round(wait_s * _MICROSECONDS)
+            values = {"due_time_us": due_us, "failure_count": failure_count + 1}
+            connection.execute(_of_claim(matching, claim).values(values))
+        return wait_s
+
+    def discard(self, matching: str, pairs: Iterable[Pair]) -> None:
+        """Deletes damaged pairs; their references are claimed again."""
+        pair, progress = reference_pair.c, reference_matching.c
+        with self._database.write() as connection:
+            for first, second in pairs:
+                is_it = (pair.first_key == first) & (pair.second_key == second) & (pair.matching == matching)
+                connection.execute(delete(reference_pair).where(is_it))
+                of_them = progress.reference_key.in_([first, second]) & (progress.matching == matching)
+                again = update(reference_matching).where(of_them, progress.due_time_us.is_(None))
+                connection.execute(again.values(due_time_us=_now_us()))
+
+    def count_waiting(self, matching: str) -> int:
+        """Number of references whose pairs are not all stored."""
+        column = reference_matching.c
+        is_complete = (
+            select(literal(1))
+            .where(column.reference_key == reference.c.key, column.matching == matching, column.due_time_us.is_(None))
+            .exists()
+        )
+        waiting = select(func.count()).select_from(reference).where(~is_detached(reference.c.scene_id), ~is_complete)
+        with self._database.read() as connection:
+            return connection.scalar(waiting) or 0
+
+
+def _due(connection: Connection, matching: str) -> Sequence[Row[Any]]:
+    """References whose claim, or wait after a failure, is over."""
+    column = reference_matching.c
+    due: Select[Any] = (
+        select(reference.c.key, reference.c.scene_id, reference.c.reference_id)
+        .join(reference_matching, column.reference_key == reference.c.key)
+        .where(column.matching == matching, column.due_time_us <= _now_us(), ~is_detached(reference.c.scene_id))
+    )
+    return connection.execute(due.limit(_CANDIDATES)).all()
+
+
+def _new(connection: Connection, matching: str, progress: Progress) -> Sequence[Row[Any]]:
+    """References of one scene that no server has claimed yet, the oldest first."""
+    column = scene_generation.c
+    scenes = select(column.scene_id, column.generation).join(scene, scene.c.scene_id == column.scene_id)
+    generations = {SceneKey(row.scene_id): row.generation for row in connection.execute(scenes)}
+    for gone in progress.keys() - generations.keys():
+        del progress[gone]
+    is_claimed = (
+        select(literal(1))
+        .where(reference_matching.c.reference_key == reference.c.key, reference_matching.c.matching == matching)
+        .exists()
+    )
+    # In any order, so that a scene of many references does not keep the others waiting.
+    for scene_key, generation in random.sample(list(generations.items()), len(generations)):
+        since = progress.get(scene_key, -1)
+        if since == generation:
+            continue
+        if since > generation:  # the database was replaced by a backup
+            since = -1
+        new: Select[Any] = (
+            select(reference.c.key, reference.c.scene_id, reference.c.reference_id)
+            .where(reference.c.scene_id == scene_key, reference.c.generation > since, ~is_claimed)
+            .order_by(reference.c.generation, reference.c.key)
+        )
+        found = connection.execute(new.limit(_CANDIDATES)).all()
+        if found:
+            return found
+        progress[scene_key] = generation
+    return []
+
+
+def _locked(connection: Connection, keys: Collection[str]) -> set[str]:
+    """Those of these references that exist; they are not deleted before the transaction ends."""
+    existing = select(reference.c.key).where(reference.c.key.in_(keys)).order_by(reference.c.key)
+    return set(connection.scalars(existing.with_for_update(read=True, key_share=True)))
+
+
+def _of_claim(matching: str, claim: Claim) -> Any:
+    column = reference_matching.c
+    return update(reference_matching).where(column.reference_key == claim.key, column.matching == matching)
+
+
+def _pair(row: Row[Any]) -> Pair:
+    return row.first_key, row.second_key
+
+
+def _decoded(matching: str, row: Row[Any]) -> Matches | None:
+    try:
+        return codec.decode_matches(_owner(matching, _pair(row)), row.data, row.sha256)
+    except codec.Damaged:
+        return None
+
+
+def _owner(matching: str, pair: Pair) -> str:
+    """Owner of a pair's matches, for `codec.sha256_for`."""
+    return f"{pair[0]}+{pair[1]} {matching}"
+
+
+def _now_us() -> int:
+    return round(time.time() * _MICROSECONDS)

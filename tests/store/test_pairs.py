@@ -1,0 +1,228 @@
+"""Stored matches of pairs: what is read is what was stored, each reference is claimed by one server at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.stores import Place, assert_same_bits, faults_of, make_reference
+
+from mapless_server.security import SceneKey
+from mapless_server.store import Claim, PairStore, Progress, Store, pairs
+from mapless_server.store.backup import back_up, restore
+
+SCENE, OTHER = SceneKey("office"), SceneKey("acme/office")
+MATCHING = "sift/strict"
+
+
+@pytest.fixture
+def two(place: Place) -> Iterator[tuple[Store, PairStore]]:
+    """A scene of the references a, b, c, in the order in which they were added."""
+    with place.open() as store:
+        store.create_scene(SCENE)
+        for seed, name in enumerate("abc"):
+            store.add_references(SCENE, [make_reference(name, seed)])
+        yield store, PairStore(store.database)
+
+
+def matches(count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 2048, (count, 2), np.int32)
+
+
+def key_of(store: Store, name: str) -> str:
+    return store.find_keys(SCENE, [name])[name]
+
+
+def claim_all(stored: PairStore, progress: Progress | None = None) -> list[Claim]:
+    progress, found = {} if progress is None else progress, []
+    while claim := stored.claim(MATCHING, progress):
+        found.append(claim)
+    return found
+
+
+def let_pass(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    now_us = pairs._now_us
+    monkeypatch.setattr(pairs, "_now_us", lambda: now_us() + round(seconds * 1e6))
+
+
+def complete(store: Store, stored: PairStore) -> dict[tuple[str, str], np.ndarray]:
+    """Every pair of the scene; what was stored."""
+    everything: dict[tuple[str, str], np.ndarray] = {}
+    for claim in claim_all(stored):
+        others = stored.list_missing(MATCHING, claim, [key_of(store, name) for name in "abc"])
+        made = {(other, claim.key): matches(5, seed) for seed, other in enumerate(others)}
+        stored.add(MATCHING, claim, made, is_complete=True)
+        everything |= made
+    return everything
+
+
+class TestMatches:
+    @pytest.mark.parametrize("count", [0, 1, 300])
+    def test_are_read_as_they_were_stored(self, two: tuple[Store, PairStore], count: int) -> None:
+        store, stored = two
+        claim = claim_all(stored)[0]
+        pair = key_of(store, "b"), key_of(store, "a")
+        stored.add(MATCHING, claim, {pair: matches(count)}, is_complete=True)
+        found = stored.load(MATCHING, [pair, pair[::-1], (key_of(store, "c"), key_of(store, "a"))])
+        assert list(found) == [pair]
+        assert_same_bits(np.asarray(found[pair]), matches(count))
+
+    def test_of_another_matching_are_not_found(self, two: tuple[Store, PairStore]) -> None:
+        store, stored = two
+        (pair, *_) = complete(store, stored)
+        assert stored.load("another", [pair]) == {}
+
+    @pytest.mark.parametrize("which", ["first_key", "second_key"])
+    def test_are_deleted_with_either_reference(self, two: tuple[Store, PairStore], place: Place, which: str) -> None:
+        store, stored = two
+        made = complete(store, stored)
+        assert len(made) == 3
+        gone = store.delete_reference(SCENE, "b")
+        left = place.fetch("SELECT first_key, second_key FROM reference_pair")
+        assert set(left) == {pair for pair in made if gone not in pair}
+        assert not place.fetch(f"SELECT 1 FROM reference_pair WHERE {which} = ?", gone)
+        # Another photograph under the old name is another reference.
+        store.add_references(SCENE, [make_reference("b", 7)])
+        assert key_of(store, "b") != gone
+        assert stored.load(MATCHING, [(key_of(store, "a"), key_of(store, "b"))]) == {}
+
+    def test_are_deleted_with_the_scene(self, two: tuple[Store, PairStore], place: Place) -> None:
+        store, stored = two
+        complete(store, stored)
+        store.delete_scene(SCENE)
+        for table in ("reference_pair", "reference_matching"):
+            assert place.fetch(f"SELECT count(*) FROM {table}") == [(0,)]
+        assert faults_of(place) == ()
+
+    @pytest.mark.parametrize(
+        "damage",
+        ["data = ?", "sha256 = 'no'", "first_key = second_key, second_key = first_key", "matching = 'sift/wide'"],
+    )
+    def test_damaged_ones_are_found_out_and_claimed_again(
+        self, two: tuple[Store, PairStore], place: Place, damage: str
+    ) -> None:
+        store, stored = two
+        pair = next(iter(complete(store, stored)))
+        parameters = [b"\1\2\3"] if "?" in damage else []
+        place.execute(f"UPDATE reference_pair SET {damage} WHERE first_key = ? AND second_key = ?", *parameters, *pair)
+        matching, at = ("sift/wide" if "wide" in damage else MATCHING), (pair[::-1] if "first" in damage else pair)
+        assert stored.load(matching, [at]) == {at: None}
+        assert faults_of(place) == ()
+        stored.discard(matching, [at])
+        assert stored.load(matching, [at]) == {}
+        if matching == MATCHING:
+            assert {it.key for it in claim_all(stored)} == set(pair)
+
+    def test_of_references_deleted_meanwhile_are_ignored(self, two: tuple[Store, PairStore], place: Place) -> None:
+        store, stored = two
+        claim = next(it for it in claim_all(stored) if it.reference_id == "c")
+        gone, left = key_of(store, "a"), key_of(store, "b")
+        store.delete_reference(SCENE, "a")
+        stored.add(MATCHING, claim, {(gone, claim.key): matches(3), (left, claim.key): matches(4)}, is_complete=True)
+        assert place.fetch("SELECT first_key FROM reference_pair") == [(left,)]
+        store.delete_reference(SCENE, "c")
+        stored.add(MATCHING, claim, {(left, claim.key): matches(4)}, is_complete=True)
+        stored.postpone(MATCHING, claim)
+        assert place.fetch("SELECT count(*) FROM reference_pair") == [(0,)]
+
+    def test_are_in_a_backup_and_in_what_is_restored(self, two: tuple[Store, PairStore], tmp_path: Path) -> None:
+        store, stored = two
+        made = complete(store, stored)
+        assert back_up(store.database, tmp_path / "backup").faults == ()
+        with Store.open(tmp_path / "other") as other:
+            restore(tmp_path / "backup", other.database)
+            found = PairStore(other.database)
+            for pair, loaded in found.load(MATCHING, made).items():
+                assert_same_bits(np.asarray(loaded), made[pair])
+            assert found.count_waiting(MATCHING) == 0
+
+
+class TestClaims:
+    def test_each_reference_is_claimed_once(self, two: tuple[Store, PairStore]) -> None:
+        store, stored = two
+        with ThreadPoolExecutor(4) as threads:
+            claims = [
+                it for found in threads.map(lambda _: claim_all(PairStore(store.database)), range(4)) for it in found
+            ]
+        assert sorted(it.reference_id for it in claims) == ["a", "b", "c"]
+        assert claim_all(stored) == []
+        assert stored.count_waiting(MATCHING) == 3
+        assert stored.claim("another", {}) is not None
+
+    def test_each_pair_belongs_to_the_later_reference(self, two: tuple[Store, PairStore]) -> None:
+        store, stored = two
+        keys = {name: key_of(store, name) for name in "abc"}
+        others = {
+            it.reference_id: stored.list_missing(MATCHING, it, [keys["c"], keys["b"], keys["a"]])
+            for it in claim_all(stored)
+        }
+        assert others == {"a": [], "b": [keys["a"]], "c": [keys["b"], keys["a"]]}
+
+    def test_what_a_killed_server_claimed_is_free_after_the_claim(
+        self, two: tuple[Store, PairStore], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        _, stored = two
+        progress: Progress = {}
+        assert len(claim_all(stored, progress)) == 3
+        let_pass(monkeypatch, pairs.CLAIM_S - 5)
+        assert claim_all(stored, progress) == []
+        let_pass(monkeypatch, 5)
+        assert len(claim_all(stored, progress)) == 3
+
+    def test_what_is_left_unfinished_may_be_claimed_at_once(self, two: tuple[Store, PairStore]) -> None:
+        store, stored = two
+        claim = next(it for it in claim_all(stored) if it.reference_id == "c")
+        keys = [key_of(store, name) for name in "ab"]
+        stored.add(MATCHING, claim, {(keys[0], claim.key): matches(2)}, is_complete=False)
+        assert claim_all(stored) == [claim]
+        assert stored.list_missing(MATCHING, claim, keys) == [keys[1]]
+
+    def test_completed_ones_are_not_claimed_again(
+        self, two: tuple[Store, PairStore], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        store, stored = two
+        progress: Progress = {}
+        complete(store, stored)
+        let_pass(monkeypatch, 1e6)
+        assert claim_all(stored, progress) == []
+        assert stored.count_waiting(MATCHING) == 0
+        store.add_references(SCENE, [make_reference("d", 9)])
+        assert [it.reference_id for it in claim_all(stored, progress)] == ["d"]
+
+    def test_the_wait_after_failures_grows(self, two: tuple[Store, PairStore], monkeypatch: pytest.MonkeyPatch) -> None:
+        _, stored = two
+        (claim, *_) = claim_all(stored)
+        waits_s = []
+        for _ in range(10):
+            waits_s.append(stored.postpone(MATCHING, claim))
+            let_pass(monkeypatch, waits_s[-1] - 5)
+            assert claim not in claim_all(stored)
+            let_pass(monkeypatch, 5)
+            assert claim in claim_all(stored)
+        assert waits_s == [min(pairs.LONGEST_RETRY_S, pairs.FIRST_RETRY_S * 2**i) for i in range(10)]
+        stored.add(MATCHING, claim, {}, is_complete=False)
+        assert claim in claim_all(stored)
+        assert stored.postpone(MATCHING, claim) == pairs.FIRST_RETRY_S
+
+    def test_scenes_of_all_tenants_are_served(self, two: tuple[Store, PairStore]) -> None:
+        store, stored = two
+        progress: Progress = {}
+        claim_all(stored, progress)
+        store.create_scene(OTHER)
+        store.add_references(OTHER, [make_reference("a", 4)])
+        (claim,) = claim_all(stored, progress)
+        assert (claim.scene_key, claim.reference_id) == (OTHER, "a")
+        # A pair lies within one scene.
+        assert stored.list_missing(MATCHING, claim, [key_of(store, name) for name in "abc"]) == []
+        store.delete_scene(OTHER)
+        store.create_scene(OTHER)
+        store.add_references(OTHER, [make_reference("a", 5)])
+        assert [it.scene_key for it in claim_all(stored, progress)] == [OTHER]
+
+    def test_a_deleted_reference_is_not_claimed(self, two: tuple[Store, PairStore]) -> None:
+        store, stored = two
+        key = store.delete_reference(SCENE, "a")  # between listing and claiming
+        assert not stored._claim(MATCHING, key)
