@@ -15,12 +15,11 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import grpc
 import grpc.aio
-from google.protobuf.message import Message
 
 from .calls import health, localization
 from .calls import references as reference_calls
-from .errors import MaplessError, from_rpc_error
-from .exchange import Attempt, Exchange, Methods, Pages, Pause, StreamReader, attempts
+from .errors import from_rpc_error
+from .exchange import Attempt, Exchange, Methods, Pages, Pause, Reader, attempts
 from .options import ConnectOptions
 from .requests import NewReference
 from .results import Reference
@@ -140,7 +139,11 @@ class Client:
 
     async def run(self, exchange: Exchange[T]) -> T:
         """Executes the calls of an exchange; used by all methods."""
-        steps = attempts(exchange, self.options)
+        return [answer async for answer in self._follow(exchange)][-1]
+
+    async def _follow(self, exchange: Exchange[T]) -> AsyncIterator[T]:
+        """Executes the calls of an exchange: yields a stream's early answers and the final answer."""
+        steps, reader = attempts(exchange, self.options), Reader()
         # The first step builds the request, which may read a file: not in the event loop.
         step = await asyncio.to_thread(next, steps)
         try:
@@ -149,45 +152,27 @@ class Client:
                     await asyncio.sleep(step.duration_s)
                     step = next(steps)
                 else:
-                    step = steps.send(await self._attempt(step))
-        except StopIteration as end:
-            value: T = end.value
-            return value
-
-    async def _follow(self, exchange: Exchange[T]) -> AsyncIterator[T]:
-        """`run` for calls that are answered by a stream; early answers are yielded first."""
-        steps, reader = attempts(exchange, self.options), StreamReader()
-        step = await asyncio.to_thread(next, steps)
-        try:
-            while True:
-                if isinstance(step, Pause):
-                    await asyncio.sleep(step.duration_s)
-                    step = next(steps)
-                else:
-                    async with aclosing(self._messages(step, reader)) as messages:
-                        async for message in messages:
-                            early: T | None = reader.read(message)
-                            if early is not None:
-                                yield early
+                    async with aclosing(self._early_answers(step, reader)) as answers:
+                        async for early in answers:
+                            yield early
                     step = steps.send(reader.outcome)
         except StopIteration as end:
             yield end.value
 
-    async def _attempt(self, attempt: Attempt) -> Message | MaplessError:
-        try:
-            response: Message = await self._methods.start(attempt)
-        except grpc.RpcError as error:
-            return from_rpc_error(error)
-        return response
-
-    async def _messages(self, attempt: Attempt, reader: StreamReader) -> AsyncGenerator[Message, None]:
-        """The messages of a stream; the call is cancelled when the caller stops reading."""
+    async def _early_answers(self, attempt: Attempt, reader: Reader) -> AsyncGenerator[Any, None]:
+        """Makes an attempt; a stream is cancelled when the caller stops reading."""
         reader.begin(attempt.call)
-        stream = self._methods.start(attempt)
         try:
-            async for message in stream:
-                yield message
+            response = self._methods.start(attempt)
+            if attempt.call.early is None:
+                reader.read(await response)
+                return
+            try:
+                async for message in response:
+                    early = reader.read(message)
+                    if early is not None:
+                        yield early
+            finally:
+                response.cancel()
         except grpc.RpcError as error:
             reader.fail(from_rpc_error(error))
-        finally:
-            stream.cancel()

@@ -6,15 +6,14 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from functools import wraps
 from types import TracebackType
-from typing import Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import grpc
-from google.protobuf.message import Message
 
 from .calls import health, localization
 from .calls import references as reference_calls
-from .errors import MaplessError, from_rpc_error
-from .exchange import Attempt, Exchange, Methods, Pages, Pause, StreamReader, attempts
+from .errors import from_rpc_error
+from .exchange import Attempt, Exchange, Methods, Pages, Pause, Reader, attempts
 from .options import ConnectOptions
 from .requests import NewReference
 from .results import Reference
@@ -141,22 +140,12 @@ class Client:
 
     def run(self, exchange: Exchange[T]) -> T:
         """Executes the calls of an exchange; used by all methods."""
-        steps = attempts(exchange, self.options)
-        try:
-            step = next(steps)
-            while True:
-                if isinstance(step, Pause):
-                    self._pause(step)
-                    step = next(steps)
-                else:
-                    step = steps.send(self._attempt(step))
-        except StopIteration as end:
-            value: T = end.value
-            return value
+        *_, answer = self._follow(exchange)
+        return answer
 
     def _follow(self, exchange: Exchange[T]) -> Iterator[T]:
-        """`run` for calls that are answered by a stream; early answers are yielded first."""
-        steps, reader = attempts(exchange, self.options), StreamReader()
+        """Executes the calls of an exchange: yields a stream's early answers and the final answer."""
+        steps, reader = attempts(exchange, self.options), Reader()
         try:
             step = next(steps)
             while True:
@@ -164,10 +153,7 @@ class Client:
                     self._pause(step)
                     step = next(steps)
                 else:
-                    for message in self._messages(step, reader):
-                        early: T | None = reader.read(message)
-                        if early is not None:
-                            yield early
+                    yield from self._early_answers(step, reader)
                     step = steps.send(reader.outcome)
         except StopIteration as end:
             yield end.value
@@ -176,20 +162,20 @@ class Client:
         if self._closed.wait(pause.duration_s):
             raise pause.error
 
-    def _attempt(self, attempt: Attempt) -> Message | MaplessError:
-        try:
-            response: Message = self._methods.start(attempt)
-        except grpc.RpcError as error:
-            return from_rpc_error(error)
-        return response
-
-    def _messages(self, attempt: Attempt, reader: StreamReader) -> Iterator[Message]:
-        """The messages of a stream; the call is cancelled when the caller stops reading."""
+    def _early_answers(self, attempt: Attempt, reader: Reader) -> Iterator[Any]:
+        """Makes an attempt; a stream is cancelled when the caller stops reading."""
         reader.begin(attempt.call)
-        stream = self._methods.start(attempt)
         try:
-            yield from stream
+            response = self._methods.start(attempt)
+            if attempt.call.early is None:
+                reader.read(response)
+                return
+            try:
+                for message in response:
+                    early = reader.read(message)
+                    if early is not None:
+                        yield early
+            finally:
+                response.cancel()
         except grpc.RpcError as error:
             reader.fail(from_rpc_error(error))
-        finally:
-            stream.cancel()

@@ -173,8 +173,8 @@ def _reading(call: Call, response: Message) -> Iterator[None]:
         raise Internal("INTERNAL", message, reason=MALFORMED_ANSWER, field=field_path, request_id=request_id) from error
 
 
-class StreamReader:
-    """Reads the streams of a call's attempts: the early answer, once, and the outcome of each attempt.
+class Reader:
+    """Reads the messages of a call's attempts: a stream's early answer, once, and the outcome of each attempt.
 
     An attempt that fails after its early answer is retried like any other; the retry yields the final answer only.
 
@@ -195,9 +195,10 @@ class StreamReader:
 
     def read(self, message: Message) -> Any | None:
         """The early answer of a message; None if it is the final answer, or if an early one was returned before."""
-        assert self._call.early is not None
-        with _reading(self._call, message):
-            early = self._call.early(message)
+        early = None
+        if self._call.early is not None:
+            with _reading(self._call, message):
+                early = self._call.early(message)
         if early is None:
             self.outcome = message
         elif not self._had_early:
