@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -94,8 +95,8 @@ def test_too_few_samples_or_none_in_order_are_refused(times: list[float]) -> Non
 # What is watched
 
 
-def state(at_s: float, **held: float) -> ServerState:
-    return replace(ServerState(at_s, 500.0, 400.0, 5e5, 20.0, 30.0, 15.0, 40.0, 0.0, 1.0, at_s), **held)
+def state(at_s: float, **held: Any) -> ServerState:
+    return replace(ServerState(at_s, 500.0, 20, 30, at_s, 400.0, 5e5, 15, 40.0, 0.0, 1.0), **held)
 
 
 def test_slopes_skip_the_settling_and_need_enough_time() -> None:

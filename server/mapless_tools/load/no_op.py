@@ -8,8 +8,8 @@ send: as long as a photograph, and as small as one can be, so that decoding it c
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -84,15 +84,13 @@ def make_no_op_engine(settings: Settings, store: Store, metrics: Metrics, quota:
     return engine_over(store, tiers, engine_options(settings), metrics, quota, no_op_method())
 
 
-def main(arguments: Sequence[str]) -> None:
-    """Serves with the store in the folder given until SIGTERM; logs into it, as much as a server does by default."""
-    data_dir = Path(arguments[0])
-    flags = {"port": 0, "data_dir": data_dir, "metrics_port": 0, "warm_up": False}
-    settings = load_settings(flags).settings
-    with (data_dir / "log").open("w", encoding="utf-8") as stream:
+def main(data_dir: Path | None) -> None:
+    """Serves until SIGTERM with a store in the folder, or the environment's; logs as much as a server by default."""
+    settings = load_settings({"port": 0, "metrics_port": 0, "warm_up": False, "data_dir": data_dir}).settings
+    with open(os.devnull if data_dir is None else data_dir / "log", "w", encoding="utf-8") as stream:
         configure_logging(settings, stream)
         asyncio.run(serve(settings, make_no_op_engine))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main(Path(sys.argv[1]) if sys.argv[1:] else None)

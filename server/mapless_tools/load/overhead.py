@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack, ExitStack
@@ -149,7 +150,8 @@ def overhead_lines(subjects: Sequence[Subject], options: OverheadOptions) -> lis
     """A table with a row a server."""
     lines = [
         f"Messages of {options.message_bytes / 1e6:g} MB, {options.rounds} rounds by turns, "
-        f"{options.concurrency} calls side by side from {options.clients} connections:",
+        f"{options.concurrency} calls side by side from {options.clients} connections; "
+        f"load average {os.getloadavg()[0]:.1f}:",
         "",
         "| server | p50 unloaded, ms | p99 unloaded, ms | calls/s | server CPU ms/call | generator's core |",
         "|---|---|---|---|---|---|",

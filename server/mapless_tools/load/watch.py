@@ -43,7 +43,7 @@ class ProcessSample:
 
     Attributes:
         at_s: by the event loop's clock.
-        resident_mib: memory.
+        resident_mib: memory, with what it shares with other processes.
         threads: how many.
         descriptors: open files and sockets.
         cpu_s: used so far by all its threads; the system counts in hundredths.
@@ -57,34 +57,24 @@ class ProcessSample:
 
 
 @dataclass(frozen=True)
-class ServerState:
-    """A server at a moment.
+class ServerState(ProcessSample):
+    """A server at a moment: its process, and more.
 
     Attributes:
-        at_s: by the event loop's clock.
-        resident_mib: memory, with what it shares with other processes.
         unique_mib: memory that would be free without it.
         python_blocks: pieces of memory that Python's objects hold, whatever the allocator keeps beside.
-        threads: how many.
-        descriptors: open files and sockets.
-        sockets: of these, sockets.
+        sockets: of the descriptors, sockets.
         data_mib: the data folder on the disk.
         waiting_jobs: in the queue.
         loop_lag_ms: how late timers of the event loop ran, on average since the moment before.
-        cpu_s: used so far.
     """
 
-    at_s: float
-    resident_mib: float
     unique_mib: float
     python_blocks: float
-    threads: float
-    descriptors: float
-    sockets: float
+    sockets: int
     data_mib: float
     waiting_jobs: float
     loop_lag_ms: float
-    cpu_s: float
 
 
 FIELDS = tuple(field.name for field in fields(ServerState) if field.name != "at_s")
@@ -120,17 +110,13 @@ def read_state(server: ServerUnderLoad, at_s: float, before: Scrape | None) -> t
     if scrape is None:
         raise ConnectionRefusedError(f"there are no metrics on {server.metrics_address}")
     state = ServerState(
-        at_s=at_s,
-        resident_mib=process.resident_mib,
+        **vars(process),
         unique_mib=_unique_mib(folder),
         python_blocks=scrape.totals.get("mapless_python_allocated_blocks", 0.0),
-        threads=process.threads,
-        descriptors=process.descriptors,
         sockets=_sockets(folder),
         data_mib=_size_mib(server.data_dir),
         waiting_jobs=scrape.totals.get("mapless_queue_depth", 0.0),
         loop_lag_ms=(scrape if before is None else scrape.since(before)).mean_lag_ms,
-        cpu_s=process.cpu_s,
     )
     return state, scrape
 

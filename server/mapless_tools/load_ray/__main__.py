@@ -11,12 +11,13 @@ from typing import Any
 
 from mapless_server.serve.signals import terminable
 from mapless_tools.demo import place_of
+from mapless_tools.load.overhead import overhead_json, overhead_lines
 from mapless_tools.load.report import Check, check_lines, machine, update_json
 from mapless_tools.progress import Progress, progress_bars
 
 from .cluster import ClusterFailed
 from .database import NoDatabase
-from .overhead import OPTIONS, measure_overhead, overhead_checks, overhead_json, overhead_lines
+from .overhead import OPTIONS, measure_overhead, overhead_checks
 from .replacing import (
     failover_checks,
     kill_one,

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import os
 from statistics import median
-from typing import Any
 
 from mapless import Client
+from mapless_server.settings import PREFIX
 from mapless_tools.child import child_module
 from mapless_tools.load import no_op
 from mapless_tools.load.overhead import Called, OverheadOptions, Subject, compare_by_turns
@@ -36,7 +35,8 @@ def measure_overhead(options: OverheadOptions, progress: Progress) -> list[Subje
     request = photo_request(photo, no_op.CAMERA, names)
     with database_url() as url, running_cluster({VARIABLE: url}) as cluster:
         cluster.deploy(application({"insecure": True, "workers": WORKERS}, 1, import_path=NO_OP))
-        with child_module("mapless_tools.load_ray.plain", str(WORKERS), environment={VARIABLE: url}) as plain:
+        environment = {VARIABLE: url, f"{PREFIX}WORKERS": str(WORKERS)}
+        with child_module("mapless_tools.load.no_op", environment=environment) as plain:
             with Client(cluster.address) as client:
                 client.create_scene(SCENE)
                 client.add_references(SCENE, [Scenes(photo=photo).reference(name) for name in names])
@@ -56,30 +56,3 @@ def overhead_checks(ways: list[Subject]) -> list[Check]:
     value = f"{median(rounds):.2f} ms (rounds {min(rounds):.2f} to {max(rounds):.2f})"
     bar, met = f"at most {MAX_OVERHEAD_MS:g} ms", median(rounds) <= MAX_OVERHEAD_MS
     return [Check("p50 overhead of the ingress, one call at a time", value, bar, met)]
-
-
-def overhead_lines(ways: list[Subject], options: OverheadOptions) -> list[str]:
-    """A table with a row a way."""
-    lines = [
-        f"Messages of {options.message_bytes / 1e6:g} MB to a server that computes nothing, {options.rounds} rounds by "
-        f"turns; load average {os.getloadavg()[0]:.1f}:",
-        "",
-        "| called | p50 of one at a time, ms | p99 of it, ms | calls/s with 16 in parallel | generator's core |",
-        "|---|---|---|---|---|",
-    ]
-    for way in ways:
-        own = f"{100 * way.own_share:.0f} %"
-        lines.append(f"| {way.name} | {way.p50_ms:.2f} | {way.p99_ms:.2f} | {way.calls_per_s:.0f} | {own} |")
-    return [*lines, ""]
-
-
-def overhead_json(ways: list[Subject], options: OverheadOptions) -> dict[str, Any]:
-    """The figures for programs."""
-    return {
-        "options": vars(options),
-        "ways": [
-            {"name": way.name}
-            | {kind: [step.as_json() for step in getattr(way, kind)] for kind in ("unloaded", "saturated")}
-            for way in ways
-        ],
-    }
