@@ -205,7 +205,7 @@ class TestTiers:
         assert (hint.advice, hint.best_reference) == (Advice.TELL_PLACES_APART, "scenes/s/references/r1")
         setting.replies = {"cheap": far, "strong": far}
         assert hint_of(setting.localize(narrowing=NEAR_ORIGIN)).advice is Advice.CHECK_PRIOR
-        setting.replies = {"cheap": rejected(), "strong": lambda *_: 1 / 0}  # type: ignore[dict-item, return-value]
+        setting.replies = {"cheap": rejected(), "strong": lambda *_: 1 / 0}  # type: ignore[dict-item]
         assert hint_of(setting.localize()).message
         elsewhere = Narrowing(Sphere(pose(900.0).translation, 0.5))
         assert hint_of(setting.localize(reference_ids=(), narrowing=elsewhere)).advice is Advice.CHECK_PRIOR
