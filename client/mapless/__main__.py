@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from .cli.arguments import connect_options, make_parser
 from .cli.folder import EXIT_FAILED, EXIT_USAGE
@@ -21,17 +23,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with Client(parsed.address, connect_options(parsed)) as client:
             sys.exit(parsed.run(client, parsed))
     except MaplessError as error:
-        field = f" (field {error.field})" if error.field and error.field not in error.message else ""
-        print(f"mapless: {error}{field}", file=sys.stderr)
+        print(f"mapless: {_source_of(error, parsed)}{error}", file=sys.stderr)
         sys.exit(EXIT_FAILED)
     except BrokenPipeError:  # the reader of our output has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(EXIT_FAILED)
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        print(
+            f"mapless: {error.filename}: {error.strerror}" if error.filename else f"mapless: {error}", file=sys.stderr
+        )
+        sys.exit(EXIT_USAGE)
+    except ValueError as error:
         print(f"mapless: {error}", file=sys.stderr)
         sys.exit(EXIT_USAGE)
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
+
+
+def _source_of(error: MaplessError, parsed: argparse.Namespace) -> str:
+    """The file that has the wrong field of a request, "photo.jpg: "; empty if it is not one of a single file."""
+    for part in (error.field or "").split("."):
+        source = getattr(parsed, _SOURCES.get(part, ""), None)
+        if source is not None and Path(source).is_file():
+            return f"{source}: "
+    return ""
+
+
+_SOURCES = {"image": "photo", "intrinsics": "camera", "world_from_camera": "pose"}
+"""The argument that has a field of the requests."""
 
 
 if __name__ == "__main__":

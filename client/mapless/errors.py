@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from typing import Any, TypeVar
+from urllib.parse import unquote
 
 import grpc
 from google.protobuf.message import DecodeError, Message
@@ -47,7 +48,8 @@ class MaplessError(Exception):
         retry_after_s: float | None = None,
         request_id: str = "",
     ) -> None:
-        super().__init__(f"{reason or code}: {message}")
+        named = f" (field {field})" if field and field not in message else ""
+        super().__init__(f"{reason or code}: {message}{named}")
         self.code = code
         self.reason = reason or code
         self.message = message
@@ -140,7 +142,7 @@ def _message(details: str) -> str:
     reason = details.rpartition("last error: ")[2]
     known = next((words for sign, words in _NOT_CONNECTED_BECAUSE.items() if sign in reason), "")
     address = _ADDRESS.search(reason)
-    return f"cannot connect{f' to {address[1]}' if address else ''}: {known or reason}"
+    return f"cannot connect{f' to {unquote(address[1])}' if address else ''}: {known or reason}"
 
 
 def _detail(status: status_pb2.Status, empty: Detail) -> Detail | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,77 @@ def test_four_numbers_take_the_size_of_the_photograph(tmp_path: Path) -> None:
         read_camera("-500,501,319,239", photo)
 
 
+GOOD = {"width_px": 640, "height_px": 480, "focal_x_px": 5, "focal_y_px": 5, "principal_x_px": 3, "principal_y_px": 2}
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"focal_x_px": -5}, "focal_x_px: must be above 0 and at most 64000, is -5"),
+        ({"focal_x_px": None}, "focal_x_px is missing"),
+        ({"focal_z_px": 5}, "focal_z_px is no field, perhaps focal_y_px; known: width_px, "),
+        ({"spherical": {"k1": 1}}, "spherical is no field; known: .* fisheye"),
+        ({"fisheye": {"k9": 1}}, "fisheye.k9 is no field; known: k1, k2, k3, k4"),
+        ({"fisheye": {"k1": 1000}}, "fisheye.k1: must be at most 100 in magnitude, is 1000"),
+        ({"fisheye": 3}, "fisheye must be an object, {...}, is 3"),
+        ({"fisheye": {}, "radialTangential": {}}, "radialTangential and fisheye exclude each other"),
+        ({"width_px": 0}, "width_px: must be 32 to 16384, is 0"),
+        ({"width_px": "wide"}, 'width_px must be a whole number, is "wide"'),
+        ({"width_px": 640.5}, "width_px must be a whole number, is 640.5"),
+        ({"width_px": True}, "width_px must be a whole number, is true"),
+        ({"focal_y_px": [1]}, "focal_y_px must be a number, is [1]"),
+        ({"focal_y_px": math.nan}, "focal_y_px: must be above 0 and at most 64000, is nan"),
+        ({"width_px": 10**400}, "width_px must be a whole number, is 1000"),
+    ],
+)
+def test_a_wrong_camera_names_file_field_and_value(tmp_path: Path, changes: dict[str, Any], complaint: str) -> None:
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps(GOOD | changes))
+    with pytest.raises(ValueError, match=f"^{re.escape(f'{file}: {complaint}').replace(re.escape('.*'), '.*')}"):
+        read_camera(file)
+
+
+def test_a_field_is_named_as_it_was_written(tmp_path: Path) -> None:
+    content = {"widthPx" if key == "width_px" else key: value for key, value in GOOD.items()}
+    with pytest.raises(ValueError, match=r"^camera: widthPx: must be 32 to 16384, is 3"):
+        read_camera(json.dumps(content | {"widthPx": 3}))
+    with pytest.raises(ValueError, match=r"^camera: focal_x_px, principal_y_px are missing"):
+        read_camera(json.dumps({key: GOOD[key] for key in GOOD if key not in ("focal_x_px", "principal_y_px")}))
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"", "is empty"),
+        (b"hello", "is not JSON: Expecting value in line 1, column 1"),
+        (b'{\n"width_px": 3,}', "is not JSON: .* in line 2"),
+        (b"[1, 2]", r"must be an object, {\.\.\.}, is \[1, 2\]"),
+        (b'{"width_px": 3, "width_px": 3}', "width_px is given twice"),
+        (b"\xff\xfe\x00", "is not a text file"),
+    ],
+)
+def test_a_file_without_a_camera_says_what_it_is(tmp_path: Path, content: bytes, complaint: str) -> None:
+    for read in (read_camera, read_pose):
+        (tmp_path / "it.json").write_bytes(content)
+        with pytest.raises(ValueError, match=rf"it\.json: {complaint}"):
+            read(tmp_path / "it.json")
+
+
+@pytest.mark.parametrize(
+    ("pose", "complaint"),
+    [
+        ({"rotation": {"w": 2}, "translation_m": {}}, "pose: rotation: quaternion must have norm 1, has 2"),
+        ({"rotation": {"w": 1}}, "pose: translation_m is missing"),
+        ({"rotation": {"w": 1}, "translation": {}}, "pose: translation is no field, perhaps translation_m"),
+        ({"rotation": {"w": 1}, "translation_m": {"y": "a"}}, 'pose: translation_m.y must be a number, is "a"'),
+        ({"rotation": {"w": 1}, "translation_m": {"y": "Infinity"}}, "pose: translation_m.y: must be finite, is inf"),
+    ],
+)
+def test_a_wrong_pose_names_the_field(pose: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(ValueError, match=f"^{re.escape(complaint)}"):
+        read_pose(json.dumps(pose))
+
+
 def frame(**changes: Any) -> dict[str, Any]:
     k = [[500.0, 0, 319.0], [0, 501.0, 239.0], [0, 0, 1]]
     return {"image": "images/a.jpg", "width": 640, "height": 480, "K": k, "dist": [0.1, 0.2, 0.3, 0.4, 0.5]} | changes
@@ -48,11 +120,23 @@ def test_the_cameras_of_a_folder(tmp_path: Path) -> None:
     assert read_cameras(file) == {tmp_path / "images" / "a.jpg": CAMERA, tmp_path / "b.jpg": CAMERA.pinhole()}
 
 
-@pytest.mark.parametrize("wrong", [{"K": [[1]]}, {"width": 3}, {"dist": [1, 2, 3, 4, 5, 6]}, {"image": None}])
-def test_a_frame_that_is_none_is_named(tmp_path: Path, wrong: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("wrong", "complaint"),
+    [
+        ({"K": [[1]]}, "K must be 3x3 numbers, is [[1]]"),
+        ({"K": [[-5, 0, 3], [0, 5, 2], [0, 0, 1]]}, "K[0][0]: must be above 0 and at most 64000, is -5"),
+        ({"width": 3}, "width: must be 32 to 16384, is 3"),
+        ({"height": 480.5}, "height must be a whole number of pixels, is 480.5"),
+        ({"dist": [1, 2, 3, 4, 5, 6]}, "dist of a radial_tangential lens must be null or 4 or 5 coefficients"),
+        ({"dist": [1, 2, 3, 400]}, "dist: must be at most 100 in magnitude, is 400"),
+        ({"dist": "none"}, 'dist must be null or a list of numbers, is "none"'),
+        ({"image": None}, "image must be a path, is null"),
+    ],
+)
+def test_a_frame_that_is_none_is_named(tmp_path: Path, wrong: dict[str, Any], complaint: str) -> None:
     file = tmp_path / "cameras.json"
     file.write_text(json.dumps({"frames": [frame(), frame(**wrong)]}))
-    with pytest.raises(ValueError, match=r"cameras.json: frames\[1\]"):
+    with pytest.raises(ValueError, match=re.escape(f"cameras.json: frames[1]: {complaint}")):
         read_cameras(file)
 
 

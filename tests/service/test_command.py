@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ from google.protobuf import json_format
 from support.servers import CAMERA, PHOTO, RunningServer, pose
 
 import mapless
-from mapless import wire
+from mapless import Camera, wire
 from mapless.__main__ import main
 from mapless.cli.arguments import make_parser
+from mapless.cli.output import plain
 
 HEALTHY = "SERVING\nLocalizationService SERVING\nReferenceService SERVING\n"
 CLIENT = Path(mapless.__file__).parents[1]
@@ -82,10 +84,27 @@ def test_complaints(run: Run, tmp_path: Path, camera_json: str) -> None:
     photo = str(tmp_path / "absent.jpg")
     code, _, complaint = run("localize", "s", photo, "--camera", camera_json)
     assert (code, "absent.jpg" in complaint) == (2, True)
+    assert complaint == f"mapless: {photo}: No such file or directory\n"
     code, _, complaint = run("localize", "s", photo, "--camera", '{"width": 3}')
-    assert (code, "width" in complaint) == (2, True)
-    code, _, complaint = run("localize", "s", photo, "--camera", '{"width_px": 3}')
-    assert (code, "camera.width_px" in complaint) == (2, True)
+    assert (code, "width is no field" in complaint) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("content", "camera", "complaint"),
+    [
+        (b"", CAMERA, "photo.png: IMAGE_EMPTY: the image is empty\n"),
+        (b"hello", CAMERA, "photo.png: IMAGE_UNKNOWN_FORMAT: "),
+        (PHOTO, replace(CAMERA, width_px=64, height_px=96), "camera.json: INVALID_ARGUMENT: intrinsics.width_px: "),
+    ],
+)
+def test_an_error_names_the_file(
+    run: Run, scene: str, tmp_path: Path, content: bytes, camera: Camera, complaint: str
+) -> None:
+    (tmp_path / "photo.png").write_bytes(content)
+    (tmp_path / "camera.json").write_text(json.dumps(plain(camera)))
+    code, _, printed = run("localize", scene, tmp_path / "photo.png", "--camera", tmp_path / "camera.json")
+    assert code == 1
+    assert printed.startswith(f"mapless: {tmp_path}/{complaint}")
 
 
 @pytest.fixture
@@ -250,7 +269,7 @@ def test_a_scene_has_its_place_on_the_earth(run: Run) -> None:
         (["--camera", "1,2,3,4,5"], "four numbers"),
         (["--camera", "nan,1,2,3"], "nan,1,2,3"),
         (["--camera", "cameras.json"], "cameras.json"),
-        (["--axes", "sideways", "--camera", '{"width_px": 96}'], "camera.height_px"),
+        (["--axes", "sideways", "--camera", '{"width_px": 96}'], "camera: height_px"),
     ],
 )
 def test_what_is_wrong_is_said_before_anything_is_asked(

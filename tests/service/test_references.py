@@ -190,6 +190,15 @@ def test_a_batch_with_one_bad_item_stores_nothing(client: Client, stubs: Stubs, 
     assert client.get_scene(scene).reference_count == 3
 
 
+def test_the_client_names_the_bad_reference_of_a_batch(server: RunningServer, scene: str) -> None:
+    photos = [PHOTO, PHOTO, PHOTO, b"none"]
+    references = [NewReference(f"p{i}", photo, CAMERA, pose(i)) for i, photo in enumerate(photos)]
+    complaint = "IMAGE_UNKNOWN_FORMAT: reference 'p3': the image is not"
+    two_by_two = ConnectOptions(batch_count=2)
+    with Client(server.address, two_by_two) as client, pytest.raises(InvalidArgument, match=complaint):
+        client.add_references(scene, references)
+
+
 def test_a_batch_with_a_taken_id_stores_nothing(client: Client, stubs: Stubs, scene: str) -> None:
     batch = pb.BatchCreateReferencesRequest(
         scene=f"scenes/{scene}", requests=[create_request("n0"), create_request("r1")]

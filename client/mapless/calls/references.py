@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 
 from numpy.typing import ArrayLike
@@ -11,7 +12,7 @@ from ..errors import MaplessError
 from ..exchange import Call, Exchange, Pages
 from ..geodesy import Datum
 from ..geometry import Camera, RigidTransform
-from ..names import reference_name, scene_name
+from ..names import reference_name, scene_name, shown
 from ..options import ConnectOptions
 from ..priors import Priors, set_priors
 from ..requests import ImageSource, NewReference, create_request, read_image
@@ -136,15 +137,33 @@ def add_batch(
         return pb.BatchCreateReferencesResponse(references=stored)
 
     request = pb.BatchCreateReferencesRequest(scene=scene_name(scene), requests=requests)
-    response = yield Call(
-        f"{SERVICE}/BatchCreateReferences",
-        request,
-        pb.BatchCreateReferencesResponse,
-        timeout_s,
-        is_upload=True,
-        on_repeat=found,
-    )
+    try:
+        response = yield Call(
+            f"{SERVICE}/BatchCreateReferences",
+            request,
+            pb.BatchCreateReferencesResponse,
+            timeout_s,
+            is_upload=True,
+            on_repeat=found,
+        )
+    except MaplessError as error:
+        raise _with_reference_id(error, requests) from error
     return list(map(reference_from_message, response.references))
+
+
+def _with_reference_id(error: MaplessError, requests: Sequence[pb.CreateReferenceRequest]) -> MaplessError:
+    """The error of a batch, naming the reference: its index counts within one message, of which there may be many."""
+    place = re.match(r"requests\[(\d+)\]", error.field or "")
+    if place is None or int(place[1]) >= len(requests):
+        return error
+    return type(error)(
+        error.code,
+        f"reference {shown(requests[int(place[1])].reference_id)}: {error.message}",
+        reason=error.reason,
+        field=error.field,
+        retry_after_s=error.retry_after_s,
+        request_id=error.request_id,
+    )
 
 
 def batches(
