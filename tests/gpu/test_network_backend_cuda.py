@@ -56,7 +56,7 @@ def outcomes_of(backend: NetworkReconstructor, requests: Sequence[Any], times: i
 
 @pytest.mark.parametrize("name", ["pi3", "pi3x"])
 @pytest.mark.parametrize("views_on_device", [0, 2, 100])
-def test_kept_tokens_give_the_same_bits(name: str, views_on_device: int) -> None:
+def test_cached_tokens_give_the_same_bits(name: str, views_on_device: int) -> None:
     """From the device, from the host, and where views push one another back and forth."""
     runner, requests = runner_of(name), [small_request(3, 1), small_request(4, 2)]
     one_view_bytes = (5 + 20) * 64 * 2

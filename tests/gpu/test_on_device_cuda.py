@@ -37,7 +37,7 @@ def on_cuda(case: Case) -> Case:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("case", CASES)
-def test_every_form_gives_what_the_host_gives(case: str, variant: str) -> None:
+def test_every_variant_equals_the_hosts_result(case: str, variant: str) -> None:
     options = (ScaleOptions(), *VARIANTS[variant])
     assert_same(on_cuda(CASES[case]).on_device(*options), CASES[case].on_host(*options))
 
@@ -56,7 +56,7 @@ def test_nothing_synchronizes_between_the_network_and_the_fetch(variant: str) ->
         torch.cuda.set_sync_debug_mode("default")
 
 
-def test_the_same_query_has_the_same_answer_to_the_bit() -> None:
+def test_the_same_query_has_the_same_answer_bit_for_bit() -> None:
     case = on_cuda(CASES["noise"])
     answers = [case.on_device(ScaleOptions(), *VARIANTS["best"]) for _ in range(2)]
     points = [answer.structure for answer in answers if isinstance(answer, Refined)]

@@ -51,7 +51,7 @@ def cheated_estimate(
 
 
 @pytest.mark.parametrize(("moved", "tolerance"), [(0.0, 1e-6), (1e-3, 2e-3)])
-def test_the_gradient_is_that_of_the_cost(moved: float, tolerance: float) -> None:
+def test_gradient_equals_finite_differences_of_the_cost(moved: float, tolerance: float) -> None:
     """Half of it, as in least squares. Away from the start the prior's error is differentiated as if it were small."""
     problem, state = problem_of("gradient", moved)
     equations = problem.linearize(state)
@@ -81,7 +81,7 @@ def dense_system(problem: BundleProblem, state: Bundle) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3, 1.0])
-def test_the_step_is_that_of_the_whole_system(damping: float) -> None:
+def test_reduced_step_equals_the_step_of_the_full_system(damping: float) -> None:
     problem, state = problem_of("dense", 1e-3)
     matrix, gradient = dense_system(problem, state)
     expected = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
@@ -92,7 +92,7 @@ def test_the_step_is_that_of_the_whole_system(damping: float) -> None:
     np.testing.assert_allclose(actual, expected, atol=2e-3 * np.abs(expected).max())
 
 
-def test_the_eliminated_system_inverts_to_the_covariance() -> None:
+def test_reduced_system_inverts_to_the_full_covariance() -> None:
     problem, state = problem_of("marginal")
     matrix, _ = dense_system(problem, state)
     cameras = 6 * len(state.poses.rotation)
@@ -101,7 +101,7 @@ def test_the_eliminated_system_inverts_to_the_covariance() -> None:
     np.testing.assert_allclose(np.linalg.inv(reduced), expected, rtol=0, atol=1e-3 * np.abs(expected).max())
 
 
-def test_the_prior_measures_the_motion() -> None:
+def test_reference_motion_is_the_motion_from_the_given_pose() -> None:
     problem, state = problem_of("prior")
     np.testing.assert_allclose(problem.reference_motion(state), 0, atol=1e-12)
     motion = random_for("prior motion").normal(0, 1e-4, (len(state.poses.rotation), 6))
@@ -109,7 +109,7 @@ def test_the_prior_measures_the_motion() -> None:
     np.testing.assert_allclose(error, motion[:-1], atol=1e-7)
 
 
-def test_a_point_behind_a_camera_has_no_cost() -> None:
+def test_cost_is_nan_for_a_point_behind_a_camera() -> None:
     problem, state = problem_of("behind")
     points = state.points.copy()
     points[0] = [0.0, 0.0, -100.0]
@@ -138,19 +138,19 @@ def mean_errors(pose_noise: float, options: SceneOptions, seeds: int) -> tuple[A
 FEW_POINTS = SceneOptions(point_count=120, reference_count=4, distractor_count=0)
 
 
-def test_with_exact_references_it_does_not_get_worse() -> None:
+def test_exact_references_do_not_make_the_pose_worse() -> None:
     """Up to what the Cauchy loss costs on keypoints that are all good: a tenth at most."""
     before, after = mean_errors(0.0, FEW_POINTS, seeds=12)
     assert (after <= 1.1 * before).all()
 
 
-def test_with_noisy_references_it_gets_better() -> None:
+def test_noisy_references_are_corrected_and_the_pose_improves() -> None:
     before, after = mean_errors(1.0, SceneOptions(point_count=300, reference_count=8, distractor_count=0), seeds=20)
     assert after[0] < 0.95 * before[0]
     assert after[1] < before[1]
 
 
-def test_a_rough_pose_is_pulled_in() -> None:
+def test_a_rough_pose_converges_to_the_planted_one() -> None:
     scene = make_scene(random_for("pulled"), replace(FEW_POINTS, noise_px=0.0))
     structure, matches = true_structure(scene, NOISE)
     rough = RigidTransform(scene.world_from_query.rotation, scene.world_from_query.translation + [0.01, -0.01, 0.02])
@@ -160,7 +160,7 @@ def test_a_rough_pose_is_pulled_in() -> None:
     assert np.median(adjusted.errors_px) < 0.01
 
 
-def test_matches_far_off_take_no_part() -> None:
+def test_matches_with_large_errors_are_not_used() -> None:
     scene = make_scene(random_for("far off"), replace(FEW_POINTS, noise_px=0.0))
     structure, matches = true_structure(scene, NOISE)
     random = random_for("far off matches")
@@ -185,7 +185,7 @@ def test_the_covariance_is_symmetric_and_names_its_source() -> None:
     assert adjusted.uncertainty.motions.shape == (len(scene.references), 6)
 
 
-def test_references_and_points_stay_where_they_were() -> None:
+def test_the_input_is_not_modified() -> None:
     scene = make_scene(random_for("untouched"), FEW_POINTS)
     structure, matches, estimate = stages(scene, scene.references)
     points = structure.x_in_world.copy()
@@ -210,7 +210,7 @@ def test_fewer_matches_than_unknowns_change_nothing(count: int) -> None:
     assert np.isfinite(adjusted.world_from_camera.matrix()).all()
 
 
-def test_all_matches_with_one_spot_are_no_exception() -> None:
+def test_matches_with_one_point_raise_no_exception() -> None:
     scene = make_scene(random_for("singular"), FEW_POINTS)
     structure, matches = true_structure(scene, NOISE)
     estimate = cheated_estimate(scene, matches, scene.world_from_query, error_px=0.5)
@@ -221,7 +221,7 @@ def test_all_matches_with_one_spot_are_no_exception() -> None:
         assert np.isfinite(adjusted.covariance).all()
 
 
-def test_true_matches_are_what_these_tests_assume() -> None:
+def test_planted_matches_are_true() -> None:
     scene = make_scene(random_for("assumed"), FEW_POINTS)
     _, matches = true_structure(scene)
     shown = {k for m in true_correspondences(scene).query_matches for k in m[:, 0].tolist()}

@@ -51,7 +51,7 @@ def adjusted(
     return adjust_pose(scene.query, scene.references, structure, matches, solved, AdjustOptions(), priors)
 
 
-def test_the_gradient_with_priors_is_that_of_the_cost() -> None:
+def test_gradient_with_priors_equals_finite_differences() -> None:
     scene, structure, matches = scene_of("gradient")
     used = np.arange(len(matches))
     problem, state = pose_problem(
@@ -68,7 +68,7 @@ def test_the_gradient_with_priors_is_that_of_the_cost() -> None:
     assert_jacobian(2 * gradient, cost, np.zeros(6), tolerance=1e-5)
 
 
-def test_right_priors_pull_a_weak_answer_right_and_sharpen_it() -> None:
+def test_right_priors_improve_a_weak_pose_and_its_covariance() -> None:
     """Seven matches among the points and a position to a millimetre."""
     alone, helped = [], []
     for seed in range(8):
@@ -86,7 +86,7 @@ def test_right_priors_pull_a_weak_answer_right_and_sharpen_it() -> None:
 
 
 @pytest.mark.parametrize("kind", ["position", "heading", "gravity", "pose"])
-def test_a_wrong_prior_is_reported_and_changes_not_a_bit(kind: str) -> None:
+def test_a_wrong_prior_is_reported_and_changes_no_bit(kind: str) -> None:
     scene, structure, matches = scene_of("wrong")
     wrong = getattr(all_priors(scene.world_from_query, 1.0), kind)
     without = adjusted(scene, structure, matches)
@@ -97,7 +97,7 @@ def test_a_wrong_prior_is_reported_and_changes_not_a_bit(kind: str) -> None:
     assert estimate.covariance.tobytes() == without.covariance.tobytes()
 
 
-def test_gravity_less_certain_than_the_photo_changes_nothing() -> None:
+def test_gravity_less_certain_than_the_photo_has_no_effect() -> None:
     scene, structure, matches = scene_of("less")
     estimate = adjusted(scene, structure, matches, Priors(gravity=gravity_at(scene.world_from_query, 3.0, 2.0)))
     (check,) = estimate.prior_checks
@@ -108,7 +108,7 @@ def test_gravity_less_certain_than_the_photo_changes_nothing() -> None:
     )
 
 
-def test_the_pull_of_too_weak_priors_is_undone() -> None:
+def test_unused_priors_do_not_change_the_answer() -> None:
     """The pose solver, to whom points are fixed, knew less: its pull must not be seen in the answer."""
     scene, structure, matches = scene_of("undone")
     solved = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())

@@ -49,7 +49,7 @@ def rejected(answer: Answer) -> Rejection:
 
 
 @pytest.mark.parametrize("offset_m", [0.0, 1e6])
-def test_two_like_places_are_both_told(offset_m: float) -> None:
+def test_both_of_two_identical_places_are_hypotheses(offset_m: float) -> None:
     """Every second reference stands in the copy: nothing decides."""
     far = RigidTransform(np.eye(3), np.array([offset_m, -offset_m, 0.0]))
     references = [replace(r, world_from_camera=far.compose(r.world_from_camera)) for r in SCENE.references]
@@ -66,7 +66,7 @@ def test_two_like_places_are_both_told(offset_m: float) -> None:
 
 
 @pytest.mark.parametrize("which", [(), (5,)], ids=["no copy", "one reference in the copy"])
-def test_a_place_is_not_its_own_rival(which: Sequence[int]) -> None:
+def test_a_place_of_one_reference_is_no_hypothesis(which: Sequence[int]) -> None:
     """One reference alone has no points, so it proposes no place."""
     outcome = answer_of(copied(SCENE.references, which, ELSEWHERE)).outcome
     assert isinstance(outcome, Localization), outcome
@@ -96,13 +96,13 @@ def test_poses_within_the_bounds_are_one_place() -> None:
     assert not (isinstance(outcome, Rejection) and outcome.reason is RejectionReason.AMBIGUOUS)
 
 
-def test_where_nearly_all_agree_no_second_pose_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_second_pose_is_searched_if_nearly_all_matches_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     """That is what makes it cheap for the usual query."""
     monkeypatch.setattr(ambiguity, "ransac", None)
     assert isinstance(answer_of(SCENE.references).outcome, Localization)
 
 
-def test_a_photograph_of_what_is_in_both_of_two_like_rooms() -> None:
+def test_a_photo_that_fits_two_identical_rooms_is_ambiguous() -> None:
     """Photographs of a corner, which stands twice in the world."""
     poses = [corner.pose(-16.0 + 4 * i, height_m=-1.6 + 0.1 * (i % 3)) for i in range(9)]
     extractor = make_extractor("sift")
@@ -125,6 +125,6 @@ def test_a_photograph_of_what_is_in_both_of_two_like_rooms() -> None:
 @pytest.mark.parametrize(
     "wrong", [{"min_share": 0.0}, {"min_own_share": 1.5}, {"min_keypoints": 3}, {"agreeing_px": 1.0}]
 )
-def test_options_check_themselves(wrong: dict[str, float]) -> None:
+def test_options_outside_their_bounds_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="must be"):
         AmbiguityOptions(**wrong)  # type: ignore[arg-type]

@@ -36,7 +36,7 @@ Kind = Callable[[NDArray[np.generic]], AnyArray]
 
 @every_kind
 @pytest.mark.parametrize("size", [0, 1, 2, 7, 8])
-def test_the_median_is_of_what_is_chosen(kind: Kind, size: int) -> None:
+def test_masked_median_is_that_of_the_chosen_values(kind: Kind, size: int) -> None:
     random = random_for("median", size)
     for chosen_count in range(size + 1):
         values, where = random.normal(size=size), random.permutation(size) < chosen_count
@@ -45,13 +45,13 @@ def test_the_median_is_of_what_is_chosen(kind: Kind, size: int) -> None:
 
 
 @every_kind
-def test_what_is_not_chosen_may_be_no_number(kind: Kind) -> None:
+def test_masked_median_ignores_nan_outside_the_mask(kind: Kind) -> None:
     values = np.array([np.nan, 3.0, np.inf, 1.0, -np.inf])
     assert median(kind(values), kind(np.array([False, True, False, True, False]))) == 2
 
 
 @every_kind
-def test_projection_is_that_of_the_client(kind: Kind) -> None:
+def test_projection_equals_the_clients(kind: Kind) -> None:
     """Also behind the camera, beside it and for what is no number."""
     points = kind(POINTS)
     np.testing.assert_array_equal(np.asarray(normalize(points)), geometry.normalize(POINTS))
@@ -60,7 +60,7 @@ def test_projection_is_that_of_the_client(kind: Kind) -> None:
 
 
 @every_kind
-def test_products_of_many_small_matrices(kind: Kind) -> None:
+def test_products_and_lengths_equal_numpys(kind: Kind) -> None:
     random = random_for("products")
     first, second, vectors = (random.normal(size=shape) for shape in ((5, 2, 3), (5, 3, 4), (5, 3)))
     np.testing.assert_allclose(np.asarray(multiply(kind(first), kind(second))), first @ second, rtol=1e-12)
@@ -70,6 +70,6 @@ def test_products_of_many_small_matrices(kind: Kind) -> None:
 
 
 @every_kind
-def test_the_namespace_takes_the_array(kind: Kind) -> None:
+def test_the_namespace_follows_the_arrays_type(kind: Kind) -> None:
     array = kind(POINTS)
     assert type(namespace(array).isnan(array)) is type(array)

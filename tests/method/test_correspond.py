@@ -58,14 +58,14 @@ def slow_mutual_matches(first: Features, second: Features, ratio: float) -> list
 
 @pytest.mark.parametrize("ratio", [0.7, 0.85, 1.0])
 @pytest.mark.parametrize(("n", "m", "noise"), [(2, 2, 0.1), (40, 25, 0.1), (25, 40, 0.2), (30, 30, 0.5)])
-def test_mutual_matches_are_those_of_loops(n: int, m: int, noise: float, ratio: float) -> None:
+def test_mutual_matches_equal_brute_force(n: int, m: int, noise: float, ratio: float) -> None:
     first, second = related(random_for("mutual", n, m, noise), n, m, noise)
     matches = mutual_matches(first, second, ratio)
     assert matches.dtype == np.int32
     assert matches.tolist() == slow_mutual_matches(first, second, ratio)
 
 
-def test_no_keypoint_matches_twice_and_looser_ratios_only_add() -> None:
+def test_matches_are_one_to_one_and_grow_with_the_ratio() -> None:
     first, second = related(random_for("nested"), 60, 60, 0.3)
     previous: set[tuple[int, ...]] = set()
     for ratio in (0.6, 0.8, 0.9, 1.0):
@@ -77,7 +77,7 @@ def test_no_keypoint_matches_twice_and_looser_ratios_only_add() -> None:
     assert previous
 
 
-def test_the_ratio_is_one_of_distances() -> None:
+def test_the_ratio_compares_distances_not_squares() -> None:
     """Two candidates at distances d and 2 d: the ratio is a half."""
     query = np.array([[1.0, 0.0], [-1.0, 0.0]])
     angles = 2 * np.arcsin(np.array([0.1, 0.2]) / 2)  # chords of 0.1 and 0.2
@@ -86,13 +86,13 @@ def test_the_ratio_is_one_of_distances() -> None:
     assert [0, 0] not in mutual_matches(features(query), features(candidates), 0.49).tolist()
 
 
-def test_the_ambiguous_is_not_matched() -> None:
+def test_ambiguous_descriptors_are_not_matched() -> None:
     twice = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     assert mutual_matches(features(twice), features(twice), 0.9).tolist() == [[2, 2]]
 
 
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 5), (5, 0), (1, 5), (5, 1)])
-def test_few_or_no_features_do_not_match(n: int, m: int) -> None:
+def test_photographs_with_few_or_no_features_have_no_matches(n: int, m: int) -> None:
     random = random_for("few", n, m)
     first, second = (features(unit_rows(random.standard_normal((k, 8)))) for k in (n, m))
     assert mutual_matches(first, second, 0.9).shape == (0, 2)
@@ -133,12 +133,12 @@ def slow_epipolar_distance(first: PosedView, second: PosedView, i: int, j: int) 
     return float(max(distances))
 
 
-def test_exact_matches_lie_on_their_epipolar_lines() -> None:
+def test_exact_matches_have_no_epipolar_distance() -> None:
     first, second = random_pair(random_for("epipolar"))
     assert epipolar_distance_px(first, second, all_of(50)).max() < 1e-3
 
 
-def test_epipolar_distance_is_that_of_loops() -> None:
+def test_epipolar_distance_equals_brute_force() -> None:
     random = random_for("epipolar loops")
     first, second = random_pair(random)
     second = shifted_keypoints(second, random.normal(0, 5, (50, 2)))
@@ -147,7 +147,7 @@ def test_epipolar_distance_is_that_of_loops() -> None:
     np.testing.assert_allclose(epipolar_distance_px(second, first, all_of(50)), slow, rtol=1e-5, atol=1e-5)
 
 
-def test_beside_one_another_the_distance_is_the_vertical_one() -> None:
+def test_side_by_side_epipolar_distance_is_vertical() -> None:
     random = random_for("stereo")
     x_in_world = random.uniform([-1, -0.7, 3], [1, 0.7, 6], (20, 3))
     poses = [RigidTransform.identity(), RigidTransform(np.eye(3), np.array([0.4, 0.0, 0.0]))]
@@ -157,7 +157,7 @@ def test_beside_one_another_the_distance_is_the_vertical_one() -> None:
     np.testing.assert_allclose(distance, np.abs(shift[:, 1]), atol=1e-3)
 
 
-def test_at_one_place_every_match_is_possible() -> None:
+def test_at_one_place_the_epipolar_constraint_rejects_nothing() -> None:
     keypoints = random_for("one place").uniform(0, 700, (10, 2))
     first, second = (
         posed(RigidTransform.identity(), keypoints),
@@ -166,7 +166,7 @@ def test_at_one_place_every_match_is_possible() -> None:
     np.testing.assert_array_equal(epipolar_distance_px(first, second, all_of(10)), np.zeros(10))
 
 
-def test_all_epipolar_distances_at_once_are_those_one_by_one() -> None:
+def test_epipolar_distances_of_all_pairs_equal_single_ones() -> None:
     random = random_for("epipolar matrix")
     first, _ = random_pair(random, 12)
     second = shifted_keypoints(random_pair(random, 20)[1], random.normal(0, 50, (20, 2)))
@@ -191,7 +191,7 @@ def test_references_keep_true_matches_and_drop_wrong_ones() -> None:
         assert len(found) < 1.1 * len(true)
 
 
-def test_wide_matches_add_to_strict_ones_along_the_lines() -> None:
+def test_wide_matches_contain_the_strict_ones() -> None:
     scene = make_scene(random_for("wide"), SceneOptions(descriptor_noise=0.5, distractor_count=1500, reference_count=3))
     options = CorrespondOptions(reference_ratio=0.6, wide_similarity=0.6)
     matcher = Matcher(options)
@@ -253,7 +253,7 @@ def test_pairs_of_references_are_matched_once(matched_pairs: list[tuple[Features
         np.testing.assert_array_equal(again.reference_pairs[pair], matches)
 
 
-def test_the_order_of_a_pair_is_not_mixed_up() -> None:
+def test_a_cached_pair_keeps_the_order_of_its_columns() -> None:
     scene = make_scene(random_for("order"), SceneOptions(reference_count=2))
     matcher = Matcher()
     first, second = scene.references
@@ -263,7 +263,7 @@ def test_the_order_of_a_pair_is_not_mixed_up() -> None:
     assert {tuple(m) for m in forth.tolist()} != {tuple(m) for m in back.tolist()}
 
 
-def test_the_memory_is_bounded_and_forgets_the_longest_unused(
+def test_the_cache_is_bounded_and_drops_the_least_recently_used(
     matched_pairs: list[tuple[Features, Features]],
 ) -> None:
     scene = make_scene(random_for("bounded"), SceneOptions(reference_count=4, point_count=50))
@@ -279,7 +279,7 @@ def test_the_memory_is_bounded_and_forgets_the_longest_unused(
     assert len(matched_pairs) == 4
 
 
-def test_pairs_of_a_deleted_reference_are_forgotten(matched_pairs: list[tuple[Features, Features]]) -> None:
+def test_pairs_of_a_deleted_reference_leave_the_cache(matched_pairs: list[tuple[Features, Features]]) -> None:
     scene = make_scene(random_for("deleted"), SceneOptions(reference_count=3, point_count=50))
     a, b, c = scene.references
     matcher = Matcher()
@@ -319,7 +319,7 @@ def test_a_query_matcher_leaves_references_to_the_matcher() -> None:
         np.testing.assert_array_equal(ours.reference_pairs[pair], matches)
 
 
-def test_known_matches_of_the_query_are_not_sought_again() -> None:
+def test_given_query_matches_are_used_as_they_are() -> None:
     scene = make_scene(random_for("known"), SceneOptions(reference_count=3))
     fixed = Fixed()
     matcher = Matcher(query_matching=fixed)
@@ -329,7 +329,7 @@ def test_known_matches_of_the_query_are_not_sought_again() -> None:
     assert second.query_matches == first.query_matches
 
 
-def test_the_check_ends_the_matching_of_the_query() -> None:
+def test_the_check_cancels_the_matching_of_the_query() -> None:
     scene = make_scene(random_for("ends"), SceneOptions(reference_count=3))
     calls = iter(range(5))
 

@@ -63,7 +63,7 @@ def dense(jackknife: JackknifeInput, left_out: int | None = None) -> tuple[Array
 
 
 @pytest.mark.parametrize("unknowns", [6, 8])
-def test_each_pose_is_one_step_of_the_dense_equations_away(unknowns: int) -> None:
+def test_left_out_poses_equal_one_dense_gauss_newton_step(unknowns: int) -> None:
     """With 8 unknowns, as a rig or a sequence may have them."""
     jackknife = random_input("dense", unknowns=unknowns)
     found = disperse(jackknife)
@@ -77,7 +77,7 @@ def test_each_pose_is_one_step_of_the_dense_equations_away(unknowns: int) -> Non
         np.testing.assert_allclose(found.motions[i], expected, rtol=1e-6, atol=1e-9)
 
 
-def test_rows_may_stand_in_any_order() -> None:
+def test_the_order_of_rows_does_not_matter() -> None:
     jackknife = random_input("order")
     order = random_for("order").permutation(len(jackknife.reference))
     r = jackknife.references
@@ -89,14 +89,14 @@ def test_rows_may_stand_in_any_order() -> None:
     np.testing.assert_allclose(other.motions, found.motions, rtol=1e-9, atol=1e-12)
 
 
-def test_a_reference_that_shows_nothing_moves_nothing() -> None:
+def test_a_reference_without_observations_adds_no_dispersion() -> None:
     jackknife = replace(random_input("idle"), reference_count=6)
     found = disperse(jackknife)
     assert found
     np.testing.assert_allclose(found.motions[4:], 0, atol=1e-9 + 0.02 * np.abs(found.offset).max())
 
 
-def test_the_photographs_part_is_the_covariance_by_its_noise() -> None:
+def test_the_photos_part_is_the_covariance_of_its_noise() -> None:
     """Residuals at the optimum of noise of 0.7 everywhere; the pose's answer to the query's noise alone is linear."""
     jackknife = random_input("photograph", points=150)
     random, n = random_for("drawn residuals"), 150
@@ -115,7 +115,7 @@ def test_the_photographs_part_is_the_covariance_by_its_noise() -> None:
     np.testing.assert_allclose(found.photograph, size * expected, atol=1e-9 + 1e-6 * np.abs(expected).max())
 
 
-def test_of_three_poses_the_covariance_is_the_jackknifes() -> None:
+def test_covariance_of_three_poses_equals_the_jackknife() -> None:
     motions = np.zeros((3, 6))
     motions[:, 0] = [0.1, -0.1, 0.3]
     found = Dispersion(np.eye(6), np.zeros(6), motions, np.zeros((6, 6)))
@@ -124,7 +124,7 @@ def test_of_three_poses_the_covariance_is_the_jackknifes() -> None:
     assert found.inflation**2 == pytest.approx(expected / 6)
 
 
-def test_nothing_to_stand_on_is_no_dispersion() -> None:
+def test_undetermined_equations_have_no_dispersion() -> None:
     jackknife = random_input("nothing")
     nowhere = replace(jackknife.query, by_point=np.full_like(jackknife.query.by_point, np.nan))
     assert disperse(replace(jackknife, query=nowhere)) is None
@@ -132,12 +132,12 @@ def test_nothing_to_stand_on_is_no_dispersion() -> None:
 
 
 @pytest.mark.parametrize("points", [1, 2, 3])
-def test_few_matches_are_no_exception(points: int) -> None:
+def test_few_matches_raise_no_exception(points: int) -> None:
     found = disperse(random_input("few", points=points))
     assert found is None or np.isfinite(found.covariance).all()
 
 
-def test_thinning_keeps_reference_errors_and_averages_the_photo() -> None:
+def test_thinning_divides_the_photographs_part_only() -> None:
     jackknife = random_input("thinned")
     every, thinned = disperse(jackknife), disperse(replace(jackknife, thinning=3))
     assert every

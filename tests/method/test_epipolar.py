@@ -10,7 +10,7 @@ from support.scenes import SceneOptions, make_scene, random_for
 from mapless_server.method.epipolar import consistent_matches, pair_error_px, sampson_px
 
 
-def test_a_moved_keypoint_has_the_distance_moved_as_error() -> None:
+def test_a_moved_keypoints_error_is_its_displacement() -> None:
     """Sampson's distance is to first order how far both keypoints must move: one alone, moved, at most as far."""
     options = SceneOptions(noise_px=0.0, reference_count=2, distractor_count=0, seen_share=1.0)
     first, second = make_scene(random_for("sampson"), options).references
@@ -23,7 +23,7 @@ def test_a_moved_keypoint_has_the_distance_moved_as_error() -> None:
     np.testing.assert_allclose(np.median(sampson_px(first, moved, matches)), 2 / np.sqrt(2), rtol=0.05)
 
 
-def test_two_photographs_at_one_place_have_no_error_at_all() -> None:
+def test_two_photographs_at_one_place_have_no_epipolar_error() -> None:
     first, second = make_scene(random_for("one place"), SceneOptions(reference_count=2)).references
     matches = consistent_matches(first.view, second.view)
     assert np.isnan(pair_error_px(first, replace(second, world_from_camera=first.world_from_camera), matches))

@@ -71,7 +71,7 @@ def assert_is_well_formed(features: Features, dimension: int = 128) -> None:
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1e-5)
 
 
-def test_blobs_are_found_where_they_are() -> None:
+def test_planted_blobs_are_found_at_their_positions() -> None:
     image, centres = blobs(random_for("blobs"), CAMERA)
     view = SiftExtractor().extract(image, CAMERA)
     missed = misses(view.features.keypoints, centres)
@@ -81,7 +81,7 @@ def test_blobs_are_found_where_they_are() -> None:
     assert_is_well_formed(view.features)
 
 
-def test_opencvs_default_upscaling_is_off_by_a_quarter_pixel() -> None:
+def test_opencvs_default_upscaling_shifts_by_a_quarter_pixel() -> None:
     """Why the extractor asks for another; when this fails, OpenCV's default has changed."""
     image, centres = blobs(random_for("blobs"), CAMERA)
     found = cv2.SIFT.create(contrastThreshold=0.02).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
@@ -89,7 +89,7 @@ def test_opencvs_default_upscaling_is_off_by_a_quarter_pixel() -> None:
     np.testing.assert_allclose(np.abs(bias), 0.25, atol=0.05)
 
 
-def test_sizes_follow_the_blobs() -> None:
+def test_keypoint_sizes_grow_with_the_blobs() -> None:
     near, _ = blobs(random_for("sizes"), CAMERA)
     far = cv2.resize(near, (200, 150), interpolation=cv2.INTER_AREA)
     sizes = [
@@ -110,7 +110,7 @@ def test_reduction_keeps_the_rays(max_side_px: int) -> None:
     assert np.abs(missed.mean(axis=0)).max() < 0.03
 
 
-def test_small_and_thin_images_are_not_enlarged_nor_lost() -> None:
+def test_small_and_thin_images_are_not_enlarged() -> None:
     small = np.zeros((20, 30), np.uint8)
     same, camera = reduce_image(small, Camera(30, 20, 30.0, 30.0, 14.5, 9.5), 1024)
     assert same is small
@@ -128,7 +128,9 @@ def test_small_and_thin_images_are_not_enlarged_nor_lost() -> None:
         ((20, 2000), 1024, (32, 1024)),
     ],
 )
-def test_sides_can_be_multiples(size: tuple[int, int], max_side_px: int, expected: tuple[int, int]) -> None:
+def test_sides_of_reduced_images_are_multiples(
+    size: tuple[int, int], max_side_px: int, expected: tuple[int, int]
+) -> None:
     width, height = size
     image, centres = np.zeros((height, width, 3), np.uint8), np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
     camera = Camera(width, height, 500.0, 500.0, (width - 1) / 2, (height - 1) / 2)
@@ -140,7 +142,7 @@ def test_sides_can_be_multiples(size: tuple[int, int], max_side_px: int, expecte
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_undistortion_and_projection_are_inverse(name: str) -> None:
+def test_undistortion_inverts_projection(name: str) -> None:
     camera = replace(CAMERA, distortion=LENSES[name])
     pixels = np.stack(np.meshgrid(np.linspace(-0.5, 399.5, 21), np.linspace(-0.5, 299.5, 16)), axis=-1).reshape(-1, 2)
     ideal = undistort_pixels(pixels, camera)
@@ -149,7 +151,7 @@ def test_undistortion_and_projection_are_inverse(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_keypoints_are_those_of_the_ideal_camera(name: str) -> None:
+def test_keypoints_are_in_pixels_of_the_pinhole(name: str) -> None:
     camera = replace(CAMERA, distortion=LENSES[name])
     image, centres = blobs(random_for("lens"), camera)
     view = SiftExtractor().extract(image, camera)
@@ -167,7 +169,7 @@ def test_keypoints_are_those_of_the_ideal_camera(name: str) -> None:
     ],
     ids=["folded", "sideways"],
 )
-def test_outside_the_valid_domain_there_is_no_pixel(lens: Distortion, radius: float) -> None:
+def test_undistortion_outside_the_lens_domain_is_nan(lens: Distortion, radius: float) -> None:
     camera = Camera(400, 300, 100.0, 100.0, 199.5, 149.5, lens)
     angle = np.linspace(0, 2 * np.pi, 17)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -193,7 +195,7 @@ def test_a_blank_image_has_no_keypoints(level: int) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 10, 200])
-def test_at_most_so_many_keypoints_and_the_strongest(count: int) -> None:
+def test_the_strongest_keypoints_up_to_the_limit_are_kept(count: int) -> None:
     image = textured(400, 300, seed=count)
     everything = SiftExtractor(SiftOptions(max_keypoints=100_000)).extract(image, CAMERA).features
     some = SiftExtractor(SiftOptions(max_keypoints=count)).extract(image, CAMERA).features
@@ -203,7 +205,7 @@ def test_at_most_so_many_keypoints_and_the_strongest(count: int) -> None:
     assert_is_well_formed(some)
 
 
-def test_an_image_is_rgb() -> None:
+def test_colour_channels_are_read_as_rgb() -> None:
     """Grey is 0.3 R + 0.6 G + 0.1 B: what is drawn in red has more contrast than what is drawn in blue."""
     image, _ = blobs(random_for("colour"), CAMERA)
     red, blue = image.copy(), image.copy()
@@ -212,7 +214,7 @@ def test_an_image_is_rgb() -> None:
     assert count[0] > 1.5 * count[1]
 
 
-def test_the_name_tells_what_changes_the_features() -> None:
+def test_the_name_changes_with_every_option_of_the_features() -> None:
     names = {
         SiftExtractor(options).name
         for options in (
@@ -226,7 +228,7 @@ def test_the_name_tells_what_changes_the_features() -> None:
     assert SiftExtractor().name == SiftExtractor(SiftOptions()).name == make_extractor("sift").name
 
 
-def test_unknown_extractors_and_senseless_options_are_refused() -> None:
+def test_unknown_extractors_and_wrong_options_are_refused() -> None:
     with pytest.raises(ValueError, match="unknown features 'surf'"):
         make_extractor("surf")
     for options in ({"max_keypoints": 0}, {"max_side_px": 8}, {"contrast_threshold": float("nan")}):
@@ -234,7 +236,7 @@ def test_unknown_extractors_and_senseless_options_are_refused() -> None:
             SiftOptions(**options)
 
 
-def test_features_of_other_shapes_are_refused() -> None:
+def test_features_of_inconsistent_shapes_are_refused() -> None:
     two, three = np.zeros((2, 2), np.float32), np.zeros((3, 128), np.float32)
     with pytest.raises(ValueError, match="do not fit"):
         Features(two, three, np.zeros(2, np.float32))

@@ -36,7 +36,7 @@ def planted(case: object, **options: object) -> SyntheticScene:
 
 
 @pytest.mark.parametrize("factor", FACTORS)
-def test_a_wrong_focal_length_is_told_and_the_true_one_found(factor: float) -> None:
+def test_a_wrong_focal_length_is_detected_and_estimated(factor: float) -> None:
     """With every fifth match wrong; within what the answer says it may be off."""
     scene = planted(factor)
     told = wrong_focal(solved(scene, factor), OPTIONS)
@@ -48,13 +48,13 @@ def test_a_wrong_focal_length_is_told_and_the_true_one_found(factor: float) -> N
     assert told.agreeing > told.agreeing_before
 
 
-def test_the_true_focal_length_is_never_doubted() -> None:
+def test_the_true_focal_length_is_never_reported() -> None:
     for case in range(16):
         few = {"point_count": 60, "noise_px": 1.5} if case % 2 else {}
         assert wrong_focal(solved(planted(case, **few), 1.0), OPTIONS) is None
 
 
-def test_what_lies_in_a_plane_ahead_says_nothing_of_it() -> None:
+def test_points_in_a_frontal_plane_do_not_determine_it() -> None:
     """Nearer with a wider lens looks the same."""
     for factor in (0.85, 1.15):
         scene = planted(
@@ -64,7 +64,7 @@ def test_what_lies_in_a_plane_ahead_says_nothing_of_it() -> None:
         assert told is None
 
 
-def test_few_matches_say_nothing_of_it() -> None:
+def test_few_matches_do_not_determine_it() -> None:
     scene = planted("few", point_count=18, outlier_share=0.0)
     assert wrong_focal(solved(scene, 1.15), OPTIONS) is None
 
@@ -83,7 +83,7 @@ def test_the_judge_rejects_with_both_numbers_and_a_hint() -> None:
     assert rejection.hint.best_reference in {reference.name for reference in support.references}
 
 
-def test_a_focal_length_is_wrong_beyond_tolerance_and_error() -> None:
+def test_it_is_wrong_only_beyond_tolerance_and_error() -> None:
     wrong = Focal(log_ratio=0.2, sigma=0.01, agreeing=100, agreeing_before=40, given_px=500.0)
     assert wrong.is_wrong(OPTIONS)
     assert not replace(wrong, log_ratio=OPTIONS.max_log_ratio * 0.9).is_wrong(OPTIONS)
@@ -91,7 +91,7 @@ def test_a_focal_length_is_wrong_beyond_tolerance_and_error() -> None:
     assert not replace(wrong, agreeing=30).is_wrong(OPTIONS)
 
 
-def test_nothing_is_said_without_a_pose() -> None:
+def test_a_support_without_a_pose_is_refused() -> None:
     with pytest.raises(ValueError, match="estimate"):
         wrong_focal(replace(solved(planted("none"), 1.0), estimate=None), OPTIONS)
 

@@ -41,13 +41,13 @@ def said(problem: Problem, estimate: PoseEstimate, options: GateOptions) -> str:
 
 
 @pytest.mark.parametrize("outlier_share", [0.0, 0.5])
-def test_a_planted_pose_passes(outlier_share: float) -> None:
+def test_a_planted_pose_passes_the_gate(outlier_share: float) -> None:
     for seed in range(5):
         assert not failure_of(planted(random_for("good", outlier_share, seed), 100, 0.5, outlier_share))
 
 
 @pytest.mark.parametrize("count", [6, 40, 400])
-def test_degenerate_points_fail(count: int) -> None:
+def test_poses_from_degenerate_points_fail_the_gate(count: int) -> None:
     on_a_line = np.linspace(-1, 1, count)[:, None] * np.array([1.0, 0.3, 0.2])
     for x_in_world in (on_a_line, np.zeros((count, 3))):
         problem = problem_of(x_in_world, CAMERA.project(POSE.inverse().apply(x_in_world)))
@@ -55,14 +55,14 @@ def test_degenerate_points_fail(count: int) -> None:
             assert failure_of(problem, initial)
 
 
-def test_points_with_no_pose_at_all_are_gated() -> None:
+def test_random_matches_fail_the_gate() -> None:
     """Random matches: no pose is true, and none may be believed."""
     for seed in range(50):
         random = random_for("no pose", seed)
         assert failure_of(planted(random, int(random.integers(6, 120)), outlier_share=1.0)), seed
 
 
-def test_guided_matches_around_a_wrong_pose_are_gated() -> None:
+def test_guided_matches_around_a_wrong_pose_fail_the_gate() -> None:
     """A search of 20 px finds some keypoint near every projection; that they agree must not count."""
     for seed in range(20):
         random = random_for("guided", seed)
@@ -74,7 +74,7 @@ def test_guided_matches_around_a_wrong_pose_are_gated() -> None:
         assert failure_of((query, structure, searched)), seed
 
 
-def test_agreement_in_one_corner_fails() -> None:
+def test_inliers_in_one_corner_fail_the_gate() -> None:
     random = random_for("corner")
     pixels = random.uniform([100, 100], [180, 160], (60, 2))
     x_in_world = POSE.apply(CAMERA.rays(pixels) * random.uniform(3, 6, (60, 1)))
@@ -83,7 +83,7 @@ def test_agreement_in_one_corner_fails() -> None:
     assert not failure_of(problem, options=GateOptions(min_hull_share=0.0))
 
 
-def test_agreement_of_few_of_many_visible_points_fails() -> None:
+def test_few_inliers_of_many_visible_points_fail_the_gate() -> None:
     random = random_for("share")
     view, structure, matches = planted(random, 1000)
     few = PointMatches(matches.point[:30], matches.keypoint[:30], matches.guided[:30], 0.0)
@@ -93,7 +93,7 @@ def test_agreement_of_few_of_many_visible_points_fails() -> None:
     assert not failure_of((view, behind, few))
 
 
-def test_agreeing_gravity_lowers_the_support_but_not_to_zero() -> None:
+def test_agreeing_gravity_lowers_the_required_shares() -> None:
     view, structure, matches = planted(random_for("share"), 1000)
 
     def failure(count: int, log10_chance: float) -> str | None:
@@ -105,13 +105,13 @@ def test_agreeing_gravity_lowers_the_support_but_not_to_zero() -> None:
     assert "should be found" in (failure(15, -2.8) or "")
 
 
-def test_the_hull_is_that_of_a_known_rectangle() -> None:
+def test_hull_share_of_a_rectangle_is_its_area() -> None:
     corners = np.array([[0.0, 0.0], [480.0, 0.0], [480.0, 360.0], [0.0, 360.0], [100.0, 100.0]])
     query, _, matches = problem_of(np.zeros((5, 3)), corners)
     assert hull_share(query, matches, np.ones(5, bool)) == pytest.approx(0.25, rel=1e-4)
 
 
-def test_findable_is_what_is_in_front_and_inside_the_photo() -> None:
+def test_findable_points_are_in_front_and_inside_the_image() -> None:
     inside = POSE.apply(CAMERA.rays(np.array([[0.0, 0.0], [959.0, 719.0]])) * 3.0)
     outside = POSE.apply(CAMERA.rays(np.array([[-2.0, 0.0], [959.0, 722.0]])) * 3.0)
     behind = POSE.apply([0.0, 0.0, -2.0])[None]
@@ -124,7 +124,7 @@ def test_findable_is_what_is_in_front_and_inside_the_photo() -> None:
 # False alarms
 
 
-def test_false_alarms_are_the_formula() -> None:
+def test_false_alarms_equal_the_formula() -> None:
     for n in (4, 5, 10, 60):
         for k in range(4, n + 1):
             for p in (1e-4, 0.01, 0.3):
@@ -147,7 +147,7 @@ def test_false_alarms_fall_with_inliers_and_rise_with_matches() -> None:
     assert np.all(np.diff([false_alarms(100, 10, p) for p in np.geomspace(1e-5, 0.9, 20)]) > 0)
 
 
-def test_each_group_of_matches_is_judged_by_its_own_chance() -> None:
+def test_guided_and_other_matches_have_their_own_chance() -> None:
     inliers = np.arange(100) < 40
     disc = INLIER_PX**2
     index = np.arange(100)

@@ -36,7 +36,7 @@ def planted(
 
 
 @pytest.mark.parametrize("wrong_share", [0.0, 0.5])
-def test_a_rig_is_posed(wrong_share: float) -> None:
+def test_rig_ransac_finds_the_planted_pose(wrong_share: float) -> None:
     cameras = planted(random_for("rig", wrong_share), (60, 40, 80), wrong_share)
     found = rig_ransac(cameras, OPTIONS)
     assert found is not None
@@ -44,7 +44,7 @@ def test_a_rig_is_posed(wrong_share: float) -> None:
     assert inlier_count(cameras, found, OPTIONS.inlier_px) >= round(180 * (1 - wrong_share))
 
 
-def test_three_matches_of_three_cameras_are_enough() -> None:
+def test_three_matches_of_three_cameras_determine_a_pose() -> None:
     cameras = planted(random_for("three"), (1, 1, 1))
     found = rig_ransac(cameras, OPTIONS)
     assert found is not None
@@ -52,7 +52,7 @@ def test_three_matches_of_three_cameras_are_enough() -> None:
 
 
 @pytest.mark.parametrize("unit", [0.37, 1.0, 25.0])
-def test_a_scale_is_found_with_the_pose(unit: float) -> None:
+def test_scaled_ransac_finds_the_planted_pose_and_scale(unit: float) -> None:
     """Metres per unit, not units per metre."""
     cameras = planted(random_for("scaled", unit), (60, 60, 60), 0.5, unit)
     found = scaled_ransac(cameras, OPTIONS, 2000, 600)
@@ -62,13 +62,13 @@ def test_a_scale_is_found_with_the_pose(unit: float) -> None:
 
 
 @pytest.mark.parametrize("counts", [(), (2,), (1, 1)])
-def test_too_few_matches_give_none(counts: tuple[int, ...]) -> None:
+def test_too_few_matches_have_no_pose(counts: tuple[int, ...]) -> None:
     cameras = planted(random_for("few"), counts)
     assert rig_ransac(cameras, OPTIONS) is None
     assert not cameras or scaled_ransac(cameras, OPTIONS, 100, 600) is None
 
 
-def test_one_camera_alone_tells_no_scale() -> None:
+def test_one_camera_alone_has_no_scale() -> None:
     assert scaled_ransac(planted(random_for("one"), (50,)), OPTIONS, 100, 600) is None
 
 

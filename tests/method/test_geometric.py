@@ -51,7 +51,7 @@ def depths_at_keypoints(part: ReconstructedView, view: View) -> Array:
     return part.depth_at(view.features.keypoints, view.camera)
 
 
-def test_poses_and_depths_are_the_truth_at_one_common_scale() -> None:
+def test_poses_and_depths_are_true_up_to_one_scale() -> None:
     scene = make_scene(random_for("truth"), EXACT)
     reconstruction = reconstruct(scene)
     similarity = world_from_local(scene, reconstruction)
@@ -72,7 +72,7 @@ def test_poses_and_depths_are_the_truth_at_one_common_scale() -> None:
         assert np.mean(np.abs(depth_m[known] - true_m) < 1e-3) > 0.97  # now and then two keypoints share a cell
 
 
-def test_maps_are_nan_where_nothing_is_known() -> None:
+def test_maps_are_nan_where_there_is_no_point() -> None:
     scene = make_scene(random_for("maps"), EXACT)
     reconstruction = reconstruct(scene)
     for part in (reconstruction.query, *reconstruction.references):
@@ -85,7 +85,7 @@ def test_maps_are_nan_where_nothing_is_known() -> None:
         assert (part.point_map[known][:, 2] > 0).all()
 
 
-def test_the_frame_is_the_first_reference_scaled_by_the_median() -> None:
+def test_the_frame_is_the_first_reference_at_median_distance() -> None:
     scene = make_scene(random_for("frame"), EXACT)
     first = reconstruct(scene).references[0]
     assert_pose_close(first.local_from_camera, RigidTransform.identity(), metres=1e-12, degrees=1e-10)
@@ -93,7 +93,7 @@ def test_the_frame_is_the_first_reference_scaled_by_the_median() -> None:
     assert np.median(distances) == pytest.approx(1, abs=0.05)
 
 
-def test_the_world_does_not_show() -> None:
+def test_the_local_frame_does_not_depend_on_the_world() -> None:
     scene = make_scene(random_for("world"), EXACT)
     moved = RigidTransform(rotation_from_vector([1.0, -2.0, 0.5]), np.array([300.0, -100.0, 20.0]))
     here, there = reconstruct(scene), reconstruct(scene, moved_references(scene.references, moved))
@@ -102,7 +102,7 @@ def test_the_world_does_not_show() -> None:
         np.testing.assert_allclose(b.point_map, a.point_map, atol=1e-4)
 
 
-def test_wrong_matches_are_survived() -> None:
+def test_wrong_matches_do_not_change_the_pose() -> None:
     scene = make_scene(random_for("outliers"), SceneOptions(outlier_share=0.4))
     reconstruction = reconstruct_one(
         GeometricReconstructor(), scene.query, scene.references, Matcher().correspond(scene.query, scene.references)
@@ -123,7 +123,7 @@ def test_queries_in_a_batch_equal_single_ones_and_fail_alone() -> None:
         np.testing.assert_array_equal(outcome.query.point_map, reconstruct(scene).query.point_map)
 
 
-def test_any_number_of_references_is_a_bucket_of_its_own() -> None:
+def test_each_number_of_references_is_a_bucket() -> None:
     scene = make_scene(random_for("bucket"), EXACT)
     assert str(GeometricReconstructor().bucket(scene.query, scene.references[:3])) == "geometric-3"
 
@@ -132,7 +132,7 @@ def test_any_number_of_references_is_a_bucket_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_depth_takes_two_references(count: int) -> None:
+def test_one_reference_is_rejected(count: int) -> None:
     scene = make_scene(random_for("count"), EXACT)
     rejection = rejection_of(scene.query, scene.references[:count], true_correspondences(scene))
     assert rejection.reason is RejectionReason.NO_USABLE_REFERENCES
@@ -149,7 +149,7 @@ def test_references_at_one_place_are_degenerate() -> None:
     assert rejection.reason is RejectionReason.DEGENERATE_REFERENCES
 
 
-def test_references_that_share_nothing_are_of_no_use() -> None:
+def test_references_without_common_points_are_rejected() -> None:
     scene = make_scene(random_for("share nothing"), EXACT)
     correspondences = true_correspondences(scene)
     alone = {pair: np.empty((0, 2), np.int32) for pair in correspondences.reference_pairs}
@@ -157,7 +157,7 @@ def test_references_that_share_nothing_are_of_no_use() -> None:
     assert rejection.reason is RejectionReason.NO_USABLE_REFERENCES
 
 
-def test_a_query_that_matches_nothing_has_no_overlap() -> None:
+def test_a_query_without_matches_is_rejected_as_low_overlap() -> None:
     scene = make_scene(random_for("matches nothing"), EXACT)
     correspondences = true_correspondences(scene)
     for kept in (0, 1, 3):
@@ -167,7 +167,7 @@ def test_a_query_that_matches_nothing_has_no_overlap() -> None:
         assert rejection.reason is RejectionReason.LOW_OVERLAP, kept
 
 
-def test_a_query_of_somewhere_else_has_no_overlap() -> None:
+def test_a_query_of_another_place_is_rejected_as_low_overlap() -> None:
     options = SceneOptions(point_count=250, reference_count=3)
     for seed in range(8):
         here, elsewhere = (make_scene(random_for("elsewhere", seed, k), options) for k in (0, 1))
@@ -176,7 +176,7 @@ def test_a_query_of_somewhere_else_has_no_overlap() -> None:
         assert rejection.reason is RejectionReason.LOW_OVERLAP, seed
 
 
-def test_matches_at_random_have_no_overlap() -> None:
+def test_random_matches_are_rejected_as_low_overlap() -> None:
     scene = make_scene(random_for("at random"), EXACT)
     correspondences = true_correspondences(scene)
     for seed in range(10):

@@ -89,7 +89,7 @@ def test_gravity_of_the_wrong_sign_gives_other_poses() -> None:
     assert all(pose_error(pose, POSE)[1] > 30 for pose in poses)
 
 
-def test_no_pose_for_two_matches_of_one_point() -> None:
+def test_two_matches_of_one_point_have_no_pose() -> None:
     point = np.array([[0.0, 0, 1], [0, 0, 1]])
     rotations, translations = solve_pairs(gravity(), point, np.ones((2, 3)), np.array([[0, 1]]))
     assert np.isfinite(rotations).all()
@@ -112,12 +112,12 @@ def test_the_same_matches_give_the_same_bits() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_fewer_than_two_matches_give_nothing(count: int) -> None:
+def test_fewer_than_two_matches_have_no_pose(count: int) -> None:
     x_in_world, pixels = seen(random_for("few"), count)
     assert ransac_with_gravity(CAMERA, x_in_world, pixels, Priors(gravity=gravity()), 4.0) == []
 
 
-def test_without_gravity_there_is_nothing_to_do() -> None:
+def test_without_gravity_the_solver_refuses() -> None:
     with pytest.raises(ValueError, match="no gravity"):
         ransac_with_gravity(CAMERA, np.zeros((3, 3)), np.zeros((3, 2)), Priors(), 4.0)
 
@@ -174,7 +174,7 @@ def hardly_seen(rng: np.random.Generator) -> tuple[Array, Array]:
     return x_in_world, pixels + rng.normal(0, 0.5, pixels.shape)
 
 
-def test_a_weak_query_is_pulled_right() -> None:
+def test_priors_improve_a_weak_query() -> None:
     """What six points in a corner leave open, gravity a half degree off and a position to 2 cm close."""
     alone, helped = [], []
     for seed in range(12):
@@ -192,7 +192,7 @@ def test_a_weak_query_is_pulled_right() -> None:
     assert np.median(helped, axis=0)[0] < 0.1
 
 
-def test_priors_that_took_part_sharpen_the_covariance() -> None:
+def test_used_priors_make_the_covariance_smaller() -> None:
     x_in_world, pixels = hardly_seen(random_for("sharper"))
     before = solved(x_in_world, pixels).covariance
     prior = PositionPrior(POSE.translation, 0.02**2 * np.eye(3))
@@ -213,7 +213,7 @@ def wrong_priors() -> dict[str, Priors]:
 
 @pytest.mark.parametrize("name", wrong_priors())
 @pytest.mark.parametrize("count", [20, 200], ids=["few matches", "many"])
-def test_a_wrong_prior_is_a_conflict_and_changes_not_a_bit(name: str, count: int) -> None:
+def test_a_wrong_prior_is_a_conflict_and_changes_no_bit(name: str, count: int) -> None:
     x_in_world, pixels = seen(random_for("wrong", name), count, wrong=count // 4)
     without = solved(x_in_world, pixels)
     estimate = solved(x_in_world, pixels, wrong_priors()[name])
@@ -223,7 +223,7 @@ def test_a_wrong_prior_is_a_conflict_and_changes_not_a_bit(name: str, count: int
     assert estimate.covariance.tobytes() == without.covariance.tobytes()
 
 
-def test_one_wrong_prior_does_not_keep_the_right_one_out() -> None:
+def test_one_wrong_prior_does_not_exclude_the_right_one() -> None:
     x_in_world, pixels = hardly_seen(random_for("one of two"))
     position = PositionPrior(POSE.translation, 0.02**2 * np.eye(3))
     flipped = GravityPrior(-gravity().in_camera, gravity().in_world, 1.0)
@@ -234,7 +234,7 @@ def test_one_wrong_prior_does_not_keep_the_right_one_out() -> None:
     ]
 
 
-def test_gravity_finds_what_three_matches_do_not() -> None:
+def test_gravity_finds_a_pose_that_plain_pnp_does_not() -> None:
     """Nine right ones of 240: three are drawn in one of 20 000 samples, PoseLib's most; two in one of 700."""
     found_alone = found_with = 0
     options = PnpOptions(max_iterations=512)

@@ -91,14 +91,14 @@ def test_a_usual_photograph_fills_its_grid(limit: int) -> None:
         assert grid.width_px * grid.height_px <= limit
 
 
-def test_a_call_has_the_grid_of_most_references() -> None:
+def test_the_common_grid_is_that_of_most_references() -> None:
     landscape, portrait, square = camera_of(640, 480), camera_of(480, 640), camera_of(500, 500)
     assert common_grid([square, portrait, landscape, portrait], OPTIONS) == natural_grid(portrait, OPTIONS)
     assert common_grid([square, landscape, portrait], OPTIONS) == natural_grid(square, OPTIONS)
     assert common_grid([square, landscape, portrait, portrait, landscape], OPTIONS) == natural_grid(landscape, OPTIONS)
 
 
-def test_without_a_lens_the_picture_is_the_official_loaders() -> None:
+def test_undistorted_pictures_equal_the_official_loaders() -> None:
     photograph = textured(752, 480, seed=3)
     layout = lay_out(camera_of(752, 480), Grid(45, 28), OPTIONS)
     official = np.asarray(Image.fromarray(photograph).resize((630, 392), Image.Resampling.LANCZOS), np.float32) / 255
@@ -107,7 +107,7 @@ def test_without_a_lens_the_picture_is_the_official_loaders() -> None:
     np.testing.assert_array_equal(picture, official.transpose(2, 0, 1))
 
 
-def test_a_large_photograph_is_nearly_the_official_loaders() -> None:
+def test_large_photographs_nearly_equal_the_official_loaders() -> None:
     photograph = textured(2800, 2100, seed=5)
     layout = lay_out(camera_of(2800, 2100), Grid(37, 28), OPTIONS)
     official = np.asarray(Image.fromarray(photograph).resize((518, 392), Image.Resampling.LANCZOS), float)
@@ -116,7 +116,7 @@ def test_a_large_photograph_is_nearly_the_official_loaders() -> None:
     assert np.sqrt((difference**2).mean()) < 0.7
 
 
-def test_a_lens_of_less_than_half_a_pixel_is_left_alone() -> None:
+def test_distortion_below_half_a_pixel_is_ignored() -> None:
     photograph, camera = textured(640, 480), camera_of(640, 480)
     slight = replace(camera, distortion=RadialTangential(k1=1e-3))
     grid = natural_grid(camera, OPTIONS)
@@ -128,7 +128,7 @@ def test_a_lens_of_less_than_half_a_pixel_is_left_alone() -> None:
 
 @pytest.mark.parametrize("grid", [Grid(37, 28), Grid(28, 37), Grid(46, 22)], ids=str)
 @pytest.mark.parametrize("name", CAMERAS)
-def test_blobs_are_where_the_pictures_camera_says(name: str, grid: Grid) -> None:
+def test_planted_blobs_are_where_the_camera_projects_them(name: str, grid: Grid) -> None:
     camera = CAMERAS[name]
     layout = lay_out(camera, grid, OPTIONS)
     left, top, width, height = layout.box
@@ -152,7 +152,7 @@ FOLDING_EVERYWHERE = Camera(640, 480, 400.0, 400.0, 319.5, 239.5, RadialTangenti
 
 
 @pytest.mark.parametrize("camera", [*CAMERAS.values(), FOLDING_EVERYWHERE], ids=[*CAMERAS, "folding at every edge"])
-def test_shown_pixels_are_the_photographs_and_no_others(camera: Camera) -> None:
+def test_shown_is_the_mask_of_the_photographs_pixels(camera: Camera) -> None:
     """Each shown pixel's ray comes back through the lens, and everything else has one colour."""
     layout = lay_out(camera, natural_grid(camera, OPTIONS), OPTIONS)
     shown = np.ones((layout.grid.height_px, layout.grid.width_px), bool) if layout.shown is None else layout.shown
@@ -171,7 +171,7 @@ def test_shown_pixels_are_the_photographs_and_no_others(camera: Camera) -> None:
     assert (filling == filling[:, :1]).all()
 
 
-def test_what_a_photograph_loses_to_its_grid() -> None:
+def test_pictures_show_the_expected_share_of_a_photograph() -> None:
     """A landscape grid shows all of a portrait or a panorama; most of a lens, but nothing beyond the field's bound."""
 
     def share(layout: Layout) -> float:
@@ -189,7 +189,7 @@ def test_what_a_photograph_loses_to_its_grid() -> None:
         assert np.abs(corner[:2]).max() <= math.tan(math.radians(OPTIONS.max_half_field_deg)) + 1e-2
 
 
-def test_extreme_shapes_have_a_picture() -> None:
+def test_photographs_of_extreme_shapes_have_a_picture() -> None:
     for width, height in ((16384, 32), (32, 4096)):
         camera = camera_of(width, height)
         layout = lay_out(camera, natural_grid(camera, OPTIONS), OPTIONS)
@@ -199,7 +199,7 @@ def test_extreme_shapes_have_a_picture() -> None:
         assert 0 < layout.shown.mean() < 0.02
 
 
-def test_a_lens_that_shows_nothing_gives_an_empty_picture() -> None:
+def test_a_lens_without_a_visible_field_has_an_empty_picture() -> None:
     """A cut-out from the rim of a fisheye's photograph, with the intrinsics of the whole."""
     camera = Camera(200, 200, 190.0, 190.0, -400.0, 100.0, Fisheye(0.003, 0.0007, -0.002, 0.0002))
     layout = lay_out(camera, natural_grid(camera, OPTIONS), OPTIONS)
@@ -208,7 +208,7 @@ def test_a_lens_that_shows_nothing_gives_an_empty_picture() -> None:
     assert np.ptp(layout.picture(textured(200, 200))) == 0
 
 
-def test_intrinsics_count_from_the_pictures_corner() -> None:
+def test_intrinsics_have_half_a_pixel_at_the_first_centre() -> None:
     layout = lay_out(camera_of(640, 480), Grid(37, 28), OPTIONS)
     np.testing.assert_allclose(layout.intrinsics[:2, 2], [518 / 2, 392 / 2])
     np.testing.assert_allclose(layout.intrinsics[[0, 1], [0, 1]], [0.8 * 518, 0.8 * 640 * 392 / 480])

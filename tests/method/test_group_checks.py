@@ -34,7 +34,7 @@ def walk(step_m: float, sigma_m: float = 0.01) -> SequenceEstimate:
     return SequenceEstimate(cast(Any, None), 0.0, poses, covariances, (), np.zeros(3))
 
 
-def test_photographs_that_lose_their_inliers_contradict_the_rig() -> None:
+def test_photographs_that_lose_their_inliers_reject_the_rig() -> None:
     found = check_mounting(rig(1, 0, 688), [alone(681), alone(438), alone(690)])
     assert isinstance(found, Rejection)
     assert found.reason is RejectionReason.GATE
@@ -44,13 +44,13 @@ def test_photographs_that_lose_their_inliers_contradict_the_rig() -> None:
 
 
 @pytest.mark.parametrize("lost", [alone(29), Answer(Rejection(RejectionReason.GATE, "chance"))])
-def test_photographs_that_knew_little_alone_contradict_nothing(lost: Answer) -> None:
+def test_photographs_with_few_inliers_alone_reject_nothing(lost: Answer) -> None:
     estimate = rig(600, 3)
     assert check_mounting(estimate, [alone(640), lost]) is estimate
 
 
 @pytest.mark.parametrize("unit_m", [0.01, 0.5, 2.0])
-def test_a_way_of_another_length_says_the_unit(unit_m: float) -> None:
+def test_a_walk_of_another_length_is_rejected_with_its_unit(unit_m: float) -> None:
     found = check_unit(walk(0.5), walk(0.5 / unit_m).world_from_camera)
     assert isinstance(found, Rejection)
     assert found.reason is RejectionReason.SCALE_UNRELIABLE
@@ -58,6 +58,6 @@ def test_a_way_of_another_length_says_the_unit(unit_m: float) -> None:
 
 
 @pytest.mark.parametrize(("drift", "sigma_m"), [(1.0, 0.001), (1.1, 0.001), (0.85, 0.001), (2.0, 0.3)])
-def test_drift_and_what_is_not_known_well_are_let_pass(drift: float, sigma_m: float) -> None:
+def test_drift_and_uncertain_lengths_are_accepted(drift: float, sigma_m: float) -> None:
     estimate = walk(0.5, sigma_m)
     assert check_unit(estimate, walk(0.5 * drift).world_from_camera) is estimate

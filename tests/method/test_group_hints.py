@@ -37,7 +37,7 @@ def test_every_reason_has_a_hint_of_one_sentence(reason: RejectionReason, matche
     assert hint.message.endswith(".")
 
 
-def test_the_reference_to_look_at_shares_most_with_any_photo() -> None:
+def test_the_best_reference_shares_most_with_any_photograph() -> None:
     assert hint_of(RejectionReason.GATE, (40, 60, 50), (31, 33, 70), ()).best_reference == NAMES[2]
     assert hint_of(RejectionReason.GATE, (0, 0), ()).best_reference is None
 
@@ -52,14 +52,14 @@ def test_the_reference_to_look_at_shares_most_with_any_photo() -> None:
         (RejectionReason.SCALE_UNRELIABLE, 400, Advice.RETAKE_PHOTOGRAPH),
     ],
 )
-def test_what_is_advised_follows_from_what_is_shared(reason: RejectionReason, best: int, advice: Advice) -> None:
+def test_the_advice_follows_from_the_shared_features(reason: RejectionReason, best: int, advice: Advice) -> None:
     hint = hint_of(reason, (best, 3))
     assert hint.advice is advice
     if reason is not RejectionReason.SCALE_UNRELIABLE:
         assert str(best) in hint.message
 
 
-def test_without_matches_the_furthest_photo_names_what_it_lacks() -> None:
+def test_without_matches_the_hint_is_the_furthest_photographs() -> None:
     own = Hint("coarse", Advice.SPREAD_REFERENCES, "Spread them.", NAMES[0])
     furthest = Rejection(RejectionReason.LOW_OVERLAP, "another place", own)
     images = [NOTHING, replace(NOTHING, answer=Answer(furthest))]

@@ -77,7 +77,7 @@ def test_the_advice_follows_from_the_numbers(
     assert hint_of(reason, matches, features).advice is advice
 
 
-def test_the_numbers_are_told() -> None:
+def test_the_message_contains_the_numbers() -> None:
     assert (
         "shares 9 of the photograph's 900 features" in hint_of(RejectionReason.LOW_OVERLAP, (3, 9, 4, 0, 0, 1)).message
     )
@@ -96,7 +96,7 @@ def test_the_best_reference_is_the_one_with_counted_matches() -> None:
     assert "shares 60 of" in outcome.hint.message
 
 
-def test_one_reference_alone_asks_for_another_reference() -> None:
+def test_matches_with_one_reference_only_ask_for_another() -> None:
     """Its very photograph shares all features with it, and hardly any has a point."""
     alone, others = Rejection(RejectionReason.LOW_OVERLAP, "planted", tried=27), (0, 1267, 8, 0, 2, 0)
     outcome = hinted(Answer(alone, reference_match_counts=others), view_of(1267), SCENE.references).outcome
@@ -107,20 +107,20 @@ def test_one_reference_alone_asks_for_another_reference() -> None:
     assert NAMES[1] in outcome.hint.message
 
 
-def test_where_a_prior_leaves_no_reference_it_is_to_be_checked() -> None:
+def test_a_prior_that_leaves_no_reference_is_to_be_checked() -> None:
     reason = RejectionReason.NO_USABLE_REFERENCES
     assert hint_of(reason, references=(), has_prior=True).advice is Advice.CHECK_PRIOR
     assert hint_of(reason, references=()).advice is Advice.ADD_REFERENCES
     assert hint_of(reason, references=SCENE.references[:1]).advice is Advice.ADD_REFERENCES
 
 
-def test_poses_and_hints_that_are_there_stay() -> None:
+def test_poses_and_existing_hints_are_not_changed() -> None:
     localized = Answer(Localization(RigidTransform.identity(), np.eye(6), PoseStage.REFINED, 50, 60, 1.0))
     assert hinted(localized, view_of(900), SCENE.references) is localized
     own = Answer(Rejection(RejectionReason.GATE, "planted", Hint("pnp", Advice.CHECK_PRIOR, "Own.")))
     assert hinted(own, view_of(900), SCENE.references) is own
 
 
-def test_options_check_themselves() -> None:
+def test_options_outside_their_bounds_are_refused() -> None:
     with pytest.raises(ValueError, match="must be"):
         HintOptions(few_matches=50, many_matches=20)

@@ -56,7 +56,7 @@ def verdict(support: Support, coverage: float, options: JudgeOptions = OPTIONS) 
     return judged.trust, judged.rejection
 
 
-def test_well_supported_is_trusted_and_poorly_supported_is_not() -> None:
+def test_trust_is_high_with_good_support_and_low_without() -> None:
     assert trust_of(GOOD, OPTIONS) > 0.3
     assert trust_of(POOR, OPTIONS) < 0.01
 
@@ -78,7 +78,7 @@ def test_more_evidence_never_lowers_the_trust(better: Evidence) -> None:
 
 
 @given(features=st.lists(st.floats(-10, 10), min_size=7, max_size=7), which=st.integers(0, 6), more=st.floats(0, 5))
-def test_the_score_is_monotone(features: list[float], which: int, more: float) -> None:
+def test_the_score_is_monotone_in_every_number(features: list[float], which: int, more: float) -> None:
     weights = np.array(OPTIONS.weights)
     raised = np.array(features)
     raised[which] += more
@@ -94,7 +94,7 @@ def test_trust_is_the_quantile_among_right_answers(share: float) -> None:
     assert abs((trusts <= share).mean() - share) < 0.03
 
 
-def test_coverage_is_what_trust_is_compared_with() -> None:
+def test_poses_with_trust_below_1_minus_coverage_are_rejected() -> None:
     support = support_of()
     trust, rejection = verdict(support, 1.0)
     assert rejection is None
@@ -110,13 +110,13 @@ def test_coverage_is_what_trust_is_compared_with() -> None:
     assert "matches agree" in refused.message
 
 
-def test_worse_matches_and_fewer_points_are_trusted_less() -> None:
+def test_worse_matches_and_fewer_points_lower_the_trust() -> None:
     clean, noisy, sparse = (verdict(s, 1.0)[0] for s in (support_of(), support_of(0.5), support_of(0.0, 0.3)))
     assert clean > noisy
     assert clean > sparse
 
 
-def test_agreement_with_what_is_known_beforehand_is_evidence() -> None:
+def test_agreement_with_priors_lowers_the_false_alarms() -> None:
     """A prior that a pose found by chance would meet once in ten thousand."""
     support = support_of(0.0, 0.3)
     before, after = evidence_of(support, INLIER_PX), evidence_of(support, INLIER_PX, -4.0)
@@ -124,7 +124,7 @@ def test_agreement_with_what_is_known_beforehand_is_evidence() -> None:
     assert trust_of(after, OPTIONS) >= trust_of(before, OPTIONS)
 
 
-def test_evidence_counts_what_is_planted() -> None:
+def test_evidence_has_the_planted_counts() -> None:
     support = support_of(0.25)
     evidence = evidence_of(support, INLIER_PX)
     assert support.estimate is not None
@@ -152,7 +152,7 @@ def test_degenerate_evidence_has_finite_features() -> None:
         {"scores": (0.0,)},
     ],
 )
-def test_options_check_themselves(wrong: dict[str, tuple[float, ...]]) -> None:
+def test_options_outside_their_bounds_are_refused(wrong: dict[str, tuple[float, ...]]) -> None:
     with pytest.raises(ValueError, match="must be"):
         JudgeOptions(**wrong)  # type: ignore[arg-type]
 

@@ -107,7 +107,7 @@ def largest_miss_px(keypoints: NDArray[np.floating], centres: Array) -> float:
 
 @pytest.mark.parametrize("max_side_px", [320, 256])
 @pytest.mark.parametrize("lens", [None, LENS], ids=["pinhole", "lens"])
-def test_aliked_keypoints_are_where_the_score_map_has_its_peaks(
+def test_aliked_keypoints_are_the_peaks_of_the_score_map(
     aliked: AlikedExtractor, monkeypatch: pytest.MonkeyPatch, lens: RadialTangential | None, max_side_px: int
 ) -> None:
     """The planted truth is in the reduced, distorted image; back to it through nothing but the two cameras."""
@@ -127,7 +127,7 @@ def test_aliked_keypoints_are_where_the_score_map_has_its_peaks(
     assert np.abs((seen - nearest).mean(axis=0)).max() < 0.05
 
 
-def test_a_wide_peak_is_a_large_keypoint(aliked: AlikedExtractor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wide_peak_has_a_large_keypoint_size(aliked: AlikedExtractor, monkeypatch: pytest.MonkeyPatch) -> None:
     centres = np.rint(peaks(random_for("wide"), 320, 256))
     feature_map = torch.ones(1, 128, 256, 320)
     sizes = []
@@ -138,7 +138,7 @@ def test_a_wide_peak_is_a_large_keypoint(aliked: AlikedExtractor, monkeypatch: p
     assert 0 < sizes[0] < sizes[1] < sizes[2] <= 4 * np.sqrt(8)  # all weight in the corners of five by five pixels
 
 
-def test_xfeat_keypoints_are_where_the_map_has_its_peaks(
+def test_xfeat_keypoints_are_the_peaks_of_the_keypoint_map(
     xfeat: XfeatExtractor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Gaussians are parabolas once their logarithm is taken, so the peaks come out exact."""
@@ -154,7 +154,7 @@ def test_xfeat_keypoints_are_where_the_map_has_its_peaks(
     assert largest_miss_px(view.features.keypoints, centres + SHIFT_PX) < 0.05
 
 
-def test_xfeat_finds_what_kornia_finds(xfeat: XfeatExtractor) -> None:
+def test_xfeat_finds_the_keypoints_that_kornia_finds(xfeat: XfeatExtractor) -> None:
     image = textured(320, 256, seed=3)
     twin = XFeat(top_k=300, detection_threshold=0.001)
     twin.net = xfeat._network
@@ -168,7 +168,7 @@ def test_xfeat_finds_what_kornia_finds(xfeat: XfeatExtractor) -> None:
     np.testing.assert_allclose(ours.descriptors[ours_order], theirs["descriptors"].numpy()[order], atol=1e-5)
 
 
-def test_edgepoint2_keypoints_and_descriptors_are_where_the_maps_have_them(
+def test_edgepoint2_features_are_read_at_the_peaks_of_the_maps(
     edgepoint2: EdgePoint2Extractor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Tops of parabolas come out exact, and so does a map of descriptors that are the places they are for."""
@@ -198,7 +198,7 @@ def test_edgepoint2_finds_nothing_at_the_border(edgepoint2: EdgePoint2Extractor)
     assert (view.features.keypoints < np.array([330, 250]) - 4.4).all()
 
 
-def test_strict_maxima_are_those_of_loops() -> None:
+def test_strict_maxima_equal_brute_force() -> None:
     scores = torch.from_numpy(random_for("maxima").integers(0, 40, (24, 31))).float()
     expected = []
     for y in range(2, 22):
@@ -211,7 +211,7 @@ def test_strict_maxima_are_those_of_loops() -> None:
     assert 3 < len(expected) < 40
 
 
-def test_offsets_find_the_top_of_a_parabola() -> None:
+def test_offsets_find_the_maximum_of_a_parabola() -> None:
     x, y = torch.meshgrid(torch.arange(9.0), torch.arange(7.0), indexing="xy")
     heights = 5 - 0.3 * (x - 4.3) ** 2 - 0.7 * (y - 2.6) ** 2
     torch.testing.assert_close(peak_offsets(heights, torch.tensor([[4, 3]])), torch.tensor([[0.3, -0.4]]))
@@ -247,7 +247,7 @@ def test_any_photograph_gives_well_formed_features(name: str, dimension: int, re
 
 
 @pytest.mark.parametrize("extractor", [AlikedExtractor, XfeatExtractor])
-def test_the_name_tells_what_changes_the_features(
+def test_the_name_changes_with_weights_and_options(
     extractor: Callable[..., FeatureExtractor], weights: dict[str, Path], tmp_path: Path
 ) -> None:
     name = "aliked" if extractor is AlikedExtractor else "xfeat"
@@ -273,7 +273,7 @@ def test_weights_that_do_not_fit_are_refused(weights: dict[str, Path], tmp_path:
         make_extractor("aliked")
 
 
-def test_superpoint_keypoints_are_pixels(tmp_path: Path) -> None:
+def test_superpoint_keypoints_are_whole_pixels(tmp_path: Path) -> None:
     """A random network, against transformers' own output; relative coordinates are whole pixels again."""
     transformers = pytest.importorskip("transformers", reason="the superpoint extra is not installed")
     from mapless_server.method.features.superpoint import SuperPointExtractor

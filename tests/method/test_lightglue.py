@@ -75,7 +75,7 @@ def tensors(query: View, references: Sequence[View]) -> list[Tensor]:
     return [torch.from_numpy(a) for a in arrays]
 
 
-def test_a_pair_in_a_batch_is_the_pair_alone(views: tuple[View, list[View]]) -> None:
+def test_a_pair_in_a_batch_equals_the_pair_alone(views: tuple[View, list[View]]) -> None:
     query, references = views
     made = network()
     with torch.inference_mode():
@@ -89,7 +89,7 @@ def test_a_pair_in_a_batch_is_the_pair_alone(views: tuple[View, list[View]]) -> 
     assert (score > 0.5).sum() > 40
 
 
-def test_what_stands_in_the_padding_changes_nothing(views: tuple[View, list[View]]) -> None:
+def test_values_in_the_padding_have_no_effect(views: tuple[View, list[View]]) -> None:
     made = network()
     position, descriptor, positions, descriptors, mask = tensors(*views)
     loud = ~mask[..., None]
@@ -100,7 +100,7 @@ def test_what_stands_in_the_padding_changes_nothing(views: tuple[View, list[View
     torch.testing.assert_close(index[score > 0.01], index_loud[score > 0.01])
 
 
-def test_the_pair_is_that_of_kornias_own_forward(views: tuple[View, list[View]]) -> None:
+def test_a_pair_equals_kornias_own_forward(views: tuple[View, list[View]]) -> None:
     query, references = views
     made = network()
     twin = KorniaLightGlue(
@@ -143,7 +143,7 @@ class NoWaiting(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def test_nothing_inside_waits_for_the_device(views: tuple[View, list[View]]) -> None:
+def test_the_network_does_not_wait_for_the_device(views: tuple[View, list[View]]) -> None:
     made, inputs = network(), tensors(*views)
     with NoWaiting(), torch.no_grad():  # type: ignore[no-untyped-call]
         _, score = made(*inputs)
@@ -181,7 +181,7 @@ def test_half_precision_finds_the_same_matches(views: tuple[View, list[View]]) -
     assert common > 0.95 * max(sum(map(len, full)), sum(map(len, half)))
 
 
-def test_only_the_first_keypoints_are_matched(views: tuple[View, list[View]]) -> None:
+def test_only_keypoints_up_to_the_limit_are_matched(views: tuple[View, list[View]]) -> None:
     query, references = views
     options = LightGlueOptions(max_keypoints=20, min_score=0.0)
     for matches in LightGlueMatching(network(), options=options).match(
@@ -191,7 +191,7 @@ def test_only_the_first_keypoints_are_matched(views: tuple[View, list[View]]) ->
         assert matches.max() < 20
 
 
-def test_photographs_without_keypoints_match_nothing(views: tuple[View, list[View]]) -> None:
+def test_photographs_without_keypoints_have_no_matches(views: tuple[View, list[View]]) -> None:
     query, references = views
     blank = view(0, np.ones((1, DIMENSION)), 0.0, "blank")
     matching = LightGlueMatching(network())
@@ -202,7 +202,7 @@ def test_photographs_without_keypoints_match_nothing(views: tuple[View, list[Vie
     assert not matching.match(query, [], lambda: None)
 
 
-def test_out_of_memory_is_tried_again_by_halves(views: tuple[View, list[View]]) -> None:
+def test_out_of_memory_is_retried_in_halves(views: tuple[View, list[View]]) -> None:
     query, references = views
     posed = [reference(v, "") for v in references]
     whole = LightGlueMatching(network()).match(query, posed, lambda: None)
@@ -224,7 +224,7 @@ def test_out_of_memory_is_tried_again_by_halves(views: tuple[View, list[View]]) 
         Small(network(), options=options).match(query, posed * 2, lambda: None)  # halves hold five
 
 
-def test_the_check_ends_it(views: tuple[View, list[View]]) -> None:
+def test_the_check_cancels_the_matching(views: tuple[View, list[View]]) -> None:
     query, references = views
 
     def cancelled() -> None:
@@ -234,7 +234,7 @@ def test_the_check_ends_it(views: tuple[View, list[View]]) -> None:
         LightGlueMatching(network()).match(query, [reference(references[0], "")], cancelled)
 
 
-def test_weights_are_those_of_the_checkpoint_and_all_of_them(tmp_path: Path) -> None:
+def test_weights_are_exactly_those_of_the_checkpoint(tmp_path: Path) -> None:
     torch.manual_seed(1)
     state = {name: tensor.clone() for name, tensor in LightGlue(128).state_dict().items()}
     save_file(state, tmp_path / "good.safetensors")
@@ -258,7 +258,7 @@ def test_options_outside_their_bounds_are_refused() -> None:
             LightGlueOptions(**options)
 
 
-def test_superpoints_is_transformers_own(tmp_path: Path) -> None:
+def test_superpoints_lightglue_equals_that_of_transformers(tmp_path: Path) -> None:
     """Random weights in transformers' network and, translated, in ours: the same scores for the same keypoints."""
     transformers = pytest.importorskip("transformers", reason="the superpoint extra is not installed")
 

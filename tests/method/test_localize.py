@@ -93,7 +93,7 @@ def without_meaning(view: View) -> View:
 @pytest.mark.parametrize("strategy", ScaleStrategy)
 @pytest.mark.parametrize("variant", Variant)
 @pytest.mark.parametrize("backend", ["geometric", "network"])
-def test_every_form_of_the_method_finds_the_pose(backend: str, variant: Variant, strategy: ScaleStrategy) -> None:
+def test_every_variant_finds_the_planted_pose(backend: str, variant: Variant, strategy: ScaleStrategy) -> None:
     answer = answer_of(pipeline_of(backend), LocalizeOptions(variant, strategy))
     found = pose_of(answer)
     assert_pose_close(found.world_from_camera, SCENE.world_from_query, metres=0.01, degrees=0.1)
@@ -112,7 +112,7 @@ def test_every_form_of_the_method_finds_the_pose(backend: str, variant: Variant,
 
 @pytest.mark.parametrize("strategy", ScaleStrategy)
 @pytest.mark.parametrize("variant", Variant)
-def test_on_the_device_the_answer_is_the_hosts(variant: Variant, strategy: ScaleStrategy) -> None:
+def test_the_answer_of_the_device_equals_the_hosts(variant: Variant, strategy: ScaleStrategy) -> None:
     options = LocalizeOptions(variant, strategy)
     there, here = (answer_of(pipeline_of(backend, options=ROUGH), options) for backend in ("device", "network"))
     found, expected = pose_of(there), pose_of(here)
@@ -125,7 +125,7 @@ def test_on_the_device_the_answer_is_the_hosts(variant: Variant, strategy: Scale
     assert list(there.stage_seconds)[2:] == ["refine", *later]
 
 
-def test_refinement_makes_a_rough_pose_fine() -> None:
+def test_refinement_makes_a_rough_pose_accurate() -> None:
     errors = {
         variant: pose_error(
             pose_of(answer_of(pipeline_of("network", options=ROUGH), LocalizeOptions(variant))).world_from_camera,
@@ -139,7 +139,7 @@ def test_refinement_makes_a_rough_pose_fine() -> None:
     assert max(errors[Variant.FULL][1], errors[Variant.BEST][1]) < 0.5 * errors[Variant.COARSE][1]
 
 
-def test_our_form_beats_the_papers_under_noisy_reference_poses() -> None:
+def test_best_beats_full_under_noisy_reference_poses() -> None:
     errors: dict[Variant, list[float]] = {Variant.FULL: [], Variant.BEST: []}
     for seed in range(6):
         scene = make_scene(random_for("average", seed), SceneOptions(point_count=300))
@@ -160,7 +160,7 @@ def disturbed(pose: RigidTransform, random: np.random.Generator, metres: float, 
     return RigidTransform(pose.rotation @ turn, pose.translation + random.normal(0.0, metres, 3))
 
 
-def test_wrong_keypoints_and_few_points_are_survived() -> None:
+def test_wrong_keypoints_and_few_points_do_not_prevent_a_pose() -> None:
     for seed in range(4):
         scene = make_scene(
             random_for("hard", seed),
@@ -170,7 +170,7 @@ def test_wrong_keypoints_and_few_points_are_survived() -> None:
         assert_pose_close(found.world_from_camera, scene.world_from_query, metres=0.03, degrees=0.3)
 
 
-def test_a_flat_scene_is_no_problem() -> None:
+def test_a_flat_scene_is_localized() -> None:
     scene = make_scene(random_for("flat"), SceneOptions(box_m=(4.0, 2.4, 0.0), reference_count=4))
     found = pose_of(localize(scene.query, scene.references, pipeline_of("geometric", scene), LocalizeOptions()))
     assert_pose_close(found.world_from_camera, scene.world_from_query, metres=0.02, degrees=0.2)
@@ -192,7 +192,7 @@ def test_stages_run_in_order_and_are_timed() -> None:
         assert all(0 < s < 10 for s in seconds.values())
 
 
-def test_counts_by_reference() -> None:
+def test_match_and_inlier_counts_are_those_of_each_reference() -> None:
     answer = answer_of(pipeline_of("geometric"))
     found = pose_of(answer)
     matches = MATCHER.correspond(SCENE.query, SCENE.references).query_matches
@@ -202,7 +202,7 @@ def test_counts_by_reference() -> None:
     assert sum(answer.reference_inlier_counts) >= 2 * found.inlier_count  # every point is seen at least twice
 
 
-def test_the_covariance_tells_how_large_errors_are() -> None:
+def test_errors_are_as_large_as_the_covariance() -> None:
     """Within the factor it is inflated by, and no promise beyond."""
     squares = []
     for seed in range(12):
@@ -252,24 +252,24 @@ def weak_below(weak_inliers: int, pipeline: Pipeline) -> Pipeline:
     return replace(pipeline, options=StageOptions(weak_inliers=weak_inliers))
 
 
-class NobodyWaits(Exception):
+class Cancelled(Exception):
     """What a check raises."""
 
 
 @pytest.mark.parametrize("steps", [0, 1, 10, 20])
-def test_work_stops_at_the_next_step_when_nobody_waits(steps: int) -> None:
+def test_a_cancelled_query_stops_at_the_next_check(steps: int) -> None:
     asked = iter(range(steps))
 
     def check() -> None:
         if next(asked, None) is None:
-            raise NobodyWaits
+            raise Cancelled
 
-    with pytest.raises(NobodyWaits):
+    with pytest.raises(Cancelled):
         localize(SCENE.query, SCENE.references, Pipeline(), LocalizeOptions(), StageContext(check))
 
 
 @pytest.mark.parametrize("metres", [1e6, 1e7])
-def test_coordinates_of_millions_of_metres_cost_no_digits(metres: float) -> None:
+def test_large_world_coordinates_cost_no_digits(metres: float) -> None:
     offset = np.array([metres, -metres, 1e3])
     far = moved_references(SCENE.references, RigidTransform(np.eye(3), offset))
     near_pose = pose_of(localize(SCENE.query, SCENE.references, Pipeline(), LocalizeOptions())).world_from_camera
@@ -281,7 +281,7 @@ def test_coordinates_of_millions_of_metres_cost_no_digits(metres: float) -> None
 
 
 @pytest.mark.parametrize("backend", ["geometric", "network"])
-def test_the_same_query_has_the_same_answer_to_the_bit(backend: str) -> None:
+def test_the_same_query_has_the_same_answer_bit_for_bit(backend: str) -> None:
     first, second = (
         pose_of(answer_of(replace(pipeline_of(backend), matcher=matcher))) for matcher in (Matcher(), Matcher())
     )
@@ -305,7 +305,7 @@ def test_the_answer_moves_with_the_world(variant: Variant) -> None:
         np.testing.assert_allclose(there.covariance, expected, atol=0.01 * np.abs(expected).max())
 
 
-def test_coordinates_of_millions_of_metres_cost_no_accuracy() -> None:
+def test_large_world_coordinates_cost_no_accuracy() -> None:
     moved = RigidTransform(np.eye(3), np.array([4_000_000.0, -3_000_000.0, 2_000_000.0]))
     for variant in Variant:
         options = LocalizeOptions(variant)
@@ -314,7 +314,7 @@ def test_coordinates_of_millions_of_metres_cost_no_accuracy() -> None:
         assert_pose_close(pose_of(there).world_from_camera, moved.compose(here), metres=1e-3, degrees=1e-3)
 
 
-def test_the_order_of_references_hardly_matters_to_our_form() -> None:
+def test_the_order_of_references_hardly_changes_the_pose() -> None:
     answers = [
         pose_of(localize(SCENE.query, references, pipeline_of("geometric"), LocalizeOptions()))
         for references in (SCENE.references, SCENE.references[::-1])
@@ -326,9 +326,7 @@ def test_the_order_of_references_hardly_matters_to_our_form() -> None:
 
 
 @pytest.mark.parametrize("variant", [Variant.NO_STRUCTURE, Variant.FULL])
-def test_the_initial_pose_stays_when_refinement_explains_less(
-    monkeypatch: pytest.MonkeyPatch, variant: Variant
-) -> None:
+def test_the_initial_pose_is_kept_if_refinement_is_worse(monkeypatch: pytest.MonkeyPatch, variant: Variant) -> None:
     monkeypatch.setattr(pnp, "ransac", lambda *_: RigidTransform.identity())
     found = pose_of(answer_of(pipeline_of("network"), LocalizeOptions(variant)))
     assert found.pose_stage is PoseStage.INITIAL
@@ -336,7 +334,7 @@ def test_the_initial_pose_stays_when_refinement_explains_less(
     np.testing.assert_array_equal(found.world_from_camera.matrix(), coarse.world_from_camera.matrix())
 
 
-def test_refinement_wins_when_it_explains_more() -> None:
+def test_the_refined_pose_is_taken_if_it_has_more_inliers() -> None:
     rough = FakeNetworkOptions(pose_noise_m=0.02, pose_noise_deg=0.2)
     found = pose_of(answer_of(pipeline_of("network", options=rough), LocalizeOptions(Variant.FULL)))
     assert found.pose_stage is PoseStage.REFINED
@@ -359,7 +357,7 @@ def blinded(reconstruction: Reconstruction) -> Reconstruction:
 
 @pytest.mark.parametrize("backend", ["geometric", "network"])
 @pytest.mark.parametrize("count", [0, 1])
-def test_no_usable_references(backend: str, count: int) -> None:
+def test_no_usable_references_is_the_reason(backend: str, count: int) -> None:
     answer = localize(SCENE.query, SCENE.references[:count], pipeline_of(backend), LocalizeOptions())
     assert reason_of(answer) is RejectionReason.NO_USABLE_REFERENCES
     assert answer.scale is None
@@ -367,7 +365,7 @@ def test_no_usable_references(backend: str, count: int) -> None:
 
 
 @pytest.mark.parametrize("backend", ["geometric", "network"])
-def test_degenerate_references(backend: str) -> None:
+def test_degenerate_references_is_the_reason(backend: str) -> None:
     where = SCENE.references[0].world_from_camera.translation
     stacked = tuple(
         replace(r, key=f"{r.key}-stacked", world_from_camera=RigidTransform(r.world_from_camera.rotation, where))
@@ -383,7 +381,7 @@ def test_degenerate_references(backend: str) -> None:
 
 
 @pytest.mark.parametrize("count", [0, MIN_FEATURES - 1])
-def test_low_texture(count: int) -> None:
+def test_low_texture_is_the_reason(count: int) -> None:
     f = SCENE.query.features
     bare = View(CAMERA, Features(f.keypoints[:count], f.descriptors[:count], f.sizes_px[:count]))
     answer = answer_of(pipeline_of("geometric"), query=bare)
@@ -391,7 +389,7 @@ def test_low_texture(count: int) -> None:
     assert not answer.stage_seconds
 
 
-def test_low_overlap() -> None:
+def test_low_overlap_is_the_reason() -> None:
     for seed in range(3):
         elsewhere = make_scene(random_for("elsewhere", seed), SceneOptions(point_count=400))
         answer = answer_of(pipeline_of("geometric"), query=elsewhere.query)
@@ -399,20 +397,20 @@ def test_low_overlap() -> None:
         assert list(answer.stage_seconds) == ["correspond", "coarse"]
 
 
-def test_scale_unreliable() -> None:
+def test_scale_unreliable_is_the_reason() -> None:
     answer = answer_of(Pipeline(ChangedNetwork(FakeNetwork(SCENE), blinded), MATCHER))
     assert reason_of(answer) is RejectionReason.SCALE_UNRELIABLE
     assert list(answer.stage_seconds) == ["correspond", "coarse", "scale"]
 
 
-def test_too_few_matches() -> None:
+def test_too_few_matches_is_the_reason() -> None:
     answer = answer_of(pipeline_of("network"), query=without_meaning(SCENE.query))
     assert reason_of(answer) is RejectionReason.TOO_FEW_MATCHES
     assert answer.scale is not None
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_gate(seed: int) -> None:
+def test_gate_is_the_reason(seed: int) -> None:
     """The paper's search matches anything near; where the network is wrong and nothing is alike, chance must not do."""
     wrong = FakeNetwork(SCENE, seed, FakeNetworkOptions(pose_noise_m=0.5, pose_noise_deg=2.0))
     options = LocalizeOptions(Variant.FULL, ScaleStrategy.TRIANGULATION)
@@ -431,7 +429,7 @@ def test_gate(seed: int) -> None:
     ],
     ids=["more inliers", "as many", "a claim as wide as a room", "instead of none", "none"],
 )
-def test_the_wide_answer_wins_with_more_inliers_at_equal_claim(
+def test_the_better_of_strict_and_wide_answer_is_returned(
     strict: tuple[int, float] | None,
     wide: tuple[int, float] | None,
     wide_wins: bool,
@@ -453,7 +451,7 @@ def test_the_wide_answer_wins_with_more_inliers_at_equal_claim(
 
 
 @pytest.mark.parametrize(("backend", "times"), [("network", 1), ("geometric", 2)])
-def test_a_network_is_asked_once_for_a_query(backend: str, times: int) -> None:
+def test_a_network_runs_once_for_a_query(backend: str, times: int) -> None:
     pipeline = pipeline_of(backend)
     asked: list[int] = []
 
@@ -481,7 +479,7 @@ def looking_back(reconstruction: Reconstruction) -> Reconstruction:
     return replace(reconstruction, query=replace(query, local_from_camera=turned))
 
 
-def test_pnp_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pnp_failed_is_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pnp, "ransac", lambda *_: None)
     answer = answer_of(Pipeline(ChangedNetwork(FakeNetwork(SCENE), looking_back), MATCHER))
     assert reason_of(answer) is RejectionReason.PNP_FAILED
@@ -525,7 +523,7 @@ def same_bits(first: Answer, second: Answer) -> bool:
 
 @pytest.mark.parametrize("weak_inliers", [0, 10**6])
 @pytest.mark.parametrize("backend", ["geometric", "network", "device"])
-def test_queries_of_one_batch_are_answered_as_alone(backend: str, weak_inliers: int) -> None:
+def test_queries_of_a_batch_have_the_answers_they_have_alone(backend: str, weak_inliers: int) -> None:
     """To the bit, where the backend itself gives the same bits; with their own options."""
     pipeline = weak_below(weak_inliers, pipeline_of(backend, options=None if backend == "geometric" else ROUGH))
     queries = [fewer_features(seed) for seed in range(3)] if backend == "geometric" else [SCENE.query] * 3
@@ -539,7 +537,7 @@ def test_queries_of_one_batch_are_answered_as_alone(backend: str, weak_inliers: 
         assert same_bits(refine(part), answer_of(pipeline, option, query))
 
 
-def test_a_coarse_answer_is_the_coarse_pose_and_says_why() -> None:
+def test_a_coarse_answer_has_the_initial_pose_and_its_stage() -> None:
     for backend in ("geometric", "network", "device"):
         offset = np.full(3, 1e5)
         far = [replace(r, world_from_camera=r.world_from_camera.shifted(offset)) for r in SCENE.references]
@@ -560,7 +558,7 @@ def test_a_coarse_answer_is_the_coarse_pose_and_says_why() -> None:
         assert list(answer.stage_seconds)[:2] == ["correspond", "coarse"]
 
 
-def test_without_a_reconstructed_pose_only_refining_may_answer() -> None:
+def test_without_an_initial_pose_there_is_no_coarse_answer() -> None:
     pipeline = Pipeline(ChangedNetwork(FakeNetwork(SCENE), blinded), MATCHER)
     hopeful, settled = reconstruct(
         [prepared_of(pipeline, LocalizeOptions(variant)) for variant in (Variant.BEST, Variant.FULL)]
@@ -571,13 +569,13 @@ def test_without_a_reconstructed_pose_only_refining_may_answer() -> None:
     assert reason_of(settled) is RejectionReason.SCALE_UNRELIABLE
 
 
-def test_the_coarse_form_is_answered_without_refining() -> None:
+def test_the_coarse_variant_is_answered_without_refinement() -> None:
     (answer,) = reconstruct([prepared_of(pipeline_of("network"), LocalizeOptions(Variant.COARSE))])
     assert isinstance(answer, Answer)
     assert pose_of(answer).pose_stage is PoseStage.INITIAL
 
 
-def test_one_query_s_exception_is_its_own() -> None:
+def test_one_querys_exception_does_not_fail_the_others() -> None:
     """Of its check before and after the backend, and of the backend; and the backend is not asked in vain."""
     network = FakeNetwork(SCENE)
     fault, asked = MemoryError("of this query"), []
@@ -589,7 +587,7 @@ def test_one_query_s_exception_is_its_own() -> None:
             return [fault, *outcomes[1:]]
 
     pipeline = Pipeline(Faulty(network, lambda it: it), MATCHER)
-    gone = NobodyWaits()
+    gone = Cancelled()
     later_calls: list[int] = []
 
     def already() -> None:

@@ -61,7 +61,7 @@ def slow_one_to_one(first: list[int], second: list[int], score: list[float]) -> 
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), unique=True, max_size=30), st.randoms())
-def test_one_to_one_is_one_to_one(pairs: list[tuple[int, int]], shuffler: object) -> None:
+def test_no_point_or_keypoint_is_matched_twice(pairs: list[tuple[int, int]], shuffler: object) -> None:
     first, second = [a for a, _ in pairs], [b for _, b in pairs]
     score = np.arange(len(pairs), dtype=float)
     shuffler.shuffle(score)  # type: ignore[attr-defined]
@@ -87,7 +87,7 @@ def query_matches(*matches: list[tuple[int, int]]) -> Correspondences:
     return Correspondences({}, tuple(np.array(m, np.int32).reshape(-1, 2) for m in matches))
 
 
-def test_the_majority_wins() -> None:
+def test_a_keypoint_takes_the_point_of_most_references() -> None:
     structure = small_structure([[(0, 0), (1, 0), (2, 0)], [(0, 1), (1, 1), (2, 1)]])
     # Two references say that keypoint 5 shows point 0, one says point 1.
     found = vote(structure, [2, 2, 2], query_matches([(5, 1)], [(5, 0)], [(5, 0)]))
@@ -100,7 +100,7 @@ def test_a_point_takes_the_keypoint_of_most_references() -> None:
     assert pairs_of(vote(structure, [1, 1, 1], query_matches([(3, 0)], [(4, 0)], [(4, 0)]))) == {(0, 4)}
 
 
-def test_matches_with_what_is_no_point_are_ignored() -> None:
+def test_matches_with_untriangulated_keypoints_are_ignored() -> None:
     structure = small_structure([[(0, 2), (1, 0)]])
     assert pairs_of(vote(structure, [3, 2], query_matches([(0, 0), (1, 1)], [(2, 1)]))) == set()
     assert pairs_of(vote(structure, [3, 2], query_matches([], []))) == set()
@@ -115,7 +115,7 @@ def test_planted_pairs_are_found_through_tracks() -> None:
     assert len(found) > 0.95 * len(true)
 
 
-def test_wrong_matches_of_one_reference_are_outvoted() -> None:
+def test_wrong_matches_of_one_reference_lose_the_vote() -> None:
     scene = make_scene(random_for("outvoted"), SceneOptions(seen_share=1.0))
     structure, true = true_structure(scene)
     random = random_for("outvoted matches")
@@ -156,7 +156,7 @@ def slow_search(
 
 @pytest.mark.parametrize("options", [PAPER_MATCH, MatchOptions(), MatchOptions(radius_px=60.0, min_similarity=0.2)])
 @pytest.mark.parametrize("off_m", [0.0, 0.05])
-def test_the_search_is_that_of_loops(options: MatchOptions, off_m: float) -> None:
+def test_the_guided_search_equals_brute_force(options: MatchOptions, off_m: float) -> None:
     scene = make_scene(random_for("search"), SceneOptions(point_count=100, reference_count=3, distractor_count=60))
     structure, true = true_structure(scene)
     pose = about(scene.world_from_query, off_m, 0.2)
@@ -182,7 +182,7 @@ def test_the_papers_search_finds_planted_pairs_in_its_radius() -> None:
     assert len(pairs_of(found) & pairs_of(true)) == 0
 
 
-def test_our_search_only_adds_to_the_votes() -> None:
+def test_the_guided_search_keeps_the_votes() -> None:
     scene = make_scene(random_for("adds"), SceneOptions(noise_px=0.3))
     structure, true = true_structure(scene)
     right = true_correspondences(scene).query_matches
@@ -196,7 +196,7 @@ def test_our_search_only_adds_to_the_votes() -> None:
     assert len(pairs_of(found) - pairs_of(true)) < 0.01 * len(true)
 
 
-def test_similarity_is_that_of_the_best_observation() -> None:
+def test_similarity_is_the_best_observations() -> None:
     """A point seen by two references, one of which shows it changed: the other is enough."""
     scene = make_scene(random_for("best"), SceneOptions(reference_count=2, descriptor_noise=0.0, seen_share=1.0))
     structure, true = true_structure(scene)
@@ -210,7 +210,7 @@ def test_similarity_is_that_of_the_best_observation() -> None:
 
 
 @pytest.mark.parametrize("options", [PAPER_MATCH, MatchOptions()])
-def test_nothing_is_found_where_nothing_is(options: MatchOptions) -> None:
+def test_without_points_or_keypoints_nothing_is_found(options: MatchOptions) -> None:
     scene = make_scene(random_for("nothing"), SceneOptions(point_count=60))
     structure, _ = true_structure(scene)
     none = query_matches(*[[] for _ in scene.references])

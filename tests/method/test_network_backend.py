@@ -146,7 +146,7 @@ def test_the_catalogue_has_the_weights_of_every_backend() -> None:
     assert {it.name for it in CATALOGUE if it.purpose == "backend"} == set(NETWORKS)
 
 
-def test_every_view_has_its_own_place_in_the_answer() -> None:
+def test_views_keep_their_order_in_the_reconstruction() -> None:
     runner = GreyRunner()
     outcome = reconstruct_one(grey_backend(runner), *grey_request(7, 50, 100, 150))
     assert greys_of(outcome) == [7, 50, 100, 150]
@@ -158,7 +158,7 @@ def test_every_view_has_its_own_place_in_the_answer() -> None:
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_maps_belong_to_the_pictures(name: str) -> None:
+def test_maps_have_the_cameras_of_the_pictures(name: str) -> None:
     """Point maps are of the grid's size, confidence is 0 to 1, and both differ from reference to reference."""
     outcome = reconstruct_one(NetworkReconstructor(small_runner(name), OPTIONS), *small_request(3))
     assert isinstance(outcome, Reconstruction)
@@ -173,7 +173,7 @@ def test_maps_belong_to_the_pictures(name: str) -> None:
     assert np.abs(outcome.references[0].point_map - outcome.references[1].point_map).max() > 0.01
 
 
-def test_there_is_no_confidence_where_a_picture_is_filled() -> None:
+def test_confidence_is_zero_where_a_picture_is_filled() -> None:
     query, references = small_request(2)
     portrait = references_of([photograph(textured(72, 96, seed=i)) for i in range(3)])[2]
     outcome = reconstruct_one(NetworkReconstructor(small_runner("pi3"), OPTIONS), query, [*references, portrait])
@@ -186,14 +186,14 @@ def test_there_is_no_confidence_where_a_picture_is_filled() -> None:
     np.testing.assert_allclose(corners, [[13.5, -0.5], [55.5, 55.5]], atol=0.51)
 
 
-def test_without_references_there_is_no_answer() -> None:
+def test_without_references_a_query_is_rejected() -> None:
     query, _ = small_request(0)
     outcome = reconstruct_one(grey_backend(GreyRunner()), query, [])
     assert isinstance(outcome, Rejection)
     assert outcome.reason is RejectionReason.NO_USABLE_REFERENCES
 
 
-def test_a_view_without_a_photograph_is_misuse() -> None:
+def test_a_view_without_a_photograph_is_refused() -> None:
     query, references = small_request(2)
     bare = replace(references[1], view=replace(references[1].view, photograph=None))
     with pytest.raises(ValueError, match="r1 has no photograph"):
@@ -204,7 +204,7 @@ def test_a_view_without_a_photograph_is_misuse() -> None:
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_kept_tokens_give_the_same_bits(name: str) -> None:
+def test_cached_tokens_give_the_same_bits(name: str) -> None:
     reads: list[str] = []
     query, references = small_request(4, reads=reads)
     runner = small_runner(name)
@@ -235,7 +235,7 @@ def test_tokens_from_the_host_give_the_same_bits(name: str) -> None:
     assert_same_bits(second, reconstruct_one(NetworkReconstructor(runner, UNCACHED), *request))
 
 
-def test_another_photograph_under_the_same_name_is_another_view() -> None:
+def test_another_photograph_of_the_same_name_misses_the_cache() -> None:
     query, references = grey_request(7, 50, 100)
     backend = grey_backend(GreyRunner())
     reconstruct_one(backend, query, references)
@@ -243,7 +243,7 @@ def test_another_photograph_under_the_same_name_is_another_view() -> None:
     assert greys_of(reconstruct_one(backend, query, [references[0], changed])) == [7, 50, 200]
 
 
-def test_another_grid_is_a_miss_and_no_more() -> None:
+def test_another_grid_misses_the_cache() -> None:
     query, references = grey_request(7, 50, 100)
     portraits = grey_request(7, 60, 70, 80, size=(72, 96))[1]
     backend = grey_backend(GreyRunner())
@@ -258,7 +258,7 @@ def test_another_grid_is_a_miss_and_no_more() -> None:
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_queries_together_are_as_alone(name: str) -> None:
+def test_queries_of_a_batch_equal_single_ones(name: str) -> None:
     requests = [
         small_request(3, 1),
         small_request(2, 2),
@@ -286,7 +286,7 @@ def test_each_view_of_a_batch_is_encoded_once(cache: TokenCacheOptions) -> None:
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_queries_that_share_their_references_are_as_alone(name: str) -> None:
+def test_queries_with_common_references_equal_single_ones(name: str) -> None:
     _, references = small_request(3)
     queries = [small_request(1, seed)[0] for seed in (1, 2, 3, 4)]
     runner = small_runner(name)
@@ -297,7 +297,7 @@ def test_queries_that_share_their_references_are_as_alone(name: str) -> None:
             np.testing.assert_allclose(one, other, atol=2e-4 * float(np.abs(other).max()))
 
 
-def test_a_bucket_is_what_the_network_computes_in_one_go() -> None:
+def test_queries_of_one_bucket_are_one_batch_of_the_network() -> None:
     backend = grey_backend(GreyRunner())
     assert backend.bucket(*grey_request(1, 50, 60)) == Bucket("grey", 2, (4, 5))
     assert str(backend.bucket(*grey_request(1, 50, 60))) == "grey-4x5-2"
@@ -307,7 +307,7 @@ def test_a_bucket_is_what_the_network_computes_in_one_go() -> None:
         backend.bucket(replace(query, photograph=None), grey_request(1, 50)[1])
 
 
-def test_one_requests_fault_is_its_own() -> None:
+def test_one_requests_error_does_not_fail_the_others() -> None:
     requests = [grey_request(1, 50), grey_request(2, 60), grey_request(3, 70)]
     query, (reference,) = requests[1]
     requests[1] = (query, (replace(reference, view=replace(reference.view, photograph=None)),))
@@ -319,7 +319,7 @@ def test_one_requests_fault_is_its_own() -> None:
 # Out of memory
 
 
-def test_what_does_not_fit_is_retried_when_tokens_are_freed() -> None:
+def test_out_of_memory_is_retried_after_tokens_are_released() -> None:
     runner = GreyRunner(failing_batches=1)
     backend = grey_backend(runner)
     outcomes = backend.reconstruct_many([Request(*grey_request(i, 50, 100)) for i in range(4)])
@@ -329,14 +329,14 @@ def test_what_does_not_fit_is_retried_when_tokens_are_freed() -> None:
     assert backend.cache.counters.device_bytes == 0
 
 
-def test_a_batch_that_does_not_fit_then_is_nobodys_alone() -> None:
+def test_a_batch_that_still_does_not_fit_raises() -> None:
     runner = GreyRunner(most_scenes=2)
     with pytest.raises(torch.OutOfMemoryError):
         grey_backend(runner).reconstruct_many([Request(*grey_request(i, 50, 100)) for i in range(4)])
     assert runner.batches == [4, 4]
 
 
-def test_the_queue_splits_it_counts_it_and_keeps_to_what_fits() -> None:
+def test_the_queue_splits_a_batch_that_does_not_fit() -> None:
     """Else each full batch would fail anew, and empty the cache each time."""
     runner = GreyRunner(most_scenes=2)
     backend, observer, gate = grey_backend(runner), CountingObserver(), threading.Event()
@@ -377,7 +377,7 @@ def test_the_queue_splits_it_counts_it_and_keeps_to_what_fits() -> None:
     asyncio.run(test())
 
 
-def test_a_query_alone_is_tried_again_once() -> None:
+def test_a_single_query_is_retried_once() -> None:
     runner = GreyRunner(most_scenes=0)
     with pytest.raises(torch.OutOfMemoryError):
         reconstruct_one(grey_backend(runner), *grey_request(1, 50))
@@ -386,7 +386,7 @@ def test_a_query_alone_is_tried_again_once() -> None:
 
 @pytest.mark.parametrize("failing", [1, 2])
 @pytest.mark.parametrize("queries", [1, 2])
-def test_encoding_is_tried_again_once(failing: int, queries: int) -> None:
+def test_encoding_is_retried_once(failing: int, queries: int) -> None:
     backend = grey_backend(GreyRunner(failing_encodings=failing))
     requests = [Request(*grey_request(i, 50)) for i in range(queries)]
     if failing == 1:
@@ -414,7 +414,7 @@ class LostDevice(RuntimeError):
     """As torch raises it when the context is poisoned."""
 
 
-def test_a_lost_device_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_of_the_device_are_passed_on_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether it is lost while one view is encoded or in the middle of the batch, the error comes out unchanged."""
     lost = LostDevice("CUDA error: an illegal memory access was encountered")
 
@@ -436,7 +436,7 @@ def test_a_lost_device_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
 # Not a number
 
 
-def test_a_broken_network_gives_a_rejection(caplog: pytest.LogCaptureFixture) -> None:
+def test_output_that_is_not_finite_is_rejected(caplog: pytest.LogCaptureFixture) -> None:
     network = small_network("pi3")
     cast(Pi3, network).camera_head.fc_t.bias.data[:] = float("nan")
     runner = NetworkRunner(network, "pi3", "sha", "cpu")
@@ -450,7 +450,7 @@ def test_a_broken_network_gives_a_rejection(caplog: pytest.LogCaptureFixture) ->
     assert kept.local_from_camera.isnan().any()
 
 
-def test_what_stays_on_the_device_is_the_same() -> None:
+def test_a_reconstruction_on_the_device_equals_the_fetched_one() -> None:
     runner, request = small_runner("pi3"), small_request(3)
     kept = reconstruct_one(NetworkReconstructor(runner, replace(OPTIONS, keep_on_device=True)), *request)
     assert isinstance(kept, DeviceReconstruction)
@@ -474,7 +474,7 @@ def normalized(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return normalize_poses(stacked)[0].numpy()
 
 
-def test_the_querys_stand_in_does_not_count_for_the_scale() -> None:
+def test_the_querys_placeholder_does_not_change_the_scale() -> None:
     """The references' poses are normalized as if they were alone; with a far stand-in they would not be."""
     poses = random_poses(5, offset_m=20.0)
     alone = normalized(np.stack([pose.matrix() for pose in poses]))
@@ -487,7 +487,7 @@ def test_the_querys_stand_in_does_not_count_for_the_scale() -> None:
         assert np.abs(shifted - alone).max() > 0.3
 
 
-def test_conditions_do_not_depend_on_where_the_world_begins() -> None:
+def test_conditions_do_not_depend_on_the_worlds_origin() -> None:
     np.testing.assert_allclose(
         condition_poses(random_poses(4, offset_m=5e6)), condition_poses(random_poses(4)), atol=1e-8
     )
@@ -498,7 +498,7 @@ def test_references_at_one_place_keep_their_scale() -> None:
     np.testing.assert_allclose(normalized(condition_poses([pose, pose])), [np.eye(4)] * 3, atol=1e-12)
 
 
-def test_pi3x_answers_as_if_the_query_were_left_out_of_the_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pi3x_normalizes_by_the_references_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """The plain way: the query stands far away, and the mean is taken without it. With it the answer is another."""
     query, references = small_request(3)
     runner = small_runner("pi3x")
@@ -541,14 +541,14 @@ def _official_intrinsics(view: View) -> NDArray[np.float64]:
     return np.diag([70 / camera.width_px, 56 / camera.height_px, 1.0]) @ k
 
 
-def test_a_single_posed_view_conditions_nothing() -> None:
+def test_a_single_posed_view_has_no_effect() -> None:
     query, (reference,) = small_request(1)
     backend = NetworkReconstructor(small_runner("pi3x"), OPTIONS)
     moved = replace(reference, world_from_camera=random_poses(1)[0])
     assert_same_bits(reconstruct_one(backend, query, [reference]), reconstruct_one(backend, query, [moved]))
 
 
-def test_pi3_is_told_no_poses() -> None:
+def test_pi3_gets_no_poses() -> None:
     query, references = small_request(3)
     backend = NetworkReconstructor(small_runner("pi3"), OPTIONS)
     moved = [replace(it, world_from_camera=pose) for it, pose in zip(references, random_poses(3), strict=True)]
@@ -568,7 +568,7 @@ def test_a_network_needs_its_weights(tmp_path: Path) -> None:
         make_reconstructor("pi3x", tmp_path)
 
 
-def test_a_network_from_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_network_is_loaded_from_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pi3, "Pi3", lambda: Pi3(SMALL["pi3"]))
     network = small_network("pi3", seed=4)
     save_file(network.state_dict(), tmp_path / "pi3.safetensors")
@@ -586,7 +586,7 @@ def test_a_network_from_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(("device", "reason"), [("cpu", "there is no CUDA device"), ("cuda", "weights fetch pi3`")])
-def test_auto_falls_back_and_says_why(
+def test_auto_falls_back_to_geometric_and_logs_the_reason(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, device: str, reason: str
 ) -> None:
     if device == "cpu":
@@ -598,7 +598,7 @@ def test_auto_falls_back_and_says_why(
     assert reason in record.message
 
 
-def test_geometric_runs_without_torch() -> None:
+def test_geometric_does_not_import_torch() -> None:
     program = (
         "import sys; sys.modules['torch'] = sys.modules['PIL'] = None\n"
         "from pathlib import Path\n"

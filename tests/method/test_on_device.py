@@ -43,18 +43,18 @@ from mapless_server.method.on_device.transfer import fetch, upload
         *(("noise", variant) for variant in VARIANTS),
     ],
 )
-def test_every_form_gives_what_the_host_gives(case: str, variant: str) -> None:
+def test_every_variant_equals_the_hosts_result(case: str, variant: str) -> None:
     options = (ScaleOptions(), *VARIANTS[variant])
     assert_same(CASES[case].on_device(*options), CASES[case].on_host(*options))
 
 
 @pytest.mark.parametrize("strategy", ScaleStrategy)
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_every_strategy_gives_what_the_host_gives(case: Case, strategy: ScaleStrategy) -> None:
+def test_every_scale_strategy_equals_the_hosts_result(case: Case, strategy: ScaleStrategy) -> None:
     assert_same(case.on_device(ScaleOptions(strategy)), case.on_host(ScaleOptions(strategy)))
 
 
-def test_the_cases_differ() -> None:
+def test_the_cases_use_different_stages_and_anchors() -> None:
     """Each stage of the scale decides, another anchor than the first; votes and searches find, tracks are cut short."""
     found = {name: case.on_host(ScaleOptions(), *VARIANTS["best"]) for name, case in CASES.items()}
     refined = {name: it for name, it in found.items() if isinstance(it, Refined)}
@@ -76,7 +76,7 @@ def test_the_cases_differ() -> None:
     assert len(kept) < len(before)
 
 
-def test_options_of_the_scale_are_heeded() -> None:
+def test_options_of_the_scale_equal_the_hosts_result() -> None:
     case = CASES["noise"]
     for scale in (
         ScaleOptions(max_deviation=0.0),
@@ -89,7 +89,7 @@ def test_options_of_the_scale_are_heeded() -> None:
 
 
 @pytest.mark.parametrize("variant", ["no_structure", "full", "best"])
-def test_nothing_to_see(variant: str) -> None:
+def test_without_matches_the_result_is_the_hosts(variant: str) -> None:
     """No matches at all, between references, of the query, or no keypoints in it."""
     case = CASES["noise"]
     none = np.empty((0, 2), np.int32)
@@ -114,13 +114,13 @@ def test_nothing_to_see(variant: str) -> None:
         assert_same(changed.on_device(scale, *VARIANTS[variant]), changed.on_host(scale, *VARIANTS[variant]))
 
 
-def test_a_search_in_pieces_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_in_chunks_equals_the_whole_search(monkeypatch: pytest.MonkeyPatch) -> None:
     case, scale = CASES["noise"], ScaleOptions()
     monkeypatch.setattr(device_match, "CHUNK_ELEMENTS", 5000)
     assert_same(case.on_device(scale, *VARIANTS["best"]), case.on_host(scale, *VARIANTS["best"]))
 
 
-def test_one_to_one_is_that_of_the_host() -> None:
+def test_one_to_one_equals_the_hosts() -> None:
     """Also among equal scores, of which votes have many."""
     random = random_for("one to one")
     for _ in range(50):
@@ -151,7 +151,7 @@ def arguments_of(case: Case, variant: str) -> tuple[DeviceReconstruction, Inputs
 
 
 @pytest.mark.parametrize("variant", ["coarse", "full", "best"])
-def test_computing_stays_on_the_device_and_reads_no_value(variant: str) -> None:
+def test_compute_stays_on_the_device_and_reads_no_value(variant: str) -> None:
     reconstruction, inputs, options = arguments_of(CASES["noise"], variant)
     meta = torch.device("meta")
     there = replace(
@@ -180,7 +180,7 @@ def test_computing_stays_on_the_device_and_reads_no_value(variant: str) -> None:
         lambda x: torch.unique(x),
     ],
 )
-def test_the_watch_would_see_it(wait: Callable[[Tensor], object]) -> None:
+def test_the_watch_fails_where_a_value_is_read(wait: Callable[[Tensor], object]) -> None:
     x = torch.ones(3, device="meta")
     with Watch("meta"), pytest.raises((RuntimeError, NotImplementedError, AssertionError)):
         wait(x)
@@ -193,7 +193,7 @@ def byte_count(record: Any) -> int:
     return inside + sum(value.nbytes for value in values if isinstance(value, np.ndarray))
 
 
-def test_what_travels() -> None:
+def test_transfers_are_small_and_keep_the_values() -> None:
     reconstruction, inputs, options = arguments_of(CASES["noise"], "best")
     uploaded = upload(inputs, torch.device("cpu"))
     outputs = compute(reconstruction, uploaded, CASES["noise"].scene.query.camera, options)
@@ -243,13 +243,13 @@ REJECTED["one reference"] = (without_references(CASES["noise"], 1), ScaleOptions
 
 @pytest.mark.parametrize("variant", ["coarse", "full", "best"])
 @pytest.mark.parametrize(("case", "scale"), REJECTED.values(), ids=REJECTED)
-def test_rejections_are_those_of_the_host(case: Case, scale: ScaleOptions, variant: str) -> None:
+def test_rejections_equal_the_hosts(case: Case, scale: ScaleOptions, variant: str) -> None:
     expected = case.on_host(scale, *VARIANTS[variant])
     assert isinstance(expected, Rejection)
     assert case.on_device(scale, *VARIANTS[variant]) == expected
 
 
-def test_predicted_at_one_place_is_rejected_like_on_the_host() -> None:
+def test_poses_predicted_at_one_place_are_rejected_as_on_host() -> None:
     case = CASES["noise"]
     poses = case.reconstruction.local_from_camera.clone()
     poses[:, :3, 3] = 0
@@ -291,7 +291,7 @@ BREAKS: dict[str, Change] = {
 
 @pytest.mark.parametrize("variant", ["coarse", "best"])
 @pytest.mark.parametrize("change", BREAKS.values(), ids=BREAKS)
-def test_what_is_not_finite_is_rejected_and_logged(
+def test_output_that_is_not_finite_is_rejected_and_logged(
     change: Change, variant: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     case = replace(CASES["dense maps"], reconstruction=broken(change))
@@ -304,7 +304,7 @@ def test_what_is_not_finite_is_rejected_and_logged(
 
 
 @pytest.mark.parametrize("name", ["a pose", "the query's pose", "all poses", "all maps", "depths behind", "everything"])
-def test_what_the_host_finds_broken_it_calls_the_same(name: str) -> None:
+def test_messages_about_broken_output_equal_the_hosts(name: str) -> None:
     case = replace(CASES["dense maps"], reconstruction=broken(BREAKS[name]))
     expected, found = case.on_host(ScaleOptions()), case.on_device(ScaleOptions())
     assert isinstance(expected, Rejection)
@@ -312,7 +312,7 @@ def test_what_the_host_finds_broken_it_calls_the_same(name: str) -> None:
     assert (found.reason, found.message.removeprefix("pi3: ")) == (expected.reason, expected.message)
 
 
-def test_unknown_pixels_are_not_broken() -> None:
+def test_pixels_of_zero_confidence_are_not_broken() -> None:
     """Where the confidence is 0, nothing was said."""
     assert CASES["noise"].reconstruction.point_maps.isnan().any()
     assert CASES["noise"].reconstruction.broken_pixels() == 0
@@ -321,7 +321,7 @@ def test_unknown_pixels_are_not_broken() -> None:
 # The reconstruction
 
 
-def test_fetched_it_is_the_same() -> None:
+def test_a_fetched_reconstruction_equals_the_original() -> None:
     scene = CASES["noise"].scene
     before: Reconstruction = FakeNetwork(scene).reconstruct(scene.query, scene.references)
     after = on_device(before).fetch()

@@ -71,7 +71,7 @@ def decay(case: object, outlier_share: float = 0.2, count: int = 60) -> Decay:
 
 @pytest.mark.parametrize("outlier_share", [0.0, 0.2, 0.4])
 @pytest.mark.parametrize("off", [0.05, 0.4])
-def test_minimum_is_scipys_cauchy(outlier_share: float, off: float) -> None:
+def test_minimum_equals_scipys_with_cauchy_loss(outlier_share: float, off: float) -> None:
     for seed in range(4):
         problem = decay((seed, outlier_share, off), outlier_share)
         start = TRUTH + random_for("start", seed).normal(0, off, 3)
@@ -84,7 +84,7 @@ def test_minimum_is_scipys_cauchy(outlier_share: float, off: float) -> None:
         assert problem.cost(found) < problem.cost(start)
 
 
-def test_each_minimum_is_scipys_soft_l1() -> None:
+def test_minimum_equals_scipys_with_soft_l1_loss() -> None:
     """Points of a plane by their distances to anchors; what is wrong is wrong for some of them."""
     random, count = random_for("each"), 20
     anchors, truth = random.normal(0, 5, (9, 3)), random.normal(0, 2, (count, 3))
@@ -130,7 +130,7 @@ def test_steps_that_raise_the_cost_are_damped() -> None:
     assert problem.linearized == 1 + int((factors < 1).sum()), "only where a step was taken"
 
 
-def test_rank_deficient_unknown_stays() -> None:
+def test_an_undetermined_unknown_does_not_move() -> None:
     """All at one time: a, b and c cannot be told apart, and the cost falls all the same."""
     problem = decay("flat", 0.0)
     problem.t = np.full_like(problem.t, 2.0)
@@ -142,13 +142,13 @@ def test_rank_deficient_unknown_stays() -> None:
     assert minimize(problem, start, CLOSELY)[1] == start[1]
 
 
-def test_non_finite_start_is_returned() -> None:
+def test_a_start_that_is_not_finite_is_returned() -> None:
     problem, start = decay("nan"), np.array([np.nan, 1.0, 1.0])
     assert minimize(problem, start, CLOSELY) is start
     assert problem.linearized == 0
 
 
-def test_undetermined_step_is_damped_until_given_up() -> None:
+def test_an_unsolvable_step_is_damped_until_the_limit() -> None:
     class Undetermined(Decay):
         def step(self, x: Array, equations: tuple[Array, Array], damping: float) -> Array | None:
             self.dampings.append(damping)
@@ -170,7 +170,7 @@ def test_it_stops_at_the_least_decrease_and_at_the_last_step() -> None:
     assert len(problem.dampings) < 10
 
 
-def test_singular_systems_have_no_step_but_a_shortest() -> None:
+def test_singular_systems_have_only_a_least_norm_step() -> None:
     singular, gradient = np.diag([2.0, 0.0]), np.array([2.0, 0.0])
     assert solve_step(singular, gradient) is None
     shortest = solve_step(singular, gradient, least_norm=True)
@@ -183,7 +183,7 @@ def test_singular_systems_have_no_step_but_a_shortest() -> None:
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
 @pytest.mark.parametrize("squared", [1e-6, 0.3, 10.0, 1e6])
-def test_losses_are_scipys_and_weights_their_derivatives(scale: float, squared: float) -> None:
+def test_losses_equal_scipys_and_weights_their_derivatives(scale: float, squared: float) -> None:
     s = np.array([squared])
     assert cauchy_cost(s, scale) == pytest.approx(scale**2 * math.log1p(squared / scale**2))
     theirs = least_squares(lambda x: [math.sqrt(squared) + 0 * x[0]], [0.0], loss="cauchy", f_scale=scale)
@@ -197,7 +197,7 @@ def test_losses_are_scipys_and_weights_their_derivatives(scale: float, squared: 
 @pytest.mark.parametrize(
     ("name", "value"), [("iterations", -1), ("min_decrease", 0.0), ("damping", -1.0), ("raised_by", 1.0)]
 )
-def test_misuse_is_named(name: str, value: float) -> None:
+def test_a_wrong_option_is_named(name: str, value: float) -> None:
     known: dict[str, Any] = {"iterations": 1, "min_decrease": 0.1, name: value}
     with pytest.raises(ValueError, match=rf"{name} must be .* is {value}"):
         MinimizeOptions(**known)

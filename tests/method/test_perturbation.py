@@ -50,7 +50,7 @@ def test_covariance_is_that_of_drawn_errors() -> None:
     assert np.linalg.norm(covariance - expected) < 0.1 * np.linalg.norm(expected)
 
 
-def test_motion_jacobian() -> None:
+def test_motion_jacobian_equals_finite_differences() -> None:
     for x in random_for("motion").normal(size=(5, 3)):
 
         def moved_point(motion: Array, x: Array = x) -> Array:
@@ -79,7 +79,7 @@ def test_covariance_from_projections_is_in_world_axes() -> None:
     "eigenvalues", [(1, 1, 1), (1, 0, 0), (1, 1, 0), (1, 0.1, 0.1), (1, 0.5, 0.01), (1, 1e-3, 1e-6), (4, 4, 0.1)]
 )
 @pytest.mark.parametrize("probability", [0.68, 0.95])
-def test_radius_against_sampling(eigenvalues: tuple[float, ...], probability: float) -> None:
+def test_radius_equals_the_quantile_of_samples(eigenvalues: tuple[float, ...], probability: float) -> None:
     rng = np.random.default_rng(7)
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     errors = np.sqrt((rng.normal(size=(200_000, 3)) ** 2 * eigenvalues).sum(axis=1))
@@ -96,5 +96,5 @@ def test_position_and_rotation_radii_are_separate() -> None:
     assert radii.position_68_m == pytest.approx(0.2 * 1.8724, rel=1e-3)  # the tail is heavier, the middle is not
 
 
-def test_no_uncertainty_is_no_radius() -> None:
+def test_zero_covariance_has_radius_zero() -> None:
     assert error_radii(np.zeros((3, 3)), [0.95]) == 0.0

@@ -49,7 +49,7 @@ def test_the_planted_pose_is_found(outlier_share: float, initial_off_m: float) -
         assert estimate.errors_px.shape == (200,)
 
 
-def test_without_noise_it_is_exact() -> None:
+def test_without_noise_the_pose_is_exact() -> None:
     estimate = solve(planted(random_for("exact"), 50, noise_px=0.0))
     assert_pose_close(estimate.world_from_camera, POSE, metres=1e-6, degrees=1e-5)
 
@@ -67,7 +67,7 @@ def test_the_same_matches_give_the_same_bits() -> None:
     assert first.covariance.tobytes() == second.covariance.tobytes()
 
 
-def test_on_a_synthetic_scene() -> None:
+def test_the_pose_of_a_synthetic_scene_is_found() -> None:
     scene = make_scene(random_for("scene"), SceneOptions(outlier_share=0.3))
     structure, matches = true_structure(scene)
     estimate = solve((scene.query, structure, matches), scene.world_from_query)
@@ -106,7 +106,7 @@ def test_the_pose_with_more_inliers_is_kept(
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 5])
-def test_few_matches_are_no_ground(count: int) -> None:
+def test_too_few_matches_are_rejected(count: int) -> None:
     rejection = rejection_of(planted(random_for("few", count), count, 0.0))
     assert rejection.reason is RejectionReason.TOO_FEW_MATCHES
     assert f"{count} 2D-3D matches" in rejection.message
@@ -117,7 +117,7 @@ def at_one_point(count: int) -> Problem:
     return problem_of(x_in_world, CAMERA.project(POSE.inverse().apply(x_in_world)))
 
 
-def test_when_no_pose_explains_anything_the_solver_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_pose_the_reason_is_pnp_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = planted(random_for("failed"), 50)
     behind = RigidTransform(POSE.rotation @ np.diag([-1.0, 1.0, -1.0]), POSE.translation)
     with_solver(monkeypatch, None)
@@ -134,7 +134,7 @@ def moved_in_world(pose: RigidTransform, error: Array) -> RigidTransform:
     return RigidTransform(rotation_from_vector(error[3:]) @ pose.rotation, pose.translation + error[:3])
 
 
-def test_errors_are_as_large_as_the_covariance_says() -> None:
+def test_errors_are_as_large_as_the_covariance() -> None:
     """Monte Carlo: errors in units of the covariance have the square sum of six standard normal numbers."""
     squares, stated, errors = [], [], []
     rng = random_for("monte carlo")
@@ -156,11 +156,11 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
 # The adapter
 
 
-def test_the_version_of_poselib_is_the_known_one() -> None:
+def test_the_version_of_poselib_is_the_tested_one() -> None:
     assert version("poselib") == "2.0.5"
 
 
-def test_poselib_knows_the_options_that_are_given_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poselib_has_the_options_that_are_passed(monkeypatch: pytest.MonkeyPatch) -> None:
     """It would take misspelt ones without a word."""
     given: list[dict[str, object]] = []
 
@@ -182,7 +182,7 @@ def test_poselibs_pose_is_camera_from_world_with_w_first() -> None:
     np.testing.assert_allclose(pose.t, camera_from_world.translation, atol=1e-12)
 
 
-def test_an_initial_pose_is_started_from() -> None:
+def test_ransac_starts_from_the_initial_pose() -> None:
     """So few iterations find a pose among 90 % wrong matches only when they begin at it."""
     view, structure, _ = planted(random_for("start"), 200, 0.5, outlier_share=0.9)
     options = PnpOptions(min_iterations=1, max_iterations=1)
@@ -192,12 +192,12 @@ def test_an_initial_pose_is_started_from() -> None:
     assert_pose_close(begun, POSE, metres=0.05, degrees=0.5)
 
 
-def test_no_finite_pose_is_none() -> None:
+def test_a_pose_that_is_not_finite_is_none() -> None:
     _, structure, _ = at_one_point(20)
     assert ransac(CAMERA, structure.x_in_world, np.full((20, 2), 300.0), None, PnpOptions()) is None
 
 
-def test_reprojection_errors() -> None:
+def test_reprojection_errors_are_nan_behind_the_camera() -> None:
     x_in_world = POSE.apply(np.array([[0.0, 0.0, 2.0], [0.1, 0.0, 2.0], [0.0, 0.0, -2.0]]))
     errors_px = reprojection_errors_px(CAMERA, POSE, x_in_world, np.array([[479.5, 359.5], [479.5, 359.5], [0, 0]]))
     np.testing.assert_allclose(errors_px, [0.0, 0.1 / 2 * 816.0, np.nan], atol=1e-9)

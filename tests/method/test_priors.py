@@ -131,7 +131,7 @@ def test_one_consistent_prior_of_10_000_is_called_a_conflict(freedom: int) -> No
     assert chdtrc(freedom, conflict_threshold(freedom)) == pytest.approx(1e-4, rel=1e-6)
 
 
-def test_a_certain_pose_makes_the_distance_the_prior_s_own() -> None:
+def test_for_a_certain_pose_the_distance_is_in_prior_sigmas() -> None:
     tilted = moved(POSE, np.array([0, 0, 0, math.radians(3), 0, 0]))
     (check,) = Priors(gravity=gravity_at(POSE)).check(tilted, 1e-12 * np.eye(6))
     assert check.mahalanobis == pytest.approx(3.0, rel=1e-3)
@@ -148,7 +148,7 @@ def test_gravity_of_the_wrong_sign_is_always_a_conflict(sigma_deg: float) -> Non
     assert not check.used
 
 
-def test_a_prior_that_adds_next_to_nothing_is_not_used() -> None:
+def test_a_prior_with_negligible_information_is_not_used() -> None:
     covariance = np.diag([0.01] * 3 + [math.radians(0.2)] * 3) ** 2
     for sigma_deg, used in ((1.0, False), (0.5, True)):
         (check,) = Priors(gravity=gravity_at(POSE, sigma_deg)).check(POSE, covariance)
@@ -171,7 +171,7 @@ def test_a_prior_weighs_no_more_than_a_conflict() -> None:
     assert Priors(gravity=far).penalty(POSE) == conflict_threshold(2)
 
 
-def test_chance_of_agreeing_is_the_share_of_directions_so_near() -> None:
+def test_chance_is_the_share_of_directions_within_the_angle() -> None:
     """Counted over random directions of the camera's down."""
     priors = Priors(gravity=gravity_at(POSE, 10.0))
     turns = random_for("chance").normal(size=(2000, 3))
@@ -206,7 +206,7 @@ def test_priors_shift_with_the_world() -> None:
     ]
 
 
-def test_nothing_known_is_false() -> None:
+def test_empty_priors_are_false() -> None:
     assert not NO_PRIORS
     assert Priors(gravity=gravity_at(POSE))
     assert NO_PRIORS.check(POSE, np.eye(6)) == ()
@@ -221,7 +221,7 @@ UNSYMMETRIC = UNSYMMETRIC + np.array([[0, 0.5, 0], [0, 0, 0], [0, 0, 0]])
     [np.eye(2), -np.eye(3), np.diag([1.0, 1.0, 0.0]), np.full((3, 3), 1.0), UNSYMMETRIC, np.full((3, 3), np.nan)],
     ids=["size", "negative", "semidefinite", "singular", "unsymmetric", "nan"],
 )
-def test_senseless_covariances_are_refused(covariance: Array) -> None:
+def test_wrong_covariances_are_refused(covariance: Array) -> None:
     with pytest.raises(ValueError, match="covariance"):
         PositionPrior(np.zeros(3), covariance)
 
@@ -240,12 +240,12 @@ def test_directions_have_unit_length(direction: Array) -> None:
 
 
 @pytest.mark.parametrize("sigma_deg", [0.0, -1.0, math.nan, 181.0])
-def test_senseless_sigmas_are_refused(sigma_deg: float) -> None:
+def test_wrong_sigmas_are_refused(sigma_deg: float) -> None:
     with pytest.raises(ValueError, match="sigma"):
         GravityPrior(DOWN, DOWN, sigma_deg)
 
 
-def test_a_prior_further_out_than_the_average_is_believed_less() -> None:
+def test_a_prior_farther_off_than_usual_has_less_weight() -> None:
     """By so much that it would be of average distance, had it said so itself."""
     pose_covariance = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1]) ** 2
     at = moved(POSE, np.array([0.3, 0, 0, 0, 0, 0]))

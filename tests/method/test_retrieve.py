@@ -48,15 +48,15 @@ def test_a_neighbour_needs_twice_the_matches() -> None:
     assert spread_choice([100, 90, 0, 46, 0], LINE, 2, options) == [0, 3]
 
 
-def test_standing_near_several_costs_no_more_than_near_one() -> None:
+def test_several_near_neighbours_cost_no_more_than_one() -> None:
     assert spread_choice([100, 90, 80, 30, 0], LINE, 4, RetrieveOptions(nearby_weight=0.5)) == [0, 1, 2, 3]
 
 
-def test_weight_one_looks_at_the_matches_alone() -> None:
+def test_weight_one_ranks_by_matches_alone() -> None:
     assert spread_choice([5, 4, 3, 2, 1], LINE, 5, RetrieveOptions(nearby_weight=1.0)) == [0, 1, 2, 3, 4]
 
 
-def test_weight_zero_spreads_at_any_price() -> None:
+def test_weight_zero_prefers_references_far_apart() -> None:
     assert spread_choice([500, 400, 300, 1, 0], LINE, 2, RetrieveOptions(nearby_weight=0.0)) == [0, 3]
     everyone = spread_choice([500, 400, 300, 1, 0], LINE, 5, RetrieveOptions(nearby_weight=0.0))
     assert sorted(everyone) == [0, 1, 2, 3, 4]
@@ -68,7 +68,7 @@ def test_ties_go_to_the_first() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 2, 5, 6, 1000])
-def test_never_more_than_there_are(count: int) -> None:
+def test_no_more_are_chosen_than_there_are(count: int) -> None:
     chosen = spread_choice([1, 2, 3, 4, 5], LINE, count)
     assert len(chosen) == len(set(chosen)) == min(count, 5)
     assert spread_choice([], np.empty((0, 3)), count) == []
@@ -80,7 +80,7 @@ def test_never_more_than_there_are(count: int) -> None:
     st.sampled_from([0.0, 0.25, 0.5, 1.0]),
     st.sampled_from([0.0, 0.3, 5.0]),
 )
-def test_the_choice_is_that_of_loops(
+def test_the_choice_equals_brute_force(
     candidates: list[tuple[int, int]], count: int, nearby_weight: float, apart_m: float
 ) -> None:
     counts = [matches for matches, _ in candidates]

@@ -33,7 +33,7 @@ def rejection(outcome: RigEstimate | Rejection) -> Rejection:
 
 
 @pytest.mark.parametrize("wrong_share", [0.0, 0.5])
-def test_a_rig_is_found_in_the_callers_world(wrong_share: float) -> None:
+def test_the_planted_rig_pose_is_found_in_the_callers_world(wrong_share: float) -> None:
     images = images_of(random_for("rig", wrong_share), CAMERAS, wrong_share=wrong_share)
     found = estimate(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
     assert_pose_close(found.world_from_rig, caller_pose(WORLD_FROM_RIG), metres=0.006, degrees=0.1)
@@ -41,7 +41,7 @@ def test_a_rig_is_found_in_the_callers_world(wrong_share: float) -> None:
     assert min(int(it.inliers.sum()) for it in found.matched) > 100
 
 
-def test_cameras_that_see_too_little_alone_help_one_another() -> None:
+def test_cameras_with_too_few_matches_alone_are_posed_together() -> None:
     """Five matches a camera, and nothing else is found near where it should be."""
     images = images_of(random_for("weak"), CAMERAS, UNGUIDED, keep=5)
     found = estimate(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
@@ -50,20 +50,20 @@ def test_cameras_that_see_too_little_alone_help_one_another() -> None:
         assert rejection(solve_rig([image], [camera], OPTIONS)).reason is not RejectionReason.LOW_TEXTURE
 
 
-def test_matches_are_found_that_no_image_had() -> None:
+def test_the_guided_search_adds_matches() -> None:
     images = images_of(random_for("guided"), CAMERAS, keep=8)
     found = estimate(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
     assert min(int(it.inliers.sum()) for it in found.matched) > 50
     assert all(it.matches.guided.sum() > 50 for it in found.matched)
 
 
-def test_a_camera_that_was_posed_wrongly_alone_is_outvoted() -> None:
+def test_one_wrong_own_pose_does_not_change_the_rigs() -> None:
     images = images_of(random_for("outvoted"), CAMERAS, alone=[True, False, False], own_noise_m=1.0)
     found = estimate(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
     assert_pose_close(found.world_from_rig, caller_pose(WORLD_FROM_RIG), metres=0.006, degrees=0.1)
 
 
-def test_a_blank_image_does_not_matter() -> None:
+def test_a_blank_image_has_no_effect() -> None:
     images = images_of(random_for("blank"), CAMERAS)
     whole = estimate(solve_rig([images[0], NOTHING, images[2]], RIG_FROM_CAMERA, OPTIONS))
     without = estimate(solve_rig([images[0], images[2]], [RIG_FROM_CAMERA[0], RIG_FROM_CAMERA[2]], OPTIONS))
@@ -71,13 +71,13 @@ def test_a_blank_image_does_not_matter() -> None:
     assert [it.source.image for it in whole.matched] == [0, 2]
 
 
-def test_one_camera_is_a_rig() -> None:
+def test_a_rig_of_one_camera_is_posed() -> None:
     images = images_of(random_for("one"), CAMERAS[:1])
     found = estimate(solve_rig(images, RIG_FROM_CAMERA[:1], OPTIONS))
     assert_pose_close(found.world_from_rig, caller_pose(WORLD_FROM_RIG), metres=0.02, degrees=0.3)
 
 
-def test_cameras_at_one_place_are_a_rig() -> None:
+def test_a_rig_of_cameras_at_one_place_is_posed() -> None:
     """A pinhole camera in two raster orientations, say: the rays meet, and gp3p has a special case."""
     poses = [
         CAMERAS[0],
@@ -96,7 +96,7 @@ def test_the_same_image_twice_is_no_second_measurement() -> None:
     np.testing.assert_allclose(sigma_twice, sigma_once, rtol=0.1)
 
 
-def test_wrong_extrinsics_leave_other_cameras_unsupported() -> None:
+def test_with_wrong_mounting_other_cameras_lose_their_inliers() -> None:
     """All cameras are said to be one: only one of them can be right."""
     images = images_of(random_for("wrong"), CAMERAS)
     outcome = solve_rig(images, [RIG_FROM_CAMERA[0]] * 3, OPTIONS)
@@ -113,20 +113,20 @@ def test_wrong_matches_alone_are_rejected() -> None:
     assert "images" in outcome.message or "rig" in outcome.message
 
 
-def test_without_matches_the_image_that_came_furthest_says_why() -> None:
+def test_without_matches_the_reason_is_the_furthest_images() -> None:
     outcome = rejection(solve_rig([NOTHING, NOTHING], RIG_FROM_CAMERA[:2], OPTIONS))
     assert outcome.reason is RejectionReason.LOW_TEXTURE
     assert "image 0: blank" in outcome.message
 
 
-def test_few_matches_are_too_few() -> None:
+def test_too_few_matches_are_rejected() -> None:
     outcome = rejection(solve_rig(images_of(random_for("few"), CAMERAS, keep=1), RIG_FROM_CAMERA, OPTIONS))
     assert outcome.reason is RejectionReason.TOO_FEW_MATCHES
     assert "3 2D-3D matches in 3 images" in outcome.message
 
 
 @pytest.mark.nightly
-def test_errors_are_as_large_as_the_covariance_says() -> None:
+def test_errors_are_as_large_as_the_covariance() -> None:
     """Whitened by it, errors of many rigs have a spread of about one over `error_inflation`, 2."""
     whitened = []
     for case in range(40):
@@ -151,6 +151,6 @@ def test_the_jacobian_is_that_of_the_cameras_motion() -> None:
     assert_jacobian(freedom.jacobian(1), motion, np.zeros(6))
 
 
-def test_a_perturbation_turns_about_the_targets_origin() -> None:
+def test_a_perturbation_rotates_about_the_targets_origin() -> None:
     moved = perturbed(RigidTransform(np.eye(3), np.array([1.0, 0, 0])), np.array([0, 0, 5.0, 0, 0, np.pi / 2]))
     np.testing.assert_allclose(moved.translation, [0, 1, 5], atol=1e-12)

@@ -87,7 +87,7 @@ RECONSTRUCTION = FakeNetwork(
 
 @pytest.mark.parametrize("strategy", list(ScaleStrategy))
 @pytest.mark.parametrize("dense", [False, True])
-def test_exact_without_noise(strategy: ScaleStrategy, dense: bool) -> None:
+def test_the_scale_is_exact_without_noise(strategy: ScaleStrategy, dense: bool) -> None:
     scene = make_scene(random_for("exact"), EXACT)
     network = FakeNetwork(scene, 1, FakeNetworkOptions(dense=dense))
     result = scale_of(scene, network, ScaleOptions(strategy=strategy))
@@ -103,7 +103,7 @@ def test_exact_without_noise(strategy: ScaleStrategy, dense: bool) -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_half_a_percent_with_noise_and_bad_depths(seed: int) -> None:
+def test_noise_and_bad_depths_cost_half_a_percent(seed: int) -> None:
     scene = make_scene(random_for("noise", seed))
     network = FakeNetwork(scene, seed, FakeNetworkOptions(depth_noise_m=0.01, bad_depth_share=0.3))
     result = scale_of(scene, network)
@@ -146,7 +146,7 @@ def test_the_initial_pose_is_as_good_as_the_predicted_poses(strategy: ScaleStrat
     shift=st.tuples(*[st.floats(-100, 100)] * 3),
     strategy=st.sampled_from(ScaleStrategy),
 )
-def test_the_local_frame_does_not_matter(
+def test_the_local_frame_does_not_change_the_result(
     scale: float, turn: tuple[float, ...], shift: tuple[float, ...], strategy: ScaleStrategy
 ) -> None:
     moved = Reconstruction(
@@ -166,7 +166,7 @@ def test_the_local_frame_does_not_matter(
     assert_same_pose(after.world_from_query, before.world_from_query, metres=1e-5, degrees=1e-5)
 
 
-def test_the_order_of_references_does_not_matter() -> None:
+def test_the_order_of_references_does_not_change_the_result() -> None:
     scene = make_scene(random_for("order"))
     confidences = (0.3, 0.4, 0.9, 0.5, 0.6, 0.7)
     network = FakeNetwork(scene, 5, FakeNetworkOptions(0.01, pose_noise_m=0.02, reference_confidences=confidences))
@@ -198,7 +198,7 @@ def test_the_anchor_has_the_highest_total_confidence() -> None:
         assert_same_pose(tied, scene.references[anchor].world_from_camera, metres=1e-9, degrees=1e-5)
 
 
-def test_few_matches_leave_it_to_the_trajectory() -> None:
+def test_with_few_matches_the_trajectory_gives_the_scale() -> None:
     scene = make_scene(random_for("few"), EXACT)
     network = FakeNetwork(scene, 7, FakeNetworkOptions(bad_depth_share=1.0))
     result = scale_of(scene, network, matches=true_matches(scene, per_pair=0))
@@ -209,7 +209,7 @@ def test_few_matches_leave_it_to_the_trajectory() -> None:
     assert enough.stage is ScaleStage.TRIANGULATION
 
 
-def test_a_wrong_first_stage_loses_by_its_deviation() -> None:
+def test_a_wrong_triangulated_scale_has_the_larger_deviation() -> None:
     scene = make_scene(random_for("biased"))
     network = FakeNetwork(scene, 8, replace(CONSISTENTLY_WRONG, pose_noise_m=0.01))
     alone = scale_of(scene, network, TRIANGULATION)
@@ -222,7 +222,7 @@ def test_a_wrong_first_stage_loses_by_its_deviation() -> None:
     assert both.metres_per_unit == pytest.approx(network.world_from_local.scale, rel=0.03)
 
 
-def test_a_wrong_second_stage_loses_by_its_deviation() -> None:
+def test_a_wrong_trajectory_scale_has_the_larger_deviation() -> None:
     # One camera predicted a metre away makes the trajectory too large for the scale that suits all others, S_traj.
     scene = make_scene(random_for("too large"), SceneOptions(reference_count=12, baseline_m=0.1))
     faults = FakeNetworkOptions(bad_depth_share=1.0, bad_depth_factors=(1.2, 1.2), bad_pose_count=1, bad_pose_m=1.0)
@@ -232,7 +232,7 @@ def test_a_wrong_second_stage_loses_by_its_deviation() -> None:
     assert (both.stage, both.metres_per_unit) == (ScaleStage.TRIANGULATION, first.metres_per_unit)
 
 
-def test_the_gate_adopts_stage_one_despite_a_better_second() -> None:
+def test_a_good_triangulated_scale_precedes_a_better_trajectory() -> None:
     scene = make_scene(random_for("gate"))
     network = FakeNetwork(scene, 10, FakeNetworkOptions(bad_depth_share=1.0, bad_depth_factors=(1.03, 1.03)))
     both = scale_of(scene, network)
@@ -244,7 +244,7 @@ def test_the_gate_adopts_stage_one_despite_a_better_second() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_bad_poses_do_not_move_the_second_stage(seed: int) -> None:
+def test_bad_poses_do_not_change_the_trajectory_scale(seed: int) -> None:
     scene = make_scene(random_for("bad poses", seed), SceneOptions(point_count=200, reference_count=10))
     network = FakeNetwork(scene, seed, FakeNetworkOptions(pose_noise_m=0.005, bad_pose_count=2, bad_pose_m=0.3))
     result = scale_of(scene, network, TRAJECTORY)
@@ -273,7 +273,7 @@ def test_distant_points_are_not_triangulated() -> None:
     assert scale_of(scene, network, replace(options, min_parallax_deg=0.0)).stage is ScaleStage.TRIANGULATION
 
 
-def test_forty_references() -> None:
+def test_forty_references_have_the_planted_scale() -> None:
     options = SceneOptions(point_count=120, reference_count=40, baseline_m=0.15, distractor_count=20)
     scene = make_scene(random_for("forty"), options)
     network = FakeNetwork(scene, 13, FakeNetworkOptions(0.01, pose_noise_m=0.02, map_width_px=96, map_height_px=72))
@@ -287,7 +287,7 @@ def test_forty_references() -> None:
 # Rejections.
 
 
-def test_one_reference_is_not_enough() -> None:
+def test_one_reference_is_rejected() -> None:
     for count in (0, 1):
         scene = make_scene(random_for("one"), SceneOptions(point_count=50))
         scene = replace(scene, references=scene.references[:count])
@@ -297,7 +297,7 @@ def test_one_reference_is_not_enough() -> None:
 
 @pytest.mark.parametrize("strategy", list(ScaleStrategy))
 @pytest.mark.parametrize("pose_noise_m", [0.0, 0.1])
-def test_references_at_one_place(strategy: ScaleStrategy, pose_noise_m: float) -> None:
+def test_references_at_one_place_are_rejected(strategy: ScaleStrategy, pose_noise_m: float) -> None:
     scene = make_scene(random_for("one place"), SceneOptions(point_count=50, baseline_m=1e-3))
     network = FakeNetwork(scene, 14, FakeNetworkOptions(pose_noise_m=pose_noise_m))
     options = ScaleOptions(strategy=strategy)
@@ -306,7 +306,7 @@ def test_references_at_one_place(strategy: ScaleStrategy, pose_noise_m: float) -
     assert "0.0017 m" in rejection.message
 
 
-def test_references_too_close_for_the_depth_of_the_scene() -> None:
+def test_references_too_close_for_the_scenes_depth_are_rejected() -> None:
     distant = SceneOptions(point_count=50, box_m=(100.0, 60.0, 50.0), distance_m=150.0, reference_count=3)
     scene = make_scene(random_for("too close"), replace(distant, baseline_m=0.2))
     rejection = rejection_of(FakeNetwork(scene).reconstruct(scene.query, scene.references), scene)
@@ -350,13 +350,13 @@ def test_misuse_is_refused() -> None:
 # The equations.
 
 
-def test_trajectory_radius_of_a_square() -> None:
+def test_trajectory_radius_of_a_square_is_its_half_diagonal() -> None:
     square = np.array([[1.0, 1, 7], [1, -1, 7], [-1, 1, 7], [-1, -1, 7]])
     assert trajectory_radius(square) == pytest.approx(np.sqrt(2))
     assert trajectory_radius(3 * square + 5) == pytest.approx(3 * np.sqrt(2))
 
 
-def test_trajectory_scale_against_a_plain_twin() -> None:
+def test_trajectory_scale_equals_a_plain_implementation() -> None:
     random = random_for("twin")
     for _ in range(20):
         known = random.normal(size=(7, 3))
@@ -372,19 +372,19 @@ def test_trajectory_scale_against_a_plain_twin() -> None:
         assert trajectory_scale(predicted, known, pairs_of(7, 32), 0.10) == pytest.approx(best[2])
 
 
-def test_pairs_predicted_at_one_place_propose_nothing() -> None:
+def test_pairs_predicted_at_one_place_give_no_scale() -> None:
     known = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     predicted = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0]])
     assert trajectory_scale(predicted, known, pairs_of(3, 32), 0.10) in (1.0, 2.0)
     assert np.isnan(trajectory_scale(np.zeros((3, 3)), known, pairs_of(3, 32), 0.10))
 
 
-def test_pairs_are_all_of_evenly_chosen_cameras() -> None:
+def test_trajectory_pairs_are_those_of_evenly_chosen_cameras() -> None:
     assert [tuple(pair) for pair in pairs_of(5, 32)] == list(combinations(range(5), 2))
     assert [tuple(pair) for pair in pairs_of(9, 3)] == [(0, 4), (0, 8), (4, 8)]
 
 
-def test_ray_depths_against_a_plain_twin() -> None:
+def test_ray_depths_equal_a_plain_implementation() -> None:
     random = random_for("rays")
     centres, rays = random.normal(size=(50, 2, 3)), random.normal(size=(50, 2, 3))
     depth_m, parallax_deg = triangulate_depths(centres, rays)

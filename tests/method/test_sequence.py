@@ -31,7 +31,7 @@ def rejection(outcome: SequenceEstimate | Rejection) -> Rejection:
 
 @pytest.mark.parametrize("alone", [True, False], ids=["posed alone", "not posed alone"])
 @pytest.mark.parametrize(("scale", "is_free"), [(1.0, False), (0.37, True)])
-def test_every_frame_is_found_in_the_callers_world(alone: bool, scale: float, is_free: bool) -> None:
+def test_every_planted_frame_is_found_in_the_callers_world(alone: bool, scale: float, is_free: bool) -> None:
     """Half of the matches are wrong, 2 % of the way is lost, and the unit may be unknown."""
     random = random_for("frames", alone, scale)
     truth = walk(random, 6)
@@ -71,7 +71,7 @@ def test_drift_makes_the_last_pose_no_worse_than_alone(share: float, deg: float)
     assert np.median(together) <= 1.1 * np.median(alone)
 
 
-def test_frames_that_say_nothing_are_carried_on_by_the_device() -> None:
+def test_frames_without_matches_are_posed_by_tracking() -> None:
     random = random_for("blind")
     truth = walk(random, 6)
     images = images_of(random, truth, alone=[True] * 4 + [False] * 2)
@@ -83,7 +83,7 @@ def test_frames_that_say_nothing_are_carried_on_by_the_device() -> None:
     assert [it.source.image for it in found.matched] == [0, 1, 2, 3]
 
 
-def test_a_jump_of_the_device_is_not_believed() -> None:
+def test_a_jump_of_the_tracking_gets_little_weight() -> None:
     random = random_for("jump")
     truth = walk(random, 6)
     session = drifting(random, truth, 0.01)
@@ -97,7 +97,7 @@ def test_a_jump_of_the_device_is_not_believed() -> None:
     assert weights[2] < 0.1 < np.delete(weights, 2).min()
 
 
-def test_a_frame_that_was_posed_wrongly_alone_is_outvoted() -> None:
+def test_one_wrong_own_pose_does_not_change_the_sequence() -> None:
     random = random_for("outvoted")
     truth = walk(random, 5)
     images = images_of(random, truth, alone=True, own_noise_m=0.005)
@@ -106,7 +106,7 @@ def test_a_frame_that_was_posed_wrongly_alone_is_outvoted() -> None:
     assert error_m(found.world_from_camera[-1], truth[-1]) < 0.02
 
 
-def test_a_session_that_stands_still_has_no_scale() -> None:
+def test_a_session_without_motion_has_no_scale() -> None:
     random = random_for("still")
     pose = walk(random, 3)[1]
     images = images_of(random, [pose] * 3, alone=True)
@@ -122,7 +122,7 @@ def test_a_session_that_stands_still_has_no_scale() -> None:
     )
 
 
-def test_a_session_that_hardly_moves_has_no_scale_either() -> None:
+def test_a_session_with_little_motion_has_no_scale() -> None:
     """A millimetre each, which the tracking's own noise exceeds; it turns, as a person who looks around does."""
     random = random_for("turning")
     truth = [look_at([0.001 * i, 0, -4.0], [0.2 * i - 0.3, 0.1, 0]) for i in range(4)]
@@ -131,7 +131,7 @@ def test_a_session_that_hardly_moves_has_no_scale_either() -> None:
     assert outcome.reason is RejectionReason.SCALE_UNRELIABLE
 
 
-def test_a_straight_walk_is_no_special_case() -> None:
+def test_a_straight_walk_is_posed() -> None:
     """Camera centres on one line, all looking the same way."""
     random = random_for("straight")
     truth = [RigidTransform(np.eye(3), np.array([0.2 * i - 0.5, 0, -4.0])) for i in range(5)]
@@ -141,7 +141,7 @@ def test_a_straight_walk_is_no_special_case() -> None:
     assert error_m(found.world_from_camera[-1], truth[-1]) < 0.008
 
 
-def test_the_same_frame_sent_again_and_again() -> None:
+def test_repeated_frames_add_no_information() -> None:
     random = random_for("same")
     truth = walk(random, 3)
     images = images_of(random, truth, alone=True)
@@ -187,7 +187,7 @@ def moved_freedom(scale_is_free: bool, moved: float) -> SequenceFreedom:
 
 
 @pytest.mark.parametrize("scale_is_free", [False, True])
-def test_residuals_are_differentiated(scale_is_free: bool) -> None:
+def test_jacobian_of_residuals_equals_finite_differences(scale_is_free: bool) -> None:
     freedom = moved_freedom(scale_is_free, 1e-4)
     for i in range(2):
 
@@ -208,7 +208,7 @@ def test_the_gradient_is_half_that_of_the_cost(scale_is_free: bool) -> None:
     assert_jacobian(2 * gradient, cost, np.zeros(freedom.size), tolerance=5e-3)
 
 
-def test_a_session_that_is_right_costs_nothing() -> None:
+def test_a_session_without_drift_has_cost_zero() -> None:
     random = random_for("right")
     truth = walk(random, 4)
     session = rescaled(drifting(random, truth, 0.0), 4.0)
@@ -217,7 +217,7 @@ def test_a_session_that_is_right_costs_nothing() -> None:
     np.testing.assert_allclose(freedom.weights(), 1)
 
 
-def test_drift_grows_with_the_way_and_the_turn() -> None:
+def test_drift_grows_with_distance_and_angle() -> None:
     options = DriftOptions(share=0.01, floor_m=0.002, deg_per_m=0.3, turn_share=0.01, floor_deg=0.05)
     step = RigidTransform(rotation_from_vector([0, np.radians(20), 0]), np.array([0, 3.0, 4.0]))
     sigma = options.sigma(step)
@@ -225,7 +225,7 @@ def test_drift_grows_with_the_way_and_the_turn() -> None:
     np.testing.assert_allclose(np.degrees(sigma[3:]), 0.05 + 1.5 + 0.2)
 
 
-def test_a_session_is_put_where_its_frame_is() -> None:
+def test_a_sessions_pose_maps_its_frame_to_the_frames_pose() -> None:
     random = random_for("session")
     pose, frame = walk(random, 2)
     there = world_from_session_at(pose, frame, 0.37)
@@ -234,6 +234,6 @@ def test_a_session_is_put_where_its_frame_is() -> None:
 
 
 @pytest.mark.parametrize("change", [{"share": 0.0}, {"floor_m": -1.0}, {"loss_scale": 0.0}, {"deg_per_m": -0.1}])
-def test_senseless_drift_is_refused(change: dict[str, float]) -> None:
+def test_drift_options_outside_their_bounds_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="must be"):
         DriftOptions(**change)

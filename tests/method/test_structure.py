@@ -93,7 +93,7 @@ def test_residuals_are_projections_minus_observations() -> None:
         np.testing.assert_allclose(residuals[o], expected, atol=1e-9)
 
 
-def test_jacobians() -> None:
+def test_jacobians_equal_finite_differences() -> None:
     _, observations, truth = planted("jacobians", SceneOptions(point_count=20), KeypointNoise(0.4, 0.05))
     _, jacobians = observations.linearized(truth)
     for o in range(0, len(observations.point), 7):
@@ -110,7 +110,7 @@ def test_jacobians() -> None:
 # Small systems
 
 
-def test_solutions_are_those_of_lapack() -> None:
+def test_solutions_equal_lapacks() -> None:
     random = random_for("systems")
     roots = random.standard_normal((200, 3, 3)) * 10.0 ** random.uniform(-3, 3, (200, 1, 1))
     matrices, vectors = roots @ np.swapaxes(roots, 1, 2), random.standard_normal((200, 3))
@@ -139,7 +139,7 @@ def test_triangulation_is_exact_without_noise() -> None:
     assert np.linalg.norm(triangulate(observations) - truth, axis=1).max() < 1e-5
 
 
-def test_parallel_rays_do_not_meet() -> None:
+def test_parallel_rays_have_no_point() -> None:
     poses = [RigidTransform(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 0.5)]
     middle = np.array([[479.5, 359.5]], np.float32)
     view = View(CAMERA, Features(middle, np.ones((1, 1), np.float32), np.ones(1, np.float32)))
@@ -150,7 +150,7 @@ def test_parallel_rays_do_not_meet() -> None:
     assert np.isnan(adjust_points(observations, triangulate(observations), 1.0, 3)).all()
 
 
-def test_the_better_start_wins_point_by_point() -> None:
+def test_each_point_starts_from_the_better_of_two_starts() -> None:
     _, observations, truth = planted("start", SceneOptions(point_count=40))
     bad = truth + np.array([0.0, 0.0, 0.5])
     first, second = truth.copy(), bad.copy()
@@ -165,7 +165,7 @@ def test_the_better_start_wins_point_by_point() -> None:
 
 
 @pytest.mark.parametrize("outlier_share", [0.0, 0.15])
-def test_points_are_those_of_scipys_soft_l1(outlier_share: float) -> None:
+def test_points_equal_scipys_with_soft_l1_loss(outlier_share: float) -> None:
     random = random_for("scipy", outlier_share)
     options = SceneOptions(point_count=25, reference_count=5)
     _, observations, truth = planted("scipy", options, KeypointNoise(0.7, 0.05))
@@ -204,7 +204,7 @@ def test_no_cost_ever_increases(displacement_m: float, iterations: int) -> None:
     assert after[valid].sum() < before[valid].sum()
 
 
-def test_points_return_after_noise() -> None:
+def test_points_converge_after_noise() -> None:
     random = random_for("return")
     _, observations, truth = planted("return", SceneOptions(noise_px=0.0))
     start = truth + random.normal(0, 0.2, truth.shape)
@@ -212,7 +212,7 @@ def test_points_return_after_noise() -> None:
     assert np.linalg.norm(returned - truth, axis=1).max() < 1e-4
 
 
-def test_points_return_in_spite_of_a_wrong_observation() -> None:
+def test_points_converge_despite_a_wrong_observation() -> None:
     random = random_for("robust")
     _, observations, truth = planted("robust", SceneOptions(noise_px=0.0, seen_share=1.0, reference_count=7))
     full = np.bincount(observations.point) == 7
@@ -223,7 +223,7 @@ def test_points_return_in_spite_of_a_wrong_observation() -> None:
     assert np.median(np.linalg.norm(adjusted - truth, axis=1)[full]) < 2e-3
 
 
-def test_nan_stays_nan_and_hurts_no_other() -> None:
+def test_nan_points_do_not_change_other_points() -> None:
     _, observations, truth = planted("nan", SceneOptions(point_count=50))
     start = truth + 0.05
     start[7] = np.nan
@@ -250,7 +250,7 @@ def test_a_planted_level_of_noise_is_found(level_px: float, reference_count: int
     assert estimate_noise(observations, points, guess).level_px == pytest.approx(level_px, rel=tolerance)
 
 
-def test_the_part_of_size_is_taken_off() -> None:
+def test_the_noise_of_keypoint_size_is_subtracted() -> None:
     # Keypoints of 8 px with a slope of 0.05 have 0.4 px of their own: 0.3 of 0.5 px is left for the level.
     guess = KeypointNoise(1.0, 0.05)
     _, observations, truth = planted("slope", SceneOptions(noise_px=0.5, reference_count=8), guess)
@@ -260,7 +260,7 @@ def test_the_part_of_size_is_taken_off() -> None:
     assert noise.slope == 0.05
 
 
-def test_no_noise_and_few_points_give_the_least_level() -> None:
+def test_without_noise_or_points_the_level_is_the_least() -> None:
     guess = KeypointNoise(0.4, 0.01)
     _, observations, truth = planted("noiseless", SceneOptions(noise_px=0.0), guess)
     assert estimate_noise(observations, truth, guess).level_px == pytest.approx(MIN_NOISE_LEVEL_PX)
@@ -283,7 +283,7 @@ def test_points_with_little_parallax_are_not_trusted() -> None:
     assert 0 < trusted.sum() < len(trusted)
 
 
-def test_points_that_do_not_fit_are_not_trusted() -> None:
+def test_points_with_large_residuals_are_not_trusted() -> None:
     _, observations, truth = planted("unfit", SceneOptions(noise_px=0.0, point_count=60))
     wrong = np.zeros(len(observations.point), bool)
     wrong[observations.tracks.starts[[3, 9]]] = True
@@ -337,7 +337,7 @@ def test_predictions_are_scaled_depths_of_the_first_keypoint() -> None:
     assert np.quantile(error_m, 0.9) < 1e-3
 
 
-def test_without_optimization_points_stay_as_predicted() -> None:
+def test_without_optimization_points_are_as_predicted() -> None:
     scene = make_scene(random_for("stay"), SceneOptions(point_count=200))
     options = replace(PAPER_STRUCTURE, optimize=False)
     structure, shown = build(scene, options, FakeNetworkOptions(depth_noise_m=0.1))
@@ -353,7 +353,7 @@ def test_without_optimization_points_stay_as_predicted() -> None:
 
 
 @pytest.mark.parametrize("options", [StructureOptions(), PAPER_STRUCTURE], ids=["ours", "paper"])
-def test_the_stage_finds_the_points(options: StructureOptions) -> None:
+def test_the_planted_points_are_found(options: StructureOptions) -> None:
     scene = make_scene(random_for("stage"), SceneOptions(noise_px=0.0))
     structure, shown = build(scene, options, FakeNetworkOptions(depth_noise_m=0.05, bad_depth_share=0.05))
     assert len(shown) > 0.9 * len(true_tracks(scene)[1]) * (1 if options.all_references else 0.8)
@@ -362,7 +362,7 @@ def test_the_stage_finds_the_points(options: StructureOptions) -> None:
     assert np.isfinite(structure.x_in_world).all()
 
 
-def test_paper_tracks_begin_in_one_view_and_ours_are_better() -> None:
+def test_tracks_over_all_references_beat_the_papers() -> None:
     scene = make_scene(random_for("better"), SceneOptions(noise_px=1.0, reference_count=8))
     paper, _ = build(scene, PAPER_STRUCTURE)
     assert (paper.tracks.view[paper.tracks.starts] == 0).all()
@@ -390,7 +390,7 @@ def test_paper_tracks_begin_in_one_view_and_ours_are_better() -> None:
     assert errors_m[1] < 0.9 * errors_m[0]
 
 
-def test_optimization_pays() -> None:
+def test_optimization_makes_points_more_accurate() -> None:
     scene = make_scene(random_for("pays"), SceneOptions())
     still = median_error_m(scene, replace(PAPER_STRUCTURE, optimize=False))
     assert median_error_m(scene, PAPER_STRUCTURE) < 0.5 * still
@@ -412,7 +412,7 @@ def test_wrong_observations_are_pruned_from_good_tracks() -> None:
     assert np.median(np.linalg.norm(structure.x_in_world - scene.x_in_world[shown], axis=1)) < 0.01
 
 
-def test_cameras_are_not_touched() -> None:
+def test_reference_poses_are_not_changed() -> None:
     scene = make_scene(random_for("untouched"))
     before = [(r.world_from_camera.matrix().copy(), r.view.features.keypoints.copy()) for r in scene.references]
     build(scene, StructureOptions())

@@ -58,14 +58,14 @@ def held(cache: TokenCache, count: int) -> list[int]:
     ],
     ids=lambda change: next(iter(change)),
 )
-def test_whatever_tokens_depend_on_tells_them_apart(change: dict[str, object]) -> None:
+def test_the_key_differs_in_everything_that_tokens_depend_on(change: dict[str, object]) -> None:
     cache = cache_of(4, 0)
     cache.put(KEY, tokens(1))
     assert cache.get(replace(KEY, **change)) is None  # type: ignore[arg-type]
     assert_holds(cache, replace(KEY), tokens(1))
 
 
-def test_the_least_recently_used_goes_to_the_host_and_then_away() -> None:
+def test_the_least_recently_used_moves_to_the_host_then_out() -> None:
     cache = cache_of(2, 2)
     for i in range(3):
         cache.put(key(i), tokens(i))  # 0 goes to the host
@@ -94,7 +94,7 @@ def test_nothing_is_copied_to_the_host_twice() -> None:
 @pytest.mark.parametrize(
     ("device_count", "host_count", "kept"), [(0, 0, 0), (3, 0, 3), (0, 3, 3), (2, 3, 5), (9, 9, 8)]
 )
-def test_the_last_views_are_held_within_the_limit(device_count: int, host_count: int, kept: int) -> None:
+def test_the_most_recent_views_are_kept_within_the_limit(device_count: int, host_count: int, kept: int) -> None:
     for i in range(8):
         cache = cache_of(device_count, host_count)
         for j in range(8):
@@ -108,7 +108,7 @@ def test_the_last_views_are_held_within_the_limit(device_count: int, host_count:
             assert_holds(cache, key(i), tokens(i))
 
 
-def test_the_batch_that_tokens_come_from_is_not_kept() -> None:
+def test_a_view_does_not_keep_its_batch_in_memory() -> None:
     batch = torch.arange(600.0).reshape(100, 3, 2)
     cache = cache_of(4, 0)
     cache.put(key(7), batch[7])
@@ -119,7 +119,7 @@ def test_the_batch_that_tokens_come_from_is_not_kept() -> None:
     assert torch.equal(found, torch.arange(42.0, 48.0).reshape(3, 2))
 
 
-def test_what_leaves_the_device_stays_at_hand() -> None:
+def test_tokens_released_from_the_device_stay_on_the_host() -> None:
     cache = cache_of(4, 2)
     for i in range(4):
         cache.put(key(i), tokens(i))
@@ -129,7 +129,7 @@ def test_what_leaves_the_device_stays_at_hand() -> None:
     assert cache.counters.host_hits == 2
 
 
-def test_putting_again_replaces() -> None:
+def test_storing_a_key_again_replaces_its_tokens() -> None:
     cache = cache_of(2, 0)
     cache.put(key(0), tokens(0))
     cache.put(key(0), tokens(5))
@@ -137,7 +137,7 @@ def test_putting_again_replaces() -> None:
     assert cache.counters.device_bytes == SIZE
 
 
-def test_threads_get_their_own() -> None:
+def test_threads_get_the_tokens_of_their_keys() -> None:
     cache = cache_of(5, 5)
     wrong: list[int] = []
 

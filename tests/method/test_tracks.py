@@ -103,14 +103,14 @@ def test_a_conflict_keeps_the_better_connected_keypoint() -> None:
     assert as_sets(tracks) == {frozenset({(0, 1), (1, 0), (2, 0), (3, 0)})}
 
 
-def test_a_track_that_a_conflict_leaves_alone_is_dropped() -> None:
+def test_a_track_left_with_one_keypoint_is_dropped() -> None:
     # One keypoint of view 1 cannot be matched twice with view 0, but let a caller try.
     tracks = build_tracks(pairs_of({(0, 1): [(0, 0), (1, 0)]}), [2, 1])
     assert_is_well_formed(tracks)
     assert tracks.point_count == 1
 
 
-def test_nothing_matched_gives_no_tracks() -> None:
+def test_without_matches_there_are_no_tracks() -> None:
     matched_views: list[list[tuple[int, int]]] = [[], [(0, 1)], [(0, 1), (1, 2)]]
     for views in matched_views:
         tracks = build_tracks(pairs_of({pair: [] for pair in views}), [3, 0, 2])
@@ -121,7 +121,7 @@ def test_nothing_matched_gives_no_tracks() -> None:
 
 
 @given(random_pairs(), st.sampled_from([None, 0, 1]))
-def test_tracks_are_those_of_union_find(drawn: tuple[Pairs, list[int]], anchor: int | None) -> None:
+def test_tracks_equal_those_of_a_union_find(drawn: tuple[Pairs, list[int]], anchor: int | None) -> None:
     pairs, counts = drawn
     tracks = build_tracks(pairs, counts, anchor)
     assert_is_well_formed(tracks)
@@ -136,7 +136,7 @@ def test_tracks_are_those_of_union_find(drawn: tuple[Pairs, list[int]], anchor: 
 
 
 @given(random_pairs(), st.randoms(use_true_random=False))
-def test_the_order_of_pairs_does_not_matter(drawn: tuple[Pairs, list[int]], shuffler: object) -> None:
+def test_the_order_of_pairs_does_not_change_the_tracks(drawn: tuple[Pairs, list[int]], shuffler: object) -> None:
     pairs, counts = drawn
     keys = sorted(pairs, key=lambda _: shuffler.random())  # type: ignore[attr-defined]
     shuffled = {key: pairs[key][::-1] for key in keys}
@@ -146,7 +146,7 @@ def test_the_order_of_pairs_does_not_matter(drawn: tuple[Pairs, list[int]], shuf
 
 
 @given(random_pairs())
-def test_from_an_anchor_every_track_begins_there(drawn: tuple[Pairs, list[int]]) -> None:
+def test_tracks_from_an_anchor_begin_in_it(drawn: tuple[Pairs, list[int]]) -> None:
     pairs, counts = drawn
     tracks = build_tracks(pairs, counts, anchor=0)
     assert (tracks.view[tracks.starts] == 0).all()
@@ -167,7 +167,7 @@ def test_select_keeps_the_chosen_and_renumbers(drawn: tuple[Pairs, list[int]], d
 
 
 @given(random_pairs(), st.data())
-def test_prune_drops_observations_and_what_is_left_alone(drawn: tuple[Pairs, list[int]], data: st.DataObject) -> None:
+def test_prune_drops_observations_and_single_leftovers(drawn: tuple[Pairs, list[int]], data: st.DataObject) -> None:
     tracks = build_tracks(*drawn)
     good = np.array([data.draw(st.booleans()) for _ in tracks.point], bool)
     pruned, rows, kept = tracks.prune(good)

@@ -58,13 +58,13 @@ def adjusted_poses(
 
 
 @pytest.mark.parametrize("references", [4, 8])
-def test_noise_of_pixels(references: int) -> None:
+def test_covariance_of_pixel_noise_equals_sampling(references: int) -> None:
     position, rotation = adjusted_poses(references, 0.0, PLAIN)
     assert position == pytest.approx(1, abs=0.35)
     assert rotation == pytest.approx(1, abs=0.35)
 
 
-def test_thinned_matches_tell_much_the_same() -> None:
+def test_thinned_matches_have_a_similar_covariance() -> None:
     scene = make_scene(random_for("thinned"), replace(FEW, point_count=400, reference_count=6))
     structure, matches, estimate = stages(scene, scene.references)
 
@@ -78,14 +78,14 @@ def test_thinned_matches_tell_much_the_same() -> None:
 
 
 @pytest.mark.parametrize("references", [5, 10])
-def test_noise_of_reference_poses(references: int) -> None:
+def test_covariance_of_reference_noise_equals_sampling(references: int) -> None:
     """Twice the pixels' noise. Errors that the references share only in part are told within a third."""
     position, rotation = adjusted_poses(references, 1.0, PLAIN)
     assert 0.75 < position < 1.4
     assert 0.75 < rotation < 1.4
 
 
-def test_the_photographs_level_claims_more_than_planted_noise() -> None:
+def test_the_photographs_level_exceeds_the_planted_noise() -> None:
     position, rotation = adjusted_poses(8, 1.0, UncertaintyOptions(), seeds=15)
     assert 0.1 < position < 0.8
     assert 0.1 < rotation < 0.8
@@ -98,7 +98,7 @@ def support_of(
     return Support(scene.query, scene.references, structure, matches, estimate, np.zeros(3))
 
 
-def test_noise_of_the_scale() -> None:
+def test_covariance_of_scale_noise_equals_sampling() -> None:
     """Predicted points, all too far or too near by 2 % as seen from the references' centroid: the query goes along."""
     random, errors, covariances = random_for("scale"), [], []
     for seed in range(20):
@@ -126,7 +126,7 @@ def test_scale_moves_the_camera_along_the_arm_only() -> None:
     np.testing.assert_array_equal(covariance[:, 3:], 0)
 
 
-def test_an_initial_pose_is_off_by_what_the_matches_say() -> None:
+def test_an_initial_poses_covariance_covers_its_errors() -> None:
     """5 cm off its optimum: that far lies within what is stated, and the direction is known."""
     scene = make_scene(random_for("initial"), FEW)
     structure, matches, estimate = stages(scene, scene.references)
@@ -142,7 +142,7 @@ def test_an_initial_pose_is_off_by_what_the_matches_say() -> None:
     assert np.sqrt(along @ refined[:3, :3] @ along) < 0.02
 
 
-def test_factors_are_of_standard_deviations() -> None:
+def test_factors_multiply_standard_deviations() -> None:
     scene = make_scene(random_for("factors"), FEW)
     structure, _, estimate = stages(scene, scene.references)
     support = support_of(scene, structure, estimate)
@@ -163,7 +163,7 @@ def test_many_matches_are_no_better_than_the_shared_ones() -> None:
     assert variances[0] - variances[2] == pytest.approx(2 * (variances[1] - variances[2]))
 
 
-def test_matches_with_one_spot_keep_what_was_stated_before() -> None:
+def test_matches_with_one_point_keep_the_former_covariance() -> None:
     scene = make_scene(random_for("spot"), FEW)
     structure, _, estimate = stages(scene, scene.references)
     nowhere = replace(structure, x_in_world=np.zeros_like(structure.x_in_world))
@@ -171,7 +171,7 @@ def test_matches_with_one_spot_keep_what_was_stated_before() -> None:
     np.testing.assert_array_equal(covariance, estimate.covariance)
 
 
-def test_without_an_estimate_there_is_nothing_to_ask() -> None:
+def test_a_support_without_a_pose_is_refused() -> None:
     scene = make_scene(random_for("nothing"), FEW)
     structure, matches = true_structure(scene)
     support = Support(scene.query, scene.references, structure, matches, None, np.zeros(3))

@@ -58,7 +58,7 @@ def load(tensors: Tensors, file: Path, network: Network | None = None, **options
     return network, load_strictly(network, file, **options)
 
 
-def test_files_of_the_library_load_as_the_library_reads_them(tensors: Tensors, file: Path) -> None:
+def test_loaded_tensors_equal_those_of_the_library(tensors: Tensors, file: Path) -> None:
     network, identity = load(tensors, file)
     state, read = network.state_dict(), library.load_file(file)
     assert list(state) == list(expected_tensors(Network()))
@@ -70,7 +70,7 @@ def test_files_of_the_library_load_as_the_library_reads_them(tensors: Tensors, f
     assert all(parameter.requires_grad for parameter in network.parameters())
 
 
-def test_a_module_on_a_device_is_filled_and_keeps_its_buffers(tensors: Tensors, file: Path) -> None:
+def test_a_module_on_a_device_keeps_its_other_buffers(tensors: Tensors, file: Path) -> None:
     network, _ = load(tensors, file, Network())
     assert torch.equal(network.scale, tensors["scale"])
     assert network.table.tolist() == [7.0, 7.0]
@@ -87,14 +87,14 @@ def test_numbers_are_converted_to_the_modules_precision(tensors: Tensors, file: 
     assert network.layers[1].num_batches_tracked.dtype == torch.int64
 
 
-def test_constants_that_the_file_lacks_are_imagenets(tensors: Tensors, file: Path) -> None:
+def test_missing_constants_are_imagenets(tensors: Tensors, file: Path) -> None:
     del tensors["image_mean"], tensors["image_std"]
     network, _ = load(tensors, file)
     assert network.image_mean.flatten().tolist() == pytest.approx([0.485, 0.456, 0.406])
     assert network.image_std.shape == (1, 3, 1, 1)
 
 
-def test_a_tensor_that_the_module_may_keep(tensors: Tensors, file: Path) -> None:
+def test_an_optional_tensor_keeps_the_modules_value(tensors: Tensors, file: Path) -> None:
     del tensors["scale"]
     network = Network()
     torch.nn.init.constant_(network.scale, 3.0)
@@ -142,7 +142,7 @@ def test_wrong_tensors_are_refused_and_the_module_is_unchanged(
         assert torch.equal(tensor, before[name])
 
 
-def test_all_that_differs_is_said_at_once(tensors: Tensors, file: Path) -> None:
+def test_all_differences_are_in_one_message(tensors: Tensors, file: Path) -> None:
     tensors["layers.0.weights"] = tensors.pop("layers.0.weight")
     tensors["scale"] = torch.zeros(2)
     with pytest.raises(CheckpointError) as caught:
@@ -153,14 +153,14 @@ def test_all_that_differs_is_said_at_once(tensors: Tensors, file: Path) -> None:
     )
 
 
-def test_unused_tensors_are_skipped_if_asked(tensors: Tensors, file: Path) -> None:
+def test_tensors_with_ignored_prefixes_are_skipped(tensors: Tensors, file: Path) -> None:
     surplus = {"omega": torch.tensor([math.nan]), "flow_head.weight": torch.zeros(3)}
     network, identity = load(tensors | surplus, file, ignored_prefixes=UNUSED)
     assert torch.equal(network.scale, tensors["scale"])
     assert identity == hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def test_files_of_another_kind_are_refused_unopened(tensors: Tensors, file: Path) -> None:
+def test_files_of_other_formats_are_refused_unopened(tensors: Tensors, file: Path) -> None:
     torch.save(tensors, file)
     with pytest.raises(CheckpointError, match="it is a zip archive, as PyTorch's pickles are"):
         load_strictly(on_meta(), file)

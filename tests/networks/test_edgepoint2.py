@@ -52,7 +52,7 @@ def random_image(*shape: int) -> Tensor:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_fused_it_computes_the_same(variant: str) -> None:
+def test_the_fused_network_computes_the_same(variant: str) -> None:
     network, image = random_network(variant), random_image(96, 130)
     with torch.inference_mode():
         expected = network(image)
@@ -62,7 +62,7 @@ def test_fused_it_computes_the_same(variant: str) -> None:
         torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
 
 
-def test_contrast_and_brightness_change_nothing_in_a_padded_image() -> None:
+def test_contrast_and_brightness_do_not_change_a_padded_image() -> None:
     """So what is padded takes no part in the normalization."""
     network, image = random_network("s64"), random_image(70, 100)
     with torch.inference_mode():

@@ -67,14 +67,14 @@ def some_views(count: int, reads: list[str] | None = None) -> list[View]:
 
 
 @pytest.mark.parametrize("size", PUBLISHED)
-def test_a_small_network_answers_as_the_published_code(size: tuple[int, int]) -> None:
+def test_a_small_network_equals_the_published_code(size: tuple[int, int]) -> None:
     descriptors = ruled_megaloc()(torch.from_numpy(images("megaloc", (2, 3, *size))))
     assert descriptors.shape == (2, 96)
     np.testing.assert_allclose(descriptors[:, ::12].flatten(), PUBLISHED[size], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("grid", [(5, 7), (23, 23), (40, 3)])
-def test_positions_are_cubic_samples_at_the_published_places(grid: tuple[int, int]) -> None:
+def test_positions_are_cubic_samples_at_the_published_offsets(grid: tuple[int, int]) -> None:
     backbone = Backbone(width=4, heads=1, depth=0)
     learned = np.asarray(weights("pos_embed", (1 + 37 * 37, 4)))
     backbone.pos_embed.data = torch.from_numpy(learned)[None]
@@ -125,7 +125,7 @@ def slow_transport(scores: NDArray[np.float64], dustbin_score: float) -> NDArray
 
 
 @pytest.mark.parametrize(("clusters", "patches"), [(1, 2), (3, 4), (6, 35)])
-def test_masses_are_those_of_sinkhorn_and_knopp(clusters: int, patches: int) -> None:
+def test_masses_equal_sinkhorns_iteration(clusters: int, patches: int) -> None:
     random = np.random.default_rng(clusters)
     scores = random.normal(0, 4, (2, clusters, patches))
     found = transport(torch.from_numpy(scores), torch.tensor(0.7))
@@ -144,7 +144,7 @@ def test_images_with_fewer_patches_than_clusters_are_refused() -> None:
         ruled_megaloc()(torch.zeros(1, 3, 28, 42))
 
 
-def test_salad_is_the_equations_of_its_paper() -> None:
+def test_salad_equals_the_equations_of_its_paper() -> None:
     salad = Salad(width=5, hidden=7, clusters=3, cluster_width=4, token_width=2)
     random = torch.Generator().manual_seed(3)
     for parameter in salad.parameters():
@@ -178,7 +178,7 @@ def unit(x: Any) -> Any:
 # ---- shortened
 
 
-def test_a_reduced_network_gives_signed_sums_of_what_it_gave() -> None:
+def test_a_reduced_descriptor_has_signed_sums_of_the_full_one() -> None:
     pictures = torch.from_numpy(images("reduced", (2, 3, 70, 70)))
     whole, reduced = ruled_megaloc(), ruled_megaloc()
     reduced.reduce(24)
@@ -190,7 +190,7 @@ def test_a_reduced_network_gives_signed_sums_of_what_it_gave() -> None:
     torch.testing.assert_close(reduced(pictures), expected, rtol=0, atol=1e-6)
 
 
-def test_reducing_is_a_projection_with_orthonormal_rows() -> None:
+def test_reduction_is_a_projection_with_orthonormal_rows() -> None:
     network = MegaLoc(SMALL_MEGALOC)
     network.aggregator.linear = torch.nn.Linear(96, 96)
     network.aggregator.linear.weight.data = torch.eye(96)
@@ -201,7 +201,7 @@ def test_reducing_is_a_projection_with_orthonormal_rows() -> None:
 
 
 @pytest.mark.parametrize("similarity", [0.0, 0.6, 0.95])
-def test_similarities_survive_reducing(similarity: float) -> None:
+def test_reduction_keeps_similarities(similarity: float) -> None:
     """Of pairs of random directions that are so similar: no bias, and the deviation that the module promises."""
     random, count = np.random.default_rng(7), 500
     a, b = (unit_rows(random.normal(size=(count, 8448))) for _ in range(2))
@@ -219,7 +219,7 @@ def unit_rows(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(x / np.linalg.norm(x, axis=1, keepdims=True))
 
 
-def test_order_and_signs_stay_as_they_are() -> None:
+def test_order_and_signs_have_their_known_values() -> None:
     """Stored vectors are compared with new ones for as long as a scene lives."""
     order, signs = signed_groups(8448)
     assert sorted(order.tolist()) == list(range(8448))
@@ -229,7 +229,7 @@ def test_order_and_signs_stay_as_they_are() -> None:
 
 
 @pytest.mark.parametrize("length", [0, 25, 192])
-def test_a_dimension_that_divides_nothing_is_refused(file: Path, length: int) -> None:
+def test_a_length_that_is_no_divisor_is_refused(file: Path, length: int) -> None:
     with pytest.raises(ValueError, match=r"which is no divisor|must be"):
         MegaLocDescriptor(file, options=MegaLocOptions(dimension=length), sizes=SMALL_MEGALOC)
 
@@ -248,7 +248,7 @@ def test_a_photograph_has_a_vector_of_unit_length(descriptor: MegaLocDescriptor)
     assert it.extractor is None
 
 
-def test_the_name_tells_weights_and_dimension(file: Path, tmp_path: Path) -> None:
+def test_the_name_has_weights_and_length(file: Path, tmp_path: Path) -> None:
     network = ruled_megaloc()
     network.aggregator.linear.bias.data[0] += 1
     save_file(network.state_dict(), tmp_path / "other")
@@ -261,7 +261,7 @@ def test_the_name_tells_weights_and_dimension(file: Path, tmp_path: Path) -> Non
     assert all(name.startswith(("megaloc-24-322px-", "megaloc-96-322px-")) for name in names)
 
 
-def test_company_changes_nothing(descriptor: MegaLocDescriptor) -> None:
+def test_a_batch_does_not_change_a_vector(descriptor: MegaLocDescriptor) -> None:
     """More views than go together, of different shapes; the last batch is smaller."""
     views = some_views(7)
     together = descriptor.describe_many(views)
@@ -269,7 +269,7 @@ def test_company_changes_nothing(descriptor: MegaLocDescriptor) -> None:
     assert descriptor.describe_many([]).shape == (0, 24)
 
 
-def test_photographs_are_read_when_their_turn_comes(descriptor: MegaLocDescriptor) -> None:
+def test_photographs_are_read_one_batch_at_a_time(descriptor: MegaLocDescriptor) -> None:
     reads: list[str] = []
     read_before: list[int] = []
     hook = descriptor._network.register_forward_pre_hook(lambda *_: read_before.append(len(reads)))
@@ -278,7 +278,7 @@ def test_photographs_are_read_when_their_turn_comes(descriptor: MegaLocDescripto
     assert read_before == [3, 6, 7]
 
 
-def test_several_threads_get_the_vectors_that_one_gets(descriptor: MegaLocDescriptor) -> None:
+def test_several_threads_get_the_vectors_of_one(descriptor: MegaLocDescriptor) -> None:
     views = some_views(6)
     expected = [descriptor.describe(view) for view in views]
     found: dict[int, Any] = {}
@@ -296,7 +296,7 @@ def test_several_threads_get_the_vectors_that_one_gets(descriptor: MegaLocDescri
 
 
 @pytest.mark.parametrize("size", [(640, 480), (90, 700), (322, 322), (1, 130)])
-def test_a_photograph_is_squeezed_as_published(descriptor: MegaLocDescriptor, size: tuple[int, int]) -> None:
+def test_photographs_are_resized_as_published(descriptor: MegaLocDescriptor, size: tuple[int, int]) -> None:
     image = textured(*size, seed=9)
     pixels = torch.from_numpy(image).permute(2, 0, 1)[None].float()
     given: list[Tensor] = []
@@ -307,7 +307,7 @@ def test_a_photograph_is_squeezed_as_published(descriptor: MegaLocDescriptor, si
     torch.testing.assert_close(given[0], expected, rtol=0, atol=1e-6)
 
 
-def test_low_precision_changes_vectors_by_little(file: Path) -> None:
+def test_low_precision_changes_vectors_little(file: Path) -> None:
     views = some_views(4)
     exact, rough = (
         MegaLocDescriptor(file, options=MegaLocOptions(24, dtype=dtype), sizes=SMALL_MEGALOC).describe_many(views)
@@ -328,7 +328,7 @@ def test_a_view_without_a_photograph_is_refused(descriptor: MegaLocDescriptor) -
 # ---- weights
 
 
-def test_adding_another_networks_weights_says_what_differs(file: Path, tmp_path: Path) -> None:
+def test_adding_another_networks_weights_lists_the_differences(file: Path, tmp_path: Path) -> None:
     """Of the small network here: the entries are there, the shapes are not those of the published one."""
     with pytest.raises(CheckpointError, match=r"does not fit MegaLoc: of its tensors .* of another shape"):
         add(named("megaloc"), file, tmp_path, unofficial=True)

@@ -42,7 +42,7 @@ def small_networks() -> dict[str, Network]:
 
 
 @pytest.mark.parametrize("case", SMALL_CASES)
-def test_a_small_network_answers_as_the_official_one(case: str, small_networks: dict[str, Network]) -> None:
+def test_a_small_network_has_the_official_output(case: str, small_networks: dict[str, Network]) -> None:
     check(small_networks[network_of(case)], fixture(HERE, case))
 
 
@@ -59,7 +59,7 @@ def test_small_networks_have_the_official_entries(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["pi3", "pi3x"])
-def test_full_networks_have_the_official_entries_and_rule(name: str) -> None:
+def test_full_networks_have_the_official_entries(name: str) -> None:
     official = json.loads(existing(BESIDE / f"{name}_state_dict.json").read_text())["keys"]
     entries = {key: entry for key, entry in official.items() if not key.startswith(UNUSED)}
     state = network_without_weights(name, small=False).state_dict()
@@ -84,7 +84,7 @@ def full_network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPa
 @pytest.mark.nightly
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(("full_network", "case"), FULL_CASES, indirect=["full_network"])
-def test_a_full_network_answers_as_the_official_one(case: str, full_network: Network) -> None:
+def test_a_full_network_has_the_official_output(case: str, full_network: Network) -> None:
     check(full_network, fixture(BESIDE, case))
 
 

@@ -63,7 +63,7 @@ def runner(name: str) -> Iterator[NetworkRunner]:
     runner.close()
 
 
-def test_it_answers_as_the_network_does() -> None:
+def test_the_runner_has_the_networks_output() -> None:
     network = ruled_network("pi3")
     runner = NetworkRunner(network, "pi3", "sha")
     layout = network.layout(GRID)
@@ -75,7 +75,7 @@ def test_it_answers_as_the_network_does() -> None:
     runner.close()
 
 
-def test_compiled_it_answers_the_same_without_compiling_again(name: str) -> None:
+def test_a_compiled_runner_does_not_compile_again(name: str) -> None:
     """That it compiles as a whole also shows that nothing in it waits for the device: that would break the graph."""
     plain = NetworkRunner(shallow_network(name), name, "sha")
     compiled = NetworkRunner(shallow_network(name), name, "sha", options=RunnerOptions(compile_backend="eager"))
@@ -104,7 +104,7 @@ def test_tokens_are_rounded_to_the_compute_type_always() -> None:
     runner.close()
 
 
-def test_threads_get_their_own_answers(runner: NetworkRunner) -> None:
+def test_threads_get_their_own_results(runner: NetworkRunner) -> None:
     expected = {views: localize(runner, views).camera_poses for views in (2, 3, 4)}
     found: dict[int, Tensor] = {}
 
@@ -120,7 +120,7 @@ def test_threads_get_their_own_answers(runner: NetworkRunner) -> None:
     assert all(torch.equal(found[views], expected[views]) for views in expected)
 
 
-def test_attention_is_flash_or_an_error_where_it_must_be_fast(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_without_flash_attention_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """The CPU has no kernel of that name, as a GPU may lack it; another one is not taken in silence."""
     token = torch.ones(1, 1, 1, 64)
     with pytest.raises(NotImplementedError, match="flash"):
@@ -130,7 +130,7 @@ def test_attention_is_flash_or_an_error_where_it_must_be_fast(monkeypatch: pytes
         NetworkRunner(ruled_network("pi3"), "pi3", "sha")
 
 
-def test_a_single_posed_view_counts_as_none() -> None:
+def test_a_single_posed_view_is_ignored() -> None:
     runner = NetworkRunner(ruled_network("pi3x"), "pi3x", "sha")
     tokens = runner.encode(some_images(2), intrinsics(2))[None]
     without = runner.reconstruct(tokens, GRID, 1)
@@ -139,7 +139,7 @@ def test_a_single_posed_view_counts_as_none() -> None:
     runner.close()
 
 
-def test_scenes_with_unequal_posed_view_counts_are_misuse() -> None:
+def test_scenes_with_unequal_posed_view_counts_are_refused() -> None:
     runner = NetworkRunner(ruled_network("pi3x"), "pi3x", "sha")
     tokens = runner.encode(some_images(3), intrinsics(3)).expand(2, -1, -1, -1)
     posed = torch.tensor([[True, True, False], [True, True, True]])

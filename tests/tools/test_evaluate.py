@@ -116,7 +116,7 @@ class TestSplit:
     ("name", "value"),
     [("reference_count", 1), ("query_count", 0), ("k", 0), ("k", 65), ("variant", "bset"), ("scale_strategy", "")],
 )
-def test_options_check_themselves(name: str, value: object) -> None:
+def test_options_outside_their_bounds_are_refused(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=str(value) or "scale"):
         EvaluationOptions(**{name: value})  # type: ignore[arg-type]
 

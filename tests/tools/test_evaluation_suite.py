@@ -155,7 +155,7 @@ class TestProtocol:
             ({"choice": "luck"}, "luck"),
         ],
     )
-    def test_options_check_themselves(self, fields: dict[str, Any], words: str) -> None:
+    def test_options_outside_their_bounds_are_refused(self, fields: dict[str, Any], words: str) -> None:
         with pytest.raises(ValueError, match=words):
             SuiteOptions(**fields)
 
