@@ -89,7 +89,6 @@ class Lines(logging.Handler):
         self.lines: list[tuple[str, str]] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Implements logging.Handler."""
         self.lines.append((JsonFormatter().format(record), TextFormatter().format(record)))
 
 

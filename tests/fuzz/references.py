@@ -51,7 +51,6 @@ class InlineExecutor(ThreadPoolExecutor):
     """Does at once what it is given: no thread is waited for."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Implements Executor."""
         future: Future[Any] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
@@ -66,34 +65,28 @@ class WatchfulEngine:
     options = EngineOptions()
 
     def forget_scene(self, key: SceneKey) -> None:
-        """Implements Engine."""
         check_key(key)
 
-    def forget_references(self, keys: Collection[str]) -> None:
-        """Implements Engine."""
+    def forget_references(self, keys: Collection[str]) -> None: ...
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
-        """Implements Engine."""
         for photo in photos:
             check_received_camera(photo.camera)
         return [Description({"sift": _VIEW}, {"vlad": np.ones(4, np.float32)}) for _ in photos]
 
     async def retrieve(self, key: SceneKey, photo: Photo, count: int, narrowing: Narrowing, caller: Caller) -> Choice:
-        """Implements Engine."""
         check_key(key)
         check_received_camera(photo.camera)
         assert 1 <= count <= reference_service.MAX_RETRIEVED
         return Choice((), "vlad", 1)
 
     async def audit(self, key: SceneKey, ids: Sequence[str], caller: Caller, are_listed: bool) -> tuple[int, list[Any]]:
-        """Implements Engine."""
         check_key(key)
         assert [check_id(it) for it in ids]
         assert len(set(ids)) == len(ids) <= reference_service.MAX_AUDITS
         return 1, []
 
     async def check_coverage(self, key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
-        """Implements Engine."""
         check_key(key)
         check_received_camera(view.camera)
         check_pose(view.world_from_camera)
@@ -104,16 +97,13 @@ class WatchfulStore:
     """Has whatever it is asked for, keeps nothing, and looks at what it is given."""
 
     def get_generation(self, key: SceneKey) -> int:
-        """Implements Store."""
         check_key(key)
         return 1
 
     def get_scene(self, key: SceneKey) -> SceneRecord:
-        """Implements Store."""
         return self.create_scene(key)
 
     def create_scene(self, key: SceneKey, attributes: SceneAttributes = NOTHING_KNOWN) -> SceneRecord:
-        """Implements Store."""
         check_key(key)
         row = rows.attributes_row(key, attributes)
         owner = rows.attributes_owner(key)
@@ -121,46 +111,37 @@ class WatchfulStore:
         return SceneRecord(key, 1, 0, _NOW, attributes)
 
     def update_scene(self, key: SceneKey, **changes: Any) -> SceneRecord:
-        """Implements Store."""
         assert changes
         assert UNCHANGED not in changes.values()
         return self.create_scene(key, SceneAttributes(**changes))
 
     def delete_scene(self, key: SceneKey) -> None:
-        """Implements Store."""
         check_key(key)
 
     def list_scenes(self, tenant: str, limit: int, after: str) -> list[SceneRecord]:
-        """Implements Store."""
         check_page(limit, after)
         return [self.create_scene(key_of(tenant, f"s{i}")) for i in range(min(limit, 3))]
 
     def add_references(self, key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
-        """Implements Store."""
         check_key(key)
         assert len({check_id(it.reference_id) for it in references}) == len(references)
         return [_stored(key, it) for it in references]
 
     def get_reference(self, key: SceneKey, reference_id: str) -> ReferenceRecord:
-        """Implements Store."""
         check_key(key)
         return _stored(key, NewReference(check_id(reference_id), b"", CAMERA, POSE, {"sift": _VIEW}))
 
     def read_image(self, key: SceneKey, reference_id: str) -> bytes:
-        """Implements Store."""
         return b""
 
     def delete_reference(self, key: SceneKey, reference_id: str) -> None:
-        """Implements Store."""
         check_key(key)
         check_id(reference_id)
 
     def list_references(self, key: SceneKey, limit: int, after: str) -> list[ReferenceRecord]:
-        """Implements Store."""
         return [self.get_reference(key, it) for it in self.list_reference_ids(key, limit, after)]
 
     def list_reference_ids(self, key: SceneKey, limit: int, after: str) -> list[str]:
-        """Implements Store."""
         check_key(key)
         check_page(limit, after)
         return [f"r{i}" for i in range(min(limit, 3))]

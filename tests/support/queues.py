@@ -20,29 +20,22 @@ class CountingObserver(Observer):
         self.batches: list[tuple[str, int]] = []
 
     def admitted(self, cost_s: float) -> None:
-        """Implements Observer."""
         self.admissions += 1
 
     def refused(self, reason: Refusal) -> None:
-        """Implements Observer."""
         self.refusals[reason] += 1
 
     def queued(self, stage: str, jobs: int, cost_s: float) -> None:
-        """Implements Observer."""
         self.waiting[stage] = jobs
 
     def running(self, stage: str, jobs: int) -> None:
-        """Implements Observer."""
         self.inflight[stage] = jobs
 
     def computed(self, stage: str, bucket: str, jobs: int, seconds: float) -> None:
-        """Implements Observer."""
         self.batches.append((stage, jobs))
 
     def ended(self, stage: str, ending: Ending) -> None:
-        """Implements Observer."""
         self.endings[ending] += 1
 
     def ran_out_of_memory(self) -> None:
-        """Implements Observer."""
         self.out_of_memory += 1

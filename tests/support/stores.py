@@ -52,20 +52,16 @@ class Folder:
     data_dir: Path
 
     def open(self, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
-        """Implements Place."""
         return Store.open(self.data_dir, cache_bytes)
 
     def open_as_is(self) -> SqliteDatabase:
-        """Implements Place."""
         return SqliteDatabase.open_as_is(self.data_dir / DATABASE_FILE)
 
     def fetch(self, statement: str, *parameters: object) -> list[tuple[Any, ...]]:
-        """Implements Place."""
         with closing(self.connect()) as connection:
             return list(connection.execute(statement, parameters).fetchall())
 
     def execute(self, statement: str, *parameters: object) -> None:
-        """Implements Place."""
         with closing(self.connect()) as connection, connection:
             assert connection.execute(statement, parameters).rowcount != 0, "nothing was changed"
 
@@ -81,20 +77,16 @@ class Shared:
     url: str
 
     def open(self, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
-        """Implements Place."""
         return Store.connect(self.url, cache_bytes)
 
     def open_as_is(self) -> PostgresqlDatabase:
-        """Implements Place."""
         return PostgresqlDatabase.open_as_is(self.url)
 
     def fetch(self, statement: str, *parameters: object) -> list[tuple[Any, ...]]:
-        """Implements Place."""
         with psycopg.connect(self.url) as connection:
             return connection.execute(_in_psycopg(statement), parameters).fetchall()
 
     def execute(self, statement: str, *parameters: object) -> None:
-        """Implements Place."""
         with psycopg.connect(self.url) as connection:
             assert connection.execute(_in_psycopg(statement), parameters).rowcount != 0, "nothing was changed"
 
@@ -107,12 +99,10 @@ class CountingStoreObserver:
     failures: int = 0
 
     def stored(self, operation: str, seconds: float) -> None:
-        """Implements StoreObserver."""
         assert seconds >= 0
         self.operations.append(operation)
 
     def store_failed(self) -> None:
-        """Implements StoreObserver."""
         self.failures += 1
 
 
