@@ -23,6 +23,7 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from pydantic import SecretStr
+from support import corner
 from support.images import encode
 from support.postgres import Cluster as Database
 from support.postgres import require
@@ -49,7 +50,7 @@ from mapless_server.security import create_token
 from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.store import Store
 from mapless_tools.child import child_server
-from mapless_tools.demo import Place, room, split_folder
+from mapless_tools.demo import Photograph, Place, split_folder
 from mapless_tools.load.requests import photo_request
 
 pytest.importorskip("ray.serve", reason="needs Ray Serve: the extra `ray`")
@@ -98,8 +99,9 @@ def real(cluster: Cluster) -> Cluster:
 
 
 def rendered() -> Place:
-    """A corner of the demo's room: six photographs along a walk, two of which are asked for."""
-    own = room().references[:6]
+    """A papered corner: six photographs, two of which are asked for."""
+    poses = map(corner.pose, range(-20, 21, 8))
+    own = [Photograph(f"r{i}", corner.photograph(it), corner.CAMERA, it) for i, it in enumerate(poses)]
     return Place("a corner", [own[i] for i in (0, 1, 4, 5)], [own[2], own[3]], metric=True)
 
 
