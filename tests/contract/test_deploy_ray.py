@@ -8,11 +8,7 @@ from __future__ import annotations
 
 import importlib
 import re
-import shutil
-import subprocess
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 import kubernetes_validate  # type: ignore[import-untyped]
 import pytest
@@ -21,6 +17,7 @@ import yaml  # type: ignore[import-untyped]
 from ray.serve._private import constants
 from ray.serve.config import AutoscalingConfig
 from ray.serve.schema import ServeDeploySchema
+from support.manifests import CONFINED, VERSIONS, Json, built, check_confined, check_valid, needs_kubectl
 
 from mapless.routing import SCENE_KEY
 from mapless_ray.app import build
@@ -30,10 +27,8 @@ from mapless_server.settings import PREFIX, Settings, load_settings
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "deploy" / "ray" / "kubernetes"
-OLDEST = "1.31"
 CALLS = Settings.model_fields["port"].default
 RAY, HEAD = {"mapless-ray": "true"}, {"mapless-ray-node": "head"}
-needs_kubectl = pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl, which has kustomize, is not here")
 FIELDS = {
     "spec": {"excludeHeadPodFromServeSvc", "rayClusterConfig", "rayClusterDeletionDelaySeconds", "serveConfigV2"}
     | {"serveService"},
@@ -45,8 +40,6 @@ FIELDS = {
     "workerGroupSpecs": {"groupName", "maxReplicas", "minReplicas", "rayStartParams", "replicas", "template"},
 }
 """Of RayService in ray.io/v1."""
-
-Json = dict[str, Any]
 
 
 def read(name: str) -> list[Json]:
@@ -69,13 +62,6 @@ def container(node: str) -> Json:
 def environment(node: str, prefix: str) -> dict[str, str]:
     """The variables that have a value in the manifest."""
     return {it["name"]: it["value"] for it in container(node)["env"] if it["name"].startswith(prefix) and "value" in it}
-
-
-@cache
-def built() -> tuple[Json, ...]:
-    command = ["kubectl", "kustomize", str(FOLDER)]
-    text = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
-    return tuple(yaml.safe_load_all(text))
 
 
 # What Serve is told
@@ -152,7 +138,7 @@ def test_fields_are_those_of_the_resource() -> None:
         assert all(isinstance(value, str) for value in params.values())
 
 
-@pytest.mark.parametrize("version", [OLDEST, kubernetes_validate.latest_version()])
+@pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("node", PODS)
 def test_pods_are_valid(node: str, version: str) -> None:
     pod = {"apiVersion": "v1", "kind": "Pod", **PODS[node]}
@@ -162,16 +148,10 @@ def test_pods_are_valid(node: str, version: str) -> None:
 
 @pytest.mark.parametrize("node", PODS)
 def test_pods_have_no_rights_and_write_to_volumes_alone(node: str) -> None:
+    check_confined(PODS[node]["spec"])
     security = PODS[node]["spec"]["securityContext"]
-    assert security["runAsNonRoot"] is True
-    assert security["runAsUser"] == security["runAsGroup"] == security["fsGroup"] == 10001
-    assert security["seccompProfile"] == {"type": "RuntimeDefault"}
-    confined = {
-        "allowPrivilegeEscalation": False,
-        "readOnlyRootFilesystem": True,
-        "capabilities": {"drop": ["ALL"]},
-    }
-    assert container(node)["securityContext"] == CLUSTER["autoscalerOptions"]["securityContext"] == confined
+    assert security["runAsGroup"] == security["fsGroup"] == 10001
+    assert CLUSTER["autoscalerOptions"]["securityContext"] == CONFINED
     writable = {it["mountPath"] for it in container(node)["volumeMounts"] if not it.get("readOnly")}
     assert writable == {"/cache", "/tmp", "/dev/shm"}
     assert {it["name"] for it in container(node)["volumeMounts"]} == {
@@ -260,11 +240,9 @@ def test_policies_allow_database_dns_and_the_cluster_api() -> None:
 
 @needs_kubectl
 def test_what_is_built_is_valid_and_the_gateway_calls_ray() -> None:
-    for document in built():
-        assert document["metadata"]["namespace"] == "mapless"
-        assert document["kind"] != "Secret"
-        if document["kind"] != "RayService":
-            for version in (OLDEST, kubernetes_validate.latest_version()):
-                kubernetes_validate.validate(document, version, strict=True)
-    (policy,) = [it for it in built() if it["kind"] == "NetworkPolicy" and it["metadata"]["name"] == "mapless-gateway"]
+    documents = built(FOLDER)
+    check_valid(documents)
+    (policy,) = [
+        it for it in documents if it["kind"] == "NetworkPolicy" and it["metadata"]["name"] == "mapless-gateway"
+    ]
     assert policy["spec"]["egress"][0] == {"to": [{"podSelector": {"matchLabels": RAY}}], "ports": [{"port": CALLS}]}
