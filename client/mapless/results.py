@@ -34,7 +34,16 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A stored photograph; `image` has the file's bytes if requested."""
+    """A stored photograph.
+
+    Attributes:
+        scene_id, reference_id: where it is.
+        camera, world_from_camera: as they were given.
+        image_sha256: of the file, hexadecimal.
+        feature_count: local features found in it; with none it is blank, and nothing can be matched with it.
+        create_time: by the server's clock.
+        image: the file's bytes, if requested.
+    """
 
     scene_id: str
     reference_id: str

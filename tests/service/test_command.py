@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf import json_format
-from support.servers import CAMERA, PHOTO, RunningServer, pose
+from support.servers import BLACK, CAMERA, PHOTO, RunningServer, pose
 
 import mapless
 from mapless import Camera, wire
@@ -87,6 +87,14 @@ def test_complaints(run: Run, tmp_path: Path, camera_json: str) -> None:
     assert complaint == f"mapless: {photo}: No such file or directory\n"
     code, _, complaint = run("localize", "s", photo, "--camera", '{"width": 3}')
     assert (code, "width is no field" in complaint) == (2, True)
+
+
+def test_a_blank_reference_is_warned_of(run: Run, scene: str, tmp_path: Path, camera_json: str) -> None:
+    (tmp_path / "blank.png").write_bytes(BLACK)
+    where = ("--camera", camera_json, "--pose", json.dumps(plain(pose(0.5))))
+    code, stored, warning = run("reference", "add", scene, tmp_path / "blank.png", *where)
+    assert (code, stored["feature_count"]) == (0, 0)
+    assert warning.startswith(f"mapless: warning: {tmp_path}/blank.png is stored, but has no local features: ")
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 import typer
+from support.images import encode
 from support.layouts import CAMERA, assert_same_camera, assert_same_pose, truth, write_cameras, write_image
 from support.servers import RunningServer
 from support.wall import wall
@@ -67,6 +68,15 @@ def run_import(server: RunningServer, folder: Path, scene: str, *more: object) -
 
 def stored(client: Client, scene: str) -> list[str]:
     return [reference.reference_id for reference in client.list_references(scene)]
+
+
+def test_blank_photographs_are_warned_of(server: RunningServer, scene: str, folder: Path, tmp_path: Path) -> None:
+    black = np.zeros((CAMERA.height_px, CAMERA.width_px, 3), np.uint8)
+    (folder / "images" / "p03.png").write_bytes(encode(".png", black))
+    done = run_import(server, folder, scene, "--skip-check", "--report", tmp_path / "report.json")
+    assert done.exit_code == 0, done.output
+    assert "  p03: no local features: nothing can be matched with it" in done.stdout
+    assert json.loads((tmp_path / "report.json").read_text())["blank"] == ["p03"]
 
 
 def test_a_folder_becomes_a_scene_and_again_changes_nothing(

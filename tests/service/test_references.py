@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import threading
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from support.images import encode, textured
 from support.messages import set_field
-from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, make_scene, pose, serving
+from support.servers import BLACK, CAMERA, PHOTO, RunningServer, Stubs, failure_of, make_scene, pose, serving
 from support.waiting import wait_until
 
 from mapless import (
@@ -188,6 +189,14 @@ def test_a_batch_with_one_bad_item_stores_nothing(client: Client, stubs: Stubs, 
     error = failure_of(stubs.references.BatchCreateReferences, batch)
     assert (error.code, error.field) == ("INVALID_ARGUMENT", (*other, path)[0])
     assert client.get_scene(scene).reference_count == 3
+
+
+def test_a_blank_reference_is_stored_and_reported(client: Client, scene: str, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "mapless_server.rpc.guard")
+    photos = {"seen": PHOTO, "blank": BLACK}
+    stored = client.add_references(scene, [NewReference(it, photos[it], CAMERA, pose(0)) for it in photos])
+    assert [it.feature_count for it in stored] == [1, 0]
+    wait_until(lambda: any(vars(it).get("references_without_features") == ["blank"] for it in caplog.records))
 
 
 def test_the_client_names_the_bad_reference_of_a_batch(server: RunningServer, scene: str) -> None:

@@ -41,6 +41,7 @@ from support.images import encode, textured
 
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
 PHOTO = encode(".png", textured())
+BLACK = encode(".png", np.zeros((64, 96, 3), np.uint8))
 COVARIANCE = np.diag([0.01, 0.01, 0.01, 1e-4, 1e-4, 1e-4])
 
 
@@ -50,7 +51,7 @@ def pose(x_m: float) -> RigidTransform:
 
 @dataclass
 class StandInExtractor:
-    """Finds one feature in each photograph: where the brightest pixel is."""
+    """Finds one feature in each photograph: where the brightest pixel is; none in a black one."""
 
     name: str = "stand-in"
     seen: list[NDArray[np.uint8]] = field(default_factory=list)
@@ -58,8 +59,9 @@ class StandInExtractor:
     def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
         self.seen.append(image)
         y, x = np.unravel_index(image.sum(axis=2).argmax(), image.shape[:2])
-        descriptor = np.full((1, 4), 0.5, np.float32)
-        features = Features(np.array([[x, y]], np.float32), descriptor, np.ones(1, np.float32))
+        count = int(image.any())
+        descriptors = np.full((count, 4), 0.5, np.float32)
+        features = Features(np.array([[x, y]], np.float32)[:count], descriptors, np.ones(count, np.float32))
         return View(camera.pinhole(), features)
 
 

@@ -147,23 +147,16 @@ def add_batch(
             on_repeat=found,
         )
     except MaplessError as error:
-        raise _with_reference_id(error, requests) from error
+        _name_reference(error, requests)
+        raise
     return list(map(reference_from_message, response.references))
 
 
-def _with_reference_id(error: MaplessError, requests: Sequence[pb.CreateReferenceRequest]) -> MaplessError:
-    """The error of a batch, naming the reference: its index counts within one message, of which there may be many."""
+def _name_reference(error: MaplessError, requests: Sequence[pb.CreateReferenceRequest]) -> None:
+    """Adds the reference's id to the error of a batch, whose index counts within one of several messages."""
     place = re.match(r"requests\[(\d+)\]", error.field or "")
-    if place is None or int(place[1]) >= len(requests):
-        return error
-    return type(error)(
-        error.code,
-        f"reference {shown(requests[int(place[1])].reference_id)}: {error.message}",
-        reason=error.reason,
-        field=error.field,
-        retry_after_s=error.retry_after_s,
-        request_id=error.request_id,
-    )
+    if place is not None and int(place[1]) < len(requests):
+        error.args = (f"{error.reason}: reference {shown(requests[int(place[1])].reference_id)}: {error.message}",)
 
 
 def batches(

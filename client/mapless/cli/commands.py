@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from contextlib import suppress
 from typing import Any
 
@@ -17,6 +18,7 @@ from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import priors
 from .output import print_json
 
+_BLANK = "nothing can be matched with it; it is blank, dark or blurred"
 _STATE = {True: "SERVING", False: "NOT_SERVING"}
 
 
@@ -84,7 +86,10 @@ def add_reference(client: Client, arguments: argparse.Namespace) -> int:
         camera=read_camera(arguments.camera, arguments.photo),
         world_from_camera=read_pose(arguments.pose),
     )
-    return print_json(client.add_reference(arguments.scene, reference))
+    stored = client.add_reference(arguments.scene, reference)
+    if not stored.feature_count:
+        print(f"mapless: warning: {arguments.photo} is stored, but has no local features: {_BLANK}", file=sys.stderr)
+    return print_json(stored)
 
 
 def list_references(client: Client, arguments: argparse.Namespace) -> int:

@@ -39,6 +39,7 @@ from .messages.references import (
 MAX_BATCH = 1000
 MAX_RETRIEVED = 1000
 DEFAULT_AUDITS, MAX_AUDITS = 10, 100
+MAX_NOTED = 10  # names in a line of the log
 STORE_THREADS = 4  # writers share one lock; the other threads keep readers from waiting for it
 
 T = TypeVar("T")
@@ -237,7 +238,10 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             NewReference(reference_id, photo.image, photo.camera, world_from_camera, found.views, found.descriptors)
             for (reference_id, photo, world_from_camera), found in zip(drafts, described, strict=True)
         ]
-        return await self._stored(self._store.add_references, scene_key, references)
+        records = await self._stored(self._store.add_references, scene_key, references)
+        if blank := [record.reference_id for record in records if not record.feature_count]:
+            call.note(references_without_features=blank[:MAX_NOTED])
+        return records
 
     async def _stored(self, operation: Callable[..., T], *arguments: object) -> T:
         """Runs an operation of the store in a thread; raises Unavailable while the server starts."""

@@ -27,6 +27,7 @@ class ImportReport:
         chosen: frames of it that were to be imported.
         verdict: of the epipolar check; None if there was none.
         added: ids of references that this run stored.
+        blank: ids of those of them without local features, with which nothing can be matched.
         skipped: references that are there already, and where.
         refused: frames that are not in, each with the reason.
         stopped: why the import ended before its end; empty if it did not.
@@ -38,6 +39,7 @@ class ImportReport:
     chosen: Sequence[Frame]
     verdict: Verdict | None = None
     added: list[str] = field(default_factory=list)
+    blank: list[str] = field(default_factory=list)
     skipped: list[Refusal] = field(default_factory=list)
     refused: list[Refusal] = field(default_factory=list)
     stopped: str = ""
@@ -100,6 +102,8 @@ def print_report(report: ImportReport, console: Console) -> None:
         summary = f"{good} references could be imported, {len(report.refused)} are refused"
         console.print(summary, markup=False, highlight=False)
         return
+    nothing = "no local features: nothing can be matched with it"
+    _print_reasons("warning, blank, dark or blurred", [Refusal(it, nothing) for it in report.blank], console)
     _print_reasons("skipped as duplicates", [it for it in report.skipped if it.reason != ALREADY_THERE], console)
     rate = f" ({len(report.added) / report.seconds:.1f} a second)" if report.added and report.seconds > 0 else ""
     counts = [f"{len(report.added)} added{rate}", f"{len(report.skipped)} skipped as duplicates"]
@@ -125,6 +129,7 @@ def to_json(report: ImportReport) -> dict[str, Any]:
         "dry_run": report.is_dry,
         "chosen": len(report.chosen),
         "added": list(report.added),
+        "blank": list(report.blank),
         "skipped": [vars(item) for item in report.skipped],
         "refused": [vars(item) for item in report.refused],
         "not_reached": report.untried_count,

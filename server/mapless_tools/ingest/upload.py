@@ -150,7 +150,7 @@ class Uploader:
             if self._stop.is_set():
                 raise _Stopped
             try:
-                self._client.add_references(self._report.scene, [item.reference() for item in left])
+                stored = self._client.add_references(self._report.scene, [item.reference() for item in left])
             except AlreadyExists as error:
                 left = self._reconcile(left, waiting, error)
             except InvalidArgument as error:
@@ -172,6 +172,8 @@ class Uploader:
                 self._end(str(error))
             else:
                 self._add(left)
+                with self._lock:
+                    self._report.blank += [it.reference_id for it in stored if not it.feature_count]
                 return
 
     def _reconcile(self, items: Sequence[Item], waiting: Waiting, error: AlreadyExists) -> list[Item]:
