@@ -1,4 +1,4 @@
-"""The final adjustment: its derivatives, its elimination of the points, and whether it pays."""
+"""The final adjustment: its derivatives, its elimination of the points, and its accuracy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mapless_server.method.results import PointMatches, PoseEstimate
 
 
 def problem_of(case: str, moved: float = 0.0) -> tuple[BundleProblem, Bundle]:
-    """A small problem, at its start or after random motions of about so much."""
+    """A small problem, at its start or after random motions of size `moved`."""
     scene = make_scene(random_for(case), SceneOptions(point_count=25, reference_count=3))
     structure, matches = true_structure(scene, NOISE)
     used = np.arange(len(matches))
@@ -174,7 +174,7 @@ def test_matches_with_large_errors_are_not_used() -> None:
 
 
 def test_the_covariance_is_symmetric_and_names_its_source() -> None:
-    """Whether it is right is asked in test_uncertainty."""
+    """Its size is tested in test_uncertainty."""
     scene = make_scene(random_for("covariance"), FEW_POINTS)
     structure, matches, estimate = stages(scene, scene.references)
     adjusted = adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions())

@@ -1,4 +1,4 @@
-"""The final adjustment with priors: their derivatives, that they help where they know more, and hurt nowhere."""
+"""The final adjustment with priors: derivatives; right priors improve weak poses, others change nothing."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_gravity_less_certain_than_the_photo_has_no_effect() -> None:
 
 
 def test_unused_priors_do_not_change_the_answer() -> None:
-    """The pose solver, to whom points are fixed, knew less: its pull must not be seen in the answer."""
+    """The pose solver, for which points are fixed, used a prior that the adjustment does not use."""
     scene, structure, matches = scene_of("undone")
     solved = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
     assert isinstance(solved, PoseEstimate)

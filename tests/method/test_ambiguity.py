@@ -1,4 +1,4 @@
-"""Two places that look the same are both told; one that is clearly better supported is answered."""
+"""Two places that look the same are both hypotheses; one that is clearly better supported is the answer."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_a_place_of_one_reference_is_no_hypothesis(which: Sequence[int]) -> None
 
 
 def test_the_clearly_better_supported_place_is_answered() -> None:
-    """The copy lost most of what there is to see."""
+    """The copy has lost most of its points."""
     random = random_for("weak copy")
 
     def worn(view: PosedView) -> PosedView:
@@ -97,7 +97,7 @@ def test_poses_within_the_bounds_are_one_place() -> None:
 
 
 def test_no_second_pose_is_searched_if_nearly_all_matches_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    """That is what makes it cheap for the usual query."""
+    """Most queries are saved the search."""
     monkeypatch.setattr(ambiguity, "ransac", None)
     assert isinstance(answer_of(SCENE.references).outcome, Localization)
 

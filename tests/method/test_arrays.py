@@ -1,4 +1,4 @@
-"""What NumPy and torch do under one name: both against plain NumPy, and the projection against that of the client."""
+"""Functions of NumPy and torch arrays: both against plain NumPy, and the projection against the client's."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_masked_median_ignores_nan_outside_the_mask(kind: Kind) -> None:
 
 @every_kind
 def test_projection_equals_the_clients(kind: Kind) -> None:
-    """Also behind the camera, beside it and for what is no number."""
+    """Also behind the camera, beside it and for NaN."""
     points = kind(POINTS)
     np.testing.assert_array_equal(np.asarray(normalize(points)), geometry.normalize(POINTS))
     expected: Array = geometry.normalize_jacobian(POINTS)

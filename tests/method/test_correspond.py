@@ -1,4 +1,4 @@
-"""Matching of descriptors: against loops, against known epipolar geometry; what is remembered."""
+"""Matching of descriptors: against brute force, against known epipolar geometry; the cache of pairs."""
 
 from __future__ import annotations
 
@@ -294,7 +294,7 @@ def test_pairs_of_a_deleted_reference_leave_the_cache(matched_pairs: list[tuple[
     assert len(matched_pairs) == 5
 
 
-# The seam
+# Query matching
 
 
 class Fixed:

@@ -1,4 +1,4 @@
-"""Leaving out references: against the dense equations, and where there is nothing to leave out."""
+"""Dispersion by leaving out references: against the dense equations, and in undetermined cases."""
 
 from __future__ import annotations
 

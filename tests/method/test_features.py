@@ -82,7 +82,7 @@ def test_planted_blobs_are_found_at_their_positions() -> None:
 
 
 def test_opencvs_default_upscaling_shifts_by_a_quarter_pixel() -> None:
-    """Why the extractor asks for another; when this fails, OpenCV's default has changed."""
+    """The reason for the extractor's option; when this fails, OpenCV's default has changed."""
     image, centres = blobs(random_for("blobs"), CAMERA)
     found = cv2.SIFT.create(contrastThreshold=0.02).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
     bias = misses(np.array([k.pt for k in found]), centres).mean(axis=0)

@@ -1,4 +1,4 @@
-"""The focal length that a photograph itself says: planted ones are found again, and none is doubted without ground."""
+"""The focal length estimated from a photograph: wrong ones are detected, right ones are never reported."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def planted(case: object, **options: object) -> SyntheticScene:
 
 @pytest.mark.parametrize("factor", FACTORS)
 def test_a_wrong_focal_length_is_detected_and_estimated(factor: float) -> None:
-    """With every fifth match wrong; within what the answer says it may be off."""
+    """With every fifth match wrong, within the standard deviation that the estimate states."""
     scene = planted(factor)
-    told = wrong_focal(solved(scene, factor), OPTIONS)
-    assert told is not None
+    found = wrong_focal(solved(scene, factor), OPTIONS)
+    assert found is not None
     true_px = scene.query.camera.focal_x_px
-    assert told.given_px == pytest.approx(factor * true_px)
-    assert abs(np.log(told.estimated_px / true_px)) < 4 * told.sigma
-    assert told.sigma < 0.02
-    assert told.agreeing > told.agreeing_before
+    assert found.given_px == pytest.approx(factor * true_px)
+    assert abs(np.log(found.estimated_px / true_px)) < 4 * found.sigma
+    assert found.sigma < 0.02
+    assert found.agreeing > found.agreeing_before
 
 
 def test_the_true_focal_length_is_never_reported() -> None:
@@ -55,13 +55,13 @@ def test_the_true_focal_length_is_never_reported() -> None:
 
 
 def test_points_in_a_frontal_plane_do_not_determine_it() -> None:
-    """Nearer with a wider lens looks the same."""
+    """A nearer camera with a wider lens has the same image."""
     for factor in (0.85, 1.15):
         scene = planted(
             factor, box_m=(4.0, 2.4, 0.0), query_offset_m=(0.0, 0.0, 0.0), reference_count=2, outlier_share=0.0
         )
-        told = wrong_focal(solved(scene, factor), OPTIONS)
-        assert told is None
+        found = wrong_focal(solved(scene, factor), OPTIONS)
+        assert found is None
 
 
 def test_few_matches_do_not_determine_it() -> None:
@@ -75,9 +75,9 @@ def test_the_judge_rejects_with_both_numbers_and_a_hint() -> None:
     rejection = judge(support, matches, PnpOptions().inlier_px, 1.0, JudgeOptions()).rejection
     assert rejection is not None
     assert rejection.reason is RejectionReason.GATE
-    told = re.search(r"says ([0-9.]+) times the focal length", rejection.message)
-    assert told is not None
-    assert float(told[1]) == pytest.approx(1 / 1.15, rel=0.01)
+    found = re.search(r"says ([0-9.]+) times the focal length", rejection.message)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(1 / 1.15, rel=0.01)
     assert rejection.hint is not None
     assert rejection.hint.advice is Advice.CHECK_CALIBRATION
     assert rejection.hint.best_reference in {reference.name for reference in support.references}

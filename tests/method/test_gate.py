@@ -1,4 +1,4 @@
-"""The gate: what chance could do is no pose, nor what repeated texture does; and the numbers it judges by."""
+"""The gate: rejects poses that chance or repeated texture could support; the numbers it compares."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ INLIER_PX = PnpOptions().inlier_px
 
 
 def failure_of(problem: Problem, initial: RigidTransform = POSE, options: GateOptions | None = None) -> str:
-    """What is said against the pose that the solver finds; empty if nothing, its own words if it finds none."""
+    """Why the solver's pose fails the gate, or the solver's rejection; empty if the pose passes."""
     estimate = solve_pose(*problem, initial, PnpOptions())
     if isinstance(estimate, Rejection):
         assert estimate.reason is RejectionReason.PNP_FAILED
@@ -56,14 +56,14 @@ def test_poses_from_degenerate_points_fail_the_gate(count: int) -> None:
 
 
 def test_random_matches_fail_the_gate() -> None:
-    """Random matches: no pose is true, and none may be believed."""
+    """Random matches have no true pose."""
     for seed in range(50):
         random = random_for("no pose", seed)
         assert failure_of(planted(random, int(random.integers(6, 120)), outlier_share=1.0)), seed
 
 
 def test_guided_matches_around_a_wrong_pose_fail_the_gate() -> None:
-    """A search of 20 px finds some keypoint near every projection; that they agree must not count."""
+    """A search of 20 px finds some keypoint near every projection, which is no evidence for the pose."""
     for seed in range(20):
         random = random_for("guided", seed)
         view, structure, matches = planted(random, 80, 0.0)

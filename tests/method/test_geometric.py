@@ -1,4 +1,4 @@
-"""The geometric backend: what a network would say of a planted scene, and what it refuses to say anything of."""
+"""The geometric backend: reconstructs planted scenes like a network, and rejects what it cannot reconstruct."""
 
 from __future__ import annotations
 

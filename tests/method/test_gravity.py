@@ -28,7 +28,7 @@ DOWNS = {"y down": [0, 1, 0], "y up": [0, -1, 0], "z up": [0, 0, -1], "x up": [-
 def gravity(
     down: Array | None = None, noise_deg: float = 0.0, sigma_deg: float = 1.0, pose: RigidTransform = POSE
 ) -> GravityPrior:
-    """What an accelerometer in the camera at the pose says, tilted about one axis."""
+    """The reading of an accelerometer in the camera at the pose, tilted about one axis."""
     down = np.array([0.0, 0.0, -1.0]) if down is None else np.asarray(down, float)
     tilted = rotation_from_vector([np.radians(noise_deg), 0, 0]) @ pose.rotation.T @ down
     return GravityPrior(tilted / np.linalg.norm(tilted), down, sigma_deg)
@@ -175,7 +175,7 @@ def hardly_seen(rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def test_priors_improve_a_weak_query() -> None:
-    """What six points in a corner leave open, gravity a half degree off and a position to 2 cm close."""
+    """Six points in a corner leave degrees of freedom that gravity to half a degree and a position to 2 cm fix."""
     alone, helped = [], []
     for seed in range(12):
         rng = random_for("weak", seed)

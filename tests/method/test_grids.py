@@ -1,4 +1,4 @@
-"""Pictures for networks: planted blobs are where the picture's camera says, whatever the lens, shape and size were."""
+"""Pictures for networks: planted blobs are where the picture's camera projects them, for any lens, shape and size."""
 
 from __future__ import annotations
 

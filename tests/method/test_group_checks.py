@@ -1,4 +1,4 @@
-"""A rig that is not mounted as it says, and a session that is not metric, are turned down; those that are, are not."""
+"""A rig with a wrong mounting and a session that is not metric are rejected; right ones are accepted."""
 
 from __future__ import annotations
 

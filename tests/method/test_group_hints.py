@@ -1,4 +1,4 @@
-"""Each rejection of a rig or a sequence says what to do about it, and which reference to look at."""
+"""The hint of each rejection of a rig or a sequence: advice, message and best reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each rejection says what to do about it, where, and which reference to look at."""
+"""The hint of each rejection: stage, advice, message and best reference."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def test_evidence_has_the_planted_counts() -> None:
 
 
 def test_degenerate_evidence_has_finite_features() -> None:
-    """Nothing that a solver answers may make a score of NaN, which no comparison rejects."""
+    """No result of a solver may give a score of NaN, which no comparison rejects."""
     worst = Evidence(np.inf, 4, 5000, 0, 0.0, 1.0, 1e6, 10.0)
     assert np.isfinite(worst.features()).all()
     assert trust_of(worst, OPTIONS) == 0.0

@@ -1,4 +1,4 @@
-"""LightGlue: the batch against each pair alone and against kornia's own forward; what waits; what is refused."""
+"""LightGlue: the batch against each pair alone and against kornia's own forward; waiting, memory, misuse."""
 
 from __future__ import annotations
 

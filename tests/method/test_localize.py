@@ -39,7 +39,7 @@ LATER_STAGES = ["structure", "match", "pnp"]
 
 @dataclass(frozen=True)
 class ChangedNetwork:
-    """A network whose answer is changed on the way."""
+    """A network whose reconstruction is changed."""
 
     network: FakeNetwork
     change: Callable[[Reconstruction], Reconstruction | DeviceReconstruction]
@@ -203,7 +203,7 @@ def test_match_and_inlier_counts_are_those_of_each_reference() -> None:
 
 
 def test_errors_are_as_large_as_the_covariance() -> None:
-    """Within the factor it is inflated by, and no promise beyond."""
+    """Within the factor by which it is inflated."""
     squares = []
     for seed in range(12):
         scene = make_scene(random_for("honest", seed), SceneOptions(point_count=150, reference_count=4))
@@ -411,7 +411,7 @@ def test_too_few_matches_is_the_reason() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_gate_is_the_reason(seed: int) -> None:
-    """The paper's search matches anything near; where the network is wrong and nothing is alike, chance must not do."""
+    """The paper's search matches anything near; with a wrong network and random descriptors that is rejected."""
     wrong = FakeNetwork(SCENE, seed, FakeNetworkOptions(pose_noise_m=0.5, pose_noise_deg=2.0))
     options = LocalizeOptions(Variant.FULL, ScaleStrategy.TRIANGULATION)
     answer = answer_of(Pipeline(wrong, MATCHER), options, without_meaning(SCENE.query))
@@ -576,7 +576,7 @@ def test_the_coarse_variant_is_answered_without_refinement() -> None:
 
 
 def test_one_querys_exception_does_not_fail_the_others() -> None:
-    """Of its check before and after the backend, and of the backend; and the backend is not asked in vain."""
+    """Of its check before and after the backend, and of the backend, which is not called after a failed check."""
     network = FakeNetwork(SCENE)
     fault, asked = MemoryError("of this query"), []
 

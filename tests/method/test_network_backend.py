@@ -1,4 +1,4 @@
-"""A network as the coarse stage: order, cache, conditions, faults; on small networks and on a transparent one."""
+"""A network as the coarse stage: order, cache, conditions, errors; small networks, and one of known output."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def grey_backend(runner: GreyRunner, options: NetworkOptions = OPTIONS) -> Netwo
 
 
 def greys_of(outcome: Outcome | Exception) -> list[int]:
-    """What the transparent network saw: the query's grey, then the references'."""
+    """The greys in the network's output: the query's, then the references'."""
     assert isinstance(outcome, Reconstruction)
     views = (outcome.query, *outcome.references)
     for view in outcome.references:
@@ -475,7 +475,7 @@ def normalized(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def test_the_querys_placeholder_does_not_change_the_scale() -> None:
-    """The references' poses are normalized as if they were alone; with a far stand-in they would not be."""
+    """The references' poses are normalized as without the query; a far placeholder would change them."""
     poses = random_poses(5, offset_m=20.0)
     alone = normalized(np.stack([pose.matrix() for pose in poses]))
     assert np.linalg.norm(alone[1:, :3, 3], axis=1).mean() == pytest.approx(1.0)
@@ -499,7 +499,7 @@ def test_references_at_one_place_keep_their_scale() -> None:
 
 
 def test_pi3x_normalizes_by_the_references_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plain way: the query stands far away, and the mean is taken without it. With it the answer is another."""
+    """Against a plain computation, with a far query pose and the mean without it; with it the output differs."""
     query, references = small_request(3)
     runner = small_runner("pi3x")
     outcome = reconstruct_one(NetworkReconstructor(runner, OPTIONS), query, references)

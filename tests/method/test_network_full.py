@@ -1,4 +1,4 @@
-"""The whole method with a full-size network, once, on the CPU: it works there too, and in how much memory."""
+"""The whole method with a full-size network, once, on the CPU: result and memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stages on the device against their twins on the host, and that nothing there waits for a value."""
+"""The stages on the device against those on the host; none of them waits for a value."""
 
 from __future__ import annotations
 
@@ -313,7 +313,7 @@ def test_messages_about_broken_output_equal_the_hosts(name: str) -> None:
 
 
 def test_pixels_of_zero_confidence_are_not_broken() -> None:
-    """Where the confidence is 0, nothing was said."""
+    """A pixel of confidence 0 has no prediction."""
     assert CASES["noise"].reconstruction.point_maps.isnan().any()
     assert CASES["noise"].reconstruction.broken_pixels() == 0
 

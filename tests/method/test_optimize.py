@@ -1,4 +1,4 @@
-"""One optimizer and its losses: the minima are SciPy's, damping and stopping as said, misuse named."""
+"""The optimizer and its losses: minima against SciPy's, damping, stopping, wrong options."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pose solver: planted poses among wrong matches, when it gives up, its covariance, and the library it hides."""
+"""The pose solver: planted poses among wrong matches, its rejections, its covariance, and PoseLib's conventions."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_without_noise_the_pose_is_exact() -> None:
 
 
 def test_many_matches_are_thinned_not_cut() -> None:
-    """All right ones stand at the end, where a solver of the first 2000 would never see them."""
+    """All right ones are at the end, beyond the first 2000."""
     problem = planted(random_for("many"), 6000, 0.5, outlier_share=0.6)
     assert_pose_close(solve(problem).world_from_camera, POSE, metres=0.005, degrees=0.05)
 
@@ -161,7 +161,7 @@ def test_the_version_of_poselib_is_the_tested_one() -> None:
 
 
 def test_poselib_has_the_options_that_are_passed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It would take misspelt ones without a word."""
+    """It silently accepts misspelt ones."""
     given: list[dict[str, object]] = []
 
     def spy(*arguments: object) -> tuple[poselib.CameraPose, dict[str, object]]:

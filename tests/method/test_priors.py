@@ -1,4 +1,4 @@
-"""Priors: derivatives against differences, distances against the chi-square they must follow, and what conflicts do."""
+"""Priors: derivatives against finite differences, distances against their chi-square, conflicts."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def gravity_at(pose: RigidTransform, sigma_deg: float = 1.0) -> GravityPrior:
 
 
 def planted(kind: str, pose: RigidTransform, rng: np.random.Generator) -> Prior:
-    """A prior of the pose that is off by what it says."""
+    """A prior whose error is drawn from its covariance."""
     if kind == "position":
         covariance = random_covariance(rng, 0.1, 0.3, 1.0)
         return PositionPrior(pose.translation + drawn(rng, covariance), covariance)
@@ -112,7 +112,7 @@ def test_the_rotation_vector_is_the_inverse_of_rodrigues(angle: float) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_squared_distances_of_consistent_priors_are_chi_square(kind: str) -> None:
-    """Monte Carlo over both uncertainties: the pose found is off by its covariance, the prior by its own."""
+    """Monte Carlo over both uncertainties: errors of the pose and the prior are drawn from their covariances."""
     rng = random_for("chi square", kind)
     covariance = random_covariance(rng, 0.05, 0.1, 0.2, 0.02, 0.01, 0.03)
     squares = []
@@ -246,7 +246,7 @@ def test_wrong_sigmas_are_refused(sigma_deg: float) -> None:
 
 
 def test_a_prior_farther_off_than_usual_has_less_weight() -> None:
-    """By so much that it would be of average distance, had it said so itself."""
+    """Its covariance is inflated until its distance is the average one."""
     pose_covariance = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1]) ** 2
     at = moved(POSE, np.array([0.3, 0, 0, 0, 0, 0]))
     for sigma_m, factor in ((1.0, 1.0), (0.05, 1.0), (0.01, 1.0)):

@@ -1,4 +1,4 @@
-"""The choice of references: the rule on planted counts and places, against a slow twin."""
+"""The choice of references: planted counts and positions, and a slow implementation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def bare_view(descriptors: Array) -> View:
 
 
 def slow_choice(counts: list[int], centres: Array, count: int, options: RetrieveOptions) -> list[int]:
-    """The rule in words: best score first, where whoever stands near a chosen one is worth less."""
+    """A slow implementation: best score first, where a reference near a chosen one has a lower score."""
     chosen: list[int] = []
     while len(chosen) < min(count, len(counts)):
         scores = {

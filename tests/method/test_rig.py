@@ -97,7 +97,7 @@ def test_the_same_image_twice_is_no_second_measurement() -> None:
 
 
 def test_with_wrong_mounting_other_cameras_lose_their_inliers() -> None:
-    """All cameras are said to be one: only one of them can be right."""
+    """All cameras have the mounting of the first."""
     images = images_of(random_for("wrong"), CAMERAS)
     outcome = solve_rig(images, [RIG_FROM_CAMERA[0]] * 3, OPTIONS)
     found = estimate(outcome)

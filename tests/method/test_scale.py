@@ -1,4 +1,4 @@
-"""Scale and initial pose: planted similarities come back; faults move the answer to the other stage or reject it."""
+"""Scale and initial pose: planted similarities are found; with faults the other stage is used, or it is rejected."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def assert_same_pose(actual: RigidTransform, expected: RigidTransform, metres: f
 
 
 def transformed(view: ReconstructedView, similarity: Similarity) -> ReconstructedView:
-    """The same prediction told in another local frame."""
+    """The same prediction in another local frame."""
     point_map = (similarity.scale * view.point_map).astype(np.float32)
     return replace(view, point_map=point_map, local_from_camera=similarity.transform_pose(view.local_from_camera))
 

@@ -1,4 +1,4 @@
-"""Sequences: planted poses are found from photographs and a device's tracking, however that drifts."""
+"""Sequences: planted poses are found from photographs and a device's drifting tracking."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def rejection(outcome: SequenceEstimate | Rejection) -> Rejection:
 @pytest.mark.parametrize("alone", [True, False], ids=["posed alone", "not posed alone"])
 @pytest.mark.parametrize(("scale", "is_free"), [(1.0, False), (0.37, True)])
 def test_every_planted_frame_is_found_in_the_callers_world(alone: bool, scale: float, is_free: bool) -> None:
-    """Half of the matches are wrong, 2 % of the way is lost, and the unit may be unknown."""
+    """Half of the matches are wrong, the tracking drifts by 2 %, and the unit may be unknown."""
     random = random_for("frames", alone, scale)
     truth = walk(random, 6)
     session = rescaled(drifting(random, truth, 0.02), 1 / scale)
@@ -56,7 +56,7 @@ def test_every_planted_frame_is_found_in_the_callers_world(alone: bool, scale: f
     ],
 )
 def test_drift_makes_the_last_pose_no_worse_than_alone(share: float, deg: float) -> None:
-    """Over several sequences, whatever the device loses, and however much more that is than it should be."""
+    """Over several sequences, for small and large drift."""
     together, alone = [], []
     for case in range(5):
         random = random_for("drift", share, deg, case)

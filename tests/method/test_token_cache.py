@@ -1,4 +1,4 @@
-"""The token cache: what it gives back is what was put in; what it holds stays within its bounds."""
+"""The token cache: returns what was stored, and stays within its bounds."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def tokens(image: int) -> torch.Tensor:
 
 
 def cache_of(device_count: int, host_count: int) -> TokenCache:
-    """A cache with room for so many views; both levels lie in the host's memory here, and behave alike."""
+    """A cache with room for so many views; both levels are in the host's memory here."""
     return TokenCache(torch.device("cpu"), TokenCacheOptions(device_count * SIZE, host_count * SIZE))
 
 

@@ -1,4 +1,4 @@
-"""Tracks: planted chains, conflicts, and a slow union-find to compare with."""
+"""Tracks: planted chains, conflicts, and a comparison with a slow union-find."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def pairs_of(matches: Mapping[tuple[int, int], Sequence[tuple[int, int]]]) -> Pa
 
 
 def as_sets(tracks: Tracks) -> set[Track]:
-    """Which keypoints belong together, whatever the numbers of the points."""
+    """The sets of keypoints, without the numbers of the points."""
     seen = defaultdict(set)
     for point, view, keypoint in zip(
         tracks.point.tolist(), tracks.view.tolist(), tracks.keypoint.tolist(), strict=True

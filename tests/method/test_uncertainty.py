@@ -79,7 +79,7 @@ def test_thinned_matches_have_a_similar_covariance() -> None:
 
 @pytest.mark.parametrize("references", [5, 10])
 def test_covariance_of_reference_noise_equals_sampling(references: int) -> None:
-    """Twice the pixels' noise. Errors that the references share only in part are told within a third."""
+    """Twice the pixels' noise; errors that only some references share are estimated within a third."""
     position, rotation = adjusted_poses(references, 1.0, PLAIN)
     assert 0.75 < position < 1.4
     assert 0.75 < rotation < 1.4
@@ -127,7 +127,7 @@ def test_scale_moves_the_camera_along_the_arm_only() -> None:
 
 
 def test_an_initial_poses_covariance_covers_its_errors() -> None:
-    """5 cm off its optimum: that far lies within what is stated, and the direction is known."""
+    """5 cm off its optimum: the stated standard deviation in this direction is 5 cm."""
     scene = make_scene(random_for("initial"), FEW)
     structure, matches, estimate = stages(scene, scene.references)
     off = np.array([0.03, 0.0, 0.04])

@@ -1,4 +1,4 @@
-"""A network takes a file of exactly its tensors, bit for bit, or is left as it was and says what differs."""
+"""A network loads a file of exactly its tensors, bit for bit; otherwise it is unchanged and the error lists why."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MegaLoc answers what the published network answers, its parts what their equations say, and its vectors stay useful.
+"""MegaLoc: the network against the published one, its parts against their equations, its reduction and its use.
 
 The published weights are not here: those of the tests are made by a rule, small, and were given to the published code
 as well.
@@ -202,7 +202,7 @@ def test_reduction_is_a_projection_with_orthonormal_rows() -> None:
 
 @pytest.mark.parametrize("similarity", [0.0, 0.6, 0.95])
 def test_reduction_keeps_similarities(similarity: float) -> None:
-    """Of pairs of random directions that are so similar: no bias, and the deviation that the module promises."""
+    """Of pairs of random directions of this similarity: no bias, and the stated deviation."""
     random, count = np.random.default_rng(7), 500
     a, b = (unit_rows(random.normal(size=(count, 8448))) for _ in range(2))
     b = unit_rows(b - (a * b).sum(1, keepdims=True) * a)

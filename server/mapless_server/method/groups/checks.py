@@ -1,8 +1,7 @@
-"""Checks of a group: mountings and units that single photographs contradict, and what helps after a rejection.
+"""Checks of a group: whether its photographs contradict a rig's mounting or a session's unit; and hints.
 
-A rig has one pose whatever its mounting, and a sequence bends to any unit of length; both are answered with small
-radii, because the photographs that fit agree well. The evidence against them is the photographs that do not fit any
-more, and the length of the way.
+A wrong mounting or unit still gives a pose with small radii, because the photographs that fit agree well. The evidence
+against it is the inliers that other photographs lose, and the length of the path.
 """
 
 from __future__ import annotations
@@ -23,27 +22,27 @@ from .rig import RigEstimate
 from .sequence import SequenceEstimate
 
 SURE_INLIERS = 30
-"""A photograph with so many alone knows where it is."""
+"""The pose of a photograph with so many inliers alone is reliable."""
 
 KEPT_SHARE = 0.25
-"""Of these, a rig that is mounted as it says keeps nearly all; one whose mounts are wrong next to none."""
+"""Least share of these inliers in the rig's pose: with the right mounting nearly all are kept, with a wrong one few."""
 
 UNIT_TOLERANCE = 1.25
-"""Drift makes a way longer or shorter by some per cent; wrong units are feet, centimetres, or a scale never found."""
+"""Drift changes the length of a path by some per cent; wrong units are feet, centimetres, or an unknown scale."""
 
 SIGNIFICANT_SIGMAS = 4.0
-"""By which the way's length has to miss the session's."""
+"""Least difference of the path's lengths, in standard deviations."""
 
 
 def check_mounting(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstimate | Rejection:
-    """The estimate, unless photographs that know where they are contradict it.
+    """Checks a rig's pose against the photographs that are localized reliably alone.
 
     Args:
         estimate: of the rig.
         alone: each photograph's own answer.
 
     Returns:
-        Else GATE, with the numbers of the photographs.
+        The estimate; or a rejection GATE with the numbers of the photographs, if one of these loses its inliers.
     """
     kept = {it.source.image: int(it.inliers.sum()) for it in estimate.matched}
     sure = {
@@ -63,37 +62,37 @@ def check_mounting(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstimat
 def check_unit(
     estimate: SequenceEstimate, session_from_camera: Sequence[RigidTransform]
 ) -> SequenceEstimate | Rejection:
-    """The estimate of a session that is said to be metric, unless the photographs' way is of another length.
+    """Checks the unit of a session that the request calls metric by the length of the photographs' path.
 
     Returns:
-        Else SCALE_UNRELIABLE, with the unit that the photographs say.
+        The estimate; or a rejection SCALE_UNRELIABLE with the estimated unit, if the two lengths differ significantly.
     """
-    way_m = _length(estimate.world_from_camera)
-    said_m = _length(session_from_camera)
-    # A step is as uncertain as its ends; ends that two steps share count twice, which errs to the safe side.
+    path_m = _length(estimate.world_from_camera)
+    tracked_m = _length(session_from_camera)
+    # The variance of a step is the sum of its ends'; an end that two steps share counts twice, which is conservative.
     variances = np.trace(estimate.covariances[:, :3, :3], axis1=1, axis2=2)
     sigma_m = math.sqrt(float((variances[1:] + variances[:-1]).sum()))
-    if abs(way_m - said_m) <= SIGNIFICANT_SIGMAS * sigma_m or said_m * way_m == 0:
+    if abs(path_m - tracked_m) <= SIGNIFICANT_SIGMAS * sigma_m or tracked_m * path_m == 0:
         return estimate
-    unit_m = way_m / said_m
+    unit_m = path_m / tracked_m
     if 1 / UNIT_TOLERANCE <= unit_m <= UNIT_TOLERANCE:
         return estimate
     message = (
-        f"the session's way is {said_m:.2f} long, that of the photographs {way_m:.2f} m: its unit is {unit_m:.2f} m, "
-        "and not a metre as it was said to be"
+        f"the session's path is {tracked_m:.2f} long, that of the photographs {path_m:.2f} m: its unit is "
+        f"{unit_m:.2f} m, and not a metre as the request says"
     )
     advice = "Ask for the session's scale (estimate_session_scale), or send its poses in metres."
     return Rejection(RejectionReason.SCALE_UNRELIABLE, message, Hint(STAGE, Advice.CHECK_CALIBRATION, advice))
 
 
 def _length(poses: Sequence[RigidTransform]) -> float:
-    """Of the way along the poses' places."""
-    places = np.array([pose.translation for pose in poses])
-    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+    """Length of the path along the poses' positions."""
+    positions = np.array([pose.translation for pose in poses])
+    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
 STAGE = "join"
-"""In which photographs are posed together."""
+"""Name of the stage in which photographs are posed together."""
 
 
 def hinted_group(
@@ -129,8 +128,8 @@ def _advice(reason: RejectionReason, matches: int, image_count: int, options: Hi
     if reason is RejectionReason.SCALE_UNRELIABLE:
         return (
             Advice.RETAKE_PHOTOGRAPH,
-            "Take the photographs from further apart, so that the session's motion tells its unit; or say that the "
-            "session is metric, if it is.",
+            "Take the photographs from further apart, so that the session's motion determines its unit; or say that "
+            "the session is metric, if it is.",
         )
     if matches < options.few_matches:
         return (

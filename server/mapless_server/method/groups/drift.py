@@ -61,10 +61,10 @@ class DriftOptions:
 
 @dataclass(frozen=True, eq=False)
 class SequenceFreedom:
-    """Frames move freely, with a cost on the difference of their steps from the session's; see `problem.Freedom`.
+    """Parameters of a sequence, with a cost on the difference of its steps from the session's; see `problem.Freedom`.
 
-    Its parameters are left perturbations (v, w) of every frame's camera_from_world, in order, and, if the unit of the
-    session is unknown, the logarithm of the scale.
+    They are left perturbations (v, w) of every frame's camera_from_world, in order, and, if the unit of the session is
+    unknown, the logarithm of the scale.
 
     Attributes:
         frames: camera_from_world of every frame, metric.
@@ -72,7 +72,7 @@ class SequenceFreedom:
         scale: metres per unit of the session.
         scale_is_free: whether it is estimated.
         sigma: (F - 1, 6) of the steps.
-        options: see there.
+        options: noise of the steps.
     """
 
     frames: tuple[RigidTransform, ...]

@@ -1,8 +1,7 @@
 """Poses of several cameras as one: generalized PnP, by PoseLib.
 
-A generalized camera is a bundle of rays that do not meet: those of all cameras, in the frame that they are fixed to.
-Its pose is found from three 2D-3D matches (gp3p), wherever they come from, and with the unit of that frame from four
-(gp4ps):
+A generalized camera is a set of rays without a common centre: those of all cameras, in the frame that they are fixed
+to. Three 2D-3D matches of any of the cameras determine its pose (gp3p), four also the unit of that frame (gp4ps):
 
     lambda_i d_i + s p_i = rig_from_world x_i
 

@@ -133,7 +133,7 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
 
 
 def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
-    """Rejection of a group without matches: that of the photograph that reached the latest stage."""
+    """The rejection of a group without matches: that of the photograph that reached the latest stage."""
     order = list(RejectionReason)
     outcomes = [(i, image.answer.outcome) for i, image in enumerate(images)]
     rejected = [(order.index(outcome.reason), i, outcome) for i, outcome in outcomes if isinstance(outcome, Rejection)]

@@ -2,10 +2,11 @@
 
 What `adjust` minimizes for one photograph, summed over those of a group,
 
-    min  sum_f sum_obs rho(|r_o|^2 / sigma_o^2) + sum_i |xi_i|^2 / sigma_prior^2 + (what holds the frames together),
+    min  sum_f sum_obs rho(|r_o|^2 / sigma_o^2) + sum_i |xi_i|^2 / sigma_prior^2 + (cost of the group's parameters),
 
 where the references xi_i are common to the photographs that use them. Each photograph has its own points, which are
-eliminated photograph by photograph; the rest is a dense system of the references and the group's parameters.
+eliminated photograph by photograph; the rest is a dense system of the references and the group's parameters, whose
+cost is zero for a rig and that of the tracked steps for a sequence (see `drift`).
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class JointEstimate(Generic[F]):
     """A group's adjusted poses.
 
     Attributes:
-        freedom: at the optimum.
+        freedom: parameters at the optimum.
         covariance: (N, N) of its parameters.
         matched: photographs with their matches, in the order of the matched images.
     """
@@ -68,7 +69,7 @@ def adjust_jointly(
         matched_images: the photographs that have matches.
         matches: of each with its points; those with too large an error at the start are not used.
         freedom: initial poses and their parametrization.
-        options: see there.
+        options: of the adjustment.
 
     Returns:
         The refined poses; the initial ones if no match is used.

@@ -27,7 +27,7 @@ F = TypeVar("F", bound="Freedom")
 
 
 class Freedom(Protocol):
-    """How the photographs of a group may move, and what holds them together; a point in its parameters' space.
+    """The parameters of a group's poses, at one point, and the cost of these parameters.
 
     Attributes:
         size: number N of parameters.
@@ -51,25 +51,25 @@ class Freedom(Protocol):
         ...
 
     def relaxed(self: F) -> F:
-        """The same point, with what holds the photographs together believed as far as it has turned out to be true."""
+        """The same point; the cost's standard deviations are enlarged to the observed errors."""
         ...
 
     def cost(self) -> float:
-        """Of what holds the photographs together."""
+        """The cost of the parameters, beside that of the observations."""
         ...
 
     def equations(self) -> tuple[Array, Array]:
-        """J^T J (N, N) and J^T r (N,) of the same."""
+        """J^T J (N, N) and J^T r (N,) of this cost."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """What a photograph contributes.
+    """The points and tracks of one photograph that are used.
 
     Attributes:
         source: the photograph.
-        world_from_camera: its pose at the start.
+        world_from_camera: its initial pose.
         chosen: (P_b,) points of its structure that it is matched with.
         tracks: of these, over its references and, last, the photograph itself.
     """
@@ -83,7 +83,7 @@ class Part:
 def part_of(
     source: MatchedImage, matches: PointMatches, freedom: Freedom, max_error_px: float, max_matches: int
 ) -> Part:
-    """With the matches that are near enough, evenly thinned."""
+    """The part of a photograph, from its matches with small errors, evenly thinned."""
     structure, pose = source.structure, freedom.camera_from_world(source.image).inverse()
     pixels = source.query.features.keypoints[matches.keypoint].astype(np.float64)
     errors_px = reprojection_errors_px(source.query.camera, pose, structure.x_in_world[matches.point], pixels)
@@ -94,7 +94,7 @@ def part_of(
 
 
 class Shared:
-    """How often measurements of keypoints stand in a group."""
+    """Counts how often each measured keypoint is used in a group."""
 
     def __init__(self, parts: Sequence[Part]) -> None:
         self._times: Counter[object] = Counter()
@@ -107,9 +107,9 @@ class Shared:
 
 
 def _measurements(part: Part) -> list[object]:
-    """What identifies each observation: the photograph and the keypoint."""
+    """The identity of each observation: its photograph and keypoint."""
     views = [it.view for it in part.source.references]
-    # A photograph of the group that was sent twice was measured once.
+    # Named by its keypoints: a photograph that was sent twice is one measurement.
     names: list[object] = [it.key for it in part.source.references]
     names.append(part.source.query.features.keypoints.tobytes())
     keypoints = [it.features.keypoints for it in (*views, part.source.query)]
@@ -123,8 +123,8 @@ class JointOptions:
 
     Attributes:
         adjust: as for one photograph.
-        max_matches: of a photograph, evenly thinned; several photographs have plenty together.
-        iterations: at most so many Levenberg-Marquardt steps; drift takes more than one photograph's pose.
+        max_matches: of a photograph, evenly thinned; several photographs have enough together.
+        iterations: largest number of Levenberg-Marquardt steps; drift needs more than one photograph's pose.
     """
 
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
@@ -141,9 +141,9 @@ class Block:
     """One photograph's part of the problem: `adjust`'s, without the prior, which is the group's.
 
     Attributes:
-        image: which of the group's.
+        image: index of the photograph in the group.
         problem: the cost and its derivatives.
-        references: (V - 1,) which of the group's references its cameras are; the last camera is the photograph.
+        references: (V - 1,) index of each of its references in the group; the last camera is the photograph.
     """
 
     image: int
@@ -151,7 +151,7 @@ class Block:
     references: NDArray[np.intp]
 
     def columns(self, reference_count: int, freedom: Freedom) -> Array:
-        """(6 V, 6 R + N): the motions of its cameras by the unknowns of the group."""
+        """(6 V, 6 R + N): derivative of its cameras' motions by the unknowns of the group."""
         local = len(self.references)
         columns = np.zeros((6 * local + 6, 6 * reference_count + freedom.size))
         for row, reference in enumerate(self.references):
@@ -162,14 +162,14 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Point(Generic[F]):
-    """Where the search for the optimum is: references (R), points of each block (P_b, 3), and the group's freedom."""
+    """Values of the unknowns: references (R), points of each block (P_b, 3), and the group's parameters."""
 
     references: Poses
     points: tuple[Array, ...]
     freedom: F
 
     def bundle(self, index: int, block: Block) -> Bundle:
-        """Of one block."""
+        """The values of one block."""
         last = self.freedom.camera_from_world(block.image)
         return Bundle(self.references[block.references].and_last(last), self.points[index])
 
@@ -178,9 +178,9 @@ class GroupProblem(Generic[F]):
     """The cost of a group and its derivatives; see `optimize.Problem`.
 
     Attributes:
-        start: where it begins.
-        blocks: one for each photograph that takes part.
-        chosen: of each block, which (P_b,) of the photograph's points these are.
+        start: the initial values.
+        blocks: one for each photograph with matches.
+        chosen: of each block, the indices (P_b,) of its points in the photograph's structure.
     """
 
     def __init__(
@@ -200,9 +200,9 @@ class GroupProblem(Generic[F]):
             part_of(source, its_matches, freedom, options.adjust.max_error_px, options.max_matches)
             for source, its_matches in zip(matched_images, matches, strict=True)
         ]
-        taking_part = [part for part in parts if len(part.chosen)]
-        shared = Shared(taking_part)
-        for part in taking_part:
+        used = [part for part in parts if len(part.chosen)]
+        shared = Shared(used)
+        for part in used:
             self.chosen.append(part.chosen)
             points.append(part.source.structure.x_in_world[part.chosen])
             self.blocks.append(self._block(part, shared))
@@ -228,7 +228,7 @@ class GroupProblem(Generic[F]):
         return Block(source.image, problem, references)
 
     def _index(self, reference: PosedView, level_px: float, depth_m: float) -> int:
-        """Which of the group's references it is; a new one is held to its pose as `adjust` does."""
+        """Index of a reference in the group; a new one gets a prior on its pose as in `adjust`."""
         if reference.key not in self._references:
             self._references[reference.key] = (len(self._references), reference)
             noise_px = self.options.adjust.prior_share * level_px
@@ -255,12 +255,12 @@ class GroupProblem(Generic[F]):
         """See optimize.Problem."""
         columns = self._columns(point)
         reduced = [it.reduced(damping) for it in equations]
-        matrix, gradient = self._held(point)
+        matrix, gradient = self._prior_equations(point)
         matrix += damping * np.diag(np.diag(matrix))
         for (its_matrix, its_gradient, _), its_columns in zip(reduced, columns, strict=True):
             matrix += its_columns.T @ its_matrix @ its_columns
             gradient += its_columns.T @ its_gradient
-        # An unobserved parameter (a photograph without matches, before anything holds it) stays.
+        # The least-norm step does not move an unobserved parameter (of a photograph without matches and cost).
         step = solve_step(matrix, gradient, least_norm=True)
         if step is None:
             return None
@@ -271,8 +271,8 @@ class GroupProblem(Generic[F]):
         references = point.references.moved(step[: 6 * self.reference_count].reshape(-1, 6))
         return Point(references, tuple(points), point.freedom.moved(step[6 * self.reference_count :]))
 
-    def _held(self, point: Point[F], data_inflation: float = 1.0) -> tuple[Array, Array]:
-        """Matrix and gradient of all that is no observation."""
+    def _prior_equations(self, point: Point[F], data_inflation: float = 1.0) -> tuple[Array, Array]:
+        """Matrix and gradient of the references' priors and the parameters' cost."""
         references = 6 * self.reference_count
         matrix = np.zeros((references + point.freedom.size,) * 2)
         gradient = np.zeros(len(matrix))
@@ -284,11 +284,11 @@ class GroupProblem(Generic[F]):
     def covariance(self, point: Point[F]) -> Array:
         """(N, N) of the freedom's parameters; infinite on the diagonal of unobserved ones.
 
-        What holds the photographs together is believed as it is said, the observations less than they say (see
+        The parameters' cost counts as stated, the observations with inflated standard deviations (see
         AdjustOptions.error_inflation).
         """
         inflation = self.options.adjust.error_inflation
-        matrix, _ = self._held(point, inflation)
+        matrix, _ = self._prior_equations(point, inflation)
         for it, its_columns in zip(self.linearize(point), self._columns(point), strict=True):
             its_matrix, _, _ = it.reduced(0.0)
             matrix += its_columns.T @ its_matrix @ its_columns / inflation**2
@@ -303,7 +303,7 @@ class GroupProblem(Generic[F]):
 def _stepped(points: Array, steps: Array, centre: Array) -> Array:
     """Points (P, 3) after steps (P, 3), none longer than half its distance to a camera.
 
-    A wrong match whose weight vanishes lets its point flee to where nothing can be solved any more.
+    The point of a wrong match, whose weight vanishes, would otherwise diverge until the system is singular.
     """
     longest = np.linalg.norm(points - centre, axis=1) / 2
     length = np.linalg.norm(steps, axis=1)
@@ -311,7 +311,7 @@ def _stepped(points: Array, steps: Array, centre: Array) -> Array:
 
 
 def _inverse(hessian: Array) -> Array:
-    """Of a symmetric matrix; huge in directions that it does not hold, not zero as a pseudo-inverse would be."""
+    """Inverse of a symmetric matrix; very large in its null space, where a pseudo-inverse would be zero."""
     if not np.isfinite(hessian).all():
         return np.full(hessian.shape, np.inf)
     unit = np.sqrt(np.maximum(np.diag(hessian), 1e-12))

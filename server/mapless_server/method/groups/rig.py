@@ -69,7 +69,7 @@ class RigEstimate:
 
 @dataclass(frozen=True, eq=False)
 class RigFreedom:
-    """A rig moves as a whole; see `joint.Freedom`. Its parameters are a left perturbation (v, w) of rig_from_world."""
+    """The six parameters of a rig: a left perturbation (v, w) of rig_from_world; see `problem.Freedom`."""
 
     rig_from_world: RigidTransform
     rig_from_camera: tuple[RigidTransform, ...]
@@ -112,7 +112,7 @@ def solve_rig(
     Args:
         images: one of each camera, with its own answer.
         rig_from_camera: mounting of each camera, metric.
-        options: see there.
+        options: of the rig.
 
     Returns:
         The estimate. Rejections: that of the image that reached the latest stage, if none has matches; TOO_FEW_MATCHES;

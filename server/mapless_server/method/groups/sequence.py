@@ -110,7 +110,7 @@ def solve_sequence(
         images: the frames in the order they were taken, with their own answers.
         session_from_camera: the tracked pose of each.
         estimate_scale: whether the unit of the session is unknown; else it is the metre.
-        options: see there.
+        options: of the sequence.
 
     Returns:
         The estimate. Rejections: that of the frame that reached the latest stage, if none has matches; TOO_FEW_MATCHES;
@@ -122,14 +122,14 @@ def solve_sequence(
         return rejection_without_matches(images)
     session = _Session(tuple(session_from_camera), estimate_scale, options)
     if estimate_scale and not session.moves:
-        return Rejection(RejectionReason.SCALE_UNRELIABLE, "the session does not move: nothing tells its unit")
+        return Rejection(RejectionReason.SCALE_UNRELIABLE, "the session does not move: its unit cannot be determined")
     total = sum(len(it.tracked) for it in matched_images)
     if total < options.pnp.min_matches:
         message = f"{total} 2D-3D matches in {len(matched_images)} frames, {options.pnp.min_matches} needed"
         return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
     guess = session.first_guess(matched_images)
     if guess is None:
-        return Rejection(RejectionReason.PNP_FAILED, f"nothing explains more than a few of {total} matches")
+        return Rejection(RejectionReason.PNP_FAILED, f"no poses of the sequence explain four of {total} matches")
     poses = session.poses(matched_images, guess)
     freedom = SequenceFreedom.of(poses, session_from_camera, guess.scale, estimate_scale, options.drift)
     estimate = adjust_in_rounds(matched_images, freedom, options.joint, options.rounds)
@@ -177,7 +177,7 @@ class _Session:
     Attributes:
         frames: session_from_camera.
         scale_is_free: whether its unit is unknown.
-        options: see there.
+        options: of the sequence.
     """
 
     frames: tuple[RigidTransform, ...]
