@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine, Sequence
+import gc
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -11,7 +12,6 @@ import pytest
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.services.progressive import Coarse, coarse_then_final
 
-LIMIT_S = 10.0
 FINAL = pb.LocalizeResponse(localization=pb.Localization(inlier_count=100))
 
 
@@ -43,85 +43,63 @@ class Planted:
         return coarse_then_final(self.answer)
 
 
-def run(test: Coroutine[Any, Any, None]) -> None:
-    asyncio.run(asyncio.wait_for(test, LIMIT_S))
-
-
 def seen(response: pb.LocalizeProgressivelyResponse) -> tuple[int, bool]:
     return response.answer.localization.inlier_count, response.is_final
 
 
-def test_the_coarse_answer_does_not_wait_for_the_final_one() -> None:
-    async def test() -> None:
-        planted = Planted([1])
-        messages = planted.messages()
-        assert seen(await anext(messages)) == (1, False)
-        planted.may_end.set()
-        assert [seen(it) async for it in messages] == [(100, True)]
-
-    run(test())
+async def test_the_coarse_answer_does_not_wait_for_the_final_one() -> None:
+    planted = Planted([1])
+    messages = planted.messages()
+    assert seen(await anext(messages)) == (1, False)
+    planted.may_end.set()
+    assert [seen(it) async for it in messages] == [(100, True)]
 
 
 @pytest.mark.parametrize(("tells", "expected"), [((), []), ((1,), [(1, False)])])
-def test_there_are_two_messages_at_most_and_the_order_is_kept(
+async def test_there_are_two_messages_at_most_and_the_order_is_kept(
     tells: Sequence[int], expected: list[tuple[int, bool]]
 ) -> None:
     """Even where the final answer is there before anybody looks."""
-
-    async def test() -> None:
-        planted = Planted(tells)
-        planted.may_end.set()
-        assert [seen(it) async for it in planted.messages()] == [*expected, (100, True)]
-
-    run(test())
+    planted = Planted(tells)
+    planted.may_end.set()
+    assert [seen(it) async for it in planted.messages()] == [*expected, (100, True)]
 
 
 @pytest.mark.parametrize("tells", [(), (1,)])
-def test_an_error_comes_in_the_place_of_the_final_answer(tells: Sequence[int]) -> None:
-    async def test() -> None:
-        planted = Planted(tells, KeyError("planted"))
-        planted.may_end.set()
-        messages = planted.messages()
-        for number in tells:
-            assert seen(await anext(messages)) == (number, False)
-        with pytest.raises(KeyError, match="planted"):
-            await anext(messages)
-
-    run(test())
-
-
-def test_whoever_stops_reading_ends_it() -> None:
-    async def test() -> None:
-        planted = Planted([1])
-        messages = planted.messages()
+async def test_an_error_comes_in_the_place_of_the_final_answer(tells: Sequence[int]) -> None:
+    planted = Planted(tells, KeyError("planted"))
+    planted.may_end.set()
+    messages = planted.messages()
+    for number in tells:
+        assert seen(await anext(messages)) == (number, False)
+    with pytest.raises(KeyError, match="planted"):
         await anext(messages)
-        await messages.aclose()
-        assert planted.is_cancelled
-
-    run(test())
 
 
-def test_whoever_is_cancelled_while_waiting_ends_it() -> None:
-    async def test() -> None:
-        planted = Planted()
-        waits = asyncio.ensure_future(anext(planted.messages()))
-        await asyncio.sleep(0)
-        waits.cancel()
-        await asyncio.gather(waits, return_exceptions=True)
-        assert waits.cancelled()
-        assert planted.is_cancelled
-
-    run(test())
+async def test_whoever_stops_reading_ends_it() -> None:
+    planted = Planted([1])
+    messages = planted.messages()
+    await anext(messages)
+    await messages.aclose()
+    assert planted.is_cancelled
 
 
-def test_an_error_that_nobody_awaits_is_not_reported(caplog: pytest.LogCaptureFixture) -> None:
-    async def test() -> None:
-        planted = Planted([1], KeyError("planted"))
-        planted.may_end.set()
-        messages = planted.messages()
-        await anext(messages)
-        await asyncio.sleep(0.01)
-        await messages.aclose()
+async def test_whoever_is_cancelled_while_waiting_ends_it() -> None:
+    planted = Planted()
+    waits = asyncio.ensure_future(anext(planted.messages()))
+    await asyncio.sleep(0)
+    waits.cancel()
+    await asyncio.gather(waits, return_exceptions=True)
+    assert waits.cancelled()
+    assert planted.is_cancelled
 
-    run(test())
+
+async def test_an_error_that_nobody_awaits_is_not_reported(caplog: pytest.LogCaptureFixture) -> None:
+    planted = Planted([1], KeyError("planted"))
+    planted.may_end.set()
+    messages = planted.messages()
+    await anext(messages)
+    await asyncio.sleep(0.01)
+    await messages.aclose()
+    gc.collect()
     assert not caplog.records

@@ -238,20 +238,17 @@ def test_who_closes_a_client_does_not_wait_for_its_pauses() -> None:
         assert [type(it) for it in failed] == [Unavailable]
 
 
-def test_a_cancelled_task_cancels_its_call(server: RunningServer, scene: str) -> None:
-    async def run() -> None:
-        async with aio.Client(server.address) as client:
-            with server.method.held():
-                task = asyncio.create_task(client.localize(PHOTO, CAMERA, scene))
-                while server.engine.queue.job_count == 0:
-                    await asyncio.sleep(0.005)
-                task.cancel()
-                with pytest.raises(asyncio.CancelledError):
-                    await task
-                while server.engine.queue.job_count:
-                    await asyncio.sleep(0.005)
-
-    asyncio.run(asyncio.wait_for(run(), 30))
+async def test_a_cancelled_task_cancels_its_call(server: RunningServer, scene: str) -> None:
+    async with aio.Client(server.address) as client:
+        with server.method.held():
+            task = asyncio.create_task(client.localize(PHOTO, CAMERA, scene))
+            while server.engine.queue.job_count == 0:
+                await asyncio.sleep(0.005)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            while server.engine.queue.job_count:
+                await asyncio.sleep(0.005)
 
 
 def test_calls_of_one_loop_run_at_the_same_time(server: RunningServer, scene: str) -> None:

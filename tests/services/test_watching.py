@@ -35,51 +35,41 @@ def inliers_of(message: pb.WatchQueriesResponse) -> int:
     return int(message.answer.localization.inlier_count)
 
 
-def test_an_answer_reaches_watchers_with_photo_and_matches() -> None:
-    async def run() -> None:
-        watchers = Watchers(True)
-        first, second, elsewhere = watchers.watch(HALL), watchers.watch(HALL), watchers.watch(OTHER)
-        waits = asyncio.ensure_future(elsewhere.__anext__())
-        publish(watchers, 7, debug=pb.Debug(error_px=[0.5]))
-        for watch in (first, second):
-            seen = await next_of(watch)
-            assert (seen.image, seen.intrinsics.width_px, inliers_of(seen)) == (b"photograph", 640, 7)
-            assert list(seen.answer.debug.error_px) == [0.5]
-            assert seen.missed_count == 0
-        assert not waits.done()
-        waits.cancel()
-
-    asyncio.run(run())
+async def test_an_answer_reaches_watchers_with_photo_and_matches() -> None:
+    watchers = Watchers(True)
+    first, second, elsewhere = watchers.watch(HALL), watchers.watch(HALL), watchers.watch(OTHER)
+    waits = asyncio.ensure_future(elsewhere.__anext__())
+    publish(watchers, 7, debug=pb.Debug(error_px=[0.5]))
+    for watch in (first, second):
+        seen = await next_of(watch)
+        assert (seen.image, seen.intrinsics.width_px, inliers_of(seen)) == (b"photograph", 640, 7)
+        assert list(seen.answer.debug.error_px) == [0.5]
+        assert seen.missed_count == 0
+    assert not waits.done()
+    waits.cancel()
 
 
-def test_a_waiting_answer_keeps_no_more_of_the_request() -> None:
+async def test_a_waiting_answer_keeps_no_more_of_the_request() -> None:
     """A part of a message keeps the whole message, so that each photograph would be in memory twice."""
-
-    async def run() -> None:
-        watchers = Watchers(True)
-        watch = watchers.watch(HALL)
-        request = pb.LocalizeRequest()
-        request.CopyFrom(REQUEST)
-        watchers.publish(HALL, request, answer(1), None)
-        request.intrinsics.width_px = 111
-        assert (await next_of(watch)).intrinsics.width_px == 640
-
-    asyncio.run(run())
+    watchers = Watchers(True)
+    watch = watchers.watch(HALL)
+    request = pb.LocalizeRequest()
+    request.CopyFrom(REQUEST)
+    watchers.publish(HALL, request, answer(1), None)
+    request.intrinsics.width_px = 111
+    assert (await next_of(watch)).intrinsics.width_px == 640
 
 
-def test_an_oversized_photograph_is_left_out_of_the_event() -> None:
-    async def run() -> None:
-        watchers = Watchers(True, 2000)
-        watch = watchers.watch(HALL)
-        for size in (1000, 1999, 5):
-            request = pb.LocalizeRequest(image=bytes(size))
-            watchers.publish(HALL, request, answer(size), pb.Debug(error_px=[0.5] * 10))
-        seen = [await next_of(watch) for _ in range(3)]
-        assert [len(it.image) for it in seen] == [1000, 0, 5]
-        assert [inliers_of(it) for it in seen] == [1000, 1999, 5]
-        assert all(it.ByteSize() <= 2000 for it in seen)
-
-    asyncio.run(run())
+async def test_an_oversized_photograph_is_left_out_of_the_event() -> None:
+    watchers = Watchers(True, 2000)
+    watch = watchers.watch(HALL)
+    for size in (1000, 1999, 5):
+        request = pb.LocalizeRequest(image=bytes(size))
+        watchers.publish(HALL, request, answer(size), pb.Debug(error_px=[0.5] * 10))
+    seen = [await next_of(watch) for _ in range(3)]
+    assert [len(it.image) for it in seen] == [1000, 0, 5]
+    assert [inliers_of(it) for it in seen] == [1000, 1999, 5]
+    assert all(it.ByteSize() <= 2000 for it in seen)
 
 
 def test_the_callers_own_answer_stays_as_it_was() -> None:
@@ -96,62 +86,50 @@ def test_the_callers_own_answer_stays_as_it_was() -> None:
     assert not response.HasField("debug")
 
 
-def test_a_slow_reader_misses_the_oldest_and_learns_how_many() -> None:
-    async def run() -> None:
-        watchers = Watchers(True)
-        watch = watchers.watch(HALL)
-        for i in range(QUEUE_LENGTH + 4):
-            publish(watchers, i)
-        seen = [await next_of(watch) for _ in range(QUEUE_LENGTH)]
-        assert [inliers_of(it) for it in seen] == [4 + i for i in range(QUEUE_LENGTH)]
-        assert [it.missed_count for it in seen] == [4] + [0] * (QUEUE_LENGTH - 1)
-
-    asyncio.run(run())
+async def test_a_slow_reader_misses_the_oldest_and_learns_how_many() -> None:
+    watchers = Watchers(True)
+    watch = watchers.watch(HALL)
+    for i in range(QUEUE_LENGTH + 4):
+        publish(watchers, i)
+    seen = [await next_of(watch) for _ in range(QUEUE_LENGTH)]
+    assert [inliers_of(it) for it in seen] == [4 + i for i in range(QUEUE_LENGTH)]
+    assert [it.missed_count for it in seen] == [4] + [0] * (QUEUE_LENGTH - 1)
 
 
-def test_nothing_is_kept_without_watchers() -> None:
-    async def run() -> None:
-        watchers = Watchers(True)
-        assert not watchers.is_watched(HALL)
-        publish(watchers, 1)
-        watch = watchers.watch(HALL)
-        assert watchers.is_watched(HALL)
-        assert not watchers.is_watched(OTHER)
-        publish(watchers, 2)
-        assert inliers_of(await next_of(watch)) == 2  # not what came before it began
-        await watch.aclose()
-        assert not watchers.is_watched(HALL)
-        kept = weakref.ref(watch)
-        del watch
-        gc.collect()
-        assert kept() is None
-
-    asyncio.run(run())
+async def test_nothing_is_kept_without_watchers() -> None:
+    watchers = Watchers(True)
+    assert not watchers.is_watched(HALL)
+    publish(watchers, 1)
+    watch = watchers.watch(HALL)
+    assert watchers.is_watched(HALL)
+    assert not watchers.is_watched(OTHER)
+    publish(watchers, 2)
+    assert inliers_of(await next_of(watch)) == 2  # not what came before it began
+    await watch.aclose()
+    assert not watchers.is_watched(HALL)
+    kept = weakref.ref(watch)
+    del watch
+    gc.collect()
+    assert kept() is None
 
 
-def test_one_tenant_cannot_keep_the_others_from_watching() -> None:
-    async def run() -> None:
-        watchers = Watchers(True)
-        for i in range(MAX_WATCHERS_OF_TENANT):
-            watchers.watch(key_of("loud", f"scene-{i}"))
-        with pytest.raises(Overloaded):
-            watchers.watch(key_of("loud", "scene-0"))
-        mine = watchers.watch(key_of("quiet", "scene-0"))
-        publish(watchers, 5, key_of("loud", "scene-0"))
-        publish(watchers, 6, key_of("quiet", "scene-0"))
-        assert inliers_of(await next_of(mine)) == 6  # the other tenant's scene of the same name is another scene
-
-    asyncio.run(run())
+async def test_one_tenant_cannot_keep_the_others_from_watching() -> None:
+    watchers = Watchers(True)
+    for i in range(MAX_WATCHERS_OF_TENANT):
+        watchers.watch(key_of("loud", f"scene-{i}"))
+    with pytest.raises(Overloaded):
+        watchers.watch(key_of("loud", "scene-0"))
+    mine = watchers.watch(key_of("quiet", "scene-0"))
+    publish(watchers, 5, key_of("loud", "scene-0"))
+    publish(watchers, 6, key_of("quiet", "scene-0"))
+    assert inliers_of(await next_of(mine)) == 6  # the other tenant's scene of the same name is another scene
 
 
-def test_all_tenants_share_a_limit() -> None:
-    async def run() -> None:
-        watchers = Watchers(True)
-        watches = [watchers.watch(key_of(f"tenant-{i}", "hall")) for i in range(MAX_WATCHERS)]
-        with pytest.raises(Overloaded) as refused:
-            watchers.watch(HALL)
-        assert refused.value.retry_after_s is not None
-        await watches[0].aclose()
+async def test_all_tenants_share_a_limit() -> None:
+    watchers = Watchers(True)
+    watches = [watchers.watch(key_of(f"tenant-{i}", "hall")) for i in range(MAX_WATCHERS)]
+    with pytest.raises(Overloaded) as refused:
         watchers.watch(HALL)
-
-    asyncio.run(run())
+    assert refused.value.retry_after_s is not None
+    await watches[0].aclose()
+    watchers.watch(HALL)
