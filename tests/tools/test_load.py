@@ -221,7 +221,7 @@ async def abort(context: Any, code: grpc.StatusCode, reason: str) -> bytes:
     raise AssertionError("abort raises")
 
 
-def test_calls_to_a_refusing_and_silent_server_are_counted_once() -> None:
+async def test_calls_to_a_refusing_and_silent_server_are_counted_once() -> None:
     number = 0
 
     async def handler(request: bytes, context: Any) -> bytes:
@@ -237,11 +237,8 @@ def test_calls_to_a_refusing_and_silent_server_are_counted_once() -> None:
 
     plan = plan_calls(400.0, 0.5, 2, REQUESTS, Mix(0.2, 0.2, 0.05), seed=5)
 
-    async def run() -> list[CallRecord]:
-        async with toy_server(handler, deadline_s=0.4) as target:
-            return await send_open_loop(target, plan)
-
-    records = asyncio.run(run())
+    async with toy_server(handler, deadline_s=0.4) as target:
+        records = await send_open_loop(target, plan)
     assert [(r.at_s, r.kind, r.client) for r in records] == [(c.at_s, c.kind, c.client) for c in plan]
     account = account_of(records, 0.5)
     assert sum(account.fates.values()) == len(plan)
@@ -260,51 +257,42 @@ def test_calls_to_a_refusing_and_silent_server_are_counted_once() -> None:
         assert r.at_s <= r.sent_s <= r.ended_s
 
 
-def test_a_stalled_server_shows_in_every_latency_meanwhile() -> None:
-    released_s = math.inf
+async def test_a_stalled_server_shows_in_every_latency_meanwhile() -> None:
+    loop, gate, seen, released_s = asyncio.get_running_loop(), asyncio.Event(), 0, math.inf
+    plan = [PlannedCall(0.01 * i, i, Kind.QUERY, GOOD) for i in range(20)]
 
-    async def run() -> tuple[list[CallRecord], float]:
-        nonlocal released_s
-        loop, gate, seen = asyncio.get_running_loop(), asyncio.Event(), 0
-        plan = [PlannedCall(0.01 * i, i, Kind.QUERY, GOOD) for i in range(20)]
+    async def handler(_: bytes, __: Any) -> bytes:
+        nonlocal seen, released_s
+        seen += 1
+        if seen == len(plan):  # it has not waited for answers: all are there while not one is answered
+            released_s = loop.time()
+            gate.set()
+        await gate.wait()
+        return b"localized"
 
-        async def handler(_: bytes, __: Any) -> bytes:
-            nonlocal seen, released_s
-            seen += 1
-            if seen == len(plan):  # it has not waited for answers: all are there while not one is answered
-                released_s = loop.time()
-                gate.set()
-            await gate.wait()
-            return b"localized"
-
-        async with toy_server(handler) as target:
-            begin_s = loop.time()
-            return await send_open_loop(target, plan, begin_s), begin_s
-
-    records, begin_s = asyncio.run(run())
+    async with toy_server(handler) as target:
+        begin_s = loop.time()
+        records = await send_open_loop(target, plan, begin_s)
     assert [r.fate for r in records] == [Fate.ANSWERED] * 20
     for r in records:
         assert r.latency_s >= released_s - begin_s - r.at_s - 1e-9
 
 
-def test_a_late_generator_counts_from_the_planned_time() -> None:
+async def test_a_late_generator_counts_from_the_planned_time() -> None:
     async def handler(_: bytes, __: Any) -> bytes:
         return b"localized"
 
-    async def run() -> list[CallRecord]:
-        async with toy_server(handler) as target:
-            late_by_5_s = asyncio.get_running_loop().time() - 5.0
-            plan = [PlannedCall(float(i), i, Kind.QUERY, GOOD) for i in range(3)]
-            return await send_open_loop(target, plan, late_by_5_s)
-
-    records = asyncio.run(run())
+    async with toy_server(handler) as target:
+        late_by_5_s = asyncio.get_running_loop().time() - 5.0
+        plan = [PlannedCall(float(i), i, Kind.QUERY, GOOD) for i in range(3)]
+        records = await send_open_loop(target, plan, late_by_5_s)
     assert [r.latency_s >= 5.0 - r.at_s for r in records] == [True] * 3
     lag = account_of(records, 10.0).send_lag
     assert lag.max_ms is not None
     assert lag.max_ms >= 5000
 
 
-def test_a_closed_loop_keeps_so_many_calls_in_progress() -> None:
+async def test_a_closed_loop_keeps_so_many_calls_in_progress() -> None:
     running = most = 0
     seen: Counter[bytes] = Counter()
 
@@ -316,17 +304,14 @@ def test_a_closed_loop_keeps_so_many_calls_in_progress() -> None:
         running -= 1
         return b"localized"
 
-    async def run() -> list[CallRecord]:
-        async with toy_server(handler) as target:
-            return await send_closed_loop(target, [b"a", b"b", b"c"], 3, 0.3)
-
-    records = asyncio.run(run())
+    async with toy_server(handler) as target:
+        records = await send_closed_loop(target, [b"a", b"b", b"c"], 3, 0.3)
     assert most == 3
     assert sum(seen.values()) == len(records)
     assert max(seen.values()) - min(seen.values()) <= 1
 
 
-def test_a_refused_closed_loop_caller_returns_when_told() -> None:
+async def test_a_refused_closed_loop_caller_returns_when_told() -> None:
     came_s: list[float] = []
 
     async def handler(_: bytes, context: Any) -> bytes:
@@ -341,11 +326,8 @@ def test_a_refused_closed_loop_caller_returns_when_told() -> None:
         await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, "too much to do")
         return b""
 
-    async def run() -> list[CallRecord]:
-        async with toy_server(handler) as target:
-            return await send_closed_loop(target, [b"a"], 1, 0.55)
-
-    records = asyncio.run(run())
+    async with toy_server(handler) as target:
+        records = await send_closed_loop(target, [b"a"], 1, 0.55)
     assert {(it.fate, it.retry_after_s) for it in records} == {(Fate.REFUSED, 0.1)}
     assert 2 <= len(records) <= 6
     assert min(later - sooner for sooner, later in itertools.pairwise(came_s)) > 0.09
@@ -532,7 +514,7 @@ def test_the_file_of_figures_keeps_earlier_parts(tmp_path: Path) -> None:
     assert len(verdicts) == len(content["pipeline"]["checks"])
 
 
-def test_a_step_uses_the_servers_account_of_its_time_only(
+async def test_a_step_uses_the_servers_account_of_its_time_only(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pages = iter([Scrape(10, {"OK": 10}, {}, {}), Scrape(13, {"OK": 13}, {}, {})])
@@ -543,7 +525,7 @@ def test_a_step_uses_the_servers_account_of_its_time_only(
         return [record(at_s=0.01 * i, took_s=0.01) for i in range(3)]
 
     under_load = ServerUnderLoad(os.getpid(), "nowhere")
-    measured = asyncio.run(run_step("toy", under_load, send, 1.0, sample_every_s=0.01))
+    measured = await run_step("toy", under_load, send, 1.0, sample_every_s=0.01)
     assert measured.scraped is not None
     assert (measured.scraped.started, measured.scraped.handled) == (3, {"OK": 3})
     assert measured.answers == 3
