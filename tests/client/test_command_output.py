@@ -35,7 +35,7 @@ def test_each_prior_has_its_line() -> None:
     ]
 
 
-def test_what_hardly_any_right_answer_looks_like_is_warned_of() -> None:
+def test_low_trust_is_warned_of() -> None:
     warning = "  warning   fewer than 5 % of right answers look as doubtful: check the intrinsics"
     assert lines(localized(trust=0.049))[-1] == warning
     for trust in (0.05, 0.9, None):
@@ -62,7 +62,7 @@ def test_a_rejection_names_the_reference_that_shares_most() -> None:
     assert lines(rejected(hint=replace(hint, best_reference="")))[-1] == "  Point the camera there."
 
 
-def test_what_the_server_is_to_keep_is_said_and_of_nothing_else() -> None:
+def test_capture_is_announced_only_where_it_is_on() -> None:
     captured = replace(diagnostics(), captured=True)
     assert "  support   180 of 200 matches, 2 references, 0.30 s, captured by the server" in lines(
         localized(diagnostics=captured)

@@ -46,7 +46,7 @@ def addresses() -> Iterator[dict[str, str]]:
         ("nobody", None, "no server listens there"),
     ],
 )
-def test_a_connection_that_cannot_be_made_is_told_in_words(
+def test_a_failed_connection_is_explained(
     addresses: dict[str, str], kind: str, certificates: bytes | None, told: str
 ) -> None:
     options = ConnectOptions(tls=certificates is not None, root_certificates=certificates, max_attempts=1)
@@ -57,7 +57,7 @@ def test_a_connection_that_cannot_be_made_is_told_in_words(
     assert told in caught.value.message
 
 
-def test_what_the_server_itself_says_stays(addresses: dict[str, str]) -> None:
+def test_the_servers_own_message_is_kept(addresses: dict[str, str]) -> None:
     with Client(addresses["plain"]) as client, pytest.raises(MaplessError, match="UNIMPLEMENTED: Method not found!"):
         client.is_serving()
 

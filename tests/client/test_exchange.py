@@ -37,7 +37,7 @@ def asking(**given: Any) -> Exchange[Any]:
     return (yield Call("s/M", Empty(), Empty, **given))
 
 
-def test_what_succeeds_is_asked_once() -> None:
+def test_a_successful_call_is_sent_once() -> None:
     played = Played(asking(), [Empty()], ConnectOptions(timeout_s=7))
     assert (played.result, played.tries, played.pauses) == (Empty(), [7.0], [])
 
@@ -92,7 +92,7 @@ def test_a_message_over_the_limit_is_not_sent_again() -> None:
     assert (len(played.tries), played.pauses) == (1, [])
 
 
-def test_who_would_come_back_after_its_deadline_is_told_at_once() -> None:
+def test_no_retry_is_started_that_would_miss_the_deadline() -> None:
     refused = full(3.0)
     played = Played(asking(timeout_s=3.5), [refused], ConnectOptions())
     assert (played.result, len(played.tries), played.pauses) == (refused, 1, [])
@@ -137,19 +137,19 @@ def found(error: MaplessError) -> Exchange[str]:
 TAKEN, ABSENT = AlreadyExists("ALREADY_EXISTS", "taken"), NotFound("NOT_FOUND", "absent")
 
 
-def test_what_was_done_though_its_answer_was_lost_is_looked_up() -> None:
+def test_a_change_whose_answer_was_lost_is_looked_up() -> None:
     played = Played(asking(on_repeat=found), [UNAVAILABLE, TAKEN, Empty()], ConnectOptions())
     assert played.result == "found after ALREADY_EXISTS"
     assert [call.method for call in played.calls] == ["s/M", "s/M", "s/Get"]
 
 
 @pytest.mark.parametrize("outcomes", [[TAKEN], [full(0.1), TAKEN]])
-def test_what_no_lost_try_can_have_done_is_an_error(outcomes: list[Any]) -> None:
+def test_a_conflict_without_a_lost_try_is_an_error(outcomes: list[Any]) -> None:
     """A server at its limit has done nothing, and says so."""
     assert Played(asking(on_repeat=found), outcomes, ConnectOptions()).result is TAKEN
 
 
-def test_the_error_stays_if_what_is_found_is_not_ours() -> None:
+def test_the_error_is_raised_if_the_found_resource_differs() -> None:
     def foreign(error: MaplessError) -> Exchange[str]:
         yield Call("s/Get", Empty(), Empty)
         raise error
@@ -182,7 +182,7 @@ def test_the_lookup_after_a_lost_answer_has_the_remaining_time() -> None:
     assert played.tries == pytest.approx([10.0, *(8.8 - i for i in range(9))])
 
 
-def test_what_is_looked_up_has_no_more_time_than_any_other_call() -> None:
+def test_a_look_up_has_the_deadline_of_any_call() -> None:
     options = ConnectOptions(timeout_s=5, upload_timeout_s=300)
     played = Played(asking(is_upload=True, on_repeat=found), [UNAVAILABLE, TAKEN, Empty()], options)
     assert played.tries == pytest.approx([300.0, 298.8, 5.0])

@@ -128,7 +128,7 @@ def test_refused_photographs_do_not_wait_behind_new_ones(
     assert set(server.answered[:3]) < {"0", "1", "2", "3"}
 
 
-def test_the_summary_says_why(server: FewAtATime, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_summary_counts_the_reasons(server: FewAtATime, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def fault(name: str, context: grpc.ServicerContext) -> pb.LocalizeResponse | None:
         if name in {"1", "4"}:
             context.abort(grpc.StatusCode.INTERNAL, "broken")
@@ -144,7 +144,7 @@ def test_the_summary_says_why(server: FewAtATime, folder: Path, capsys: pytest.C
     assert "5.jpg cannot be read: No such file" in answers[5]["error"]["message"]
 
 
-def test_a_run_that_ends_early_says_how_far_it_came(
+def test_an_interrupted_run_reports_its_progress(
     server: FewAtATime, folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     def fault(name: str, context: grpc.ServicerContext) -> None:

@@ -45,7 +45,7 @@ def test_thumbnails_and_padding_are_passed_over() -> None:
 
 
 @pytest.mark.parametrize("ending", [".jpg", ".png", ".webp"])
-def test_what_ends_early_or_is_none_is_said(ending: str) -> None:
+def test_truncated_and_other_files_are_refused_by_name(ending: str) -> None:
     data = encode(ending, np.zeros((40, 50, 3), np.uint8))
     for length in range(32 if ending != ".jpg" else 150):
         with contextlib.suppress(ValueError):

@@ -115,7 +115,7 @@ def test_a_batch_is_found_by_one_call() -> None:
     assert methods(played) == ["BatchCreateReferences"] * 2 + ["ListReferences"]
 
 
-def test_what_a_large_scene_lists_later_is_asked_for_one_by_one() -> None:
+def test_items_of_a_large_scene_are_looked_up_one_by_one() -> None:
     wanted = requests(3)
     page = pb.ListReferencesResponse(references=map(stored, wanted[:1]), next_page_token="more")
     singles = [pb.GetReferenceResponse(reference=stored(it)) for it in wanted[1:]]
@@ -125,7 +125,7 @@ def test_what_a_large_scene_lists_later_is_asked_for_one_by_one() -> None:
     assert absent.result is TAKEN
 
 
-def test_a_batch_of_which_one_is_somebody_elses_is_not_ours() -> None:
+def test_a_batch_with_another_clients_item_is_not_repeated() -> None:
     wanted = requests(3)
     there = [stored(it) for it in wanted]
     there[2].image_sha256 = "0" * 64
@@ -214,7 +214,7 @@ def test_an_answer_that_breaks_its_contract_is_a_server_error(
     assert error.reason == "MALFORMED_ANSWER"
 
 
-def test_such_an_error_says_which_field_of_which_call() -> None:
+def test_the_error_names_field_and_call() -> None:
     error = Played(localize(), [localized()], ConnectOptions()).result
     assert (error.field, error.request_id) == ("localization.world_from_camera.translation_m.x", "id-7")
     assert "LocalizationService/Localize" in error.message

@@ -95,7 +95,7 @@ BOTH = (reference("a"), reference("b"))
     ids=["localized", "coarse", "rejected", "ambiguous", "bare", "unknown reason"],
 )
 @pytest.mark.parametrize("references", [(), BOTH], ids=["alone", "with references"])
-def test_it_needs_nothing_else_and_runs_nothing(
+def test_the_page_has_no_external_resources_and_no_scripts(
     answer: LocalizationResult | Rejected, references: tuple[Reference, ...]
 ) -> None:
     html = report_html(answer, PHOTO, CAMERA, references)
@@ -185,7 +185,7 @@ def test_the_ellipse_holds_95_percent() -> None:
     assert ((along / radii) ** 2).sum(axis=1).__le__(1).mean() == pytest.approx(0.95, abs=0.004)
 
 
-def test_a_rejection_says_why_and_what_helps() -> None:
+def test_a_rejection_has_its_reason_and_hint() -> None:
     text = " ".join(Page.of(report_html(rejected(), PHOTO, CAMERA, BOTH)).words)
     assert "Not localized" in text
     assert "only 3 matches" in text
@@ -224,13 +224,13 @@ def test_matches_that_were_not_asked_for_are_told_from_none() -> None:
     assert "include_debug" not in report_html(rejected(diagnostics=early), PHOTO, CAMERA)
 
 
-def test_what_is_not_calibrated_says_so_where_it_is_read_first() -> None:
+def test_an_uncalibrated_answer_is_marked_in_the_header() -> None:
     assert report_html(localized(), PHOTO, CAMERA).count("(uncalibrated)") == 2
     calibrated = localized(accuracy=Accuracy(0.02, 0.04, 0.1, 0.2, True))
     assert "uncalibrated" not in report_html(calibrated, PHOTO, CAMERA)
 
 
-def test_what_the_server_is_to_keep_is_said() -> None:
+def test_capture_is_announced() -> None:
     captured = replace(diagnostics(), captured=True)
     for answer in (localized(diagnostics=captured), rejected(diagnostics=captured)):
         assert "The server keeps this call" in report_html(answer, PHOTO, CAMERA)

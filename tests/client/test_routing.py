@@ -53,11 +53,11 @@ def about(request: Any, scene_id: str) -> Message:
 @pytest.mark.parametrize("method", sorted(REQUESTS.keys() - OF_NO_SCENE))
 @settings(max_examples=20)
 @given(scene_id=IDS)
-def test_every_method_says_which_scene_it_concerns(method: str, scene_id: str) -> None:
+def test_every_method_routes_by_its_scene(method: str, scene_id: str) -> None:
     assert scene_metadata(about(REQUESTS[method], scene_id)) == ((SCENE_KEY, f"scenes/{scene_id}"),)
 
 
-def test_what_concerns_no_scene_says_nothing() -> None:
+def test_calls_without_a_scene_have_no_routing_header() -> None:
     empty: Any = empty_pb2
     assert scene_metadata(empty.Empty()) == ()
     for method in OF_NO_SCENE:
@@ -73,7 +73,7 @@ def test_invalid_names_pass_and_valid_names_fit_a_header(scene: str) -> None:
 
 
 @pytest.mark.parametrize("scene", ["", "kitchen", "scenes/", "scenes/ä", "scenes/a\r\nauthorization: x", "scenes/a/b"])
-def test_bad_names_say_nothing(scene: str) -> None:
+def test_malformed_names_have_no_routing_header(scene: str) -> None:
     assert scene_metadata(localization_pb.LocalizeRequest(scene=scene)) == ()
 
 

@@ -40,7 +40,7 @@ def client() -> Iterator[Client]:
         server.stop(None).wait()
 
 
-def test_a_coarse_pose_says_that_it_is_one(client: Client) -> None:
+def test_a_coarse_pose_has_its_stage(client: Client) -> None:
     answer = client.localize(PHOTO, CAMERA, "s", allow_coarse=True)
     assert isinstance(answer, LocalizationResult)
     assert answer.pose_stage == "COARSE"

@@ -93,7 +93,7 @@ def test_servers_are_found_by_their_name_and_port() -> None:
 
 
 @needs_kubectl
-def test_nobody_but_the_gateway_reaches_the_servers() -> None:
+def test_only_the_gateway_reaches_the_servers() -> None:
     calls, metrics = the("NetworkPolicy", "mapless")["spec"]["ingress"]
     assert calls["from"] == [{"podSelector": {"matchLabels": GATEWAY}}]
     assert calls["ports"] == [{"port": "grpc"}]

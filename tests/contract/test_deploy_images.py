@@ -177,7 +177,7 @@ def test_what_is_copied_exists_and_reaches_the_build() -> None:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_an_image_runs_the_server_as_nobody_in_particular(target: str) -> None:
+def test_an_image_runs_the_server_without_root(target: str) -> None:
     uid, gid = all_of(target, "USER")[-1].split(":")
     assert int(uid) > 0 < int(gid)  # a number, since only that lets Kubernetes see that it is not root
     assert chain(target)[-1][0] == "USER"
@@ -219,7 +219,7 @@ def test_what_an_image_writes_to_is_a_volume(target: str) -> None:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_an_image_speaks_to_either_database(target: str) -> None:
+def test_an_image_has_the_drivers_of_both_databases(target: str) -> None:
     (extras,) = [value for name, _, value in arguments_of(f"build-{target}") if name == "EXTRAS"]
     assert {"server", "postgres"} <= set(extras.split(","))
 

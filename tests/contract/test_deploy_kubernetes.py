@@ -180,7 +180,7 @@ def test_ports_are_the_settings(folder: str) -> None:
 
 @needs_kubectl
 @pytest.mark.parametrize("folder", SERVERS)
-def test_who_is_selected_is_there(folder: str) -> None:
+def test_every_selector_selects_a_pod(folder: str) -> None:
     documents = built(KUBERNETES / folder)
     labels = server(documents)[0]["metadata"]["labels"].items()
     for document in (workload(documents), the(documents, "PodDisruptionBudget")):
@@ -294,7 +294,7 @@ def test_the_graphics_card_is_asked_for_once() -> None:
     assert {"key": "nvidia.com/gpu", "operator": "Exists", "effect": "NoSchedule"} in pod["spec"]["tolerations"]
 
 
-def test_the_job_fetches_weights_that_nobody_restricts() -> None:
+def test_the_job_fetches_weights_of_permissive_licences() -> None:
     (job,) = read(KUBERNETES / "weights" / "job.yaml")
     (container,) = job["spec"]["template"]["spec"]["containers"]
     command, action, *names = container["args"]

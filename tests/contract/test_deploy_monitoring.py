@@ -161,7 +161,7 @@ def test_counters_are_not_read_as_they_are() -> None:
 # Alerts
 
 
-def test_every_alert_says_how_bad_and_is_in_the_runbook() -> None:
+def test_every_alert_has_a_severity_and_is_in_the_runbook() -> None:
     names = [rule["alert"] for rule in ALERTS]
     assert len(set(names)) == len(names)
     for rule in ALERTS:
@@ -206,7 +206,7 @@ def test_every_alert_is_tried_out() -> None:
 # The dashboard
 
 
-def test_panels_can_be_told_apart_and_do_not_overlap() -> None:
+def test_panels_have_distinct_titles_and_do_not_overlap() -> None:
     panels = DASHBOARD["panels"]
     assert len({panel["id"] for panel in panels}) == len(panels)
     assert len({panel["title"] for panel in panels}) == len(panels)
@@ -218,7 +218,7 @@ def test_panels_can_be_told_apart_and_do_not_overlap() -> None:
 
 
 @pytest.mark.parametrize("panel", PANELS, ids=lambda panel: panel["title"])
-def test_a_panel_says_how_to_read_it_in_which_unit(panel: dict[str, Any]) -> None:
+def test_every_panel_has_a_description_and_a_unit(panel: dict[str, Any]) -> None:
     assert len(panel["description"]) > 20
     assert panel["fieldConfig"]["defaults"]["unit"]
     assert panel["datasource"] == {"type": "prometheus", "uid": "${datasource}"}

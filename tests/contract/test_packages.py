@@ -74,7 +74,7 @@ def install(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[
     return install
 
 
-def test_the_wheel_holds_every_file_of_the_packages_and_no_other(source: Path, wheel: Path) -> None:
+def test_the_wheel_holds_exactly_the_files_of_the_packages(source: Path, wheel: Path) -> None:
     packaged = set(zipfile.ZipFile(wheel).namelist())
     tops = {name.partition("/")[0] for name in packaged}
     packages = {"mapless", "mapless_command", "mapless_ray", "mapless_server", "mapless_tools"}
@@ -101,7 +101,7 @@ def test_the_client_alone_needs_neither_server_nor_torch(install: Callable[[str]
     assert message == "mapless-server: the Python package typer is not installed: pip install 'mapless[server]'\n"
 
 
-def test_a_server_serves_and_says_what_its_tools_need(install: Callable[[str], Path], tmp_path: Path) -> None:
+def test_a_server_without_tools_names_their_extra(install: Callable[[str], Path], tmp_path: Path) -> None:
     programs = install("[server]")
     command = programs / "mapless-server"
     for arguments in (["--help"], ["serve", "--help"], ["store", "--help"], ["token", "--help"], ["weights", "list"]):

@@ -148,7 +148,7 @@ class TestTiers:
     @pytest.mark.parametrize(
         "sure", [localized(SURE_INLIERS), rejected(RejectionReason.DEGENERATE_REFERENCES)], ids=["pose", "rejection"]
     )
-    def test_an_answer_beyond_doubt_costs_one_tier(self, setting: Setting, sure: Answer) -> None:
+    def test_a_trusted_answer_uses_one_tier(self, setting: Setting, sure: Answer) -> None:
         setting.replies["cheap"] = sure
         result = setting.localize()
         assert setting.asked == ["cheap"]
@@ -175,7 +175,7 @@ class TestTiers:
         assert result.tier.extractor.name == answered
         assert is_outcome(result, {"cheap": first, "strong": second}[answered])
 
-    def test_the_time_of_both_is_told_apart(self, setting: Setting) -> None:
+    def test_the_times_of_both_tiers_are_separate(self, setting: Setting) -> None:
         setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
         seconds = setting.localize().stage_seconds
         assert list(seconds) == [

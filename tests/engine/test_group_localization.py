@@ -159,7 +159,7 @@ def test_one_caller_s_groups_leave_room_for_another_s() -> None:
     run(engine, work())
 
 
-def test_a_group_too_large_for_the_setting_is_told_not_to_retry() -> None:
+def test_a_group_above_the_limit_is_refused_without_retry() -> None:
     engine = Toy()
 
     async def work() -> None:
@@ -215,7 +215,7 @@ def test_and_while_the_server_drains_but_not_after_its_end() -> None:
     run(engine, work())
 
 
-def test_the_stages_of_a_group_that_fails_are_told_too() -> None:
+def test_a_failed_group_has_its_stage_times() -> None:
     engine = Toy()
     engine.fails_at = 3
 

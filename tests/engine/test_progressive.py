@@ -76,7 +76,7 @@ async def test_an_error_comes_in_the_place_of_the_final_answer(tells: Sequence[i
         await anext(messages)
 
 
-async def test_whoever_stops_reading_ends_it() -> None:
+async def test_a_caller_that_stops_reading_ends_the_job() -> None:
     planted = Planted([1])
     messages = planted.messages()
     await anext(messages)
@@ -84,7 +84,7 @@ async def test_whoever_stops_reading_ends_it() -> None:
     assert planted.is_cancelled
 
 
-async def test_whoever_is_cancelled_while_waiting_ends_it() -> None:
+async def test_a_cancelled_caller_ends_the_job() -> None:
     planted = Planted()
     waits = asyncio.ensure_future(anext(planted.messages()))
     await asyncio.sleep(0)
@@ -94,7 +94,7 @@ async def test_whoever_is_cancelled_while_waiting_ends_it() -> None:
     assert planted.is_cancelled
 
 
-async def test_an_error_that_nobody_awaits_is_not_reported(caplog: pytest.LogCaptureFixture) -> None:
+async def test_an_error_of_an_abandoned_call_is_not_logged(caplog: pytest.LogCaptureFixture) -> None:
     planted = Planted([1], KeyError("planted"))
     planted.may_end.set()
     messages = planted.messages()

@@ -59,12 +59,12 @@ class TestDoubt:
         assert {it.name for it in UNRECOVERABLE} == {"NO_USABLE_REFERENCES", "DEGENERATE_REFERENCES"}
 
     @given(trust=st.floats(0, 1), sigma_m=st.floats(1e-4, 1.0))
-    def test_doubt_is_little_trust_or_a_large_radius(self, trust: float, sigma_m: float) -> None:
+    def test_low_trust_or_a_large_radius_is_doubtful(self, trust: float, sigma_m: float) -> None:
         radius_m = float(error_radii(np.eye(3) * sigma_m**2, [0.68])[0])
         expected = trust < OPTIONS.doubtful_trust or radius_m > OPTIONS.doubtful_radius_m
         assert is_doubtful(localized(sigma_m=sigma_m, trust=trust), OPTIONS) is expected
 
-    def test_a_pose_that_claims_nothing_is_not_doubtful(self) -> None:
+    def test_a_coarse_pose_is_not_doubtful(self) -> None:
         coarse = Localization(RigidTransform.identity(), None, PoseStage.INITIAL, 0, 0, 0.0)
         assert not is_doubtful(Answer(coarse), OPTIONS)
 
@@ -74,7 +74,7 @@ class TestBetter:
         assert better(rejected(), localized()).tier is STRONG
         assert better(localized(), rejected()).tier is CHEAP
 
-    def test_of_two_rejections_the_stronger_features_are_heard(self) -> None:
+    def test_of_two_rejections_the_stronger_tiers_is_answered(self) -> None:
         answer = better(rejected(RejectionReason.LOW_TEXTURE), rejected(RejectionReason.LOW_OVERLAP))
         assert answer.tier is STRONG
         assert isinstance(answer.answer.outcome, Rejection)
@@ -89,7 +89,7 @@ class TestBetter:
 
     @pytest.mark.parametrize(("inliers", "tier"), [(30, None), (44, None), (45, STRONG), (300, STRONG)])
     @pytest.mark.parametrize("far", [{"x_m": 3.0}, {"turn_deg": 20.0}], ids=["far", "turned"])
-    def test_of_two_that_disagree_the_clearly_better_is_believed(
+    def test_of_two_contradictory_poses_the_clearly_better_is_taken(
         self, far: dict[str, float], inliers: int, tier: Tier | None
     ) -> None:
         chosen = better(localized(inliers=30), localized(inliers=inliers, **far))

@@ -81,7 +81,7 @@ def test_poses_go_on_after_the_server_was_away(loop: Any, tmp_path: Path, camera
     np.testing.assert_allclose(np.linalg.norm(written[:, 4:], axis=1), 1.0, atol=1e-6)
 
 
-def test_who_is_slow_is_given_the_newest_frame(loop: Any, tmp_path: Path) -> None:
+def test_a_slow_consumer_gets_the_newest_frame(loop: Any, tmp_path: Path) -> None:
     """Every frame that is given is the newest one then, so those between are skipped and never queued."""
     frames = loop.LatestFrame(write_video(tmp_path / "drive.avi", 40), speed=2.0)
     seen = []

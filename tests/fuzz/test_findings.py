@@ -230,7 +230,7 @@ def test_a_pose_too_far_away_is_refused_in_our_own_layout_too(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("name", ["images/\\u001b[2J.png", "images/\\ud800.png", "images/\\u0000", "x" * 5000])
-def test_what_is_told_of_a_refused_frame_can_be_printed(tmp_path: Path, name: str) -> None:
+def test_messages_about_a_refused_frame_can_be_printed(tmp_path: Path, name: str) -> None:
     """Half a character made printing fail, and an escape would have been the terminal's to follow."""
     of = layout(captures.LAYOUTS, "nerfstudio")
     folder = written(tmp_path, of, b"./images/1.png", name.encode())
@@ -242,7 +242,7 @@ def test_what_is_told_of_a_refused_frame_can_be_printed(tmp_path: Path, name: st
         text.encode()
 
 
-def test_what_is_told_of_a_refused_folder_can_be_printed(tmp_path: Path) -> None:
+def test_messages_about_a_refused_folder_can_be_printed(tmp_path: Path) -> None:
     of = layout(captures.LAYOUTS, "nerfstudio")
     folder = written(tmp_path, of, b'"test_filenames"', b'"train_filenames": ["\\ud800\\u001b"], "test_filenames"')
     (folder / "transforms.json").write_bytes(
@@ -260,7 +260,7 @@ def test_printable_keeps_printable_and_shows_other_characters() -> None:
     assert Refusal("\x07", "\x1b") == Refusal("\\x07", "\\x1b")
 
 
-def test_names_in_a_file_of_tokens_are_told_as_text(tmp_path: Path) -> None:
+def test_names_in_a_file_of_tokens_are_printed_as_text(tmp_path: Path) -> None:
     file = tmp_path / "tokens.json"
     file.write_text('{"\\u001b[2J\\u2028": 1}')
     with pytest.raises(SecurityError, match="Extra inputs") as caught:
@@ -268,7 +268,7 @@ def test_names_in_a_file_of_tokens_are_told_as_text(tmp_path: Path) -> None:
     assert str(caught.value).isprintable()
 
 
-def test_names_in_settings_are_told_as_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_in_settings_are_printed_as_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "mapless.toml"
     file.write_text('"\\u001b[2J" = 1\n')
     with pytest.raises(ConfigError) as caught:

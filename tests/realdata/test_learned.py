@@ -40,7 +40,7 @@ def tiers(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tier, ...]:
     return make_tiers(settings)
 
 
-def test_strong_features_answer_what_cheap_ones_lose(
+def test_strong_features_localize_what_cheap_ones_reject(
     photographs: Callable[[str], Dataset], tiers: tuple[Tier, ...]
 ) -> None:
     cheap, strong = (answers(photographs(SCENE), tier) for tier in tiers)

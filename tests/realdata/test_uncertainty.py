@@ -48,7 +48,7 @@ def held(data: Path, scene: str, k: int) -> tuple[int, dict[str, int]]:
 @pytest.mark.parametrize(
     ("scene", "k"), [("fountain-P11", 5), pytest.param("tum-fr3-office", 10, marks=pytest.mark.nightly)]
 )
-def test_radii_hold_as_often_as_they_say(photographs: Callable[[str], Dataset], scene: str, k: int) -> None:
+def test_radii_contain_the_truth_as_often_as_stated(photographs: Callable[[str], Dataset], scene: str, k: int) -> None:
     """Within what chance allows one time in a thousand; photographs of one walk are not independent, besides."""
     data = photographs(scene).frames[0].image_path.parents
     count, shares = held(next(it.parent for it in data if it.name == scene), scene, k)

@@ -434,7 +434,7 @@ async def test_a_message_that_is_too_large_is_counted_once(counted: Counted) -> 
     assert counted.codes in (["CANCELLED"], ["INVALID_ARGUMENT"])
 
 
-async def test_a_fault_in_authentication_admits_nobody(counted: Counted) -> None:
+async def test_an_error_in_authentication_admits_no_caller(counted: Counted) -> None:
     def broken(*_: Any) -> Principal:
         raise OSError("the file of tokens is gone")
 

@@ -95,7 +95,7 @@ def test_a_wrong_focal_length_is_named_with_what_puts_it_right(
     assert f"{100 * (ratio - 1):+.1f} %" in found.message
 
 
-def test_wrong_pose_and_focal_length_together_are_told_apart(references: list[PosedView], pairs: PairMatches) -> None:
+def test_a_wrong_pose_and_focal_length_are_both_named(references: list[PosedView], pairs: PairMatches) -> None:
     view = references[VICTIM].view
     victim = replace(
         moved(references[VICTIM], (0.0, 0.3, 0.0)), view=replace(view, camera=with_focal(view.camera, 1.1))
@@ -149,7 +149,7 @@ def test_a_photograph_half_changed_means_a_changed_scene(references: list[PosedV
     assert 0.35 < found.changed_share < 0.65
 
 
-def test_what_nobody_else_sees_is_unverifiable_and_no_alarm(references: list[PosedView], pairs: PairMatches) -> None:
+def test_a_reference_without_neighbours_is_unverifiable(references: list[PosedView], pairs: PairMatches) -> None:
     elsewhere = make_scene(np.random.default_rng(99), replace(SCENE, reference_count=2)).references[0]
     alone = moved(replace(elsewhere, key="alone", name="scenes/synthetic/references/alone"), (50.0, 0.0, 0.0))
     audits = audit([*references, alone], pairs)
@@ -162,7 +162,7 @@ def test_one_reference_alone_is_unverifiable(references: list[PosedView], pairs:
     assert [a.verdict for a in audit(references[:1], pairs)] == [AuditVerdict.UNVERIFIABLE]
 
 
-def test_the_verdict_does_not_depend_on_who_else_is_asked(references: list[PosedView], pairs: PairMatches) -> None:
+def test_the_verdict_does_not_depend_on_other_references(references: list[PosedView], pairs: PairMatches) -> None:
     scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
     together = audit(scene, pairs)
     neighbour = VICTIM + 1

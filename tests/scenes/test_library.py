@@ -83,7 +83,7 @@ def context(seconds: float = 60.0, is_abandoned: Callable[[], bool] = lambda: Fa
 
 
 class TestPhotographs:
-    def test_are_read_when_somebody_looks_and_not_before(self, store: CountingStore) -> None:
+    def test_are_read_on_first_use(self, store: CountingStore) -> None:
         generation, references = ReferenceLibrary(store).load(SCENE, IDS[::-1], OLD, context())
         assert generation == store.get_scene(SCENE).generation
         assert [it.name for it in references] == [f"scenes/s/references/{it}" for it in IDS[::-1]]
@@ -190,7 +190,7 @@ class TestDescribing:
             assert len({tuple(names) for names in pool.map(load, [1, -1] * 3)}) == 1
         assert len(new.seen) == len(IDS)
 
-    def test_who_fails_leaves_the_work_to_who_waits(self, store: CountingStore) -> None:
+    def test_after_an_error_a_waiting_thread_takes_over(self, store: CountingStore) -> None:
         """The first thread to describe r0 fails; the other one, which waited for it, does it."""
         library, entered, fail = ReferenceLibrary(store), threading.Event(), threading.Event()
 
@@ -252,7 +252,7 @@ class TestUsable:
         _, references = load_usable(load, ids, unusable, lambda reference_id, _: omitted.append(reference_id))
         return [it.name.rpartition("/")[2] for it in references], omitted
 
-    def test_the_damaged_and_the_deleted_are_left_out_and_told(self, store: CountingStore) -> None:
+    def test_damaged_and_deleted_ones_are_skipped_and_reported(self, store: CountingStore) -> None:
         damage(store, SCENE, "r1", "features")
         store.delete_reference(SCENE, "r2")
         assert self.load(store, IDS[::-1], (DataLoss, NotFound)) == (["r3", "r0"], ["r2", "r1"])

@@ -88,7 +88,7 @@ class TestDescriptor:
 
 
 class TestNames:
-    def test_a_name_tells_rule_vocabulary_and_features(self) -> None:
+    def test_the_name_has_rule_vocabulary_and_features(self) -> None:
         extractor = SiftExtractor()
         made = VladDescriptor.of(extractor)
         assert made.name == f"vlad-1-{DIGESTS['sift']}-{extractor.name}"

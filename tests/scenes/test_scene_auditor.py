@@ -108,7 +108,7 @@ def test_a_neighbour_deleted_during_an_audit_loses_no_answer(store: Store) -> No
     assert verdicts(auditor, ["r2", "r3", "r4"]) == [AuditVerdict.CONSISTENT, None, AuditVerdict.CONSISTENT]
 
 
-def test_one_that_is_gone_is_an_error_only_for_who_named_it(store: Store) -> None:
+def test_a_deleted_reference_is_an_error_only_if_named(store: Store) -> None:
     tools = tools_of(store)
     listed, named = SceneAuditor(tools, KEY), SceneAuditor(tools, KEY, named=["r4", "r0"])
     listed._read()

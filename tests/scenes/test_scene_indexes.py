@@ -43,9 +43,7 @@ def indexes_of(store: Store, capacity_bytes: int = 2**30) -> SceneIndexes:
 
 
 class TestDamage:
-    def test_one_that_cannot_be_described_is_tried_and_told_once(
-        self, store: Store, caplog: pytest.LogCaptureFixture
-    ) -> None:
+    def test_one_that_fails_is_tried_and_reported_once(self, store: Store, caplog: pytest.LogCaptureFixture) -> None:
         store.add_references(SCENE, [new(i, is_described=False) for i in range(3)])
         damage(store, SCENE, "r1", "features")
         indexes = indexes_of(store)

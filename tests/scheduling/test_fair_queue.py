@@ -92,7 +92,7 @@ def test_everything_comes_out_exactly_once(pushed: list[tuple[int, int, float]],
     assert sorted(out) == list(range(len(pushed)))
 
 
-def test_callers_who_come_once_leave_nothing_behind() -> None:
+def test_callers_of_one_job_leave_no_state() -> None:
     """Each connection is a caller, and there is no end of them."""
     queue: FairQueue[int] = FairQueue(QUANTUM_S)
     for job in range(12):
@@ -103,7 +103,7 @@ def test_callers_who_come_once_leave_nothing_behind() -> None:
         assert len(queue._accounts) == len(queue) == 12
 
 
-def test_who_was_taken_along_pays_it_back() -> None:
+def test_a_job_taken_into_a_batch_early_is_charged_later() -> None:
     queue: FairQueue[str] = FairQueue(QUANTUM_S)
     for i in range(20):
         queue.push(f"a {i}", Flow("t", "a"), 1.0)

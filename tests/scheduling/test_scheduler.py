@@ -185,7 +185,7 @@ class TestAdmission:
         assert (hopeless.reason, hopeless.retry_after_s) == (Refusal.DEADLINE_INFEASIBLE, None)
         toy.admit(deadline_s=2.5)
 
-    def test_an_idle_server_tries_what_it_believes_impossible(self) -> None:
+    def test_an_idle_server_admits_jobs_of_infeasible_prediction(self) -> None:
         """Else a prediction that is wrong once would be wrong for ever."""
         Toy().admit(deadline_s=0.01)
 
@@ -196,7 +196,7 @@ class TestAdmission:
         assert toy.refusal(client="heavy", deadline_s=1.7).reason is Refusal.QUEUE_FULL
         toy.admit(client="light", deadline_s=1.7)
 
-    def test_nobody_is_admitted_any_more_when_it_drains(self) -> None:
+    def test_no_job_is_admitted_while_draining(self) -> None:
         toy = Toy()
         before = toy.admit()
         toy.scheduler.drain()
@@ -302,7 +302,7 @@ class TestTime:
         assert not any(reference() is not None for reference in ended)
 
     @pytest.mark.parametrize(("seconds", "learns"), [(2.0, True), (0.001, False)])
-    def test_what_is_given_up_late_teaches_that_it_takes_longer(self, seconds: float, learns: bool) -> None:
+    def test_an_expired_job_raises_the_predicted_cost(self, seconds: float, learns: bool) -> None:
         """Else a server that is too slow for its callers would go on admitting them."""
         toy = Toy()
         toy.admit(stage="describe")
@@ -353,7 +353,7 @@ class TestTime:
         assert refined > 50
         assert toy.ending_of(job) is Ending.OK
 
-    def test_whoever_gives_up_while_it_is_computed_pays_for_it(self) -> None:
+    def test_a_job_cancelled_while_computed_is_charged(self) -> None:
         quota = PlantedQuota()
         toy = Toy(quota=quota)
         toy.admit(deadline_s=5.0)

@@ -197,7 +197,7 @@ class TestResults:
                 await toy.queue.run(job)
 
     @in_loop
-    async def test_a_job_goes_through_its_stages_and_its_records_say_when(self) -> None:
+    async def test_a_job_passes_its_stages_and_records_their_times(self) -> None:
         marks: dict[str, tuple[float, float]] = {}
 
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
@@ -532,7 +532,7 @@ class TestEndOfAll:
 
 class TestCallersWhoLeave:
     @in_loop
-    async def test_one_who_waits_frees_its_place_and_is_not_computed(self) -> None:
+    async def test_a_cancelled_waiting_job_is_not_computed(self) -> None:
         async with Toy() as toy:
             calls = await toy.waiting(range(3))
             calls[1].cancel()

@@ -31,7 +31,7 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
         yield client
 
 
-def test_the_fault_is_named_and_nobody_else(client: Client) -> None:
+def test_only_the_faulty_reference_is_named(client: Client) -> None:
     audits = {audit.name.rpartition("/")[2]: audit for audit in client.audit_scene("wall")}
     assert list(audits) == [f"r{i}" for i in range(len(SHOTS))]
     assert {name: audit.verdict for name, audit in audits.items() if audit.verdict != "CONSISTENT"} == {

@@ -211,7 +211,7 @@ class TestDisk:
                 client.create_scene("t")
                 assert health_of(client) == (True, True, True)
 
-    def test_the_command_tells_that_changes_alone_are_refused(
+    def test_the_command_reports_that_only_changes_are_refused(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         with small_disk(tmp_path / "disk", 16) as disk:

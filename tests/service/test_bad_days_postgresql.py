@@ -94,7 +94,7 @@ def test_killed_under_load_it_costs_retrying_callers_time_only(
     assert {name for names in acknowledged for name in names} <= stored
 
 
-def test_without_a_free_connection_callers_are_told_to_retry(tmp_path: Path, database: Cluster) -> None:
+def test_without_a_free_connection_calls_may_be_retried(tmp_path: Path, database: Cluster) -> None:
     store = Store.connect(database.fresh_url())
     with serving(tmp_path, store=store) as server, Client(server.address, ONCE) as client, ExitStack() as stack:
         client.create_scene("s")

@@ -201,7 +201,7 @@ def test_few_photographs_calibrate_nothing(
     assert json.loads((tmp_path / "report.json").read_text())["factors"] is None
 
 
-def test_another_world_is_told_and_not_stored(
+def test_another_world_is_reported_and_not_stored(
     server: RunningServer, client: Client, planted: str, tmp_path: Path
 ) -> None:
     motion = RigidTransform(rotation_from_vector([0.0, 0.0, 0.5]), np.array([10.0, 0.0, 0.0]))
@@ -210,14 +210,14 @@ def test_another_world_is_told_and_not_stored(
     assert client.get_scene(planted).calibration is None
 
 
-def test_a_reference_with_another_pose_is_told(server: RunningServer, planted: str, tmp_path: Path) -> None:
+def test_a_reference_with_another_pose_is_reported(server: RunningServer, planted: str, tmp_path: Path) -> None:
     other = write_folder(tmp_path / "other", [moved(i) for i in range(COUNT)], ".png")
     said = refusal(calibrate(server, tmp_path, other, "--scene", planted))
     assert "0.png is reference r0" in said
     assert "0.05 m" in said
 
 
-def test_a_scene_that_can_answer_nothing_is_told(
+def test_a_scene_without_answers_is_reported(
     server: RunningServer, client: Client, folder: Path, tmp_path: Path
 ) -> None:
     fill(client, "lonely", 1)

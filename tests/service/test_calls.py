@@ -35,7 +35,7 @@ def pool() -> Iterator[futures.ThreadPoolExecutor]:
         yield threads
 
 
-def test_a_full_queue_refuses_and_says_when_to_come_back(tmp_path: Path, pool: futures.ThreadPoolExecutor) -> None:
+def test_a_full_queue_refuses_with_a_retry_delay(tmp_path: Path, pool: futures.ThreadPoolExecutor) -> None:
     with (
         serving(tmp_path, max_queued_s=2.0) as server,
         Client(server.address) as client,
@@ -72,7 +72,7 @@ def test_a_full_queue_refuses_and_says_when_to_come_back(tmp_path: Path, pool: f
     wait_until(lambda: server.engine.queue.job_count == 0)
 
 
-def test_what_nobody_waits_for_is_not_computed(
+def test_a_cancelled_call_is_not_computed(
     server: RunningServer, client: Client, scene: str, stubs: Stubs, pool: futures.ThreadPoolExecutor
 ) -> None:
     before = server.method.call_count

@@ -127,7 +127,7 @@ def test_a_server_that_is_busy_twice_answers_the_third_time(connect: Connect, co
 
 @both
 @pytest.mark.parametrize("retry_after_s", [None, 60.0])
-def test_a_refusal_that_waiting_would_not_mend_is_told_at_once(connect: Connect, retry_after_s: float | None) -> None:
+def test_a_permanent_refusal_is_not_retried(connect: Connect, retry_after_s: float | None) -> None:
     with (
         failing([status("RESOURCE_EXHAUSTED", retry_after_s)] * 9) as (address, server),
         connect(address, FAST) as client,
@@ -159,7 +159,9 @@ def test_a_change_whose_answer_was_lost_is_made_once(server: RunningServer, conn
 
 
 @both
-def test_what_somebody_else_created_is_not_taken_for_ours(server: RunningServer, connect: Connect, scene: str) -> None:
+def test_another_clients_resource_is_not_taken_for_ones_own(
+    server: RunningServer, connect: Connect, scene: str
+) -> None:
     other = NewReference("r0", PHOTO, CAMERA, pose(0.001))  # a millimetre beside the one that is there
     with losing(server.address, does_it=False) as (address, between), connect(address, FAST) as client:
         with pytest.raises(AlreadyExists):
@@ -217,7 +219,7 @@ def test_a_deadline_ends_a_call(server: RunningServer, connect: Connect, scene: 
         client.localize(PHOTO, CAMERA, scene, timeout_s=0.5)
 
 
-def test_who_closes_a_client_does_not_wait_for_its_pauses() -> None:
+def test_closing_a_client_ends_its_pauses() -> None:
     with failing([status("UNAVAILABLE", 30.0)] * 9) as (address, server):
         client = Client(address, FAST)
         failed: list[BaseException] = []

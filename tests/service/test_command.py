@@ -184,7 +184,7 @@ def test_a_photograph_beside_a_cameras_json_needs_no_camera(run: Run, scene: str
     assert (code, "give --camera" in complaint) == (2, True)
 
 
-def test_what_would_fail_for_all_ends_at_once(run: Run, folder: Path) -> None:
+def test_an_error_that_concerns_all_photographs_ends_the_run(run: Run, folder: Path) -> None:
     code, printed, complaint = run("localize", "nowhere", folder)
     assert (code, printed) == (1, "")
     assert complaint.startswith("mapless: NOT_FOUND: ")
@@ -234,7 +234,7 @@ class TestOnATerminal:
         assert "[########################] 2/2" in told
         assert told.endswith("\r\x1b[K2 of 2 localized\n")
 
-    def test_one_that_is_not_localized_says_why(self, run: Run, folder: Path, terminal: Callable[[], None]) -> None:
+    def test_a_rejection_is_printed_with_its_reason(self, run: Run, folder: Path, terminal: Callable[[], None]) -> None:
         terminal()
         run("scene", "create", "nothing")
         photo = str(folder / "images" / "0.png")
@@ -280,9 +280,7 @@ def test_a_scene_has_its_place_on_the_earth(run: Run) -> None:
         (["--axes", "sideways", "--camera", '{"width_px": 96}'], "camera: height_px"),
     ],
 )
-def test_what_is_wrong_is_said_before_anything_is_asked(
-    run: Run, folder: Path, arguments: list[str], told: str
-) -> None:
+def test_wrong_arguments_are_reported_before_any_call(run: Run, folder: Path, arguments: list[str], told: str) -> None:
     code, printed, complaint = run("localize", "s", folder / "images", *arguments)
     assert (code, printed) == (2, "")
     assert told in complaint

@@ -201,7 +201,7 @@ def test_errors_pass_with_all_their_details(fleet: Fleet, what: str) -> None:
     assert len(there.value.request_id) == 36  # the gateway's own, by which its log and the server's go together
 
 
-def test_a_refusal_says_when_to_come_back(url: str, fleet: Fleet, tmp_path: Path) -> None:
+def test_a_refusal_has_a_retry_delay(url: str, fleet: Fleet, tmp_path: Path) -> None:
     """No retry of the gateway's hides it, and no server is left out for it."""
     with (
         fleet_of(tmp_path, url, max_queued_s=2.0) as full,
@@ -265,7 +265,7 @@ def test_what_is_not_for_callers_does_not_pass(fleet: Fleet) -> None:
             assert from_rpc_error(caught.value).code == "UNIMPLEMENTED"
 
 
-def test_what_nobody_waits_for_ends_at_the_server(fleet: Fleet) -> None:
+def test_a_cancelled_call_ends_at_the_server(fleet: Fleet) -> None:
     with ExitStack() as stack:
         for server in fleet.servers:
             stack.enter_context(server.method.held())
@@ -317,7 +317,7 @@ class Echo(grpc.GenericRpcHandler):
         return grpc.unary_unary_rpc_method_handler(answer)
 
 
-def test_servers_are_told_what_the_caller_said_and_who_called(tmp_path: Path) -> None:
+def test_servers_get_the_callers_metadata_and_address(tmp_path: Path) -> None:
     echo = Echo()
     server = grpc.server(futures.ThreadPoolExecutor(4), handlers=[echo])
     service = health.HealthServicer()
@@ -380,7 +380,7 @@ def asking(client: Client) -> Iterator[list[BaseException]]:
 
 
 @pytest.mark.nightly
-def test_a_server_that_drains_is_left_and_nobody_notices(url: str, fleet: Fleet, tmp_path: Path) -> None:
+def test_calls_leave_a_draining_server_without_errors(url: str, fleet: Fleet, tmp_path: Path) -> None:
     with fleet_of(tmp_path, url, drain_delay_s=2.0) as leaving:
         once = replace(leaving.gateway.options, max_attempts=1)  # not even a retry hides anything
         stays = {leaving.servers[1].address}
@@ -427,7 +427,7 @@ def before_the_end(running: Gateway) -> list[str]:
 
 
 @pytest.mark.nightly
-def test_a_gateway_that_is_to_go_says_so_and_answers_until_then(url: str, fleet: Fleet, tmp_path: Path) -> None:
+def test_a_draining_gateway_reports_it_and_answers(url: str, fleet: Fleet, tmp_path: Path) -> None:
     (server,) = fleet.servers[:1]
     with gateway(tmp_path, [server.address]) as leaving:
         once = replace(leaving.options, max_attempts=1)

@@ -107,7 +107,7 @@ class TestClients:
                 assert scraped(server.metrics_address).terminated["cancelled"] == 1
             assert is_served(client, "s")
 
-    def test_one_that_never_reads_holds_up_nobody(self, server: RunningServer, client: Client, scene: str) -> None:
+    def test_a_caller_that_never_reads_delays_no_other(self, server: RunningServer, client: Client, scene: str) -> None:
         camera = Camera(800, 600, 700.0, 700.0, 399.5, 299.5)
         noise = np.random.default_rng(0).integers(0, 256, (600, 800, 3)).astype(np.uint8)
         client.add_reference(scene, NewReference("large", encode(".png", noise), camera, pose(9)))
@@ -126,7 +126,7 @@ class TestClients:
                 assert len(client.get_reference(scene, "large", include_image=True).image or b"") > 1_000_000
 
     @pytest.mark.parametrize("method", ["grpc.health.v1.Health/Check", "grpc.health.v1.Health/Watch"])
-    def test_those_who_never_send_their_message_keep_nobody_out(
+    def test_callers_that_never_send_block_no_other(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
     ) -> None:
         """Open methods take no token, so these are strangers; a tenth of the real numbers."""
@@ -163,7 +163,7 @@ class TestClients:
         assert error.code == "RESOURCE_EXHAUSTED"
         assert stubs.localization.Localize(localize_request(scene), timeout=30).HasField("localization")
 
-    def test_a_thousand_that_say_nothing(self, tmp_path: Path) -> None:
+    def test_a_thousand_silent_connections_block_no_call(self, tmp_path: Path) -> None:
         with enough_files(2500), real(tmp_path / "server") as server, ExitStack() as stack:
             address, process = server.address, Path(f"/proc/{server.process.pid}")
             client = stack.enter_context(Client(address))
@@ -205,7 +205,7 @@ def resident_mib(process: Path) -> float:
 
 
 class TestMethods:
-    def test_one_that_raises_costs_others_nothing(self, server: RunningServer, client: Client, scene: str) -> None:
+    def test_an_exception_fails_no_other_call(self, server: RunningServer, client: Client, scene: str) -> None:
         server.method.failure = RuntimeError("planted")
         try:
             with ThreadPoolExecutor(8) as pool:
@@ -224,7 +224,9 @@ class TestMethods:
 
     @pytest.mark.parametrize("where", ["rotation", "translation", "covariance", "reprojection_error_px"])
     @pytest.mark.parametrize("number", [np.nan, np.inf])
-    def test_one_that_gives_nonsense_is_internal(self, tmp_path: Path, where: str, number: float) -> None:
+    def test_a_backend_with_invalid_output_is_an_internal_error(
+        self, tmp_path: Path, where: str, number: float
+    ) -> None:
         def spoil(answer: Answer) -> Answer:
             found = answer.outcome
             assert isinstance(found, Localization)

@@ -242,7 +242,7 @@ def test_a_group_with_too_many_bytes_is_refused(tmp_path: Path) -> None:
         assert isinstance(client.localize_rig([image], "hall"), GroupRejected)
 
 
-def test_callers_are_told_of_each_photograph_that_is_captured(tmp_path: Path) -> None:
+def test_each_captured_photograph_is_announced(tmp_path: Path) -> None:
     captured = tmp_path / "captured"
     with serving(tmp_path / "data", capture_dir=captured) as server, Client(server.address) as client:
         client.create_scene("hall")

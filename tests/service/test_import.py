@@ -184,7 +184,7 @@ def test_a_folder_without_a_layout_is_named(tmp_path: Path) -> None:
     assert run("import", tmp_path, "not an id", "--dry-run").exit_code == 2
 
 
-def test_poses_that_do_not_fit_are_not_stored_unless_told_to(
+def test_poses_that_do_not_fit_need_an_option_to_be_stored(
     server: RunningServer, client: Client, scene: str, tmp_path: Path
 ) -> None:
     """A script sees it by the exit code."""
@@ -215,7 +215,7 @@ def test_a_dry_run_finds_images_of_another_size(folder: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_terminated_in_the_middle_the_next_run_goes_on(tmp_path: Path) -> None:
+def test_after_a_termination_the_next_run_continues(tmp_path: Path) -> None:
     """Without an address: a server of its own on the settings' store, which goes with the command."""
     folder = tmp_path / "many"
     count = 80

@@ -64,7 +64,7 @@ def refusal(tmp_path: Path, **settings: object) -> str:
 
 
 @pytest.mark.parametrize(("setting", "value"), [("data_dir", "/dev/null/x"), ("features", "nonesuch")])
-def test_a_server_that_cannot_start_says_why_in_one_line(tmp_path: Path, setting: str, value: str) -> None:
+def test_a_server_that_cannot_start_reports_why_in_one_line(tmp_path: Path, setting: str, value: str) -> None:
     assert value in refusal(tmp_path, **{setting: value})
 
 

@@ -119,7 +119,7 @@ def calls_handled(server: RunningServer, code: str | None = None) -> float:
     return server.value("grpc_server_handled_total", **labels)
 
 
-def test_one_who_asks_little_is_served_while_another_floods(tmp_path: Path) -> None:
+def test_a_modest_caller_is_served_while_another_floods(tmp_path: Path) -> None:
     stop, refused, answers = threading.Event(), threading.Event(), list[LocalizationResult | Rejected]()
 
     def flood(client: Client) -> None:
@@ -198,7 +198,7 @@ def test_the_coarse_pose_is_answered_if_refining_has_no_time(tmp_path: Path) -> 
             wait_until(lambda: server.value("mapless_jobs_terminated_total", outcome=outcome) == 1)  # noqa: B023
 
 
-def test_what_is_foreseen_to_come_too_late_is_not_even_begun(tmp_path: Path) -> None:
+def test_a_stage_predicted_to_be_late_is_not_begun(tmp_path: Path) -> None:
     refining = Refining(1.0)
     with overloaded(tmp_path, refining.method()) as server, Client(server.address) as client:
         make_scene(client)

@@ -270,14 +270,14 @@ def test_a_coarse_pose_may_turn_out_to_be_none(server: Serving) -> None:
 
 
 @pytest.mark.parametrize("coarse", [None, RigidTransform(np.eye(3), np.full(3, np.nan))], ids=["none", "not finite"])
-def test_without_early_knowledge_only_the_answer_is_sent(server: Serving, coarse: RigidTransform | None) -> None:
+def test_without_a_coarse_pose_only_the_answer_is_sent(server: Serving, coarse: RigidTransform | None) -> None:
     server.method.coarse = coarse
     server.method.gate.set()
     (only,) = asking(server)
     assert only.is_final
 
 
-def test_a_coarse_pose_outside_a_hard_limit_is_not_told(server: Serving) -> None:
+def test_a_coarse_pose_outside_a_hard_limit_is_not_sent(server: Serving) -> None:
     server.method.gate.set()
     near = pb.PositionPrior(position_m=wire.transform_to_message(pose(0)).translation_m, radius_m=2.5)
     (only,) = asking(server, position_prior=near)
@@ -342,7 +342,7 @@ def test_misuse_is_reported_as_by_localize(server: Serving) -> None:
         ]
 
 
-def test_who_does_not_read_holds_up_nobody(server: Serving) -> None:
+def test_a_caller_that_does_not_read_delays_no_other(server: Serving) -> None:
     """There is one worker, and the answer that nobody reads is computed and out of its way."""
     unread = asking(server)
     assert server.method.refining.acquire(timeout=LIMIT_S)
@@ -377,7 +377,7 @@ def test_of_two_tiers_the_better_gives_the_final_answer(tmp_path: Path) -> None:
     assert messages[1].answer.diagnostics.features == "strong"
 
 
-def test_the_log_says_when_the_coarse_answer_was_there(server: Serving, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_log_has_the_time_of_the_coarse_answer(server: Serving, caplog: pytest.LogCaptureFixture) -> None:
     counted = server.server.value("mapless_coarse_answer_seconds_count")
     with caplog.at_level("INFO", "mapless_server.rpc.guard"):
         call = asking(server, metadata=(("x-request-id", "logged"),))
@@ -395,7 +395,7 @@ def test_the_log_says_when_the_coarse_answer_was_there(server: Serving, caplog: 
     assert told["bytes_out"] > 0
 
 
-def test_who_goes_through_the_log_finds_no_fault(server: Serving, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_caller_that_leaves_is_logged_without_an_error(server: Serving, caplog: pytest.LogCaptureFixture) -> None:
     """However its callers leave."""
     with caplog.at_level("WARNING"):
         for leave in ("cancel", "deadline", "close"):

@@ -132,7 +132,7 @@ def told(kind: Any, address: str, **asked: Any) -> tuple[list[LocalizationResult
     return answers, None
 
 
-def test_the_coarse_answer_is_told_and_then_the_final_one(kind: Any) -> None:
+def test_the_coarse_answer_is_printed_before_the_final_one(kind: Any) -> None:
     with playing(([COARSE, FINAL], None)) as (address, played):
         (first, last), error = told(kind, address, variant="full", axes="unity")
     assert error is None
@@ -223,7 +223,7 @@ def test_what_breaks_the_contract_is_the_servers_fault(
     assert len(answers) == (len(messages) == 3)
 
 
-def test_who_reads_no_further_ends_the_call() -> None:
+def test_a_reader_that_stops_ends_the_call() -> None:
     with playing(([COARSE], None)) as (address, played), Client(address, FAST) as client:
         answers = client.localize_progressively(PHOTO, CAMERA, "s")
         assert not next(answers).is_final
@@ -232,7 +232,7 @@ def test_who_reads_no_further_ends_the_call() -> None:
         assert played.gone.wait(LIMIT_S)
 
 
-def test_who_reads_no_further_ends_the_call_in_asyncio_too() -> None:
+def test_a_reader_that_stops_ends_the_call_in_asyncio() -> None:
     async def read_one(address: str) -> None:
         async with aio.Client(address, FAST) as client:
             answers = client.localize_progressively(PHOTO, CAMERA, "s")
@@ -272,7 +272,7 @@ def test_the_command_prints_a_line_for_each_answer(
     assert [json.loads(line)["is_final"] for line in lines] == [False, True]
 
 
-def test_a_person_is_told_which_is_which(
+def test_output_labels_the_coarse_and_the_final_answer(
     capsys: pytest.CaptureFixture[str], photo: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)

@@ -275,7 +275,7 @@ def test_errors_are_those_of_the_plain_server_with_details(url: str, guarded: Gu
 
 
 @nightly
-def test_faults_are_internal_without_a_word_of_the_exception(guarded: Guarded) -> None:
+def test_errors_are_internal_without_the_exceptions_text(guarded: Guarded) -> None:
     with guarded.stub() as stub, pytest.raises(grpc.RpcError) as caught:
         stub.Localize(localize_request("faulty"), timeout=30, metadata=guarded.metadata(("x-request-id", "mine")))
     assert from_rpc_error(caught.value).code == "INTERNAL"
@@ -475,7 +475,7 @@ def test_a_redeploy_costs_no_call_and_ends_endless_streams(guarded: Guarded) -> 
 
 
 @nightly
-def test_without_any_replica_callers_are_told_to_come_back(guarded: Guarded) -> None:
+def test_without_any_replica_calls_may_be_retried(guarded: Guarded) -> None:
     with guarded.client(max_attempts=1, timeout_s=5.0) as once, guarded.client() as patient:
         for replica in guarded.cluster.replicas():
             os.kill(replica.process_id, signal.SIGKILL)

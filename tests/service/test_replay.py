@@ -163,7 +163,7 @@ def is_named(call: CapturedCall) -> bool:
     return [part.choice for part in call.parts] == [None] and len(call.parts[0].references) == len(NAMED)
 
 
-def test_a_reference_that_stands_elsewhere_is_found_out(captured: Path, tmp_path: Path) -> None:
+def test_a_moved_reference_is_detected(captured: Path, tmp_path: Path) -> None:
     path, call = only(captured, tmp_path / "copy", is_named)
     (part,) = call.parts
     first = part.references[0]
@@ -192,7 +192,7 @@ def test_what_is_computed_with_is_compared_too(captured: Path, tmp_path: Path) -
     assert code == 1
 
 
-def test_a_person_reads_what_has_changed(captured: Path, tmp_path: Path) -> None:
+def test_the_table_shows_what_has_changed(captured: Path, tmp_path: Path) -> None:
     path, call = only(captured, tmp_path / "copy", is_named)
     path.write_bytes(encode_call(replace(call, circumstances={**call.circumstances, "mapless": "0.0.1"})))
     command = [sys.executable, "-m", "mapless_tools", "replay", str(tmp_path / "copy"), "--last", "1"]
@@ -203,7 +203,7 @@ def test_a_person_reads_what_has_changed(captured: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "blob"])
-def test_damage_is_named_and_nothing_is_said_to_be_identical(captured: Path, tmp_path: Path, damage: str) -> None:
+def test_damage_is_named_and_not_counted_as_identical(captured: Path, tmp_path: Path, damage: str) -> None:
     path, call = only(captured, tmp_path / "copy", is_named)
     data = bytearray(path.read_bytes())
     if damage == "cut":
@@ -299,7 +299,7 @@ def test_what_its_server_deletes_meanwhile_is_left_out(
         (["--last", "0"], "--last"),
     ],
 )
-def test_what_cannot_be_done_is_said(captured: Path, arguments: list[str], message: str) -> None:
+def test_a_replay_that_is_not_possible_is_refused(captured: Path, arguments: list[str], message: str) -> None:
     command = [sys.executable, "-m", "mapless_tools", "replay", str(captured), *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert done.returncode == 2

@@ -56,7 +56,7 @@ def test_what_is_not_given_stays_and_none_forgets(client: Client, scene: str) ->
     assert updated.reference_count == 3
 
 
-def test_an_update_says_what_it_changes_of_an_existing_scene(client: Client, stubs: Stubs, scene: str) -> None:
+def test_an_update_needs_a_mask_and_an_existing_scene(client: Client, stubs: Stubs, scene: str) -> None:
     with pytest.raises(InvalidArgument) as caught:
         client.update_scene(scene)
     assert caught.value.field == "update_mask"

@@ -256,7 +256,7 @@ def test_a_token_that_is_made_or_revoked_while_the_server_runs(guarded: Guarded)
         assert client.get_scene("secret").scene_id == "secret"
 
 
-def test_the_log_names_who_called_and_never_shows_a_token(guarded: Guarded, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_log_names_the_caller_and_shows_no_token(guarded: Guarded, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.DEBUG), guarded.client("reader") as client:
         client.get_scene("secret")
         with pytest.raises(Unauthenticated), guarded.client("mapless_wrong") as unknown:

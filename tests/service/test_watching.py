@@ -103,7 +103,7 @@ def test_a_scene_that_is_not_there_and_a_name_that_is_none(stub: LocalizationSer
     assert (senseless.code, senseless.field) == ("INVALID_ARGUMENT", "scene")
 
 
-def test_too_many_are_sent_away_and_who_leaves_makes_room(stub: LocalizationServiceStub) -> None:
+def test_watchers_above_the_limit_are_refused(stub: LocalizationServiceStub) -> None:
     seen = [watching(stub) for _ in range(MAX_WATCHERS_OF_TENANT)]
     failure = ending(stub.WatchQueries(REQUEST, timeout=LIMIT_S))
     assert (failure.code, failure.reason) == ("RESOURCE_EXHAUSTED", "TOO_MANY_WATCHERS")

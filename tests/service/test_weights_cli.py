@@ -81,7 +81,7 @@ def complaint(result: Result, code: int) -> str:
     return result.stderr.strip().splitlines()[-1]
 
 
-def test_the_list_tells_licence_and_presence(folder: Path, file: Path, fetched: list[str]) -> None:
+def test_the_list_shows_licence_and_presence(folder: Path, file: Path, fetched: list[str]) -> None:
     def row(name: str) -> str:
         return next(line for line in listed.splitlines() if line.startswith(name))
 
@@ -109,7 +109,7 @@ def test_the_real_list_names_every_licence_that_restricts(folder: Path) -> None:
     assert listed.count("research only") == 2
 
 
-def test_the_licence_is_said_before_anything_is_fetched(folder: Path, fetched: list[str]) -> None:
+def test_the_licence_is_shown_before_a_download(folder: Path, fetched: list[str]) -> None:
     result = run("fetch", "bound", "--accept-licence")
     assert result.exit_code == 0
     said = result.stderr

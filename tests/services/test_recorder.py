@@ -84,7 +84,7 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Cl
         yield client, LocalizationServiceStub(channel), folder
 
 
-def test_a_captured_answer_says_so(served: tuple[Client, LocalizationServiceStub, Path]) -> None:
+def test_a_captured_answer_is_marked(served: tuple[Client, LocalizationServiceStub, Path]) -> None:
     _, stub, folder = served
     answer = stub.Localize(localize_request("s"), timeout=30)
     assert answer.diagnostics.captured
@@ -95,7 +95,7 @@ def test_a_captured_answer_says_so(served: tuple[Client, LocalizationServiceStub
     assert kept.request_id == answer.diagnostics.request_id
 
 
-def test_a_captured_final_answer_of_a_stream_says_so(
+def test_a_captured_final_answer_of_a_stream_is_marked(
     served: tuple[Client, LocalizationServiceStub, Path],
 ) -> None:
     _, stub, folder = served
@@ -105,7 +105,7 @@ def test_a_captured_final_answer_of_a_stream_says_so(
     assert decode_call(captured_in(folder)[0].read_bytes()).response == final.SerializeToString()
 
 
-def test_a_captured_group_says_so_at_each_photograph(
+def test_each_photograph_of_a_captured_group_is_marked(
     served: tuple[Client, LocalizationServiceStub, Path],
 ) -> None:
     _, stub, folder = served

@@ -40,7 +40,7 @@ def test_a_new_scene_has_no_attributes(store: Store) -> None:
     assert store.create_scene(OFFICE).attributes == known_of(store, OFFICE) == SceneAttributes()
 
 
-def test_what_is_said_at_its_creation_is_kept_exactly(place: Place) -> None:
+def test_attributes_of_a_new_scene_are_stored_exactly(place: Place) -> None:
     said = SceneAttributes(DATUM, DOWN, replace(CALIBRATION, create_time=BEFORE))
     with place.open() as store:
         assert store.create_scene(OFFICE, said).attributes == said
@@ -204,7 +204,7 @@ def test_changes_at_once_lose_none_of_each_other(store: Store) -> None:
     assert store.get_scene(OFFICE).generation == 1 + 6 * rounds
 
 
-def test_a_store_that_nobody_else_changes_is_asked_once(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unshared_store_is_read_once(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[SceneKey] = []
     find = queries.find_attributes
 
@@ -220,7 +220,7 @@ def test_a_store_that_nobody_else_changes_is_asked_once(place: Place, monkeypatc
         assert len(asked) == (5 if isinstance(place, Shared) else 1)
 
 
-def test_a_store_that_remembers_nothing_hears_of_every_change(place: Place) -> None:
+def test_a_store_without_a_cache_sees_every_change(place: Place) -> None:
     with place.open() as store:
         store.create_scene(OFFICE, SceneAttributes(DATUM))
         store.add_references(OFFICE, [make_reference("a")])

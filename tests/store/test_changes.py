@@ -102,7 +102,7 @@ def test_what_is_no_descriptor_is_refused(store: Store, wrong: np.ndarray) -> No
     assert store.get_scene(OFFICE).generation == 2
 
 
-def test_each_change_is_told_once(store: Store) -> None:
+def test_each_change_is_reported_once(store: Store) -> None:
     store.create_scene(OFFICE)
     store.create_scene(HALL)
     a, b = store.add_references(OFFICE, [described("a"), described("b")])
@@ -248,7 +248,7 @@ def test_features_of_one_more_extractor_are_no_change(store: Store) -> None:
     assert store.list_changes(OFFICE, 2, NAME).generation == 2
 
 
-def test_who_comes_after_deletions_are_forgotten_reads_all(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_behind_the_kept_deletions_reads_all(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tombstones do not pile up; whether remembered or not, following is reading whole."""
     remembered = 4
     monkeypatch.setattr("mapless_server.store.store.GENERATIONS_REMEMBERED", remembered)

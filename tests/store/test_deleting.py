@@ -81,7 +81,7 @@ def test_nothing_is_left(place: Place) -> None:
         assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 1) | {"removed_reference": 0}
 
 
-def test_in_the_middle_it_is_gone_for_everybody(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_during_the_deletion_the_scene_is_not_found(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
 
     def look() -> None:
@@ -159,7 +159,7 @@ def test_a_crash_midway_leaves_what_the_next_delete_removes(
         assert row_counts(other)["scene"] == 1
 
 
-def test_what_is_left_is_deleted_by_who_deletes_the_scene_again(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_deleting_again_removes_the_remainder(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     leave_some(place, monkeypatch)
     leave_alone(monkeypatch)
     with place.open() as store, pytest.raises(errors.NotFound):
@@ -290,7 +290,7 @@ class TestFullDisk:
         assert tried == [3] + [1] * COUNT
         assert row_counts(place) == EMPTY
 
-    def test_without_room_for_one_it_is_said_until_there_is(
+    def test_without_disk_space_the_deletion_reports_an_error(
         self, place: Place, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         with place.open() as store:

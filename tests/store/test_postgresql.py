@@ -210,9 +210,7 @@ class TestGoingAway:
 
 
 class TestLimits:
-    def test_who_waits_too_long_for_a_lock_is_told_to_come_back(
-        self, shared: Shared, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_lock_wait_beyond_the_limit_may_be_retried(self, shared: Shared, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(postgresql._SESSION_OPTIONS, "lock_timeout", "50ms")
         with shared.open() as store:
             store.create_scene(OFFICE)
@@ -223,7 +221,7 @@ class TestLimits:
                 assert store.get_scene(OFFICE).generation == 1  # readers do not wait
             store.add_references(OFFICE, [make_reference("a")])
 
-    def test_more_threads_than_connections_wait_or_are_told(
+    def test_more_threads_than_connections_wait_or_get_an_error(
         self, shared: Shared, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(postgresql, "CONNECTIONS_AT_MOST", 4)

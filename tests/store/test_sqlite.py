@@ -33,7 +33,7 @@ def store(data_dir: Path) -> Iterator[Store]:
 
 
 class TestFaults:
-    def test_a_full_disk_is_said_and_harms_nothing(self, store: Store) -> None:
+    def test_a_full_disk_is_reported_and_harms_nothing(self, store: Store) -> None:
         store.create_scene(OFFICE)
         store.add_references(OFFICE, [make_reference("a")])
         before = store.get_scene(OFFICE)

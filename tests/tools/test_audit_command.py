@@ -45,7 +45,7 @@ def test_the_summary_counts_every_finding() -> None:
     assert summary_of(Examined("hall", total=0)) == "0 references: none"
 
 
-def test_an_audit_that_was_stopped_says_how_far_it_came() -> None:
+def test_an_interrupted_audit_reports_its_progress() -> None:
     stopped = Examined("hall", worst_first(FINDINGS[:2]), 40, "the server is gone")
     assert summary_of(stopped).startswith("stopped after 2 of 40 references (the server is gone); 2 references: ")
     content = to_json(stopped)
@@ -66,7 +66,7 @@ def test_a_page_has_time_for_its_references_within_the_limit() -> None:
     ],
     ids=["error", "ctrl-c", "sigterm"],
 )
-def test_what_was_found_before_the_end_is_told(
+def test_findings_before_the_interruption_are_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException, code: int, why: str
 ) -> None:
     asked: list[float | None] = []
@@ -101,7 +101,7 @@ def test_figures_that_are_not_known_are_dashes_not_zeros() -> None:
     assert cells_of(finding("dark", "UNVERIFIABLE", focal_ratio=0.0))[2:5] == ("-", "-", "-")
 
 
-def test_the_given_focal_length_is_told_by_how_much_it_is_wrong() -> None:
+def test_a_wrong_focal_length_is_printed_with_its_factor() -> None:
     assert cells_of(finding("long", "WRONG_INTRINSICS", focal_ratio=1 / 1.05))[4] == "+5.0"
 
 

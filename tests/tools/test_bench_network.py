@@ -196,7 +196,7 @@ def test_the_table_fits_a_screen_and_names_the_unmeasured() -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_part_that_fails_says_so_and_the_rest_goes_on(
+def test_a_part_that_fails_is_reported_and_the_rest_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(host, "compare_rounding", lambda: iter([Figure("rounding", "difference", 0.01, "")]))

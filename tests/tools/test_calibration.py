@@ -323,7 +323,7 @@ class TestFindings:
         found = find([*self.outcomes(), *stronger], RightRule())
         assert (found.conditions, found.others, len(found.sample)) == (SIFT, 5, 40)
 
-    def test_nothing_answered_is_told_and_not_calibrated(self) -> None:
+    def test_a_folder_without_answers_is_reported(self) -> None:
         found = find([rejected("r0", "GATE")], RightRule())
         assert found.factors is None
         assert "0 answers are too few" in found.refusal
@@ -373,7 +373,7 @@ class TestOtherWorld:
             answers.append(replace(it, position=claim(error_m, 0.01)))
         return answers
 
-    def test_is_told_with_the_motion(self) -> None:
+    def test_has_the_planted_motion(self) -> None:
         found = other_world(self.answers(self.MOTION))
         assert found is not None
         assert found.moved_m == pytest.approx(np.linalg.norm(self.MOTION.translation), abs=0.1)

@@ -108,7 +108,7 @@ class TestPaper:
             assert average[1] == pytest.approx(rotation, rel=0.1, abs=0.06), method.name
 
     @pytest.mark.parametrize("name", list(BENCHMARKS))
-    def test_what_the_paper_says_of_its_own_method(self, name: str) -> None:
+    def test_the_papers_own_figures_are_shown(self, name: str) -> None:
         benchmark = BENCHMARKS[name]
         (ours,) = (method for method in benchmark.paper.methods if method.variant == "full")
         dense = {"7scenes": (1.3, 0.41), "12scenes": (0.4, 0.19), "cambridge": (11, 0.27)}
@@ -223,7 +223,7 @@ class TestScenes:
         assert [p.name for p in find_scenes(tmp_path)] == ["apt1/kitchen", "apt1/living", "office1/lounge"]
         assert [p.name for p in find_scenes(tmp_path / "apt1" / "living")] == ["apt1/living"]
 
-    def test_says_what_it_looked_for(self, tmp_path: Path) -> None:
+    def test_the_error_names_the_missing_files(self, tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="is not a folder"):
             find_scenes(tmp_path / "nowhere")
         with pytest.raises(UsageError, match=r"cameras\.json"):
@@ -291,7 +291,7 @@ class TestJournal:
         other.add(result("q0", 0.02))
         assert Journal(tmp_path, "chess.dense", self.IDENTITY).results["q0"].translation_error == 0.01
 
-    def test_survives_a_tear_at_every_byte(self, tmp_path: Path) -> None:
+    def test_a_file_truncated_at_any_byte_is_read(self, tmp_path: Path) -> None:
         """A crash leaves whole lines and a piece; the piece is cut off, and the run goes on behind the last line."""
         journal = Journal(tmp_path, "chess.dense", self.IDENTITY)
         journal.add(result("q0", 0.01))

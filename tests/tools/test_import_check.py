@@ -216,7 +216,7 @@ def frames_of(folder: Path, views: Sequence[PosedView], fault: Fault) -> list[Fr
 
 
 @pytest.mark.parametrize("fault", [RigidTransform.inverse, turned(OPENGL)])
-def test_poses_that_hide_who_is_near_are_still_explained(tmp_path: Path, fault: Fault) -> None:
+def test_wrong_poses_that_separate_neighbours_are_explained(tmp_path: Path, fault: Fault) -> None:
     """Photographs that are near in the folder's order are compared as well."""
     views = planted("hidden", count=10)
     steps: list[str] = []

@@ -130,7 +130,7 @@ def test_large_photographs_go_in_smaller_messages(tmp_path: Path) -> None:
     assert server.messages == [["r000"], ["r001"], ["r002"], ["r003"]]
 
 
-def test_a_second_run_stores_nothing_and_says_so(tmp_path: Path) -> None:
+def test_a_second_run_stores_nothing_and_reports_it(tmp_path: Path) -> None:
     frames = frames_in(tmp_path)
     server = Server()
     upload(server, frames)

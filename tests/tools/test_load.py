@@ -311,7 +311,7 @@ async def test_a_closed_loop_keeps_so_many_calls_in_progress() -> None:
     assert max(seen.values()) - min(seen.values()) <= 1
 
 
-async def test_a_refused_closed_loop_caller_returns_when_told() -> None:
+async def test_a_refused_closed_loop_caller_waits_the_retry_delay() -> None:
     came_s: list[float] = []
 
     async def handler(_: bytes, context: Any) -> bytes:

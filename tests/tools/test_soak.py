@@ -73,7 +73,7 @@ def test_a_third_of_wild_samples_moves_it_little() -> None:
     assert found(wild).per_hour == pytest.approx(60, abs=6)
 
 
-def test_what_never_changes_is_flat_without_any_doubt() -> None:
+def test_a_constant_series_has_slope_zero() -> None:
     constant = found(np.zeros(len(TIMES_S)))
     assert (constant.level, constant.per_hour, constant.low, constant.high) == (500, 0, 0, 0)
 
@@ -137,7 +137,7 @@ def test_a_process_is_read_with_its_files_sockets_and_folder(tmp_path: Path, mon
     assert second.loop_lag_ms == pytest.approx(5.0)
 
 
-def test_the_picture_has_a_panel_for_each_figure_and_its_verdict() -> None:
+def test_the_picture_has_a_panel_and_verdict_for_each_figure() -> None:
     seen = [state(at, waiting_jobs=at % 3) for at in np.arange(0.0, 900.0, EVERY_S).tolist()]
     panels = draw_soak(seen, slopes_of(seen, 300)).axes
     assert len(panels) == len(UNITS)

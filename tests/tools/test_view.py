@@ -190,7 +190,7 @@ class TestPictures:
 
 
 class TestWords:
-    def test_a_query_is_told_in_a_line_and_in_full(self) -> None:
+    def test_a_query_is_shown_in_a_line_and_in_full(self) -> None:
         found, lost = query(upright(0)), query(None)
         assert found.label == "#4 localized to 2.0 cm"
         assert "**95 % within** 2.0 cm and 0.20°" in found.details()
@@ -265,7 +265,7 @@ class TestCommand:
         assert "not a loopback address" in result.stderr
         assert "ssh -L" in result.stderr
 
-    def test_without_viser_it_says_what_to_install(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_without_viser_the_error_names_the_extra(self, monkeypatch: pytest.MonkeyPatch) -> None:
         for name in [it for it in sys.modules if it == "viser" or it.startswith(("viser.", "mapless_tools.view."))]:
             monkeypatch.delitem(sys.modules, name)
         monkeypatch.setitem(sys.modules, "viser", None)
