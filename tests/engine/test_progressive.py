@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.services.progressive import Coarse, coarse_then_final
+from mapless_server.services.progressive import FutureCoarseAnswer, coarse_then_final
 
 FINAL = pb.LocalizeResponse(localization=pb.Localization(inlier_count=100))
 
@@ -27,7 +27,7 @@ class Planted:
         self.may_end = asyncio.Event()
         self.is_cancelled = False
 
-    async def answer(self, coarse: Coarse) -> pb.LocalizeResponse:
+    async def answer(self, coarse: FutureCoarseAnswer) -> pb.LocalizeResponse:
         for number in self._tells:
             coarse.set_result(message(number))
         try:

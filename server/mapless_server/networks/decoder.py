@@ -21,7 +21,7 @@ Injection = Callable[[int, Tensor], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class TokenLayout:
     """The arrangement of the T = 5 + P tokens of one view, the same for all views of a scene.
 
     Attributes:
@@ -33,12 +33,12 @@ class Layout:
     rope: Rope
 
 
-def make_layout(grid: tuple[int, int], head_width: int, device: torch.device) -> Layout:
+def make_layout(grid: tuple[int, int], head_width: int, device: torch.device) -> TokenLayout:
     """The layout of a grid (rows, columns) of patches."""
     rows = torch.arange(1, grid[0] + 1, device=device)
     columns = torch.arange(1, grid[1] + 1, device=device)
     patches = torch.cartesian_prod(rows, columns)
-    return Layout(grid, rope_table(torch.cat([patches.new_zeros(SPECIALS, 2), patches]), head_width))
+    return TokenLayout(grid, rope_table(torch.cat([patches.new_zeros(SPECIALS, 2), patches]), head_width))
 
 
 class AlternatingDecoder(nn.ModuleList):

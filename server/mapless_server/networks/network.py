@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from .blocks import Linear
-from .decoder import SPECIALS, AlternatingDecoder, Injection, Layout, make_layout
+from .decoder import SPECIALS, AlternatingDecoder, Injection, TokenLayout, make_layout
 from .encoder import PATCH_PX, Encoder, PatchEmbedding
 from .heads import CameraHead, HeadDecoder
 
@@ -98,11 +98,11 @@ class Network(nn.Module, ABC):
             if isinstance(module, (Linear, PatchEmbedding)):
                 module.to(dtype)
 
-    def layout(self, grid: tuple[int, int]) -> Layout:
+    def layout(self, grid: tuple[int, int]) -> TokenLayout:
         """The layout of tokens that the methods below take, of a grid (rows, columns) of patches."""
         return make_layout(grid, self.sizes.width // self.sizes.heads, self.register_token.device)
 
-    def encode(self, images: Tensor, layout: Layout, intrinsics: Tensor | None = None) -> Tensor:
+    def encode(self, images: Tensor, layout: TokenLayout, intrinsics: Tensor | None = None) -> Tensor:
         """Tokens (V, T, C) of each view alone, after block 0 of the decoder; T = 5 + H/14 * W/14.
 
         Args:
@@ -116,7 +116,7 @@ class Network(nn.Module, ABC):
     def reconstruct(
         self,
         tokens: Tensor,
-        layout: Layout,
+        layout: TokenLayout,
         mapped: int,
         poses: Tensor | None = None,
         posed: Tensor | None = None,
@@ -140,22 +140,22 @@ class Network(nn.Module, ABC):
         """The encoder's patch tokens (V, P, C) of images (V, 3, H, W) in [0, 1]."""
         return self.encoder((images - self.image_mean) / self.image_std)
 
-    def begin(self, patches: Tensor, layout: Layout) -> Tensor:
+    def begin(self, patches: Tensor, layout: TokenLayout) -> Tensor:
         """Patch tokens (V, P, C) to tokens (V, T, C), special ones first, after block 0 of the decoder."""
         specials = self.register_token[0].expand(len(patches), -1, -1)
         return self.decoder.begin(torch.cat([specials, patches], dim=1), layout.rope)
 
-    def decode(self, tokens: Tensor, layout: Layout, inject: Injection | None = None) -> Tensor:
+    def decode(self, tokens: Tensor, layout: TokenLayout, inject: Injection | None = None) -> Tensor:
         """Tokens (B, N, T, C) of `encode` to decoded tokens (B, N, T, 2 C), float32."""
         return self.decoder(tokens.to(self.register_token.dtype), layout.rope, inject)
 
-    def cameras(self, decoded: Tensor, layout: Layout) -> Tensor:
+    def cameras(self, decoded: Tensor, layout: TokenLayout) -> Tensor:
         """Poses (B, N, 4, 4) of decoded tokens (B, N, T, 2 C)."""
         tokens = self.camera_decoder(decoded.flatten(0, 1), layout.rope)
         poses: Tensor = self.camera_head(tokens)
         return poses.unflatten(0, decoded.shape[:2])
 
-    def maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
+    def maps(self, decoded: Tensor, layout: TokenLayout) -> tuple[Tensor, Tensor]:
         """Local points (B, M, H, W, 3), confidence logits (B, M, H, W) of decoded tokens (B, M, T, 2 C); M may be 0."""
         shape = decoded.shape[:2]
         if not shape.numel():  # not every kernel accepts an empty tensor
@@ -165,7 +165,7 @@ class Network(nn.Module, ABC):
         return points.unflatten(0, shape), logits.unflatten(0, shape)
 
     @abstractmethod
-    def read_maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
+    def read_maps(self, decoded: Tensor, layout: TokenLayout) -> tuple[Tensor, Tensor]:
         """Local points (V, H, W, 3) and confidence logits (V, H, W) of decoded tokens (V, T, 2 C)."""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .decoder import Layout
+from .decoder import TokenLayout
 from .heads import LinearHead
 from .network import Network, NetworkOutput, Sizes
 
@@ -30,7 +30,7 @@ class Pi3(Network):
     def reconstruct(
         self,
         tokens: Tensor,
-        layout: Layout,
+        layout: TokenLayout,
         mapped: int,
         poses: Tensor | None = None,
         posed: Tensor | None = None,
@@ -42,7 +42,7 @@ class Pi3(Network):
         points, logits = self.maps(decoded[:, :mapped], layout)
         return NetworkOutput(points, logits, self.cameras(decoded, layout))
 
-    def read_maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
+    def read_maps(self, decoded: Tensor, layout: TokenLayout) -> tuple[Tensor, Tensor]:
         """See Network.read_maps."""
         x, y, log_z = self.point_head(self.point_decoder(decoded, layout.rope), layout.grid).unbind(-1)
         z = torch.exp(log_z)

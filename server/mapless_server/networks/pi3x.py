@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from .conditions import PoseInjection, prope, rays_from_intrinsics
-from .decoder import SPECIALS, Injection, Layout
+from .decoder import SPECIALS, Injection, TokenLayout
 from .encoder import PatchEmbedding
 from .heads import ConvHead, MetricDecoder
 from .network import Network, NetworkOutput, Sizes
@@ -47,7 +47,7 @@ class Pi3X(Network):
     def reconstruct(
         self,
         tokens: Tensor,
-        layout: Layout,
+        layout: TokenLayout,
         mapped: int,
         poses: Tensor | None = None,
         posed: Tensor | None = None,
@@ -78,12 +78,12 @@ class Pi3X(Network):
 
         return inject
 
-    def _metric(self, decoded: Tensor, layout: Layout) -> Tensor:
+    def _metric(self, decoded: Tensor, layout: TokenLayout) -> Tensor:
         """Scale (B,) of each scene, about metres per unit."""
         scale: Tensor = self.metric_head(self.metric_decoder(self.metric_token, decoded.flatten(1, 2), layout.rope))
         return scale.exp()[:, 0]
 
-    def read_maps(self, decoded: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
+    def read_maps(self, decoded: Tensor, layout: TokenLayout) -> tuple[Tensor, Tensor]:
         """See Network.read_maps; before the metric scale."""
         x, y, log_z = self.point_head(self.point_decoder(decoded, layout.rope), layout.grid).unbind(-1)
         z = torch.exp(log_z.clamp_max(MAX_LOG_DEPTH))

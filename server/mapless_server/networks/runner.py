@@ -16,7 +16,7 @@ from torch.torch_version import TorchVersion
 
 from .blocks import Attention
 from .conditions import normalize_poses
-from .decoder import Layout
+from .decoder import TokenLayout
 from .encoder import PATCH_PX
 from .network import Network, NetworkOutput
 
@@ -91,7 +91,7 @@ class NetworkRunner:
         self.network.set_compute_type(self.dtype)
         self.network.to(self.device)
         self._warm: set[object] = set()
-        self._layouts: dict[tuple[int, int], Layout] = {}
+        self._layouts: dict[tuple[int, int], TokenLayout] = {}
         # CUDA graphs belong to the thread that recorded them.
         self._thread = ThreadPoolExecutor(1, f"network {name}", initializer=_keep_graphs_in_this_thread)
         self._check_kernels(name)
@@ -174,7 +174,7 @@ class NetworkRunner:
         with torch.no_grad():
             return work(*arguments)
 
-    def _layout(self, grid: tuple[int, int]) -> Layout:
+    def _layout(self, grid: tuple[int, int]) -> TokenLayout:
         if grid not in self._layouts:
             self._layouts[grid] = self.network.layout(grid)
         return self._layouts[grid]

@@ -8,12 +8,12 @@ from typing import Any
 
 from mapless.v1 import localization_service_pb2 as pb
 
-Coarse = asyncio.Future[pb.LocalizeResponse]
+FutureCoarseAnswer = asyncio.Future[pb.LocalizeResponse]
 """Is set to the coarse answer, on the event loop, if there is one."""
 
 
 async def coarse_then_final(
-    answer: Callable[[Coarse], Coroutine[Any, Any, pb.LocalizeResponse]],
+    answer: Callable[[FutureCoarseAnswer], Coroutine[Any, Any, pb.LocalizeResponse]],
 ) -> AsyncGenerator[pb.LocalizeProgressivelyResponse, None]:
     """Yields the coarse answer as soon as it is known, if there is one, and then the final answer.
 
@@ -26,7 +26,7 @@ async def coarse_then_final(
     Raises:
         Exception: as `answer`, after the coarse message if there was one.
     """
-    coarse: Coarse = asyncio.get_running_loop().create_future()
+    coarse: FutureCoarseAnswer = asyncio.get_running_loop().create_future()
     answering = asyncio.ensure_future(answer(coarse))
     either: set[asyncio.Future[Any]] = {answering, coarse}
     try:

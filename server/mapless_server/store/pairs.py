@@ -75,7 +75,7 @@ class PairStore:
         stored: Select[Any] = select(column.first_key, column.second_key, column.data, column.sha256)
         stored = stored.where(column.matching == matching, column.first_key.in_(first), column.second_key.in_(second))
         with self._database.read() as connection:
-            found = unless_damaged(connection, lambda: connection.execute(stored).all(), list)
+            found: Sequence[Row[Any]] = unless_damaged(connection, lambda: connection.execute(stored).all(), list)
         wanted = set(pairs)
         return {_pair(row): _decoded(matching, row) for row in found if _pair(row) in wanted}
 

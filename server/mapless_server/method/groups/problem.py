@@ -137,7 +137,7 @@ class JointOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class ImageBlock:
     """One photograph's part of the problem: `adjust`'s, without the prior, which is the group's.
 
     Attributes:
@@ -168,7 +168,7 @@ class Point(Generic[F]):
     points: tuple[Array, ...]
     freedom: F
 
-    def bundle(self, index: int, block: Block) -> Bundle:
+    def bundle(self, index: int, block: ImageBlock) -> Bundle:
         """The values of one block."""
         last = self.freedom.camera_from_world(block.image)
         return Bundle(self.references[block.references].and_last(last), self.points[index])
@@ -193,7 +193,7 @@ class GroupProblem(Generic[F]):
         self.options = options
         self._references: dict[str, tuple[int, PosedView]] = {}
         self._information: list[Array] = []
-        self.blocks: list[Block] = []
+        self.blocks: list[ImageBlock] = []
         self.chosen: list[NDArray[np.intp]] = []
         points: list[Array] = []
         parts = [
@@ -215,7 +215,7 @@ class GroupProblem(Generic[F]):
         """References of all photographs, each counted once."""
         return len(self._references)
 
-    def _block(self, part: Part, shared: Shared) -> Block:
+    def _block(self, part: Part, shared: Shared) -> ImageBlock:
         source, structure = part.source, part.source.structure
         views = [*source.references, PosedView("", "", source.query, part.world_from_camera)]
         observations, start, depth_m = bundle_of(part.tracks, views, structure, part.chosen)
@@ -225,7 +225,7 @@ class GroupProblem(Generic[F]):
         problem = BundleProblem(
             observations, part.tracks.view, start.poses[:-1], free, self.options.adjust.loss_scale_sigma
         )
-        return Block(source.image, problem, references)
+        return ImageBlock(source.image, problem, references)
 
     def _index(self, reference: PosedView, level_px: float, depth_m: float) -> int:
         """Index of a reference in the group; a new one gets a prior on its pose as in `adjust`."""
