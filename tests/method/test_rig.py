@@ -10,7 +10,7 @@ from support.jacobians import assert_jacobian
 from support.scenes import SceneOptions, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.groups.rig import RigEstimate, RigFreedom, RigOptions, solve_rig
+from mapless_server.method.groups.rig import RigEstimate, RigOptions, RigState, solve_rig
 from mapless_server.method.perturbation import perturbed, rotation_vector
 from mapless_server.method.rejection import Rejection, RejectionReason
 
@@ -140,15 +140,15 @@ def test_errors_are_as_large_as_the_covariance() -> None:
 
 
 def test_the_jacobian_is_that_of_the_cameras_motion() -> None:
-    freedom = RigFreedom(WORLD_FROM_RIG.inverse(), tuple(RIG_FROM_CAMERA))
-    before = freedom.camera_from_world(1)
+    state = RigState(WORLD_FROM_RIG.inverse(), tuple(RIG_FROM_CAMERA))
+    before = state.camera_from_world(1)
 
     def motion(step: Array) -> Array:
-        after = freedom.moved(step).camera_from_world(1)
+        after = state.moved(step).camera_from_world(1)
         turn = after.rotation @ before.rotation.T
         return np.concatenate([after.translation - turn @ before.translation, rotation_vector(turn)])
 
-    assert_jacobian(freedom.jacobian(1), motion, np.zeros(6))
+    assert_jacobian(state.jacobian(1), motion, np.zeros(6))
 
 
 def test_a_perturbation_rotates_about_the_targets_origin() -> None:

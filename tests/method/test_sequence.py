@@ -10,7 +10,7 @@ from support.jacobians import assert_jacobian
 from support.scenes import SceneOptions, look_at, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.groups.drift import DriftOptions, SequenceFreedom, world_from_session_at
+from mapless_server.method.groups.drift import DriftOptions, SequenceState, world_from_session_at
 from mapless_server.method.groups.rig import RigOptions, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOptions, solve_sequence
 from mapless_server.method.rejection import Rejection, RejectionReason
@@ -92,7 +92,7 @@ def test_a_jump_of_the_tracking_gets_little_weight() -> None:
     images = images_of(random, truth, alone=True, own_noise_m=0.005)
     found = estimate(solve_sequence(images, session, False, OPTIONS))
     assert max(error_m(*it) for it in zip(found.world_from_camera, truth, strict=True)) < 0.008
-    weights = SequenceFreedom.of(found.world_from_camera, session, 1.0, False, OPTIONS.drift).weights()
+    weights = SequenceState.of(found.world_from_camera, session, 1.0, False, OPTIONS.drift).weights()
     assert weights.argmin() == 2
     assert weights[2] < 0.1 < np.delete(weights, 2).min()
 
@@ -179,42 +179,42 @@ def test_the_same_frames_give_the_same_answer() -> None:
 # Drift
 
 
-def moved_freedom(scale_is_free: bool, moved: float) -> SequenceFreedom:
+def moved_state(scale_is_free: bool, moved: float) -> SequenceState:
     random = random_for("freedom", scale_is_free)
     truth = walk(random, 3)
-    freedom = SequenceFreedom.of(truth, rescaled(truth, 2.0), 0.5, scale_is_free, DriftOptions())
-    return freedom.moved(random.normal(0, moved, freedom.size))
+    state = SequenceState.of(truth, rescaled(truth, 2.0), 0.5, scale_is_free, DriftOptions())
+    return state.moved(random.normal(0, moved, state.size))
 
 
 @pytest.mark.parametrize("scale_is_free", [False, True])
 def test_jacobian_of_residuals_equals_finite_differences(scale_is_free: bool) -> None:
-    freedom = moved_freedom(scale_is_free, 1e-4)
+    state = moved_state(scale_is_free, 1e-4)
     for i in range(2):
 
         def error(step: Array, i: int = i) -> Array:
-            return freedom.moved(step)._error(i)
+            return state.moved(step)._error(i)
 
-        assert_jacobian(freedom._jacobian_of_error(i), error, np.zeros(freedom.size), tolerance=1e-3)
+        assert_jacobian(state._jacobian_of_error(i), error, np.zeros(state.size), tolerance=1e-3)
 
 
 @pytest.mark.parametrize("scale_is_free", [False, True])
 def test_the_gradient_is_half_that_of_the_cost(scale_is_free: bool) -> None:
-    freedom = moved_freedom(scale_is_free, 1e-3)
-    _, gradient = freedom.equations()
+    state = moved_state(scale_is_free, 1e-3)
+    _, gradient = state.equations()
 
     def cost(step: Array) -> float:
-        return freedom.moved(step).cost()
+        return state.moved(step).cost()
 
-    assert_jacobian(2 * gradient, cost, np.zeros(freedom.size), tolerance=5e-3)
+    assert_jacobian(2 * gradient, cost, np.zeros(state.size), tolerance=5e-3)
 
 
 def test_a_session_without_drift_has_cost_zero() -> None:
     random = random_for("right")
     truth = walk(random, 4)
     session = rescaled(drifting(random, truth, 0.0), 4.0)
-    freedom = SequenceFreedom.of(truth, session, 0.25, True, DriftOptions())
-    assert freedom.cost() == pytest.approx(0, abs=1e-12)
-    np.testing.assert_allclose(freedom.weights(), 1)
+    state = SequenceState.of(truth, session, 0.25, True, DriftOptions())
+    assert state.cost() == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(state.weights(), 1)
 
 
 def test_drift_grows_with_distance_and_angle() -> None:

@@ -60,11 +60,11 @@ class DriftOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class SequenceFreedom:
-    """Parameters of a sequence, with a cost on the difference of its steps from the session's; see `problem.Freedom`.
+class SequenceState:
+    """The poses of a sequence, with a cost on the difference of its steps from the session's; see `problem.GroupState`.
 
-    They are left perturbations (v, w) of every frame's camera_from_world, in order, and, if the unit of the session is
-    unknown, the logarithm of the scale.
+    The parameters are left perturbations (v, w) of every frame's camera_from_world, in order, and, if the unit of the
+    session is unknown, the logarithm of the scale.
 
     Attributes:
         frames: camera_from_world of every frame, metric.
@@ -89,38 +89,38 @@ class SequenceFreedom:
         scale: float,
         scale_is_free: bool,
         options: DriftOptions,
-    ) -> SequenceFreedom:
+    ) -> SequenceState:
         """Frames at these poses, in a session."""
         neighbours = itertools.pairwise(session_from_camera)
         steps = tuple(first.inverse().compose(second) for first, second in neighbours)
         metric = (replace(step, translation=scale * step.translation) for step in steps)
         sigma = np.array([options.sigma(step) for step in metric]).reshape(-1, 6)
         frames = tuple(pose.inverse() for pose in world_from_camera)
-        return SequenceFreedom(frames, steps, scale, scale_is_free, sigma, options)
+        return SequenceState(frames, steps, scale, scale_is_free, sigma, options)
 
     @property
     def size(self) -> int:
-        """See Freedom."""
+        """See GroupState."""
         return 6 * len(self.frames) + self.scale_is_free
 
     def camera_from_world(self, image: int) -> RigidTransform:
-        """See Freedom."""
+        """See GroupState."""
         return self.frames[image]
 
     def jacobian(self, image: int) -> Array:
-        """See Freedom."""
+        """See GroupState."""
         jacobian = np.zeros((6, self.size))
         jacobian[:, 6 * image : 6 * image + 6] = np.eye(6)
         return jacobian
 
-    def moved(self, step: Array) -> SequenceFreedom:
-        """See Freedom."""
+    def moved(self, step: Array) -> SequenceState:
+        """See GroupState."""
         motions = step[: 6 * len(self.frames)].reshape(-1, 6)
         frames = tuple(perturbed(frame, motion) for frame, motion in zip(self.frames, motions, strict=True))
         scale = self.scale * math.exp(step[-1]) if self.scale_is_free else self.scale
         return replace(self, frames=frames, scale=scale)
 
-    def relaxed(self) -> SequenceFreedom:
+    def relaxed(self) -> SequenceState:
         """With the noise of the steps enlarged to that observed.
 
         The quality is that of the whole session, estimated by the median over the steps, which jumps do not affect.
@@ -131,7 +131,7 @@ class SequenceFreedom:
         return replace(self, sigma=self.sigma * math.sqrt(max(1.0, found / _MEDIAN_SQUARE)))
 
     def cost(self) -> float:
-        """See Freedom."""
+        """See GroupState."""
         return cauchy_cost((self.residuals() ** 2).sum(axis=1), self._loss_scale)
 
     def residuals(self) -> Array:
@@ -143,7 +143,7 @@ class SequenceFreedom:
         return cauchy_weight((self.residuals() ** 2).sum(axis=1), self._loss_scale)
 
     def equations(self) -> tuple[Array, Array]:
-        """See Freedom."""
+        """See GroupState."""
         matrix, gradient = np.zeros((self.size, self.size)), np.zeros(self.size)
         residuals, weights = self.residuals(), self.weights()
         for i, (residual, weight) in enumerate(zip(residuals, weights, strict=True)):

@@ -23,22 +23,22 @@ from ..optimize import MinimizeOptions, minimize
 from ..perturbation import reprojection_errors_px
 from ..results import PointMatches
 from .images import MatchedImage, PosedImage
-from .problem import F, Freedom, GroupProblem, JointOptions
+from .problem import GroupProblem, GroupState, JointOptions, S
 
-__all__ = ["Freedom", "JointEstimate", "JointOptions", "adjust_in_rounds", "adjust_jointly", "covariance_in_world"]
+__all__ = ["GroupState", "JointEstimate", "JointOptions", "adjust_in_rounds", "adjust_jointly", "covariance_in_world"]
 
 
 @dataclass(frozen=True, eq=False)
-class JointEstimate(Generic[F]):
+class JointEstimate(Generic[S]):
     """A group's adjusted poses.
 
     Attributes:
-        freedom: parameters at the optimum.
+        state: the poses at the optimum.
         covariance: (N, N) of its parameters.
         matched: photographs with their matches, in the order of the matched images.
     """
 
-    freedom: F
+    state: S
     covariance: Array
     matched: tuple[PosedImage, ...]
 
@@ -49,32 +49,32 @@ class JointEstimate(Generic[F]):
 
 
 def adjust_in_rounds(
-    matched_images: Sequence[MatchedImage], freedom: F, options: JointOptions, rounds: int
-) -> JointEstimate[F]:
+    matched_images: Sequence[MatchedImage], state: S, options: JointOptions, rounds: int
+) -> JointEstimate[S]:
     """Alternates guided searches from the current poses with adjustments."""
     for _ in range(rounds):
-        poses = [freedom.camera_from_world(it.image).inverse() for it in matched_images]
+        poses = [state.camera_from_world(it.image).inverse() for it in matched_images]
         matches = [it.matches_at(pose) for it, pose in zip(matched_images, poses, strict=True)]
-        estimate = adjust_jointly(matched_images, matches, freedom, options)
-        freedom = estimate.freedom.relaxed()
+        estimate = adjust_jointly(matched_images, matches, state, options)
+        state = estimate.state.relaxed()
     return estimate
 
 
 def adjust_jointly(
-    matched_images: Sequence[MatchedImage], matches: Sequence[PointMatches], freedom: F, options: JointOptions
-) -> JointEstimate[F]:
+    matched_images: Sequence[MatchedImage], matches: Sequence[PointMatches], state: S, options: JointOptions
+) -> JointEstimate[S]:
     """Refines the poses of a group.
 
     Args:
         matched_images: the photographs that have matches.
         matches: of each with its points; those with too large an error at the start are not used.
-        freedom: initial poses and their parametrization.
+        state: the initial poses.
         options: of the adjustment.
 
     Returns:
         The refined poses; the initial ones if no match is used.
     """
-    problem = GroupProblem(matched_images, matches, freedom, options)
+    problem = GroupProblem(matched_images, matches, state, options)
     steps = MinimizeOptions(options.iterations, options.adjust.min_decrease)
     point = minimize(problem, problem.start, steps) if problem.blocks else problem.start
     points = {block.image: (problem.chosen[i], point.points[i]) for i, block in enumerate(problem.blocks)}
@@ -85,14 +85,14 @@ def adjust_jointly(
             chosen, moved = points[source.image]
             x_in_world = x_in_world.copy()
             x_in_world[chosen] = moved
-        matched.append(_matched(source, its_matches, x_in_world, point.freedom, options.adjust.inlier_px))
-    return JointEstimate(point.freedom, problem.covariance(point), tuple(matched))
+        matched.append(_matched(source, its_matches, x_in_world, point.state, options.adjust.inlier_px))
+    return JointEstimate(point.state, problem.covariance(point), tuple(matched))
 
 
 def _matched(
-    source: MatchedImage, matches: PointMatches, x_in_world: Array, freedom: Freedom, inlier_px: float
+    source: MatchedImage, matches: PointMatches, x_in_world: Array, state: GroupState, inlier_px: float
 ) -> PosedImage:
-    pose = freedom.camera_from_world(source.image).inverse()
+    pose = state.camera_from_world(source.image).inverse()
     pixels = source.query.features.keypoints[matches.keypoint].astype(np.float64)
     errors_px = reprojection_errors_px(source.query.camera, pose, x_in_world[matches.point], pixels)
     return PosedImage(source, pose, matches, errors_px < inlier_px, errors_px)

@@ -23,14 +23,14 @@ from ..tracks import Tracks
 from ..views import PosedView
 from .images import MatchedImage
 
-F = TypeVar("F", bound="Freedom")
+S = TypeVar("S", bound="GroupState")
 
 
-class Freedom(Protocol):
-    """The parameters of a group's poses, at one point, and the cost of these parameters.
+class GroupState(Protocol):
+    """The poses of a group, as values of N parameters that have a cost of their own.
 
     Attributes:
-        size: number N of parameters.
+        size: N.
     """
 
     @property
@@ -46,11 +46,11 @@ class Freedom(Protocol):
         """(6, N): the left perturbation (v, w) of its camera_from_world by the parameters."""
         ...
 
-    def moved(self: F, step: Array) -> F:
+    def moved(self: S, step: Array) -> S:
         """After a step (N,) of the parameters."""
         ...
 
-    def relaxed(self: F) -> F:
+    def relaxed(self: S) -> S:
         """The same point; the cost's standard deviations are enlarged to the observed errors."""
         ...
 
@@ -81,10 +81,10 @@ class Part:
 
 
 def part_of(
-    source: MatchedImage, matches: PointMatches, freedom: Freedom, max_error_px: float, max_matches: int
+    source: MatchedImage, matches: PointMatches, state: GroupState, max_error_px: float, max_matches: int
 ) -> Part:
     """The part of a photograph, from its matches with small errors, evenly thinned."""
-    structure, pose = source.structure, freedom.camera_from_world(source.image).inverse()
+    structure, pose = source.structure, state.camera_from_world(source.image).inverse()
     pixels = source.query.features.keypoints[matches.keypoint].astype(np.float64)
     errors_px = reprojection_errors_px(source.query.camera, pose, structure.x_in_world[matches.point], pixels)
     used = np.flatnonzero(errors_px < max_error_px)
@@ -150,31 +150,31 @@ class ImageBlock:
     problem: BundleProblem
     references: NDArray[np.intp]
 
-    def columns(self, reference_count: int, freedom: Freedom) -> Array:
+    def columns(self, reference_count: int, state: GroupState) -> Array:
         """(6 V, 6 R + N): derivative of its cameras' motions by the unknowns of the group."""
         local = len(self.references)
-        columns = np.zeros((6 * local + 6, 6 * reference_count + freedom.size))
+        columns = np.zeros((6 * local + 6, 6 * reference_count + state.size))
         for row, reference in enumerate(self.references):
             columns[6 * row : 6 * row + 6, 6 * reference : 6 * reference + 6] = np.eye(6)
-        columns[-6:, 6 * reference_count :] = freedom.jacobian(self.image)
+        columns[-6:, 6 * reference_count :] = state.jacobian(self.image)
         return columns
 
 
 @dataclass(frozen=True, eq=False)
-class Point(Generic[F]):
-    """Values of the unknowns: references (R), points of each block (P_b, 3), and the group's parameters."""
+class Point(Generic[S]):
+    """Values of the unknowns: references (R), points of each block (P_b, 3), and the group's state."""
 
     references: Poses
     points: tuple[Array, ...]
-    freedom: F
+    state: S
 
     def bundle(self, index: int, block: ImageBlock) -> Bundle:
         """The values of one block."""
-        last = self.freedom.camera_from_world(block.image)
+        last = self.state.camera_from_world(block.image)
         return Bundle(self.references[block.references].and_last(last), self.points[index])
 
 
-class GroupProblem(Generic[F]):
+class GroupProblem(Generic[S]):
     """The cost of a group and its derivatives; see `optimize.Problem`.
 
     Attributes:
@@ -187,7 +187,7 @@ class GroupProblem(Generic[F]):
         self,
         matched_images: Sequence[MatchedImage],
         matches: Sequence[PointMatches],
-        freedom: F,
+        state: S,
         options: JointOptions,
     ) -> None:
         self.options = options
@@ -197,7 +197,7 @@ class GroupProblem(Generic[F]):
         self.chosen: list[NDArray[np.intp]] = []
         points: list[Array] = []
         parts = [
-            part_of(source, its_matches, freedom, options.adjust.max_error_px, options.max_matches)
+            part_of(source, its_matches, state, options.adjust.max_error_px, options.max_matches)
             for source, its_matches in zip(matched_images, matches, strict=True)
         ]
         used = [part for part in parts if len(part.chosen)]
@@ -208,7 +208,7 @@ class GroupProblem(Generic[F]):
             self.blocks.append(self._block(part, shared))
         self.information = np.array(self._information).ravel()
         references = Poses.of(reference.world_from_camera for _, reference in self._references.values())
-        self.start = Point(references, tuple(points), freedom)
+        self.start = Point(references, tuple(points), state)
 
     @property
     def reference_count(self) -> int:
@@ -235,23 +235,23 @@ class GroupProblem(Generic[F]):
             self._information.append(reference_information(noise_px, reference.view.camera.focal_x_px, depth_m))
         return self._references[reference.key][0]
 
-    def cost(self, point: Point[F]) -> float:
+    def cost(self, point: Point[S]) -> float:
         """NaN for a point behind a camera."""
         data = sum(block.problem.cost(point.bundle(i, block)) for i, block in enumerate(self.blocks))
-        return data + float((self._reference_motion(point) ** 2 * self.information).sum()) + point.freedom.cost()
+        return data + float((self._reference_motion(point) ** 2 * self.information).sum()) + point.state.cost()
 
-    def _reference_motion(self, point: Point[F]) -> Array:
+    def _reference_motion(self, point: Point[S]) -> Array:
         """(6 R,): the motion of each reference away from its given pose."""
         return point.references.motion_from(self.start.references).ravel()
 
-    def linearize(self, point: Point[F]) -> list[NormalEquations]:
+    def linearize(self, point: Point[S]) -> list[NormalEquations]:
         """See optimize.Problem."""
         return [block.problem.linearize(point.bundle(i, block)) for i, block in enumerate(self.blocks)]
 
-    def _columns(self, point: Point[F]) -> list[Array]:
-        return [block.columns(self.reference_count, point.freedom) for block in self.blocks]
+    def _columns(self, point: Point[S]) -> list[Array]:
+        return [block.columns(self.reference_count, point.state) for block in self.blocks]
 
-    def step(self, point: Point[F], equations: Sequence[NormalEquations], damping: float) -> Point[F] | None:
+    def step(self, point: Point[S], equations: Sequence[NormalEquations], damping: float) -> Point[S] | None:
         """See optimize.Problem."""
         columns = self._columns(point)
         reduced = [it.reduced(damping) for it in equations]
@@ -266,23 +266,23 @@ class GroupProblem(Generic[F]):
             return None
         points = []
         for i, (it, (_, _, inverse), its_columns) in enumerate(zip(equations, reduced, columns, strict=True)):
-            centre = point.freedom.camera_from_world(self.blocks[i].image).inverse().translation
+            centre = point.state.camera_from_world(self.blocks[i].image).inverse().translation
             points.append(_stepped(point.points[i], it.point_steps(its_columns @ step, inverse), centre))
         references = point.references.moved(step[: 6 * self.reference_count].reshape(-1, 6))
-        return Point(references, tuple(points), point.freedom.moved(step[6 * self.reference_count :]))
+        return Point(references, tuple(points), point.state.moved(step[6 * self.reference_count :]))
 
-    def _prior_equations(self, point: Point[F], data_inflation: float = 1.0) -> tuple[Array, Array]:
+    def _prior_equations(self, point: Point[S], data_inflation: float = 1.0) -> tuple[Array, Array]:
         """Matrix and gradient of the references' priors and the parameters' cost."""
         references = 6 * self.reference_count
-        matrix = np.zeros((references + point.freedom.size,) * 2)
+        matrix = np.zeros((references + point.state.size,) * 2)
         gradient = np.zeros(len(matrix))
         matrix[range(references), range(references)] = self.information / data_inflation**2
         gradient[:references] = self.information * self._reference_motion(point) / data_inflation**2
-        matrix[references:, references:], gradient[references:] = point.freedom.equations()
+        matrix[references:, references:], gradient[references:] = point.state.equations()
         return matrix, gradient
 
-    def covariance(self, point: Point[F]) -> Array:
-        """(N, N) of the freedom's parameters; infinite on the diagonal of unobserved ones.
+    def covariance(self, point: Point[S]) -> Array:
+        """(N, N) of the parameters; infinite on the diagonal of unobserved ones.
 
         The parameters' cost counts as stated, the observations with inflated standard deviations (see
         AdjustOptions.error_inflation).

@@ -68,8 +68,8 @@ class RigEstimate:
 
 
 @dataclass(frozen=True, eq=False)
-class RigFreedom:
-    """The six parameters of a rig: a left perturbation (v, w) of rig_from_world; see `problem.Freedom`."""
+class RigState:
+    """The pose of a rig; see `problem.GroupState`. Its parameters are a left perturbation (v, w) of rig_from_world."""
 
     rig_from_world: RigidTransform
     rig_from_camera: tuple[RigidTransform, ...]
@@ -77,7 +77,7 @@ class RigFreedom:
     size = 6
 
     def camera_from_world(self, image: int) -> RigidTransform:
-        """See Freedom."""
+        """See GroupState."""
         return self.rig_from_camera[image].inverse().compose(self.rig_from_world)
 
     def jacobian(self, image: int) -> Array:
@@ -87,11 +87,11 @@ class RigFreedom:
         lever = cross_matrix(camera_from_rig.translation) @ rotation
         return np.block([[rotation, lever], [np.zeros((3, 3)), rotation]])
 
-    def moved(self, step: Array) -> RigFreedom:
-        """See Freedom."""
-        return RigFreedom(perturbed(self.rig_from_world, step), self.rig_from_camera)
+    def moved(self, step: Array) -> RigState:
+        """See GroupState."""
+        return RigState(perturbed(self.rig_from_world, step), self.rig_from_camera)
 
-    def relaxed(self) -> RigFreedom:
+    def relaxed(self) -> RigState:
         """Unchanged: a rig is rigid."""
         return self
 
@@ -100,7 +100,7 @@ class RigFreedom:
         return 0.0
 
     def equations(self) -> tuple[Array, Array]:
-        """See Freedom."""
+        """See GroupState."""
         return np.zeros((6, 6)), np.zeros(6)
 
 
@@ -124,14 +124,14 @@ def solve_rig(
     start = _start(matched_images, rig_from_camera, options)
     if isinstance(start, Rejection):
         return start
-    freedom = RigFreedom(start.inverse(), tuple(rig_from_camera))
-    estimate = adjust_in_rounds(matched_images, freedom, options.joint, options.rounds)
+    state = RigState(start.inverse(), tuple(rig_from_camera))
+    estimate = adjust_in_rounds(matched_images, state, options.joint, options.rounds)
     if estimate.inlier_count < 4:
         return Rejection(RejectionReason.PNP_FAILED, "no pose of the rig explains four matches")
     failure = group_gate_failure(estimate.matched, options.pnp.inlier_px, options.gate)
     if failure:
         return Rejection(RejectionReason.GATE, failure)
-    world_from_rig = estimate.freedom.rig_from_world.inverse()
+    world_from_rig = estimate.state.rig_from_world.inverse()
     covariance = covariance_in_world(estimate.covariance, world_from_rig)
     return RigEstimate(world_from_rig.shifted(origin), covariance, estimate.matched, origin)
 

@@ -23,7 +23,7 @@ from ..options import check_bounds
 from ..pnp import PnpOptions
 from ..rejection import Rejection, RejectionReason
 from ..trust.gate import GateOptions
-from .drift import DriftOptions, SequenceFreedom, world_from_session_at
+from .drift import DriftOptions, SequenceState, world_from_session_at
 from .generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from .images import (
     GroupImage,
@@ -131,12 +131,12 @@ def solve_sequence(
     if guess is None:
         return Rejection(RejectionReason.PNP_FAILED, f"no poses of the sequence explain four of {total} matches")
     poses = session.poses(matched_images, guess)
-    freedom = SequenceFreedom.of(poses, session_from_camera, guess.scale, estimate_scale, options.drift)
-    estimate = adjust_in_rounds(matched_images, freedom, options.joint, options.rounds)
+    state = SequenceState.of(poses, session_from_camera, guess.scale, estimate_scale, options.drift)
+    estimate = adjust_in_rounds(matched_images, state, options.joint, options.rounds)
     return _rejection(estimate, options) or _result(estimate, session.frames, origin)
 
 
-def _rejection(estimate: JointEstimate[SequenceFreedom], options: SequenceOptions) -> Rejection | None:
+def _rejection(estimate: JointEstimate[SequenceState], options: SequenceOptions) -> Rejection | None:
     if estimate.inlier_count < 4:
         return Rejection(RejectionReason.PNP_FAILED, "no poses of the sequence explain four matches")
     failure = group_gate_failure(estimate.matched, options.pnp.inlier_px, options.gate)
@@ -149,17 +149,17 @@ def _rejection(estimate: JointEstimate[SequenceFreedom], options: SequenceOption
     return None
 
 
-def _scale_sigma(estimate: JointEstimate[SequenceFreedom]) -> float:
-    return math.sqrt(estimate.covariance[-1, -1]) if estimate.freedom.scale_is_free else 0.0
+def _scale_sigma(estimate: JointEstimate[SequenceState]) -> float:
+    return math.sqrt(estimate.covariance[-1, -1]) if estimate.state.scale_is_free else 0.0
 
 
 def _result(
-    estimate: JointEstimate[SequenceFreedom], session: Sequence[RigidTransform], origin: Array
+    estimate: JointEstimate[SequenceState], session: Sequence[RigidTransform], origin: Array
 ) -> SequenceEstimate:
-    freedom = estimate.freedom
-    poses = [frame.inverse() for frame in freedom.frames]
+    state = estimate.state
+    poses = [frame.inverse() for frame in state.frames]
     blocks = (estimate.covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(poses)))
-    last = world_from_session_at(poses[-1], session[-1], freedom.scale)
+    last = world_from_session_at(poses[-1], session[-1], state.scale)
     return SequenceEstimate(
         replace(last, translation=last.translation + origin),
         _scale_sigma(estimate),
@@ -238,8 +238,8 @@ class _Session:
 
     def _consistent_frames(self, own: dict[int, RigidTransform], guess: Similarity) -> list[int]:
         """Frames whose own poses agree with another's by the tracking; or, if none do, with the guess."""
-        freedom = SequenceFreedom.of((), self.frames, guess.scale, False, self.options.drift)
-        drift = np.concatenate([np.zeros((1, 6)), np.cumsum(freedom.sigma, axis=0)])  # largest drift to each frame
+        state = SequenceState.of((), self.frames, guess.scale, False, self.options.drift)
+        drift = np.concatenate([np.zeros((1, 6)), np.cumsum(state.sigma, axis=0)])  # largest drift to each frame
 
         def agree(i: int, j: int) -> bool:
             tracked = world_from_session_at(own[i], self.frames[i], guess.scale).transform_pose(self.frames[j])
