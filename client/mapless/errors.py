@@ -142,7 +142,12 @@ def _message(details: str) -> str:
     reason = details.rpartition("last error: ")[2]
     known = next((words for sign, words in _NOT_CONNECTED_BECAUSE.items() if sign in reason), "")
     address = _ADDRESS.search(reason)
-    return f"cannot connect{f' to {unquote(address[1])}' if address else ''}: {known or reason}"
+    where = unquote(address[1]) if address else ""
+    if where.endswith(":443") and "Connection refused" in reason:
+        known += "; an address without a port has port 443"
+    if where.startswith("["):  # the last of all that a name such as localhost has, and the only one that gRPC reports
+        known = f"{known or reason}; there may be another reason at the name's IPv4 address, such as 127.0.0.1"
+    return f"cannot connect{f' to {where}' if where else ''}: {known or reason}"
 
 
 def _detail(status: status_pb2.Status, empty: Detail) -> Detail | None:

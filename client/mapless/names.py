@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 _ID = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,126}[A-Za-z0-9_])?", re.ASCII)
 _SHOWN_CHARACTERS = 60  # of a wrong value in an error message: ids of 10,000 have been sent
@@ -30,6 +31,13 @@ def scene_name(scene: str) -> str:
 def reference_name(scene: str, reference: str) -> str:
     """The name of a reference given by id or by name, in a scene given by id or by name."""
     return reference if reference.startswith("scenes/") else f"{scene_name(scene)}/references/{reference}"
+
+
+def reference_names(scene: str, references: Sequence[str]) -> list[str]:
+    """The names of references, as `reference_name`; TypeError for a single one, which is a sequence of letters."""
+    if isinstance(references, str):
+        raise TypeError(f"references must be a list of ids or names, is the text {shown(references)}")
+    return [reference_name(scene, reference) for reference in references]
 
 
 def parse_scene_name(name: str) -> str:

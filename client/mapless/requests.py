@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from . import wire
-from .geometry import Camera, RigidTransform
+from .geometry import Camera, RigidTransform, nearest_rotation
+from .names import shown
 from .v1 import reference_service_pb2 as reference_pb
 
 ImageSource = bytes | str | os.PathLike[str]
@@ -25,14 +26,27 @@ class NewReference:
 
 
 def create_request(scene_name: str, reference: NewReference) -> reference_pb.CreateReferenceRequest:
-    """The request that stores a reference; reads the photograph's file."""
+    """The request that stores a reference; reads the photograph's file.
+
+    Raises:
+        OSError: the file cannot be read.
+        TypeError: a value has another type; names it.
+        ValueError: the pose's rotation is none.
+    """
+    if not isinstance(reference.reference_id, str):
+        raise TypeError(f"reference_id must be a text, is {reference.reference_id!r}")
+    world_from_camera = wire.transform_to_message(reference.world_from_camera)
+    try:
+        nearest_rotation(reference.world_from_camera.rotation)
+    except ValueError as error:
+        raise ValueError(f"world_from_camera of reference {shown(reference.reference_id)}: {error}") from None
     return reference_pb.CreateReferenceRequest(
         scene=scene_name,
         reference_id=reference.reference_id,
         reference=reference_pb.Reference(
             image=read_image(reference.image),
             intrinsics=wire.camera_to_message(reference.camera),
-            world_from_camera=wire.transform_to_message(reference.world_from_camera),
+            world_from_camera=world_from_camera,
         ),
     )
 

@@ -90,9 +90,17 @@ def time_from_message(message: Any) -> datetime:
 
 
 def camera_to_message(camera: Camera) -> pb.CameraIntrinsics:
-    """Message of a camera."""
-    intrinsics = {name: value for name, value in vars(camera).items() if name != "distortion"}
-    message = pb.CameraIntrinsics(**intrinsics)
+    """Message of a camera; TypeError, naming the field, if one is not a number, or for another type than a camera."""
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera must be a Camera, is {_kind(camera)}; read_camera makes one of a file")
+    message = pb.CameraIntrinsics()
+    for name, value in vars(camera).items():
+        if name != "distortion":
+            try:
+                setattr(message, name, value)
+            except TypeError:
+                number = "a whole number" if name.startswith(("width", "height")) else "a number"
+                raise TypeError(f"camera.{name} must be {number}, is {value!r}") from None
     if camera.distortion is not None:
         model = lens_model_of(camera.distortion)
         if not hasattr(message, model):
@@ -141,7 +149,11 @@ def _distortion_from_message(message: pb.CameraIntrinsics, field: str) -> Distor
 
 
 def transform_to_message(target_from_source: RigidTransform) -> pb.RigidTransform:
-    """Message of a rigid transform, its quaternion with w >= 0."""
+    """Message of a rigid transform, its quaternion with w >= 0; TypeError for another type."""
+    if not isinstance(target_from_source, RigidTransform):
+        raise TypeError(
+            f"a pose must be a RigidTransform, is {_kind(target_from_source)}; RigidTransform.from_matrix makes one"
+        )
     q = target_from_source.quaternion()
     return pb.RigidTransform(
         rotation=pb.Quaternion(**vars(q)), translation_m=vector_to_message(target_from_source.translation)
@@ -183,6 +195,10 @@ def vector_from_message(message: pb.Vector3, field: str, max_coordinate_m: float
         if abs(value) > max_coordinate_m:
             raise FieldError(joined(field, axis), f"must be at most {max_coordinate_m:g} m in magnitude, is {value:g}")
     return np.array([message.x, message.y, message.z])
+
+
+def _kind(value: object) -> str:
+    return f"{type(value).__module__}.{type(value).__qualname__}".removeprefix("builtins.")
 
 
 def enum_prefix(enum: ProtoEnum) -> str:

@@ -238,6 +238,12 @@ def default_text(name: str) -> str:
     return f"{default}".lower() if isinstance(default, bool) else f"{default}".removesuffix(".0")
 
 
+_PLAIN_BOUNDS = {
+    "greater than or equal to": "at least",
+    "greater than": "above",
+    "less than or equal to": "at most",
+    "less than": "below",
+}
 _BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 _COMPUTED_DEFAULTS = {"workers": "all cores", "weights_dir": "~/.cache/mapless/weights"}
 
@@ -326,6 +332,8 @@ def _read_environment() -> dict[str, str]:
 def _describe(fault: Mapping[str, Any], origins: Mapping[str, str]) -> str:
     name = ascii(".".join(map(str, fault["loc"])))[1:-1]  # a key of a file may be any text
     message = str(fault["msg"]).removeprefix("Value error, ").replace("Input should be", "must be")
+    for formal, plain in _PLAIN_BOUNDS.items():
+        message = message.replace(formal, plain)
     if not name:
         return message
     field = Settings.model_fields.get(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +13,7 @@ import pytest
 from support.certificates import authority, signed
 
 from mapless import Client, ConnectOptions, MaplessError
+from mapless.errors import _message
 
 OURS, ANOTHER = authority(), authority("another")
 CERTIFICATE = signed(OURS, "server")
@@ -55,6 +57,18 @@ def test_a_failed_connection_is_explained(
     assert caught.value.code == "UNAVAILABLE"
     assert caught.value.message.startswith(f"cannot connect to {addresses[kind]}: ")
     assert told in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("address", "told"),
+    [
+        ("ipv4:127.0.0.1:443", "cannot connect to 127.0.0.1:443: no server .*; an address without a port has port 443"),
+        ("ipv6:%5B::1%5D:50051", r"cannot connect to \[::1\]:50051: no server .*; there may be another reason at"),
+    ],
+)
+def test_an_address_that_was_not_meant_is_explained(address: str, told: str) -> None:
+    details = f"failed: connections to all backends failing; last error: UNKNOWN: {address}: Connection refused (111)"
+    assert re.match(told, _message(details.removeprefix("failed: ")))
 
 
 def test_the_servers_own_message_is_kept(addresses: dict[str, str]) -> None:

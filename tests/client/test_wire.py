@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -13,11 +14,18 @@ from hypothesis import strategies as st
 
 from mapless import names, wire
 from mapless.geometry import MAX_COORDINATE_M, Camera, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
+from mapless.priors import PositionPrior, set_priors
+from mapless.requests import NewReference, create_request
 from mapless.v1 import geometry_pb2 as pb
 from mapless.v1 import localization_service_pb2 as localization_pb
 
 CAMERA = Camera(640, 480, 500.0, 501.5, 319.5, 239.25)
 FINITE = st.floats(-1e7, 1e7)
+
+
+def changed(**values: Any) -> Camera:
+    """The camera with values of any type."""
+    return replace(CAMERA, **values)
 
 
 @pytest.mark.parametrize(
@@ -27,6 +35,41 @@ def test_cameras_come_back_as_they_were(distortion: RadialTangential | Fisheye |
     camera = replace(CAMERA, distortion=distortion)
     message = pb.CameraIntrinsics.FromString(wire.camera_to_message(camera).SerializeToString())
     assert wire.camera_from_message(message, "intrinsics") == camera
+
+
+@pytest.mark.parametrize(
+    ("convert", "value", "complaint"),
+    [
+        (wire.camera_to_message, "camera.json", "camera must be a Camera, is str; read_camera"),
+        (wire.camera_to_message, changed(width_px=640.0), "camera.width_px must be a whole number, is 640.0"),
+        (wire.camera_to_message, changed(focal_x_px="5"), "camera.focal_x_px must be a number, is '5'"),
+        (
+            wire.transform_to_message,
+            np.eye(4),
+            "must be a RigidTransform, is numpy.ndarray; ",
+        ),
+        (
+            lambda it: names.reference_names("s", it),
+            "r1",
+            "references must be a list of .*, is the text 'r1'",
+        ),
+        (lambda it: set_priors(None, it), PositionPrior(np.zeros(3), 1.0), "must be a Priors, .* is a PositionPrior"),
+        (
+            lambda it: create_request("s", it),
+            NewReference(3, b"x", CAMERA, RigidTransform.identity()),  # type: ignore[arg-type]
+            "reference_id must be a text, is 3",
+        ),
+    ],
+)
+def test_a_value_of_another_type_is_named(convert: Callable[[Any], Any], value: Any, complaint: str) -> None:
+    with pytest.raises(TypeError, match=complaint):
+        convert(value)
+
+
+def test_a_reference_whose_rotation_is_none_is_not_sent() -> None:
+    scaled = RigidTransform(2 * np.eye(3), np.zeros(3))
+    with pytest.raises(ValueError, match="world_from_camera of reference 'r': rotation is not an orthonormal"):
+        create_request("scenes/s", NewReference("r", b"x", CAMERA, scaled))
 
 
 @given(st.lists(FINITE, min_size=3, max_size=3), st.lists(st.floats(-10, 10), min_size=3, max_size=3))

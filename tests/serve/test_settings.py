@@ -72,7 +72,7 @@ def test_the_file_may_be_named_by_the_environment(config: Path, monkeypatch: pyt
     ("text", "told"),
     [
         ("prot = 1", "prot (file)"),
-        ("port = 65536", "port (file)"),
+        ("port = 65536", "port (file): must be at most 65535, is 65536"),
         ("port = [", "mapless.toml"),
         ('workers = "many"', "workers (file)"),
         ("max_image_mib = 33", "max_image_mib must not exceed max_message_mib (32), is 33"),

@@ -22,7 +22,7 @@ from ..groups import (
     rig_from_message,
     sequence_from_message,
 )
-from ..names import reference_name, scene_name
+from ..names import reference_names, scene_name
 from ..priors import Priors, set_priors
 from ..requests import ImageSource, read_image
 from ..v1 import localization_service_pb2 as pb
@@ -78,7 +78,7 @@ def localize(
     scene = scene_name(scene)
     request = pb.LocalizeRequest(
         scene=scene,
-        references=[reference_name(scene, reference) for reference in references],
+        references=reference_names(scene, references),
         image=read_image(image),
         intrinsics=wire.camera_to_message(camera),
         options=pb.LocalizeOptions(
@@ -176,7 +176,7 @@ def localize_rig(
                 image=read_image(image.image),
                 intrinsics=wire.camera_to_message(image.camera),
                 rig_from_camera=wire.transform_to_message(image.rig_from_camera),
-                references=[reference_name(scene, reference) for reference in image.references],
+                references=reference_names(scene, image.references),
             )
             for image in images
         ],
@@ -229,7 +229,7 @@ def _frame_to_message(frame: SequenceFrame, scene: str) -> pb.SequenceFrame:
         image=read_image(frame.image),
         intrinsics=wire.camera_to_message(frame.camera),
         session_from_camera=wire.transform_to_message(frame.session_from_camera),
-        references=[reference_name(scene, reference) for reference in frame.references],
+        references=reference_names(scene, frame.references),
     )
     if frame.capture_time is not None:
         message.capture_time.FromDatetime(frame.capture_time)

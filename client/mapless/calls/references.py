@@ -12,7 +12,7 @@ from ..errors import MaplessError
 from ..exchange import Call, Exchange, Pages
 from ..geodesy import Datum
 from ..geometry import Camera, RigidTransform
-from ..names import reference_name, scene_name, shown
+from ..names import reference_name, reference_names, scene_name, shown
 from ..options import ConnectOptions
 from ..priors import Priors, set_priors
 from ..requests import ImageSource, NewReference, create_request, read_image
@@ -242,7 +242,7 @@ def audit_scene(
         page_size: references per call, about half a second of computation each; 0 for the server's default.
         timeout_s: deadline of each call.
     """
-    named = [reference_name(scene, reference) for reference in references]
+    named = reference_names(scene, references)
 
     def fetch(token: str) -> Exchange[tuple[list[ReferenceAudit], str]]:
         request = pb.AuditSceneRequest(scene=scene_name(scene), references=named, page_size=page_size, page_token=token)

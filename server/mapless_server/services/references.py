@@ -233,6 +233,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def _add(self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call) -> Sequence[ReferenceRecord]:
         # Describing takes long, so an unknown scene is rejected before. The store checks again when it adds.
         await self._stored(self._store.get_generation, scene_key)
+        call.note(scene=scene_key, references=len(drafts))
         described = await self._engine().describe([photo for _, photo, _ in drafts], call.caller)
         references = [
             NewReference(reference_id, photo.image, photo.camera, world_from_camera, found.views, found.descriptors)
