@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def related(random: np.random.Generator, n: int, m: int, noise: float, size: int
     return features(first), features(second)
 
 
-def slow_mutual_matches(first: Features, second: Features, ratio: float) -> list[list[int]]:
+def slow_mutual_matches(first: Features, second: Features, ratio: float, either: bool) -> list[list[int]]:
     """The same by loops over distances."""
     distance = [[float(np.linalg.norm(a - b)) for b in second.descriptors] for a in first.descriptors]
     matches = []
@@ -51,18 +52,24 @@ def slow_mutual_matches(first: Features, second: Features, ratio: float) -> list
         j = min(range(len(row)), key=row.__getitem__)
         back = min(range(len(distance)), key=lambda other: distance[other][j])
         second_best = min(d for k, d in enumerate(row) if k != j)
+        if either:
+            second_best = max(second_best, min(other[j] for k, other in enumerate(distance) if k != i))
         if back == i and row[j] < ratio * second_best:
             matches.append([i, j])
     return matches
 
 
+@pytest.mark.parametrize("either", [False, True])
 @pytest.mark.parametrize("ratio", [0.7, 0.85, 1.0])
 @pytest.mark.parametrize(("n", "m", "noise"), [(2, 2, 0.1), (40, 25, 0.1), (25, 40, 0.2), (30, 30, 0.5)])
-def test_mutual_matches_equal_brute_force(n: int, m: int, noise: float, ratio: float) -> None:
+def test_mutual_matches_equal_brute_force(n: int, m: int, noise: float, ratio: float, either: bool) -> None:
     first, second = related(random_for("mutual", n, m, noise), n, m, noise)
-    matches = mutual_matches(first, second, ratio)
+    matches = mutual_matches(first, second, ratio, either)
     assert matches.dtype == np.int32
-    assert matches.tolist() == slow_mutual_matches(first, second, ratio)
+    assert matches.tolist() == slow_mutual_matches(first, second, ratio, either)
+    if either:
+        turned = mutual_matches(second, first, ratio, either)
+        assert sorted(turned[:, ::-1].tolist()) == matches.tolist()
 
 
 def test_matches_are_one_to_one_and_grow_with_the_ratio() -> None:
@@ -88,7 +95,11 @@ def test_the_ratio_compares_distances_not_squares() -> None:
 
 def test_ambiguous_descriptors_are_not_matched() -> None:
     twice = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    assert mutual_matches(features(twice), features(twice), 0.9).tolist() == [[2, 2]]
+    for either in (False, True):
+        assert mutual_matches(features(twice), features(twice), 0.9, either).tolist() == [[2, 2]]
+    # Seen from the other photograph, there is one keypoint and none like it.
+    once = features(np.array([[1.0, 0.0], [0.0, 1.0]]))
+    assert mutual_matches(features(twice), once, 0.9, either=True).tolist() == [[2, 1]]
 
 
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 5), (5, 0), (1, 5), (5, 1)])
@@ -193,7 +204,7 @@ def test_references_keep_true_matches_and_drop_wrong_ones() -> None:
 
 def test_wide_matches_contain_the_strict_ones() -> None:
     scene = make_scene(random_for("wide"), SceneOptions(descriptor_noise=0.5, distractor_count=1500, reference_count=3))
-    options = CorrespondOptions(reference_ratio=0.6, wide_similarity=0.6)
+    options = CorrespondOptions(reference_ratio=0.5, wide_similarity=0.6)
     matcher = Matcher(options)
     for i, j in ((0, 1), (0, 2), (1, 2)):
         first, second = scene.references[i], scene.references[j]
@@ -234,9 +245,9 @@ def matched_pairs(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Features, Featu
     """Every pair whose descriptors have been compared."""
     calls: list[tuple[Features, Features]] = []
 
-    def spy(first: Features, second: Features, ratio: float) -> Matches:
+    def spy(first: Features, second: Features, ratio: float, either: bool = False) -> Matches:
         calls.append((first, second))
-        return mutual_matches(first, second, ratio)
+        return mutual_matches(first, second, ratio, either)
 
     monkeypatch.setattr(correspond, "mutual_matches", spy)
     return calls
@@ -261,6 +272,62 @@ def test_a_cached_pair_keeps_the_order_of_its_columns() -> None:
     fresh = Matcher().match_references(second, first)
     np.testing.assert_array_equal(back, fresh)
     assert {tuple(m) for m in forth.tolist()} != {tuple(m) for m in back.tolist()}
+
+
+def test_matches_depend_neither_on_the_order_nor_on_the_other_references() -> None:
+    scene = make_scene(random_for("no order"), SceneOptions(outlier_share=0.3, reference_count=4))
+    forth, back = scene.references, scene.references[::-1]
+    for wide in (False, True):
+        for some in combinations(forth, 2):
+            alone = Matcher().correspond(scene.query, some, wide).reference_pairs[0, 1]
+            pair = forth.index(some[0]), forth.index(some[1])
+            among = Matcher().correspond(scene.query, forth, wide).reference_pairs[pair]
+            turned = Matcher().correspond(scene.query, back, wide).reference_pairs[3 - pair[1], 3 - pair[0]]
+            np.testing.assert_array_equal(among, alone)
+            np.testing.assert_array_equal(turned[:, ::-1], alone)
+
+
+class Shelf:
+    """Pairs that were stored; which were looked for."""
+
+    def __init__(self, matches: dict[tuple[str, str], Matches]) -> None:
+        self.matches = matches
+        self.asked: list[tuple[str, list[tuple[str, str]]]] = []
+
+    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> list[Matches | None]:
+        keys = [(first.key, second.key) for first, second in pairs]
+        self.asked.append((matching, keys))
+        return [self.matches.get(key) for key in keys]
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_stored_pairs_are_used_and_give_the_same(wide: bool, matched_pairs: list[tuple[Features, Features]]) -> None:
+    scene = make_scene(random_for("stored"), SceneOptions(outlier_share=0.3, reference_count=4))
+    expected = Matcher().correspond(scene.query, scene.references, wide)
+    made = {(a.key, b.key): Matcher().match_pair(a, b, wide) for a, b in list(combinations(scene.references, 2))[:4]}
+    matched_pairs.clear()
+    matcher = Matcher()
+    matcher.stored = shelf = Shelf(made)
+    for _ in range(2):
+        # In any order of the references, the pairs are looked for as they were stored, and once.
+        found = matcher.correspond(scene.query, scene.references[::-1], wide)
+        for (i, j), matches in found.reference_pairs.items():
+            np.testing.assert_array_equal(matches[:, ::-1], expected.reference_pairs[3 - j, 3 - i])
+    ((matching, keys),) = shelf.asked
+    assert matching == matcher.matching(wide)
+    assert {tuple(sorted(key)) for key in keys} == set(keys)
+    assert len(matched_pairs) == 2 + 2 * 4  # the two that are not stored, and the query's twice
+
+
+def test_what_determines_matches_is_in_their_name() -> None:
+    usual = CorrespondOptions()
+    changed = [
+        replace(usual, **{name: getattr(usual, name) * 0.99})
+        for name in ("reference_ratio", "epipolar_px", "wide_ratio", "wide_similarity")
+    ]
+    names = {Matcher(options).matching(wide) for options in (usual, *changed) for wide in (False, True)}
+    assert len(names) == 5 + 3  # strict matches do not depend on the options of wide ones
+    assert Matcher(replace(usual, query_ratio=0.5)).matching() == Matcher(usual).matching()
 
 
 def test_the_cache_is_bounded_and_drops_the_least_recently_used(

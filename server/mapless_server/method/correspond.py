@@ -1,7 +1,8 @@
 """Correspondences: matches of keypoints between photographs.
 
 Matches between references, whose poses are known, must also satisfy the epipolar constraint; they depend only on the
-two stored references and are cached. Matches of the query with each reference come from descriptors alone, or from a
+two stored references, so they are made once: ahead of the queries and stored (`scenes.background`), or by the first
+query that needs them, and cached. Matches of the query with each reference come from descriptors alone, or from a
 network that compares all keypoints of both photographs: implementations of `QueryMatching`.
 
 Between distant references few matches pass the ratio test over all keypoints. Wide correspondences add matches that
@@ -29,6 +30,9 @@ from .choices import EDGEPOINT2
 from .options import check_bounds
 from .views import Features, Matches, PosedView, View
 
+PAIR_RULE = 1
+"""Version of how two references are matched; to be raised by every change that can change a match."""
+
 
 @dataclass(frozen=True)
 class CorrespondOptions:
@@ -36,7 +40,7 @@ class CorrespondOptions:
 
     Attributes:
         reference_ratio: Lowe's ratio, the largest distance of the nearest descriptor over that of the second-nearest,
-            between references; loose, because the epipolar constraint filters too.
+            between references, from either of them; loose, because the epipolar constraint filters too.
         query_ratio: the same for matches with the query, which have no other filter.
         epipolar_px: largest distance from the epipolar line, in both images; keypoints are accurate to about a pixel.
         wide_ratio: the ratio among the keypoints along the line; stricter, because they are few.
@@ -106,6 +110,17 @@ class QueryMatching(Protocol):
         ...
 
 
+class StoredPairs(Protocol):
+    """Matches of pairs of references that were made before."""
+
+    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> Sequence[Matches | None]:
+        """The matches of each pair, given `in_order`, that `Matcher.match_pair` made; None where there are none.
+
+        `matching` is what `Matcher.matching` returns. Does not raise.
+        """
+        ...
+
+
 class NearestNeighbours:
     """Mutual nearest neighbours that pass the ratio test, for any descriptor."""
 
@@ -128,6 +143,10 @@ class Matcher:
 
     A query's pairs are distributed over `threads`: a single query takes half the time on two threads, and concurrent
     queries take no more processor time, because each product is computed by one thread.
+
+    Attributes:
+        options: see there.
+        stored: where pairs are looked up that are not cached; None looks up none.
     """
 
     def __init__(
@@ -137,6 +156,7 @@ class Matcher:
         query_matching: QueryMatching | None = None,
     ) -> None:
         self.options = options or CorrespondOptions()
+        self.stored: StoredPairs | None = None
         self._pool = ThreadPoolExecutor(threads, "match")
         self._query_matching = query_matching or NearestNeighbours(self.options.query_ratio, self._pool)
         self._remembered: OrderedDict[tuple[str, str, bool], Matches] = OrderedDict()
@@ -161,6 +181,7 @@ class Matcher:
             return self.match_references(references[pair[0]], references[pair[1]], wide)
 
         pairs = list(combinations(range(len(references)), 2))
+        self._look_up([in_order(references[i], references[j]) for i, j in pairs], wide)
         pair_matches = self._pool.map(of_pair, pairs)
         if query_matches is None:
             query_matches = self.match_query(query, references, check)
@@ -176,19 +197,46 @@ class Matcher:
         """Ends the threads."""
         self._pool.shutdown()
 
+    def matching(self, wide: bool = False) -> str:
+        """Names everything that determines the matches of a pair, except for the two references."""
+        options = self.options
+        strict = f"{PAIR_RULE}-{options.reference_ratio}-{options.epipolar_px}"
+        return f"wide-{strict}-{options.wide_ratio}-{options.wide_similarity}" if wide else f"strict-{strict}"
+
     def match_references(self, first: PosedView, second: PosedView, wide: bool = False) -> Matches:
         """Matches between two references, each within `epipolar_px` of the epipolar line of the known poses."""
-        key = (first.key, second.key, wide)
+        pair = in_order(first, second)
+        key = _key(pair, wide)
         with self._lock:
-            if key in self._remembered:
+            matches = self._remembered.get(key)
+            if matches is not None:
                 self._remembered.move_to_end(key)
-                return self._remembered[key]
-        matches = self._match_widely(first, second) if wide else self._match_strictly(first, second)
+        if matches is None:
+            matches = self._widened(*pair, self.match_references(*pair)) if wide else self._match_strictly(*pair)
+            self._remember(key, matches)
+        return matches if pair[0] is first else np.ascontiguousarray(matches[:, ::-1])
+
+    def match_pair(self, first: PosedView, second: PosedView, wide: bool = False) -> Matches:
+        """The same for two references `in_order`, computed anew and not cached."""
+        strict = self._match_strictly(first, second)
+        return self._widened(first, second, strict) if wide else strict
+
+    def _look_up(self, pairs: Sequence[tuple[PosedView, PosedView]], wide: bool) -> None:
+        """Caches those of these pairs that are stored."""
+        if self.stored is None:
+            return
+        with self._lock:
+            missing = [pair for pair in pairs if _key(pair, wide) not in self._remembered]
+        if missing:
+            for pair, matches in zip(missing, self.stored.find(self.matching(wide), missing), strict=True):
+                if matches is not None:
+                    self._remember(_key(pair, wide), matches)
+
+    def _remember(self, key: tuple[str, str, bool], matches: Matches) -> None:
         with self._lock:
             self._remembered[key] = matches
             while len(self._remembered) > self.options.remembered_pairs:
                 self._remembered.popitem(last=False)
-        return matches
 
     def forget(self, keys: Collection[str]) -> None:
         """Removes the pairs of deleted references from the cache, in time linear in its size."""
@@ -197,17 +245,29 @@ class Matcher:
                 del self._remembered[pair]
 
     def _match_strictly(self, first: PosedView, second: PosedView) -> Matches:
-        matches = mutual_matches(first.view.features, second.view.features, self.options.reference_ratio)
+        matches = mutual_matches(first.view.features, second.view.features, self.options.reference_ratio, either=True)
         return matches[epipolar_distance_px(first, second, matches) < self.options.epipolar_px]
 
-    def _match_widely(self, first: PosedView, second: PosedView) -> Matches:
+    def _widened(self, first: PosedView, second: PosedView, strict: Matches) -> Matches:
         """The strict matches, and matches along the epipolar lines of the other keypoints."""
-        strict = self.match_references(first, second)
         similarity = first.view.features.descriptors @ second.view.features.descriptors.T
         similarity[epipolar_distances_px(first, second) >= self.options.epipolar_px] = -1.0
         added = best_of_both(similarity, self.options.wide_ratio, self.options.wide_similarity)
         taken = np.isin(added[:, 0], strict[:, 0]) | np.isin(added[:, 1], strict[:, 1])
         return np.concatenate([strict, added[~taken]])
+
+
+def in_order(first: PosedView, second: PosedView) -> tuple[PosedView, PosedView]:
+    """Two references in the order in which they are matched, whichever comes first in a query.
+
+    The ratio test of wide matches is not symmetric, and the order decides how sums are rounded. Names, unlike keys, are
+    the same wherever the scene is stored.
+    """
+    return (first, second) if (first.name, first.key) <= (second.name, second.key) else (second, first)
+
+
+def _key(pair: tuple[PosedView, PosedView], wide: bool) -> tuple[str, str, bool]:
+    return pair[0].key, pair[1].key, wide
 
 
 def make_matcher(features: str, threads: int = 1, weights: Path | None = None, device: str = "cpu") -> Matcher:
@@ -235,20 +295,22 @@ def make_matcher(features: str, threads: int = 1, weights: Path | None = None, d
     return Matcher(OPTIONS[features], threads, LightGlueMatching(load_lightglue(features, weights), device))
 
 
-def mutual_matches(first: Features, second: Features, ratio: float) -> Matches:
-    """Mutual nearest neighbours that pass the ratio test from first to second.
+def mutual_matches(first: Features, second: Features, ratio: float, either: bool = False) -> Matches:
+    """Mutual nearest neighbours that pass the ratio test from first to second, or, if `either`, from second to first.
 
     Descriptors have unit length, so with cosine s the distance is sqrt(2 - 2 s).
     """
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), np.int32)
-    return best_of_both(first.descriptors @ second.descriptors.T, ratio)
+    return best_of_both(first.descriptors @ second.descriptors.T, ratio, either=either)
 
 
-def best_of_both(similarity: NDArray[np.float32], ratio: float, smallest: float = -1.0) -> Matches:
+def best_of_both(
+    similarity: NDArray[np.float32], ratio: float, smallest: float = -1.0, either: bool = False
+) -> Matches:
     """Entries of a matrix of cosines (N, M) that are mutual maxima, above `smallest`, and pass the ratio test by row.
 
-    Overwrites the matrix.
+    If `either`, it suffices that they pass it by column. Overwrites the matrix.
     """
     if not similarity.size:
         return np.empty((0, 2), np.int32)
@@ -257,8 +319,11 @@ def best_of_both(similarity: NDArray[np.float32], ratio: float, smallest: float 
     best = similarity[rows, nearest]
     # The maximum of its column too: compared by value, because an argmax along columns takes ten times as long.
     mutual = best >= similarity.max(axis=0)[nearest]
-    similarity[rows, nearest] = -1.0
+    similarity[rows[mutual], nearest[mutual]] = -1.0
     second_best = similarity.max(axis=1)
+    if either:
+        mutual &= np.bincount(nearest[mutual], minlength=similarity.shape[1])[nearest] == 1  # ties are not matched
+        second_best = np.minimum(second_best, similarity.max(axis=0)[nearest])
     keep = mutual & (best > smallest) & (1 - best < ratio**2 * (1 - second_best))
     return np.stack([rows[keep], nearest[keep]], axis=1).astype(np.int32)
 
@@ -287,10 +352,12 @@ def epipolar_distances_px(first: PosedView, second: PosedView) -> NDArray[np.flo
 
 def fundamental_matrix(first: PosedView, second: PosedView) -> Array:
     """F (3, 3) of the known poses, x_first^T F x_second = 0 in homogeneous pixels; zero without a baseline."""
-    first_from_second = first.world_from_camera.inverse().compose(second.world_from_camera)
-    if np.linalg.norm(first_from_second.translation) < 1e-6:
+    first_from_world = first.world_from_camera.rotation.T
+    # The difference first: world coordinates may be millions of metres.
+    baseline = first_from_world @ (second.world_from_camera.translation - first.world_from_camera.translation)
+    if np.linalg.norm(baseline) < 1e-6:
         return np.zeros((3, 3))
-    essential = cross_matrix(first_from_second.translation) @ first_from_second.rotation
+    essential = cross_matrix(baseline) @ first_from_world @ second.world_from_camera.rotation
     k_first_inv, k_second_inv = (np.linalg.inv(v.view.camera.matrix()) for v in (first, second))
     return np.asarray(k_first_inv.T @ essential @ k_second_inv)
 

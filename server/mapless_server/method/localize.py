@@ -74,8 +74,19 @@ def prepare(
     nearby = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references)
     bucket = pipeline.reconstructor.bucket(query, nearby)
     with context.stage("correspond"):
-        correspondences = pipeline.matcher.correspond(query, nearby, False, context.check, query_matches)
-    return Prepared(query, nearby, origin, pipeline, options, correspondences, bucket, context, priors.shifted(-origin))
+        correspondences = pipeline.matcher.correspond(query, references, False, context.check, query_matches)
+    return Prepared(
+        query,
+        nearby,
+        tuple(references),
+        origin,
+        pipeline,
+        options,
+        correspondences,
+        bucket,
+        context,
+        priors.shifted(-origin),
+    )
 
 
 def refine(coarse: Coarse) -> Answer:

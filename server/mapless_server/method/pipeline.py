@@ -96,6 +96,8 @@ class Prepared:
         query: the photograph.
         references: the most similar first, in a world whose origin is the first one's camera centre. World coordinates
             may be millions of metres (UTM, ECEF), too large for differences of squares in double precision.
+        references_in_world: the same in the caller's world, in which their pairs are matched: many queries use these
+            matches, which must not depend on a query's origin, not even by a last digit.
         origin: (3,) that origin in the caller's world, metres.
         pipeline: backend, matcher and options.
         options: of the request.
@@ -107,6 +109,7 @@ class Prepared:
 
     query: View
     references: tuple[PosedView, ...]
+    references_in_world: tuple[PosedView, ...]
     origin: Array
     pipeline: Pipeline
     options: LocalizeOptions
@@ -209,7 +212,8 @@ def with_wide_correspondences(coarse: Coarse) -> Coarse:
     query, references, pipeline, context = prepared.query, prepared.references, prepared.pipeline, prepared.context
     with context.stage("correspond"):
         known = prepared.correspondences.query_matches
-        correspondences = pipeline.matcher.correspond(query, references, True, context.check, known)
+        in_world = prepared.references_in_world
+        correspondences = pipeline.matcher.correspond(query, in_world, True, context.check, known)
     with context.stage("coarse"):
         if pipeline.reconstructor.uses_correspondences:
             reconstruction = reconstruct_one(
