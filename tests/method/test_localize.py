@@ -116,7 +116,7 @@ def test_the_answer_of_the_device_equals_the_hosts(variant: Variant, strategy: S
     options = LocalizeOptions(variant, strategy)
     there, here = (answer_of(pipeline_of(backend, options=ROUGH), options) for backend in ("device", "network"))
     found, expected = pose_of(there), pose_of(here)
-    # The device is told poses in float32, as a network gives them.
+    # Poses on the device are float32, as from a network.
     assert_pose_close(found.world_from_camera, expected.world_from_camera, metres=1e-5, degrees=1e-4)
     assert (found.inlier_count, found.match_count) == (expected.inlier_count, expected.match_count)
     assert there.reference_inlier_counts == here.reference_inlier_counts

@@ -214,8 +214,8 @@ def test_without_points_or_keypoints_nothing_is_found(options: MatchOptions) -> 
     scene = make_scene(random_for("nothing"), SceneOptions(point_count=60))
     structure, _ = true_structure(scene)
     none = query_matches(*[[] for _ in scene.references])
-    nobody: NDArray[np.intp] = np.empty(0, np.intp)
-    empty = Structure(np.empty((0, 3)), Tracks(nobody, nobody, nobody), ONE_PIXEL)
+    nothing: NDArray[np.intp] = np.empty(0, np.intp)
+    empty = Structure(np.empty((0, 3)), Tracks(nothing, nothing, nothing), ONE_PIXEL)
     away = RigidTransform(
         np.diag([-1.0, 1.0, -1.0]) @ scene.world_from_query.rotation, scene.world_from_query.translation
     )

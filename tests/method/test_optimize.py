@@ -131,14 +131,14 @@ def test_steps_that_raise_the_cost_are_damped() -> None:
 
 
 def test_an_undetermined_unknown_does_not_move() -> None:
-    """All at one time: a, b and c cannot be told apart, and the cost falls all the same."""
+    """All at one time: a, b and c cannot be distinguished, and the cost decreases all the same."""
     problem = decay("flat", 0.0)
     problem.t = np.full_like(problem.t, 2.0)
     start = TRUTH + [0.5, 0.0, 0.5]
     found = minimize(problem, start, CLOSELY)
     assert np.isfinite(found).all()
     assert problem.cost(found) < problem.cost(start)
-    problem.t = np.zeros_like(problem.t)  # b tells nothing at all
+    problem.t = np.zeros_like(problem.t)  # the cost does not depend on b
     assert minimize(problem, start, CLOSELY)[1] == start[1]
 
 

@@ -70,7 +70,7 @@ class Failing(grpc.GenericRpcHandler):
     Attributes:
         tries: (method, seconds left to its deadline) of every call that came.
         answers: the response to a method's request; may raise grpc.RpcError.
-        does_it: whether calls that are told a failure are done all the same.
+        does_it: whether failed calls are carried out all the same.
     """
 
     def __init__(self, statuses: Sequence[grpc.Status], answers: Callable[[str, bytes], bytes], does_it: bool) -> None:

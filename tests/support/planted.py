@@ -59,7 +59,7 @@ def true_structure(scene: SyntheticScene, noise: KeypointNoise = ONE_PIXEL) -> t
 
 
 NOISE = KeypointNoise(0.5, 0.0)
-"""Of the scenes' keypoints, unless they are told another."""
+"""Of the scenes' keypoints by default."""
 
 
 def metric_scale(world_from_local: Similarity, world_from_query: RigidTransform) -> MetricScale:
@@ -68,7 +68,7 @@ def metric_scale(world_from_local: Similarity, world_from_query: RigidTransform)
 
 
 def moved_references(references: tuple[PosedView, ...], world: RigidTransform) -> tuple[PosedView, ...]:
-    """The same references, told in another world frame; with keys of their own, as different references have."""
+    """The same references in another world frame, with keys of their own."""
     return tuple(PosedView(f"{r.key}-moved", r.name, r.view, world.compose(r.world_from_camera)) for r in references)
 
 

@@ -97,7 +97,7 @@ class Cluster:
         return psycopg.connect(f"postgresql://{USER}@127.0.0.1:{self.port}/postgres", autocommit=True)
 
     def start(self) -> None:
-        """Start it and wait until it lets somebody in, after it has recovered from whatever ended it."""
+        """Start it and wait until it accepts connections, after its recovery."""
         settings = [f"--{name}={value}" for name, value in self._settings.items()]
         with (self._folder / "log").open("ab") as log:
             self._server = subprocess.Popen(
@@ -167,11 +167,11 @@ def require() -> None:
     if programs() is None:
         pytest.skip("needs PostgreSQL: Debian's package `postgresql`")
     if os.geteuid() == 0 and not any(map(_has_user, _UNPRIVILEGED)):
-        pytest.skip("PostgreSQL does not run as root, and there is nobody else")
+        pytest.skip("PostgreSQL does not run as root, and there is no other user")
 
 
 def _end_with_parent() -> None:
-    """In the new process: it is told to end when its parent does, even by SIGKILL."""
+    """In the new process: makes it end with its parent, even by SIGKILL."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGQUIT)
 
 
