@@ -7,15 +7,16 @@ from collections import Counter, OrderedDict
 from .jobs import Flow, Job
 
 MAX_KINDS = 1000
+FIRST_GUESS_S = 0.25
+"""Predicted before anything is observed."""
+MEMORY = 10
+"""About so many of the last jobs of a kind count."""
 
 
 class CostModel:
     """Predicts the computing time of a job in a stage: an average over jobs of its kind that favours recent ones."""
 
-    def __init__(self, first_guess_s: float = 0.25, memory: int = 10) -> None:
-        """`first_guess_s` is predicted before anything is observed; about the last `memory` jobs of a kind count."""
-        self._first_guess_s = first_guess_s
-        self._memory = memory
+    def __init__(self) -> None:
         self._kinds: OrderedDict[tuple[str, str], tuple[int, float]] = OrderedDict()
 
     def forget(self) -> None:
@@ -25,13 +26,13 @@ class CostModel:
     def predict(self, stage: str, kind: str) -> float:
         """Seconds. For an unknown kind, the average over all kinds in the stage."""
         known = self._kinds.get((stage, kind)) or self._kinds.get((stage, ""))
-        return self._first_guess_s if known is None else known[1]
+        return FIRST_GUESS_S if known is None else known[1]
 
     def observe(self, stage: str, kind: str, seconds: float) -> None:
         """A job took so long; its share, if it was computed with others."""
         for key in ((stage, kind), (stage, "")):
             count, mean_s = self._kinds.pop(key, (0, 0.0))
-            count = min(count + 1, self._memory)
+            count = min(count + 1, MEMORY)
             self._kinds[key] = (count, mean_s + (seconds - mean_s) / count)
         while len(self._kinds) > MAX_KINDS:
             self._kinds.popitem(last=False)

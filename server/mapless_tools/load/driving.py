@@ -106,7 +106,6 @@ async def open_step(
     settle_s: float,
     seed: int,
     mix: Mix | None = None,
-    sample_every_s: float = 1.0,
     requests: Requests | None = None,
     beside: Callable[[], AbstractAsyncContextManager[object]] = nullcontext,
 ) -> Step:
@@ -124,5 +123,4 @@ async def open_step(
         seconds,
         asked_per_s=rate_per_s,
         settle_s=settle_s,
-        sample_every_s=sample_every_s,
     )

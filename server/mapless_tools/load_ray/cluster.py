@@ -32,6 +32,9 @@ END_LIMIT_S = 20.0
 LEAVING_S = 2.0
 """Short, because on one machine HAProxy learns of changes at once, and tests wait for it."""
 
+CPUS = 4
+"""Number that Ray assumes."""
+
 PORTS = 200
 """Ports of replicas, for each of two protocols; a port is reused only minutes after its replica ended."""
 
@@ -159,15 +162,11 @@ def application(
 
 
 @contextmanager
-def running_cluster(
-    environment: Mapping[str, str] | None = None, leaving_s: float = LEAVING_S, cpus: int = 4
-) -> Iterator[Cluster]:
+def running_cluster(environment: Mapping[str, str] | None = None) -> Iterator[Cluster]:
     """A cluster without an application, until the block is left.
 
     Args:
         environment: variables of all its processes, such as settings that are not in the application's arguments.
-        leaving_s: see `mapless_ray.environment`.
-        cpus: number that Ray assumes.
 
     Raises:
         ClusterFailed: it did not start.
@@ -175,8 +174,8 @@ def running_cluster(
     # It holds sockets, whose paths are limited to 107 bytes.
     folder = Path(tempfile.mkdtemp(prefix="mr-", dir="/tmp"))
     ports = _free_ports(8)
-    given = os.environ | variables(leaving_s=leaving_s) | _own_places(folder, ports) | dict(environment or {})
-    options = {"folder": str(folder / "ray"), "cpus": cpus, "http_port": ports[0], "grpc_port": ports[1]}
+    given = os.environ | variables(leaving_s=LEAVING_S) | _own_places(folder, ports) | dict(environment or {})
+    options = {"folder": str(folder / "ray"), "cpus": CPUS, "http_port": ports[0], "grpc_port": ports[1]}
     with (folder / "log").open("w") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "mapless_tools.load_ray.host", json.dumps(options)],
