@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,13 +18,15 @@ pytest.importorskip("PIL", reason="the networks' extra is not installed")
 
 import torch
 from support.images import encode, textured
-from support.servers import serving
+from support.servers import RunningServer, serving
 from support.small_networks import GRIDS, small_network
+from support.waiting import wait_until
 
 from mapless import Client, LocalizationResult, NewReference, Rejected
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.engine.query import Tier
 from mapless_server.engine.stages import Method
+from mapless_server.method import pipeline
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.features import SiftExtractor
 from mapless_server.method.pipeline import Pipeline
@@ -32,6 +37,7 @@ CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 DISTANCE_M = 3.0
 WALL = textured(800, 240, seed=8)
 """Wallpaper: it moves by 100 px when the camera moves by a metre along it."""
+NAMES = ["r0", "r1", "r2", "r3"]
 
 
 def photograph_at(x_m: float) -> NDArray[np.uint8]:
@@ -44,13 +50,17 @@ def pose_at(x_m: float) -> RigidTransform:
 
 
 @contextmanager
-def on_network(data_dir: Path, network: Network, name: str) -> Iterator[tuple[Client, NetworkReconstructor]]:
-    """A client of a server on this network, with the real method and SIFT."""
+def on_network(
+    data_dir: Path, network: Network, name: str, method: Method | None = None, **options: Any
+) -> Iterator[tuple[Client, NetworkReconstructor, RunningServer]]:
+    """A client of a server on this network, with the real method and SIFT, and a scene of four photographs."""
     torch.set_num_threads(1)
     runner = NetworkRunner(network, name, f"sha-of-{name}", "cpu")
     with (
         closing(NetworkReconstructor(runner, NetworkOptions(grids=GRIDS))) as backend,
-        serving(data_dir, method=Method(), tier=Tier(SiftExtractor(), Pipeline(backend))) as server,
+        serving(
+            data_dir, method=method or Method(), tier=Tier(SiftExtractor(), Pipeline(backend)), **options
+        ) as server,
         Client(server.address) as client,
     ):
         client.create_scene("wall")
@@ -59,15 +69,14 @@ def on_network(data_dir: Path, network: Network, name: str) -> Iterator[tuple[Cl
             for i, x_m in enumerate((0.0, 0.5, 1.0, 1.5))
         ]
         client.add_references("wall", photos)
-        yield client, backend
+        yield client, backend, server
 
 
 @pytest.mark.parametrize("name", ["pi3", "pi3x"])
 def test_a_random_network_is_answered_for(tmp_path: Path, name: str) -> None:
     """Nothing but the answer's form is known: the network is random, but matches and poses of references are true."""
-    with on_network(tmp_path, small_network(name), name) as (client, backend):
-        names = ["r0", "r1", "r2", "r3"]
-        answers = [client.localize(encode(".png", photograph_at(x_m)), CAMERA, "wall", names) for x_m in (0.7, 1.2)]
+    with on_network(tmp_path, small_network(name), name) as (client, backend, _):
+        answers = [client.localize(encode(".png", photograph_at(x_m)), CAMERA, "wall", NAMES) for x_m in (0.7, 1.2)]
         for answer in answers:
             assert isinstance(answer, (LocalizationResult, Rejected))
             used = answer.diagnostics
@@ -82,9 +91,44 @@ def test_a_network_of_nans_is_a_rejection(tmp_path: Path, caplog: pytest.LogCapt
     network = small_network("pi3")
     for parameter in network.parameters():
         parameter.data[:] = float("nan")
-    with on_network(tmp_path, network, "pi3") as (client, _):
+    with on_network(tmp_path, network, "pi3") as (client, *_):
         answer = client.localize(encode(".png", photograph_at(0.7)), CAMERA, "wall", ["r0", "r1", "r2"])
     assert isinstance(answer, Rejected)
     assert answer.reason == "SCALE_UNRELIABLE"
     assert "pi3" in answer.message
     assert "pi3: the network's output is not finite" in [record.message for record in caplog.records]
+
+
+def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path) -> None:
+    sizes: list[int] = []
+    entered, gate = threading.Semaphore(0), threading.Event()
+
+    def reconstruct(batch: Any) -> Any:
+        entered.release()
+        assert gate.wait(60)
+        sizes.append(len(batch))
+        return pipeline.reconstruct(batch)
+
+    options = {"workers": 2, "max_batch": 4, "max_queued_s": 60.0}
+    with (
+        ThreadPoolExecutor(5) as pool,
+        on_network(tmp_path, small_network("pi3"), "pi3", Method(reconstruct=reconstruct), **options) as running,
+    ):
+        client, backend, server = running
+
+        def localize(x_m: float) -> Any:
+            return client.localize(encode(".png", photograph_at(x_m)), CAMERA, "wall", NAMES, timeout_s=60)
+
+        calls = [pool.submit(localize, 0.2)]
+        try:
+            assert entered.acquire(timeout=30)
+            calls += [pool.submit(localize, x_m) for x_m in (0.3, 0.6, 0.9, 1.2)]
+            wait_until(lambda: server.value("mapless_queue_depth", stage="coarse") == 4)
+        finally:
+            gate.set()
+        assert all(isinstance(call.result(60), LocalizationResult | Rejected) for call in calls)
+        assert sizes == [1, 4]
+        assert server.value("mapless_batch_size_sum", stage="coarse") == 5
+        assert server.value("mapless_batch_size_count", stage="coarse") == 2
+        # Each reference was encoded once: by the first query, for all of them.
+        assert backend.cache.counters.misses == 4

@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, closing, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
-from support.images import encode, textured
 from support.servers import (
     CAMERA,
     PHOTO,
@@ -35,17 +34,13 @@ from mapless import (
     ConnectOptions,
     DeadlineExceeded,
     LocalizationResult,
-    NewReference,
     Rejected,
     ResourceExhausted,
 )
 from mapless.errors import from_rpc_error
-from mapless.geometry import Camera, RigidTransform
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.engine.query import Tier
 from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.results import PoseStage
 
 COST_S = 0.04
@@ -209,64 +204,3 @@ def test_a_stage_predicted_to_be_late_is_not_begun(tmp_path: Path) -> None:
         assert isinstance(coarse, LocalizationResult)
         assert coarse.pose_stage == "COARSE"
         assert refining.began == 1
-
-
-def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path) -> None:
-    torch = pytest.importorskip("torch", reason="the networks' extra is not installed")
-    pytest.importorskip("PIL", reason="the networks' extra is not installed")
-    from support.small_networks import GRIDS, small_network
-
-    from mapless_server.method import pipeline as real
-    from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
-    from mapless_server.method.features import SiftExtractor
-    from mapless_server.networks.runner import NetworkRunner
-
-    torch.set_num_threads(1)
-    camera = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
-    wall = textured(800, 240, seed=8)
-
-    def photograph_at(x_m: float) -> bytes:
-        start = round(x_m * 100)  # a wall 3 m away
-        return encode(".png", wall[:, start : start + camera.width_px])
-
-    sizes: list[int] = []
-    entered, gate = threading.Semaphore(0), threading.Event()
-
-    def reconstruct(batch: Any) -> Any:
-        entered.release()
-        assert gate.wait(60)
-        sizes.append(len(batch))
-        return real.reconstruct(batch)
-
-    with closing(
-        NetworkReconstructor(NetworkRunner(small_network("pi3"), "pi3", "sha", "cpu"), NetworkOptions(grids=GRIDS))
-    ) as backend:
-        tier = Tier(SiftExtractor(), Pipeline(backend))
-        with (
-            overloaded(tmp_path, Method(reconstruct=reconstruct), tier=tier, max_batch=4, max_queued_s=60.0) as server,
-            Client(server.address) as client,
-            ThreadPoolExecutor(5) as pool,
-        ):
-            client.create_scene("s")
-            references = [
-                NewReference(f"r{i}", photograph_at(x_m), camera, RigidTransform(np.eye(3), np.array([x_m, 0.0, 0.0])))
-                for i, x_m in enumerate((0.0, 0.5, 1.0, 1.5))
-            ]
-            client.add_references("s", references)
-            names = [it.reference_id for it in references]
-            calls = [pool.submit(client.localize, photograph_at(0.2), camera, "s", names, timeout_s=60)]
-            try:
-                assert entered.acquire(timeout=30)
-                calls += [
-                    pool.submit(client.localize, photograph_at(x_m), camera, "s", names, timeout_s=60)
-                    for x_m in (0.3, 0.6, 0.9, 1.2)
-                ]
-                wait_until(lambda: server.value("mapless_queue_depth", stage="coarse") == 4)
-            finally:
-                gate.set()
-            assert all(isinstance(call.result(60), LocalizationResult | Rejected) for call in calls)
-            assert sizes == [1, 4]
-            assert server.value("mapless_batch_size_sum", stage="coarse") == 5
-            assert server.value("mapless_batch_size_count", stage="coarse") == 2
-        # Each reference was encoded once: by the first query, for all of them.
-        assert backend.cache.counters.misses == 4
