@@ -8,18 +8,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.compare import assert_pose_close, pose_error
+from support.pnp_problems import problem_of
 from support.scenes import CAMERA, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.observations import ONE_PIXEL
 from mapless_server.method.perturbation import moved
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.priors.gravity import GravityOptions, ransac_with_gravity, solve_pairs
 from mapless_server.method.priors.known import NO_PRIORS, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
 from mapless_server.method.priors.pose_only import PoseOnlyOptions, refine_pose
-from mapless_server.method.results import PointMatches, PoseEstimate, PoseStage, Structure
-from mapless_server.method.tracks import Tracks
-from mapless_server.method.views import Features, View
+from mapless_server.method.results import PoseEstimate, PoseStage
 
 POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
 DOWNS = {"y down": [0, 1, 0], "y up": [0, -1, 0], "z up": [0, 0, -1], "x up": [-1, 0, 0], "askew": [0.6, 0.0, 0.8]}
@@ -41,15 +39,6 @@ def seen(rng: np.random.Generator, count: int, noise_px: float = 0.5, wrong: int
     pixels = pixels + rng.normal(0, noise_px, pixels.shape)
     pixels[:wrong] = rng.uniform([0, 0], [959, 719], (wrong, 2))
     return x_in_world, pixels
-
-
-def problem_of(x_in_world: Array, pixels: Array) -> tuple[View, Structure, PointMatches]:
-    """Point i matched with keypoint i."""
-    n = len(x_in_world)
-    index = np.arange(n)
-    features = Features(pixels.astype(np.float32), np.ones((n, 1), np.float32), np.ones(n, np.float32))
-    structure = Structure(x_in_world, Tracks(index[:0], index[:0], index[:0]), ONE_PIXEL)
-    return View(CAMERA, features), structure, PointMatches(index, index, np.zeros(n, bool), 0.0)
 
 
 def solved(

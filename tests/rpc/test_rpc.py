@@ -14,6 +14,7 @@ import grpc
 import pytest
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from support import raw_http2
+from support.waiting import until
 
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
@@ -113,14 +114,6 @@ async def failure(channel: Channel, data: bytes = b"", **arguments: Any) -> Any:
     with pytest.raises(grpc.RpcError) as caught:
         await ask(channel, data, **arguments)
     return from_rpc_error(caught.value)
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    async def wait() -> None:
-        while not condition():
-            await asyncio.sleep(0.002)
-
-    await asyncio.wait_for(wait(), LIMIT_S)
 
 
 def lines_of(caplog: pytest.LogCaptureFixture) -> list[dict[str, Any]]:

@@ -14,6 +14,7 @@ from typing import Any
 
 import grpc
 import pytest
+from support.waiting import until
 
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
@@ -108,14 +109,6 @@ async def read(call: Any, seen: list[int] | None = None) -> list[int]:
     async for data in call:
         seen += [pb.WatchQueriesResponse.FromString(data).missed_count]
     return seen
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    async def wait() -> None:
-        while not condition():
-            await asyncio.sleep(0.002)
-
-    await asyncio.wait_for(wait(), LIMIT_S)
 
 
 @pytest.mark.parametrize("method", [METHOD, FINITE])

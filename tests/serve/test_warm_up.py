@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import socket
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
@@ -49,6 +48,7 @@ from mapless_server.serve.assembly import MakeEngine, StartupError, engine_optio
 from mapless_server.serve.warm_up import ROUNDS, warm_up
 from mapless_server.settings import Settings
 from mapless_server.store import Store
+from mapless_tools.load.driving import free_port
 
 LIMIT_S = 60.0
 TRUTH = np.array([0.25, 0.025, 0.0])
@@ -179,12 +179,6 @@ def test_a_broken_method_ends_the_start(tmp_path: Path, way: str) -> None:
         raise AssertionError("it began to serve")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def free_port() -> int:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        return int(taken.getsockname()[1])
 
 
 @contextmanager

@@ -58,17 +58,12 @@ from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.rpc import receiving
 from mapless_server.serve import listening as grpc_server
+from mapless_tools.load.driving import free_port
 from mapless_tools.load.scrape import Scrape, read_metrics
 
 ONCE = ConnectOptions(max_attempts=1)
 PATIENT = ConnectOptions(max_attempts=5, initial_backoff_s=1.0, max_backoff_s=5.0)
 SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
-
-
-def free_port() -> int:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        return int(taken.getsockname()[1])
 
 
 def scraped(address: str) -> Scrape:

@@ -22,6 +22,7 @@ from support.servers import (
     PHOTO,
     RunningServer,
     StandInMethod,
+    ending,
     localize_request,
     make_scene,
     pose,
@@ -149,13 +150,6 @@ def asking(server: Serving, timeout: float | None = LIMIT_S, metadata: Any = (),
     request = localize_request("s")
     request.MergeFrom(pb.LocalizeRequest(**fields))
     return server.stub.LocalizeProgressively(request, timeout=timeout, metadata=metadata)
-
-
-def ending(call: Any) -> MaplessError:
-    """The error that a call ends with."""
-    with pytest.raises(grpc.RpcError) as caught:
-        list(call)
-    return from_rpc_error(caught.value)
 
 
 def test_the_coarse_pose_comes_first_with_only_what_is_known(server: Serving) -> None:

@@ -10,10 +10,9 @@ from typing import Any
 
 import grpc
 import pytest
-from support.servers import CAMERA, PHOTO, RunningServer, localize_request, pose, serving
+from support.servers import CAMERA, PHOTO, RunningServer, ending, localize_request, pose, serving
 
 from mapless import Client, LocalizationResult, NewReference
-from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.services.watching import MAX_WATCHERS_OF_TENANT
@@ -47,13 +46,6 @@ def watching(stub: LocalizationServiceStub, scene: str = "hall", **arguments: An
     call = stub.WatchQueries(pb.WatchQueriesRequest(scene=f"scenes/{scene}"), timeout=LIMIT_S, **arguments)
     call.initial_metadata()
     return call
-
-
-def ending(call: Any) -> Any:
-    """The error that a watch ends with."""
-    with pytest.raises(grpc.RpcError) as caught:
-        list(call)
-    return from_rpc_error(caught.value)
 
 
 def test_answers_of_the_watched_scene_alone_arrive_at_once(

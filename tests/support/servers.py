@@ -298,6 +298,13 @@ def failure_of(method: Callable[..., Any], request: Any, **arguments: Any) -> Ma
     return from_rpc_error(caught.value)
 
 
+def ending(call: Any) -> MaplessError:
+    """The error that a stream ends with."""
+    with pytest.raises(grpc.RpcError) as caught:
+        list(call)
+    return from_rpc_error(caught.value)
+
+
 def localize_request(scene_id: str) -> localization_pb.LocalizeRequest:
     """A good request."""
     return localization_pb.LocalizeRequest(
