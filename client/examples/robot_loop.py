@@ -48,6 +48,7 @@ class LatestFrame:
         """Begins at once; `speed`: how many times faster than it was recorded."""
         if not video.is_file():
             raise OSError(f"there is no video {video}")
+        self._video = video
         self._capture = cv2.VideoCapture(str(video))
         if not self._capture.isOpened():
             raise OSError(f"{video} is no video that OpenCV can read")
@@ -60,11 +61,13 @@ class LatestFrame:
         threading.Thread(target=self._play, daemon=True).start()
 
     def __iter__(self) -> Iterator[Frame]:
-        """The newest frame at each step; ends with the video."""
+        """The newest frame at each step; ends with the video. ValueError if it has no frame."""
         seen = -1
         while (frame := self._newer_than(seen)) is not None:
             seen = frame.number
             yield frame
+        if seen < 0:
+            raise ValueError(f"{self._video} has no frame that can be decoded")
 
     def _newer_than(self, number: int) -> Frame | None:
         """The newest frame, as soon as it is another than that; None after the last."""
@@ -118,9 +121,9 @@ class Outputs:
             numbers = [frame.capture_time.timestamp(), *position, q.x, q.y, q.z, q.w]
             print(*(f"{number:.9f}" for number in numbers), file=self.tum, flush=True)
 
-    def lost(self, frame: Frame, reason: str) -> None:
-        """No pose, and why."""
-        self._write(frame, reason=reason)
+    def lost(self, frame: Frame, reason: str, message: str) -> None:
+        """No pose, and why: for programs, and for people."""
+        self._write(frame, reason=reason, message=message)
 
     def _write(self, frame: Frame, **fields: Any) -> None:
         line = {"frame": frame.number, "capture_time": frame.capture_time.isoformat(), **fields}
@@ -152,12 +155,12 @@ class Robot:
                 capture_time=frame.capture_time,
             )
         except (mapless.Unavailable, mapless.ResourceExhausted, mapless.DeadlineExceeded) as error:
-            self.outputs.lost(frame, error.reason)
+            self.outputs.lost(frame, error.reason, error.message)
             self._wait(error)
             return
         self.pause_s = 0.0
         if isinstance(answer, mapless.Rejected):
-            self.outputs.lost(frame, answer.reason)
+            self.outputs.lost(frame, answer.reason, answer.message)
             if answer.reason == "PRIOR_CONFLICT":
                 self.last = None
             return

@@ -119,3 +119,9 @@ def test_what_is_wrong_is_one_line(loop: Any, tmp_path: Path, camera_json: str, 
 def test_what_is_no_video_is_said(loop: Any, tmp_path: Path) -> None:
     with pytest.raises(OSError, match="is no video"):
         loop.LatestFrame(tmp_path / "absent.mp4")
+
+
+def test_a_file_without_frames_is_named(loop: Any, tmp_path: Path) -> None:
+    (tmp_path / "text.jpg").write_text("no photograph")
+    with pytest.raises(ValueError, match=r"text\.jpg has no frame"):
+        list(loop.LatestFrame(tmp_path / "text.jpg"))
