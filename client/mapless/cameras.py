@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,15 @@ from typing import Any
 import numpy as np
 
 from . import wire
-from .geometry import DEFAULT_LENS_MODEL, Camera, RigidTransform, lens_from_coefficients
+from .geometry import DEFAULT_LENS_MODEL, Array, Camera, RigidTransform, lens_from_coefficients
 from .json_input import read_json, read_message, shown
 from .pixels import size_of_image
 from .v1 import geometry_pb2
 from .wire import FieldError
 
 FOLDER_FILE = "cameras.json"
+MAX_SIDE_PX = 2**30
+"""In a cameras.json: more than any image's, and few enough for arithmetic with doubles and 32 bits."""
 
 
 def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
@@ -85,6 +88,39 @@ def read_cameras(file: str | Path) -> dict[Path, Camera]:
     return dict(_photograph(path, index, frame) for index, frame in enumerate(frames))
 
 
+def camera_of_frame(frame: Mapping[str, Any]) -> Camera:
+    """The camera of a frame of a cameras.json; its numbers are finite, but not yet within the interface's bounds.
+
+    Raises:
+        ValueError: a field is missing or wrong; names it.
+    """
+    if missing := [it for it in ("width", "height", "K") if it not in frame]:
+        raise ValueError(f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing")
+    for side in ("width", "height"):
+        if not isinstance(frame[side], int) or isinstance(frame[side], bool) or not 0 < frame[side] <= MAX_SIDE_PX:
+            raise ValueError(f"{side} must be a whole number of pixels, above 0, is {shown(frame[side])}")
+    k = _numbers(frame["K"])
+    if k.shape != (3, 3) or max(abs(k[0, 1]), abs(k[1, 0])) > 1e-6 or not np.allclose(k[2], [0, 0, 1]):
+        raise ValueError(f"K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], is {shown(frame['K'])}")
+    dist = frame.get("dist")
+    coefficients = None if dist is None else _numbers(dist)
+    if coefficients is not None and coefficients.ndim != 1:
+        raise ValueError(f"dist must be null or a list of numbers, is {shown(dist)}")
+    model = frame.get("lens", DEFAULT_LENS_MODEL)
+    lens = lens_from_coefficients(model, None if coefficients is None else coefficients.tolist())
+    focal_x_px, focal_y_px, principal_x_px, principal_y_px = k[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return Camera(frame["width"], frame["height"], focal_x_px, focal_y_px, principal_x_px, principal_y_px, lens)
+
+
+def _numbers(value: object) -> Array:
+    """An array of finite numbers; without dimensions if it is none."""
+    try:
+        numbers = np.array(value, float)
+    except (TypeError, ValueError, OverflowError):  # JSON's integers have any number of digits
+        return np.zeros(())
+    return numbers if np.isfinite(numbers).all() else np.zeros(())
+
+
 _NUMBERS = re.compile(r"[-+0-9.eE]+(,[-+0-9.eE]*)+")
 _REQUIRED_OF_CAMERAS = [it.name for it in fields(Camera) if it.name != "distortion"]
 _FIELDS_OF_FRAMES = {
@@ -108,34 +144,12 @@ def _photograph(path: Path, index: int, frame: Any) -> tuple[Path, Camera]:
     try:
         if not isinstance(frame, dict):
             raise ValueError(f"must be an object, {{...}}, is {shown(frame)}")
-        if missing := [it for it in ("image", "width", "height", "K") if it not in frame]:
-            raise ValueError(f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing")
-        if not isinstance(frame["image"], str):
-            raise ValueError(f"image must be a path, is {shown(frame['image'])}")
-        return path.parent / frame["image"], _checked(_camera(frame))
+        if not isinstance(frame.get("image"), str):
+            raise ValueError(f"image must be a path, is {shown(frame.get('image'))}")
+        return path.parent / frame["image"], _checked(camera_of_frame(frame))
     except FieldError as error:
         model, _, _ = error.field.partition(".")
         where = _FIELDS_OF_FRAMES.get(model, "dist")
         raise ValueError(f"{name}: {str(error).replace(error.field, where, 1)}") from None
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
-
-
-def _camera(frame: dict[str, Any]) -> Camera:
-    for side in ("width", "height"):
-        if not isinstance(frame[side], int) or isinstance(frame[side], bool) or abs(frame[side]) > 2**30:
-            raise ValueError(f"{side} must be a whole number of pixels, is {shown(frame[side])}")
-    try:
-        k = np.array(frame["K"], float)
-    except (TypeError, ValueError, OverflowError):
-        k = np.empty(0)
-    if k.shape != (3, 3):
-        raise ValueError(f"K must be 3x3 numbers, is {shown(frame['K'])}")
-    dist = frame.get("dist") or None
-    try:
-        coefficients = None if dist is None else [*map(float, dist)]
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"dist must be null or a list of numbers, is {shown(dist)}") from None
-    lens = lens_from_coefficients(frame.get("lens", DEFAULT_LENS_MODEL), coefficients)
-    focal_x_px, focal_y_px, principal_x_px, principal_y_px = k[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    return Camera(frame["width"], frame["height"], focal_x_px, focal_y_px, principal_x_px, principal_y_px, lens)

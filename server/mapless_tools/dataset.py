@@ -19,22 +19,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from mapless.cameras import FOLDER_FILE, camera_of_frame
 from mapless.geodesy import Datum
-from mapless.geometry import (
-    DEFAULT_LENS_MODEL,
-    MAX_COORDINATE_M,
-    Array,
-    Camera,
-    Distortion,
-    RigidTransform,
-    lens_from_coefficients,
-)
+from mapless.geometry import MAX_COORDINATE_M, Array, Camera, RigidTransform
 from mapless.scenes import Vector, unit_vector
 
-FILE_NAME = "cameras.json"
+FILE_NAME = FOLDER_FILE
 MAX_NAME_LENGTH = 128
-MAX_SIDE_PX = 2**30
-"""More than any image's, and few enough for arithmetic with doubles and 32 bits."""
 SPLITS = ("", "train", "test")
 _MAX_QUOTED = 1000
 """Characters that messages quote of a file's content, which may be anything and of any length."""
@@ -247,26 +238,10 @@ def read_frame(folder: Path, entry: object, taken: Container[str]) -> Frame:
 
 
 def _camera(entry: Mapping[str, Any]) -> Camera:
-    for side in ("width", "height"):
-        if not isinstance(entry.get(side), int) or isinstance(entry[side], bool) or not 0 < entry[side] <= MAX_SIDE_PX:
-            raise ValueError(f"{side} must be a whole number of pixels")
-    k = _numbers(entry, "K", (3, 3))
-    if not (k[0, 0] > 0 and k[1, 1] > 0):
-        raise ValueError("K: focal lengths must be above 0")
-    if abs(k[0, 1]) > 1e-6 or abs(k[1, 0]) > 1e-6 or not np.allclose(k[2], [0, 0, 1]):
-        raise ValueError("K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    distortion = _distortion(entry)
-    focal_x, focal_y, principal_x, principal_y = k[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    return Camera(entry["width"], entry["height"], focal_x, focal_y, principal_x, principal_y, distortion)
-
-
-def _distortion(entry: Mapping[str, Any]) -> Distortion | None:
-    coefficients = None if entry.get("dist") is None else _numbers(entry, "dist", None)
-    if coefficients is not None and coefficients.ndim != 1:
-        raise ValueError("dist must be null or a list of coefficients")
-    return lens_from_coefficients(
-        entry.get("lens", DEFAULT_LENS_MODEL), None if coefficients is None else coefficients.tolist()
-    )
+    camera = camera_of_frame(entry)
+    if not (camera.focal_x_px > 0 and camera.focal_y_px > 0):
+        raise ValueError(f"K: focal lengths must be above 0, are {camera.focal_x_px:g} and {camera.focal_y_px:g}")
+    return camera
 
 
 def _numbers(entry: Mapping[str, Any], field: str, shape: tuple[int, ...] | None) -> Array:

@@ -123,10 +123,11 @@ def test_the_cameras_of_a_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("wrong", "complaint"),
     [
-        ({"K": [[1]]}, "K must be 3x3 numbers, is [[1]]"),
+        ({"K": [[1]]}, "K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], is [[1]]"),
         ({"K": [[-5, 0, 3], [0, 5, 2], [0, 0, 1]]}, "K[0][0]: must be above 0 and at most 64000, is -5"),
         ({"width": 3}, "width: must be 32 to 16384, is 3"),
-        ({"height": 480.5}, "height must be a whole number of pixels, is 480.5"),
+        ({"height": 480.5}, "height must be a whole number of pixels, above 0, is 480.5"),
+        ({"K": [[5, 0, 0], [0, 5, 0], [3, 2, 1]]}, "K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], is [[5, 0, 0]"),
         ({"dist": [1, 2, 3, 4, 5, 6]}, "dist of a radial_tangential lens must be null or 4 or 5 coefficients"),
         ({"dist": [1, 2, 3, 400]}, "dist: must be at most 100 in magnitude, is 400"),
         ({"dist": "none"}, 'dist must be null or a list of numbers, is "none"'),

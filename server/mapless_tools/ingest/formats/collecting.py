@@ -14,10 +14,11 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from mapless.cameras import MAX_SIDE_PX
 from mapless.geometry import MAX_COORDINATE_M, Array, Camera, Quaternion, RigidTransform
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, image_size
-from mapless_tools.dataset import MAX_SIDE_PX, Dataset, Frame, Refusal, image_file, legal_id
+from mapless_tools.dataset import Dataset, Frame, Refusal, image_file, legal_id
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 """Camera axes x right, y up, z back to x right, y down, z forward; its own inverse."""
