@@ -6,7 +6,6 @@ often health is asked for, so that tests need not wait.
 
 from __future__ import annotations
 
-import socket
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from urllib.request import Request, urlopen
 import yaml  # type: ignore[import-untyped]
 
 from mapless import ConnectOptions
+from mapless_tools.load.driving import free_port
 from support.certificates import Pair, authority, signed
 from support.waiting import LIMIT_S, wait_until
 
@@ -98,19 +98,12 @@ def configured(folder: Path, by: Pair, servers: Sequence[str], health_interval_s
             for check in cluster["health_checks"] if health_interval_s is not None else ():
                 check["interval"] = check["no_traffic_interval"] = f"{health_interval_s}s"
     administration = config["admin"]["address"]["socket_address"]
-    administration["port_value"] = _free_port()
+    administration["port_value"] = free_port()
     (proxied,) = [it for it in resources["clusters"] if it["name"] == "administration"]
     (group,) = proxied["load_assignment"]["endpoints"]
     group["lb_endpoints"] = [_endpoint(f"127.0.0.1:{administration['port_value']}")]
     (folder / "envoy.yaml").write_text(yaml.safe_dump(config))
     return folder / "envoy.yaml"
-
-
-def _free_port() -> int:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        port: int = taken.getsockname()[1]
-        return port
 
 
 def _endpoint(address: str) -> Json:

@@ -11,7 +11,6 @@ import os
 import pwd
 import shutil
 import signal
-import socket
 import subprocess
 import tempfile
 import time
@@ -22,6 +21,8 @@ from typing import Any
 
 import psycopg
 import pytest
+
+from mapless_tools.load.driving import free_port
 
 USER = "mapless"
 START_LIMIT_S = 30.0
@@ -34,6 +35,7 @@ _SETTINGS = {
     "shared_buffers": "32MB",
     "wal_level": "minimal",
     "max_wal_senders": "0",
+    "fsync": "off",  # processes may be killed: what they have written is the kernel's
 }
 
 
@@ -48,15 +50,11 @@ class Cluster:
     """A running PostgreSQL.
 
     Args:
-        survives_power_failure: whether it waits for the disk. Processes may be killed without: what they have written
-            is the kernel's.
         tables_on, log_on: the disks of its files and of its write-ahead log, which all must be able to reach; None for
             the usual place.
     """
 
-    def __init__(
-        self, survives_power_failure: bool = False, tables_on: Path | None = None, log_on: Path | None = None
-    ) -> None:
+    def __init__(self, tables_on: Path | None = None, log_on: Path | None = None) -> None:
         folder = programs()
         assert folder is not None
         self._programs = folder
@@ -67,9 +65,9 @@ class Cluster:
         self._data = self._own_folder(tables_on) / "data"
         log_folder = self._own_folder(log_on) / "log"
         self._folders = (self._folder, self._data.parent, log_folder.parent)
-        self.port = _free_port()
+        self.port = free_port()
         self._numbers = count()
-        self._settings = _SETTINGS | {"port": str(self.port), "fsync": "on" if survives_power_failure else "off"}
+        self._settings = _SETTINGS | {"port": str(self.port)}
         self._server: subprocess.Popen[bytes] | None = None
         try:
             who = ("--auth=trust", f"--username={USER}")
@@ -78,12 +76,6 @@ class Cluster:
         except BaseException:
             self.remove()
             raise
-
-    @property
-    def process_id(self) -> int:
-        """Of the server's first process."""
-        assert self._server is not None
-        return self._server.pid
 
     def fresh_url(self) -> str:
         """URL of an empty schema."""
@@ -181,10 +173,3 @@ def _has_user(name: str) -> bool:
     except KeyError:
         return False
     return True
-
-
-def _free_port() -> int:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        port: int = listener.getsockname()[1]
-        return port
