@@ -24,7 +24,7 @@ from safetensors.torch import save_file  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
 from mapless_server.method.features.aliked import AlikedExtractor  # noqa: E402
-from mapless_server.method.features.edgepoint2 import EdgePoint2Extractor  # noqa: E402
+from mapless_server.method.features.edgepoint2 import SIZE_OF_WIDTH, EdgePoint2Extractor  # noqa: E402
 from mapless_server.method.features.network import (  # noqa: E402
     LearnedOptions,
     image_tensor,
@@ -186,6 +186,8 @@ def test_edgepoint2_features_are_read_at_the_peaks_of_the_maps(
     view = edgepoint2.extract(np.zeros((250, 320, 3), np.uint8), camera)
     assert view.camera == camera
     assert largest_miss_px(view.features.keypoints, centres) < 1e-3
+    # Each parabola's second derivative is 0.6.
+    np.testing.assert_allclose(view.features.sizes_px, SIZE_OF_WIDTH / np.sqrt(0.6), rtol=1e-3)
     places = view.features.descriptors[:, :2] / view.features.descriptors[:, 2:] * 200
     np.testing.assert_allclose(places, view.features.keypoints, atol=0.01)
 

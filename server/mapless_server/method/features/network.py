@@ -77,9 +77,14 @@ def peak_offsets(heights: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
         heights: (H, W).
         pixels: x and y, not at the border.
     """
+    return peaks(heights, pixels)[0]
+
+
+def peaks(heights: torch.Tensor, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """As `peak_offsets`, and the second derivatives (N, 2) of the parabolas, negative."""
     x, y = pixels.unbind(1)
     here = heights[y, x]
     left, right, above, below = heights[y, x - 1], heights[y, x + 1], heights[y - 1, x], heights[y + 1, x]
-    return torch.stack(
-        [(left - right) / (2 * (left + right - 2 * here)), (above - below) / (2 * (above + below - 2 * here))], dim=1
-    )
+    slopes = torch.stack([right - left, below - above], dim=1) / 2
+    curvatures = torch.stack([left + right - 2 * here, above + below - 2 * here], dim=1)
+    return -slopes / curvatures, curvatures
