@@ -89,6 +89,15 @@ def test_complaints(run: Run, tmp_path: Path, camera_json: str) -> None:
     assert (code, "width is no field" in complaint) == (2, True)
 
 
+def test_a_file_whose_name_is_no_id_needs_one(run: Run, scene: str, tmp_path: Path, camera_json: str) -> None:
+    (tmp_path / "my photo.png").write_bytes(PHOTO)
+    where = ("--camera", camera_json, "--pose", json.dumps(plain(pose(0.5))))
+    code, _, complaint = run("reference", "add", scene, tmp_path / "my photo.png", *where)
+    assert (code, "my photo.png: its name gives no id, so give one with --id: " in complaint) == (2, True)
+    code, stored, _ = run("reference", "add", scene, tmp_path / "my photo.png", *where, "--id", "mine")
+    assert (code, stored["reference_id"]) == (0, "mine")
+
+
 def test_a_blank_reference_is_warned_of(run: Run, scene: str, tmp_path: Path, camera_json: str) -> None:
     (tmp_path / "blank.png").write_bytes(BLACK)
     where = ("--camera", camera_json, "--pose", json.dumps(plain(pose(0.5))))

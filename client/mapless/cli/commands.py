@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from ..calls.health import SERVICES
@@ -13,6 +14,7 @@ from ..client import Client
 from ..errors import NotFound
 from ..geodesy import Datum
 from ..geometry import Quaternion
+from ..names import check_id
 from ..requests import NewReference
 from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import priors
@@ -81,7 +83,7 @@ def delete_scene(client: Client, arguments: argparse.Namespace) -> int:
 def add_reference(client: Client, arguments: argparse.Namespace) -> int:
     """Stores a photograph with its camera and pose."""
     reference = NewReference(
-        reference_id=arguments.id or arguments.photo.stem,
+        reference_id=arguments.id or _id_of(arguments.photo),
         image=arguments.photo,
         camera=read_camera(arguments.camera, arguments.photo),
         world_from_camera=read_pose(arguments.pose),
@@ -90,6 +92,14 @@ def add_reference(client: Client, arguments: argparse.Namespace) -> int:
     if not stored.feature_count:
         print(f"mapless: warning: {arguments.photo} is stored, but has no local features: {_BLANK}", file=sys.stderr)
     return print_json(stored)
+
+
+def _id_of(photo: Path) -> str:
+    """The id that a file's name gives."""
+    try:
+        return check_id(photo.stem)
+    except ValueError as error:
+        raise ValueError(f"{photo}: its name gives no id, so give one with --id: {error}") from None
 
 
 def list_references(client: Client, arguments: argparse.Namespace) -> int:
