@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from mapless_server.images import ImageLimits
+from mapless_server.method.options import check_bounds
 from mapless_server.scheduling import Job, WorkQueueOptions
 
 from .tiers import EscalationOptions
@@ -46,12 +47,8 @@ class EngineOptions:
     queue: WorkQueueOptions = field(default_factory=WorkQueueOptions)
 
     def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise ValueError(f"workers must be at least 1, is {self.workers}")
-        if self.max_batch < 1:
-            raise ValueError(f"max_batch must be at least 1, is {self.max_batch}")
-        if not 0 < self.coverage < 1:
-            raise ValueError(f"coverage must be above 0 and below 1, is {self.coverage}")
+        check_bounds(self, "workers max_batch", at_least=1)
+        check_bounds(self, "coverage", above=0, below=1)
 
 
 class Engine(Protocol):

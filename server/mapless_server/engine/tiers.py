@@ -14,6 +14,7 @@ import numpy as np
 
 from mapless.geometry import rotation_angle_deg
 from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.options import check_bounds
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.method.uncertainty.covariance import Accuracy, accuracy_from_covariance
 
@@ -47,13 +48,9 @@ class EscalationOptions:
     time_share: float = 0.8
 
     def __post_init__(self) -> None:
-        for name in ("doubtful_trust", "doubtful_radius_m", "same_position_m", "same_rotation_deg"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be at least 0, is {getattr(self, name)}")
-        if not self.clearly_more >= 1:
-            raise ValueError(f"clearly_more must be at least 1, is {self.clearly_more}")
-        if not 0 < self.time_share <= 1:
-            raise ValueError(f"time_share must be above 0 and at most 1, is {self.time_share}")
+        check_bounds(self, "doubtful_trust doubtful_radius_m same_position_m same_rotation_deg", at_least=0)
+        check_bounds(self, "clearly_more", at_least=1)
+        check_bounds(self, "time_share", above=0, at_most=1)
 
 
 def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:

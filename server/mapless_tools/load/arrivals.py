@@ -14,6 +14,7 @@ from enum import Enum
 import numpy as np
 
 from mapless.geometry import Array
+from mapless_server.method.options import check_bounds
 
 
 class Kind(str, Enum):
@@ -58,10 +59,7 @@ class Mix:
         shares = (self.cancelled_share, self.bad_share, self.hurried_share)
         if min(shares) < 0 or sum(shares) > 1:
             raise ValueError(f"shares must be at least 0 and together at most 1, are {shares}")
-        if not min(self.cancel_within_s, self.hurry_s) > 0:
-            raise ValueError(
-                f"cancel_within_s and hurry_s must be above 0, are {self.cancel_within_s:g}, {self.hurry_s:g}"
-            )
+        check_bounds(self, "cancel_within_s hurry_s", above=0)
 
 
 @dataclass(frozen=True, eq=False)

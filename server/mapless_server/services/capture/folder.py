@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from mapless_server.method.options import check_bounds
 from mapless_server.security import SceneKey, key_of
 
 from .calls import BlobDeleted, CapturedCall, CaptureError, DamagedCapture, decode_call, encode_call
@@ -56,9 +57,7 @@ class Retention:
     max_bytes: int
 
     def __post_init__(self) -> None:
-        for name in ("keep_s", "max_bytes"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be above 0, is {getattr(self, name)}")
+        check_bounds(self, "keep_s max_bytes", above=0)
 
 
 @dataclass(frozen=True, eq=False)
