@@ -30,7 +30,7 @@ from mapless_tools.load.arrivals import Kind, Mix, PlannedCall, Requests, plan_c
 from mapless_tools.load.charts import LATENCIES, RATES, draw_load
 from mapless_tools.load.no_op import CAMERA, padded_photo
 from mapless_tools.load.pipeline import PipelineOptions, PipelineResult, pipeline_checks, pipeline_json
-from mapless_tools.load.records import CallRecord, Fate, account_of, latencies, percentile
+from mapless_tools.load.records import CallRecord, Fate, account_of, latencies
 from mapless_tools.load.report import Check, check_lines, machine_lines, step_lines, update_json
 from mapless_tools.load.requests import photo_request, read_answer
 from mapless_tools.load.scrape import Scrape, parse_metrics, reconcile
@@ -111,7 +111,6 @@ def test_equal_seeds_plan_equal_calls_and_others_differ() -> None:
         lambda: plan_calls(0.0, 1.0, 1, REQUESTS, Mix(), 0),
         lambda: plan_calls(1.0, 1.0, 1, Requests((GOOD,)), Mix(bad_share=0.5), 0),
         lambda: account_of([], 1.0, 1.0),
-        lambda: percentile([], 0.5),
     ],
 )
 def test_senseless_arguments_are_refused(make: Callable[[], object]) -> None:
@@ -120,16 +119,6 @@ def test_senseless_arguments_are_refused(make: Callable[[], object]) -> None:
 
 
 # Accounts
-
-
-@given(st.lists(st.floats(0, 1e6), min_size=1), st.floats(0.001, 1))
-def test_a_percentile_is_the_least_value_with_so_many_below(values: list[float], share: float) -> None:
-    found = percentile(values, share)
-    assert found in values
-    assert sum(value <= found for value in values) >= share * len(values) * (1 - 1e-9)
-    smaller = [value for value in values if value < found]
-    if smaller:
-        assert sum(value <= max(smaller) for value in values) < share * len(values) * (1 + 1e-9)
 
 
 def test_percentiles_of_known_values() -> None:
