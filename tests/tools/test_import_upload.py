@@ -50,7 +50,7 @@ class Server:
         self._fault = fault
         self._lock = threading.Lock()
 
-    def add_references(self, scene: str, references: Sequence[NewReference]) -> None:
+    def add_references(self, scene: str, references: Sequence[NewReference]) -> list[Reference]:
         with self._lock:
             self.messages.append([reference.reference_id for reference in references])
             call = len(self.messages)
@@ -61,6 +61,7 @@ class Server:
             if error is not None:
                 raise error
             self.store(references)
+            return list(map(as_stored, references))
         finally:
             with self._lock:
                 self.in_flight -= 1
@@ -302,11 +303,12 @@ def test_an_interruption_ends_it_soon_and_keeps_what_is_in(tmp_path: Path) -> No
     began = threading.Event()
 
     class Interrupted(Server):
-        def add_references(self, scene: str, references: Sequence[NewReference]) -> None:
-            super().add_references(scene, references)
+        def add_references(self, scene: str, references: Sequence[NewReference]) -> list[Reference]:
+            stored = super().add_references(scene, references)
             if len(self.messages) == 1:
                 began.set()
                 raise KeyboardInterrupt
+            return stored
 
     server = Interrupted()
     with pytest.raises(KeyboardInterrupt):
