@@ -263,14 +263,14 @@ class TestDisk:
             assert client.get_reference("s", "r0", include_image=True).image == large_photo(0)
 
     def test_a_slow_disk_delays_no_answer_from_memory(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        slow, meets = threading.Event(), threading.Event()
+        slow, meets, goes_on = (threading.Event() for _ in range(3))
         real_read = SqliteDatabase.read
 
         @contextmanager
         def read(database: SqliteDatabase) -> Iterator[Connection]:
             if slow.is_set():
                 meets.set()
-                time.sleep(3.0)
+                assert goes_on.wait(30)
             with real_read(database) as connection:
                 yield connection
 
@@ -286,6 +286,7 @@ class TestDisk:
             assert is_answered(client, "r0", "r1")
             assert not any(it.done() for it in listed), "what is in memory waited for the disk"
             assert isinstance(late.result(30), DeadlineExceeded)
+            goes_on.set()
             assert [len(it.result(60)) for it in listed] == [3, 3]
 
 
