@@ -12,9 +12,8 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Coroutine, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import wraps
 from typing import Any, ParamSpec
 
 import pytest
@@ -169,25 +168,15 @@ async def outcomes(calls: Sequence[asyncio.Task[Any]]) -> list[Any]:
     return await asyncio.wait_for(asyncio.gather(*calls, return_exceptions=True), LIMIT_S)
 
 
-def in_loop(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
-    """Runs a test in an event loop of its own; an exception that reaches only the loop is a failure."""
-
-    @wraps(test)
-    def wrapper(*args: P.args, **kwargs: P.kwargs) -> None:
-        unhandled: list[dict[str, Any]] = []
-
-        async def observed() -> None:
-            asyncio.get_running_loop().set_exception_handler(lambda _, context: unhandled.append(context))
-            await test(*args, **kwargs)
-
-        asyncio.run(observed())
-        assert not unhandled
-
-    return wrapper
+@pytest.fixture(autouse=True)
+def _nothing_unhandled(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
+    """An exception that reaches only the loop is a failure."""
+    yield
+    told = [*caplog.get_records("call"), *caplog.get_records("teardown")]
+    assert not [it for it in told if it.name == "asyncio" and it.levelname == "ERROR"]
 
 
 class TestResults:
-    @in_loop
     async def test_a_job_that_has_ended_is_not_run_again(self) -> None:
         async with Toy(lambda jobs: [Done(job.step.payload) for job in jobs]) as toy:
             job = Job(Flow("t", "c"), Step("then", "toy", "b", "z"), time.monotonic() + FAR_S, 1)
@@ -196,7 +185,6 @@ class TestResults:
             with pytest.raises(ValueError, match="has ended"):
                 await toy.queue.run(job)
 
-    @in_loop
     async def test_a_job_passes_its_stages_and_records_their_times(self) -> None:
         marks: dict[str, tuple[float, float]] = {}
 
@@ -223,7 +211,6 @@ class TestResults:
         assert second.queued_s == first.end_s  # nothing lies between two stages
         assert toy.observer.batches[-1] == ("then", 3)
 
-    @in_loop
     async def test_a_batchs_output_is_taken_up_by_as_many_threads_at_once(self) -> None:
         """One notification, work for two."""
         both = threading.Barrier(2, timeout=LIMIT_S)
@@ -239,7 +226,6 @@ class TestResults:
             assert await toy.together(range(2)) == [0, 1]
 
     @pytest.mark.parametrize("is_first_stage_cheap", [False, True])
-    @in_loop
     async def test_a_light_caller_does_not_wait_for_a_heavy_ones_jobs(self, is_first_stage_cheap: bool) -> None:
         """Even if only the second stage takes time: the cost of a turn includes all stages."""
 
@@ -268,7 +254,6 @@ class TestResults:
 class TestFailure:
     @settings(max_examples=25, deadline=None)
     @given(st.lists(st.booleans(), min_size=1, max_size=3 * MAX_BATCH))
-    @in_loop
     async def test_the_failing_jobs_of_a_batch_fail_alone(self, fails: list[bool]) -> None:
         def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             for job in jobs:
@@ -283,7 +268,6 @@ class TestFailure:
         assert toy.observer.endings[Ending.FAILED] == sum(fails)
         assert not toy.fatals
 
-    @in_loop
     async def test_a_job_given_an_exception_fails_alone_and_once(self) -> None:
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
             return [PlantedError() if job.step.payload == 1 else Done(job.step.payload) for job in jobs]
@@ -294,7 +278,6 @@ class TestFailure:
         assert toy.seen == [[0, 1, 2]]
 
     @pytest.mark.parametrize("error", [StopIteration(), StopAsyncIteration(), asyncio.TimeoutError(), KeyError("x")])
-    @in_loop
     async def test_any_exception_is_the_jobs_alone(self, error: Exception) -> None:
         """Some of them mean something to futures and coroutines."""
 
@@ -310,7 +293,6 @@ class TestFailure:
         assert not toy.fatals
 
     @pytest.mark.parametrize("surplus", [-1, 1])
-    @in_loop
     async def test_a_stage_with_the_wrong_number_of_results_fails_all(self, surplus: int) -> None:
         def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             if "right" in [job.step.payload for job in jobs]:
@@ -324,7 +306,6 @@ class TestFailure:
             assert await toy.submit("right") == "right"
 
     @pytest.mark.parametrize("fits", [1, 2, 3, 5])
-    @in_loop
     async def test_out_of_memory_halves_the_batch_for_good(self, fits: int) -> None:
         def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             if len(jobs) > fits and jobs[0].step.bucket == "large":
@@ -340,7 +321,6 @@ class TestFailure:
         assert toy.seen[-1] == [*range(7)], "other buckets are not limited"
         assert set(toy.observer.endings) == {Ending.OK}
 
-    @in_loop
     async def test_memory_of_a_failed_attempt_is_free_for_its_halves(self) -> None:
         """An exception that is being handled holds the frames that it came through, and the tensors in them."""
         held: list[weakref.ref[Any]] = []
@@ -357,7 +337,6 @@ class TestFailure:
             assert await toy.together(range(4)) == [*range(4)]
         assert len(held) == 3
 
-    @in_loop
     async def test_a_batch_size_that_was_too_much_once_stays_so(self) -> None:
         """Though a later half of the same batch would have allowed more."""
 
@@ -372,7 +351,6 @@ class TestFailure:
             await toy.together(range(1, 9))
         assert [len(it) for it in toy.seen] == [1] * 8
 
-    @in_loop
     async def test_a_job_that_is_too_large_alone_ends_out_of_memory(self) -> None:
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
             raise MemoryError
@@ -399,7 +377,6 @@ class TestEndOfAll:
         assert toy.queue.job_count == 0
 
     @pytest.mark.parametrize("is_raised", [True, False])
-    @in_loop
     async def test_a_lost_device_ends_the_queue(self, is_raised: bool, caplog: pytest.LogCaptureFixture) -> None:
         error = LostDevice("poisoned context")
 
@@ -424,7 +401,6 @@ class TestEndOfAll:
         critical = [it.getMessage() for it in caplog.records if it.levelname == "CRITICAL"]
         assert critical == ["the device is lost: poisoned context"] == [str(it) for it in toy.fatals]
 
-    @in_loop
     async def test_two_threads_that_lose_it_at_once_are_one_end(self) -> None:
         both = threading.Barrier(2, timeout=LIMIT_S)
 
@@ -436,7 +412,6 @@ class TestEndOfAll:
             await self._ends(toy, [toy.submit(i, "first") for i in range(2)])
 
     @pytest.mark.parametrize("event", ["queued", "running", "waited", "computed", "ended"])
-    @in_loop
     async def test_a_bug_in_the_loop_itself_ends_the_queue(self, event: str) -> None:
         """Such as an observer that raises, which it must not."""
         broken = threading.Event()
@@ -456,7 +431,6 @@ class TestEndOfAll:
             broken.clear()
 
     @pytest.mark.parametrize("error", [SystemExit(3), KeyboardInterrupt()])
-    @in_loop
     async def test_a_stage_that_wants_to_end_the_program_ends_the_queue(self, error: BaseException) -> None:
         def compute(jobs: Sequence[Job]) -> list[StageResult]:
             raise error
@@ -464,7 +438,6 @@ class TestEndOfAll:
         async with Toy(compute) as toy:
             await self._ends(toy, [toy.submit(0)])
 
-    @in_loop
     async def test_a_stage_that_hangs_ends_the_queue(self) -> None:
         async with Toy(options=replace(ROOMY, stall_limit_s=0.2)) as toy:
             plugs = await toy.plug()
@@ -472,7 +445,6 @@ class TestEndOfAll:
         assert "the stage then has computed for" in str(toy.fatals[0])
         assert "hangs" in str(toy.fatals[0])
 
-    @in_loop
     async def test_a_long_stage_that_checks_between_steps_does_not_hang(self) -> None:
         def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             until_s = time.monotonic() + (2.0 if jobs[0].step.payload == "long" else 0.1)
@@ -488,7 +460,6 @@ class TestEndOfAll:
             assert not toy.fatals
             await self._ends(toy, [toy.submit("hangs")])
 
-    @in_loop
     async def test_closing_ends_waiting_jobs_and_awaits_the_computing(self) -> None:
         async with Toy() as toy:
             calls = await toy.waiting(range(3))
@@ -501,7 +472,6 @@ class TestEndOfAll:
         assert not toy.seen
         assert not toy.fatals
 
-    @in_loop
     async def test_closing_does_not_wait_for_ever(self, caplog: pytest.LogCaptureFixture) -> None:
         async with Toy() as toy:
             await toy.plug()
@@ -511,7 +481,6 @@ class TestEndOfAll:
         assert "toy-device" in said
         assert "left behind" in said
 
-    @in_loop
     async def test_a_queue_that_never_began_can_be_closed(self) -> None:
         async with Toy() as toy:
             await toy.queue.close()
@@ -519,7 +488,6 @@ class TestEndOfAll:
             assert isinstance(refused, Refused)
             assert not toy.queue.is_alive_within(FAR_S)
 
-    @in_loop
     async def test_draining_finishes_what_waits(self) -> None:
         async with Toy() as toy:
             calls = await toy.waiting(range(3))
@@ -531,7 +499,6 @@ class TestEndOfAll:
 
 
 class TestCallersWhoLeave:
-    @in_loop
     async def test_a_cancelled_waiting_job_is_not_computed(self) -> None:
         async with Toy() as toy:
             calls = await toy.waiting(range(3))
@@ -545,7 +512,6 @@ class TestCallersWhoLeave:
         assert toy.observer.endings == {Ending.CANCELLED: 1, Ending.OK: 3}
 
     @pytest.mark.parametrize("way", [Ending.CANCELLED, Ending.EXPIRED])
-    @in_loop
     async def test_a_thread_notices_at_its_next_check_that_a_job_ended(self, way: Ending) -> None:
         """The caller learns it at once; the thread is not interrupted."""
         began, asks, noticed = threading.Event(), threading.Event(), threading.Event()
@@ -576,7 +542,6 @@ class TestCallersWhoLeave:
             assert noticed.is_set()
         assert toy.observer.endings == {way: 1, Ending.OK: 1}
 
-    @in_loop
     async def test_a_waiting_call_ends_at_its_deadline_without_a_thread(self) -> None:
         async with Toy() as toy:
             await toy.submit("quick")  # so that enough time is predicted
@@ -585,7 +550,6 @@ class TestCallersWhoLeave:
             assert not toy.gate.is_set()
         assert toy.seen == [["quick"]]
 
-    @in_loop
     async def test_a_fallback_is_given_when_time_runs_out(self) -> None:
         def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
             if jobs[0].step.stage == "then":
@@ -600,7 +564,6 @@ class TestCallersWhoLeave:
         assert toy.observer.endings == {Ending.OK: 1, Ending.DEGRADED: 1}
 
     @pytest.mark.parametrize("seed", range(3))
-    @in_loop
     async def test_in_any_order_everything_comes_to_its_end(self, seed: int) -> None:
         """Callers come, leave at any moment, run out of time, fail and go through one stage or two."""
         random_ = random.Random(seed)
